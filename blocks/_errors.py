@@ -1,0 +1,189 @@
+"""Every error that Loopwright raises, as one tree.
+
+::
+
+    LoopwrightError
+    ├── DefinitionError (ValueError)      a block, path, model or option is given wrongly
+    │   ├── ParameterError                a parameter's name, value or shape
+    │   ├── OptionError                   an option of an experiment, a run or a command
+    │   └── TraceError                    an equation that can't be traced, or traces wrongly
+    ├── WiringError (ValueError)          a diagram that can't be built
+    │   ├── UnwiredInputError
+    │   ├── DoubleDriveError              an input driven twice, a block called twice
+    │   ├── DuplicateNameError
+    │   ├── UnknownNameError (KeyError)   a path, port, signal or parameter that isn't there
+    │   ├── ShapeError
+    │   ├── UnitError
+    │   ├── SampleTimeError
+    │   └── AlgebraicLoopError
+    ├── SimulationError (RuntimeError)    a run that stopped; ``.run`` holds what was recorded
+    │   ├── NonFiniteError
+    │   ├── GuardError
+    │   │   └── PathDomainError           a position outside the domain of a path's coordinates
+    │   └── FmuRuntimeError               an FMU's function returned an error
+    └── FmuError (RuntimeError)           an FMU that can't be read, built or loaded
+        ├── FmuFileError
+        └── CompilerError
+
+Each says who (block path, port), when (t), what was found, what was expected, and one next step.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
+
+class LoopwrightError(Exception):
+    """The root of all errors raised on purpose.
+
+    Parameters
+    ----------
+    message : str
+        What was found, what was expected, and the next step.
+    block : str, optional
+        Dotted path of the block concerned; put in front of the message.
+    port : str, optional
+        Port concerned.
+    t : float, optional
+        Simulation time in s.
+    """
+
+    def __init__(self, message: str, *, block: str | None = None, port: str | None = None, t: float | None = None):
+        self.message, self.block, self.port, self.t = message, block, port, t
+        super().__init__(message)
+
+    def __str__(self) -> str:
+        who = ".".join(part for part in (self.block, self.port) if part)
+        when = "" if self.t is None else f"t = {self.t:.9g} s"
+        head = ", ".join(part for part in (who, when) if part)
+        return f"{head}: {self.message}" if head else self.message
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild, (type(self), self.__dict__.copy())
+
+    def at(self, *, block: str | None = None, port: str | None = None, t: float | None = None) -> LoopwrightError:
+        """Fill in who and when where they are not known yet, and return self."""
+        self.block, self.port = self.block or block, self.port or port
+        self.t = t if self.t is None else self.t
+        return self
+
+
+def _rebuild(cls: type[LoopwrightError], state: dict[str, Any]) -> LoopwrightError:
+    error = cls.__new__(cls)
+    Exception.__init__(error, state.get("message", ""))
+    error.__dict__.update(state)
+    return error
+
+
+class DefinitionError(LoopwrightError, ValueError):
+    """A block, path, model or option is given wrongly."""
+
+
+class ParameterError(DefinitionError):
+    """A parameter's name, value or shape is wrong."""
+
+
+class OptionError(DefinitionError):
+    """An option of an experiment, a run or a command is wrong."""
+
+
+class TraceError(DefinitionError):
+    """An equation can't be traced, or its traced result differs from NumPy's."""
+
+
+class WiringError(LoopwrightError, ValueError):
+    """A diagram can't be built as it is wired."""
+
+
+class UnwiredInputError(WiringError):
+    """A required input has no source."""
+
+
+class DoubleDriveError(WiringError):
+    """An input is driven twice, or one block is called twice."""
+
+
+class DuplicateNameError(WiringError):
+    """Two blocks or wires of one frame carry the same name."""
+
+
+class UnknownNameError(WiringError, KeyError):
+    """A path, port, signal or parameter is not there."""
+
+
+class ShapeError(WiringError):
+    """The shapes at the two ends of a wire differ."""
+
+
+class UnitError(WiringError):
+    """The units at the two ends of a wire differ, or a unit can't be read."""
+
+
+class SampleTimeError(WiringError):
+    """A sample time is missing, not positive, or finer than the clock's base."""
+
+
+class AlgebraicLoopError(WiringError):
+    """Ports depend on each other without a state in between."""
+
+
+class SimulationError(LoopwrightError, RuntimeError):
+    """A run stopped. ``run`` holds every sample recorded until then (None before the first)."""
+
+    run: Any = None
+
+
+class NonFiniteError(SimulationError):
+    """A block made a NaN or an infinity."""
+
+
+class GuardError(SimulationError):
+    """A block's guard (an expression that must stay positive) failed."""
+
+
+class PathDomainError(GuardError):
+    """A position is outside the domain in which a path's coordinates are valid.
+
+    Attributes
+    ----------
+    position : tuple of float
+        The position, m.
+    theta : float
+        Path parameter of its foot point.
+    xi : float
+        Signed distance to the path, m (positive to the left).
+    reach : float
+        Distance to the limit of the domain at this foot point, on that side, m.
+    """
+
+    position: tuple[float, ...] = ()
+    theta: float = float("nan")
+    xi: float = float("nan")
+    reach: float = float("nan")
+
+
+class FmuRuntimeError(SimulationError):
+    """A function of an FMU returned an error; its own log lines are in the message."""
+
+
+class FmuError(LoopwrightError, RuntimeError):
+    """An FMU can't be read, built or loaded."""
+
+
+class FmuFileError(FmuError):
+    """A file is no FMU, or one that can't be used here."""
+
+
+class CompilerError(FmuError):
+    """No C compiler was found, or it failed; its own message is quoted."""
+
+
+def near(name: str, known: Iterable[str]) -> str:
+    """Say which known names are close to ``name``, for the end of an error message."""
+    known = sorted({str(k) for k in known})
+    close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    if close:
+        return f"Did you mean {' or '.join(repr(c) for c in close)}?"
+    return f"Known: {', '.join(known)}." if known else "There are none."
