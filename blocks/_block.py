@@ -1,0 +1,153 @@
+"""The base of all blocks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from ._errors import DefinitionError, GuardError
+from ._ports import Input, Output, Port, State
+from ._signals import Call, Signal, Wireable, as_signal, bind, check_name, primary_outputs
+from ._values import Value
+
+
+class Block(Value, Wireable):
+    """A signal-flow block: parameters, ports, and equations that are written once.
+
+    A subclass declares ports and parameters and writes its equations as plain functions of ``(t, x, u)`` with NumPy's
+    names; the same functions are run, traced, differentiated and compiled::
+
+        class Lag(Block):
+            '''First-order lag: T₁ ẏ = u − y.'''
+
+            time_constant: float = parameter(unit="s", above=0.0)
+            u = Input()
+            y = State(output=True)
+
+            def derivative(self, t, x, u):
+                return (u.u - x.y) / self.time_constant
+
+    ``x`` and ``u`` are named tuples of the states and the inputs, in the order of declaration. A function returns one
+    value for one port (or state), else a tuple in the order of declaration. None of them may change its arguments or
+    depend on anything but them and the parameters. Vectors are built with ``np.stack``; branches with ``np.where``.
+
+    A block has continuous states if it has a ``derivative``, sampled ones if it has an ``update`` alone. A continuous
+    block in a sampled subsystem is discretized by the subsystem's method, unless it has an ``update`` of its own.
+
+    Equations (all optional; ``T`` may be declared as a last argument of ``output``, ``update`` and ``guards`` and is
+    then the sample time in s)
+    ----------------------------------------------------------------------------------------------------------------
+    output(t, x, u)
+        The outputs that are not states.
+    derivative(t, x, u)
+        Time derivative of the states.
+    update(t, x, u)
+        The states at the next tick.
+    guards(t, x, u)
+        Expressions by name that must stay positive, else the run stops with `guard_error`.
+    initial(u)
+        Initial states from the inputs at the start: plain Python, not traced.
+    constants(T, method)
+        Numbers computed from the parameters in plain Python, which the equations then read as attributes.
+
+    Parameters
+    ----------
+    name : str, optional
+        Name in the diagram; without one the class name in snake case, numbered where it repeats.
+    """
+
+    _keywords: ClassVar[frozenset[str]] = frozenset({"name"})
+    memory: ClassVar[bool] = False
+    """True where the states are only a warm start for the outputs, such as a projection's last foot point."""
+    opaque: ClassVar[bool] = False
+    """True where there are no equations to trace."""
+    same_units: ClassVar[bool] = False
+    """True where all inputs must be in one unit, as in a sum."""
+
+    inputs: ClassVar[Mapping[str, Input]] = {}
+    outputs: ClassVar[Mapping[str, Output | State]] = {}
+    states: ClassVar[Mapping[str, State]] = {}
+    name: str | None
+    _hint: str | None
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        ports: dict[str, Port] = {}
+        for base in reversed(cls.__mro__):
+            for name, item in vars(base).items():
+                if isinstance(item, Port):
+                    ports[name] = item
+                else:
+                    ports.pop(name, None)
+        for clash in ports.keys() & cls.parameter_specs.keys():
+            raise DefinitionError("a port and a parameter share this name; rename one.", block=cls.__name__, port=clash)
+        for attribute, kind in (("inputs", Input), ("states", State)):
+            if not isinstance(cls.__dict__.get(attribute), property):
+                setattr(cls, attribute, {k: p for k, p in ports.items() if isinstance(p, kind)})
+        if not isinstance(cls.__dict__.get("outputs"), property):
+            cls.outputs = {
+                k: p for k, p in ports.items() if isinstance(p, Output) or (isinstance(p, State) and p.output)
+            }
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        name = kwargs.get("name")
+        object.__setattr__(self, "name", None if name is None else check_name(name))
+        object.__setattr__(self, "_hint", None)
+        super().__init__(*args, **kwargs)
+
+    @property
+    def label(self) -> str:
+        """Name for messages and for numbering: the given one, else the class name in snake case."""
+        return self.name or self._hint or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(self).__name__).lower()
+
+    @property
+    def starts_from_inputs(self) -> bool:
+        """Whether the initial state is computed from the inputs at the start, by ``initial``."""
+        return hasattr(self, "initial")
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a variant with some parameters (or the name) changed; it is another node."""
+        result = type(self)(**{**self.parameters, "name": self.name, **changes})
+        object.__setattr__(result, "_hint", self._hint)
+        return result
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Call:
+        """Wire the block: signals by position in the order of the inputs, or by keyword."""
+        return Call(self, bind(self, args, kwargs))
+
+    def _signal(self) -> Signal:
+        if any(port.default is None for port in self.inputs.values()) or len(primary_outputs(self)) != 1:
+            return as_signal_error(self)
+        return Signal(self, primary_outputs(self)[0])
+
+    def __repr__(self) -> str:
+        text = super().__repr__()
+        return text if self.name is None else f"{text[:-1]}{', ' if text[-2] != '(' else ''}name={self.name!r})"
+
+    def guard_error(self, name: str, value: float, u: Any, y: Any) -> GuardError:
+        """Return the error for a failed guard; ``u`` and ``y`` are named tuples of the inputs and outputs then."""
+        return GuardError(
+            f"guard {name!r} is {value:.6g}; expected a positive value. Check what its inputs are: "
+            f"{', '.join(f'{k} = {np.asarray(v).tolist()}' for k, v in u._asdict().items())}."
+        )
+
+
+def as_signal_error(block: Block) -> Signal:
+    """Raise the error of a block used as a signal that isn't one."""
+    from ._errors import WiringError
+
+    outputs = ", ".join(primary_outputs(block)) or "none"
+    needed = [name for name, port in block.inputs.items() if port.default is None]
+    if needed:
+        raise WiringError(
+            f"a block is used as a signal before it is wired; call it first, or name an output ({outputs}): "
+            f"{block.label}({', '.join(f'{n}=…' for n in needed)}).",
+            block=block.label,
+        )
+    raise WiringError(f"it has not one output ({outputs}); name one.", block=block.label)
+
+
+__all__ = ["Block", "as_signal"]

@@ -1,0 +1,178 @@
+"""Compliance: the error dynamics of section III-B and the admittance of section IV."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from ._block import Block
+from ._discretization import hold
+from ._errors import ParameterError
+from ._ports import Input, Output, State
+from ._values import Array, parameter
+
+
+class ErrorDynamics(Block):
+    """PID error dynamics (12): v = r̈ − a₂ ė − a₁ e − a₀ ∫e dt, e = y − r.
+
+    Behind `FeedbackLinearization` it makes e⁽³⁾ + a₂ ë + a₁ ė + a₀ e = 0 (E5). Inputs are the coordinate (y, ẏ) and
+    the path reference (r, ṙ, r̈). Anti-windup: while ``excess``, the part of the motor force that a saturation cut off, is
+    not zero, the integral holds.
+    """
+
+    a2: float = parameter(unit="1/s", description="gain of the rate error")
+    a1: float = parameter(unit="1/s2", description="gain of the error")
+    a0: float = parameter(unit="1/s3", description="gain of the integral")
+    coordinate = Input(shape=(2,), unit=("m", "m/s"), description="η or ξ: value and rate")
+    reference = Input(shape=(3,), unit=("m", "m/s", "m/s2"), description="path reference: value, rate, acceleration")
+    excess = Input(shape=None, default=0.0, description="what a saturation cut off, any shape; zero: none acts")
+    v = Output(unit="m/s2", description="virtual input v∥ or v⊥")
+    integral = State(unit="m.s", description="∫e dt")
+
+    @classmethod
+    def from_poles(cls, poles: Sequence[complex], *, name: str | None = None) -> Self:
+        """Return the error dynamics with three given poles.
+
+        Parameters
+        ----------
+        poles : sequence of 3 numbers
+            Poles in 1/s, real or in conjugate pairs, in the left half plane.
+        name : str, optional
+            Name of the block.
+
+        Raises
+        ------
+        ParameterError
+            If there are not three, they don't come in conjugate pairs, or one is not in the left half plane.
+        """
+        p = np.asarray(poles, dtype=complex)
+        coefficients = np.poly(p)
+        if p.shape != (3,) or np.any(p.real >= 0) or np.max(np.abs(np.imag(coefficients))) > 1e-9 * np.abs(p).max() ** 3:
+            raise ParameterError(
+                f"found {list(poles)}; expected three poles in the left half plane, complex ones in conjugate pairs, such as "
+                "[-20, -20, -20].",
+                block=name or cls.__name__,
+                port="poles",
+            )
+        _, a2, a1, a0 = np.real(coefficients)
+        return cls(a2=a2, a1=a1, a0=a0, name=name)
+
+    @property
+    def poles(self) -> np.ndarray:
+        """The three poles in 1/s."""
+        return np.roots([1.0, self.a2, self.a1, self.a0])
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return v of (12)."""
+        e, e_rate = u.coordinate[0] - u.reference[0], u.coordinate[1] - u.reference[1]
+        return u.reference[2] - self.a2 * e_rate - self.a1 * e - self.a0 * x.integral
+
+    def derivative(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the error, or zero while the motor force is cut."""
+        return np.where(np.sum(np.abs(u.excess)) > 0.0, 0.0, u.coordinate[0] - u.reference[0])
+
+
+class AdmittanceFilter(Block):
+    """Admittance control law (15): the path reference that yields to a force like m ë + d ė + k e = F − F^d, (14).
+
+    e = r^p − r^d is the deviation of the path reference from the given reference; d = 2 ζ √(m k) (E7). Force tracking
+    (section IV-B) is the case k = 0 with a desired force; the damping must then be given (E8). ``offset`` is a set-point
+    without derivatives, measured from the reference: it adds k·offset to the force (E27).
+
+    ``velocity_limit`` and ``acceleration_limit`` bound the path reference by conditional integration (end of section
+    IV-A): in a tick in which one would be exceeded the acceleration is cut to the admissible value and held over the tick.
+    """
+
+    mass: float = parameter(unit="kg", above=0.0, description="rendered mass m")
+    stiffness: float = parameter(unit="N/m", minimum=0.0, description="rendered stiffness k")
+    damping_ratio: float | None = parameter(default=None, minimum=0.0, description="ζ; or give the damping itself")
+    damping: float | None = parameter(default=None, unit="N.s/m", minimum=0.0, description="rendered damping d")
+    velocity_limit: float | None = parameter(default=None, unit="m/s", above=0.0, description="largest speed of r^p")
+    acceleration_limit: float | None = parameter(default=None, unit="m/s2", above=0.0, description="largest |r̈^p|")
+    force = Input(unit="N", description="force on the robot in this direction")
+    reference = Input(shape=(3,), unit=("m", "m/s", "m/s2"), description="r^d: value, rate, acceleration")
+    desired_force = Input(unit="N", default=0.0, description="F^d, subtracted from the force (E16)")
+    offset = Input(unit="m", default=0.0, description="set-point without derivatives, relative to the reference")
+    path_reference = Output(shape=(3,), unit=("m", "m/s", "m/s2"), description="r^p: value, rate, acceleration")
+    error = State(unit="m", description="e")
+    error_rate = State(unit="m/s", description="ė")
+
+    def check(self) -> None:
+        """Refuse a damping that is given twice or not at all."""
+        if (self.damping is None) == (self.damping_ratio is None):
+            raise ParameterError("give either damping_ratio or damping.", block=self.label, port="damping")
+        if self.stiffness == 0 and self.damping is None:
+            raise ParameterError(
+                f"found stiffness=0 with damping_ratio={self.damping_ratio:g}; 2 ζ √(m k) would be no damping at all. Give "
+                "damping=… in N.s/m, for instance the value that it had before.",
+                block=self.label,
+                port="damping",
+            )
+
+    @property
+    def effective_damping(self) -> Array:
+        """Damping d in N s/m, 2 ζ √(m k) where the ratio is given."""
+        return self.damping if self.damping is not None else 2.0 * self.damping_ratio * np.sqrt(self.mass * self.stiffness)
+
+    def constants(self, T: float, method: str) -> dict[str, np.ndarray]:
+        """Return transition and forcing of the free filter over one sample."""
+        A = np.array([[0.0, 1.0], [-self.stiffness / self.mass, -self.effective_damping / self.mass]])
+        transition, forcing = hold(A, T, method)
+        return {"transition": transition, "forcing": forcing}
+
+    def free_acceleration(self, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return the driving part of ë, and ë itself while no limit acts."""
+        drive = (u.force - u.desired_force + self.stiffness * u.offset) / self.mass
+        return drive, drive - (self.effective_damping * x.error_rate + self.stiffness * x.error) / self.mass
+
+    def step(self, x: Any, u: Any, T: Array) -> tuple[Array, Array, Array]:
+        """Return e and ė at the next tick, and ë that is held over this one."""
+        drive, a = self.free_acceleration(x, u)
+        free = self.transition @ np.stack([x.error, x.error_rate]) + self.forcing @ np.stack([0.0 * drive, drive])
+        if self.velocity_limit is None and self.acceleration_limit is None:
+            return free[0], free[1], a
+        v_d, a_d = u.reference[1], u.reference[2]
+        wanted, v = a_d + a, v_d + x.error_rate
+        cut, acts = wanted, wanted != wanted
+        if self.velocity_limit is not None:
+            acts = np.abs(v_d + a_d * T + free[1]) > self.velocity_limit
+            cut = _clip(cut, (-self.velocity_limit - v) / T, (self.velocity_limit - v) / T)
+        if self.acceleration_limit is not None:
+            acts = np.logical_or(acts, np.abs(wanted) > self.acceleration_limit)
+            cut = _clip(cut, -self.acceleration_limit, self.acceleration_limit)
+        cut = cut - a_d
+        return (
+            np.where(acts, x.error + x.error_rate * T + 0.5 * cut * T**2, free[0]),
+            np.where(acts, x.error_rate + cut * T, free[1]),
+            np.where(acts, cut, a),
+        )
+
+    def output(self, t: Array, x: Any, u: Any, T: Array = None) -> Array:
+        """Return r^p with its derivatives."""
+        a = self.derivative(t, x, u)[1] if T is None else self.step(x, u, T)[2]
+        return u.reference + np.stack([x.error, x.error_rate, a])
+
+    def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return ė and ë; at a velocity limit the acceleration points inwards."""
+        _, a = self.free_acceleration(x, u)
+        v_d, a_d = u.reference[1], u.reference[2]
+        wanted = a_d + a
+        if self.acceleration_limit is not None:
+            wanted = _clip(wanted, -self.acceleration_limit, self.acceleration_limit)
+        if self.velocity_limit is not None:
+            v = v_d + x.error_rate
+            outwards = np.logical_and(np.abs(v) >= self.velocity_limit, v * wanted > 0.0)
+            wanted = np.where(outwards, 0.0, wanted)
+        limited = self.acceleration_limit is not None or self.velocity_limit is not None
+        return x.error_rate, wanted - a_d if limited else a
+
+    def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
+        """Return e and ė at the next tick."""
+        return self.step(x, u, T)[:2]
+
+
+def _clip(value: Array, low: Array, high: Array) -> Array:
+    """Clip, letting NaN through (a traced np.clip swallows it)."""
+    return np.where(value < low, low, np.where(value > high, high, value))

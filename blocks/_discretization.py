@@ -1,0 +1,47 @@
+"""How a continuous block advances over one sample when its inputs are held."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from ._errors import SampleTimeError
+
+Method = Literal["exact", "forward", "semi_implicit"]
+METHODS = ("exact", "forward", "semi_implicit")
+
+
+def check_method(method: str) -> None:
+    """Raise `SampleTimeError` unless ``method`` names a discretization."""
+    if method not in METHODS:
+        raise SampleTimeError(f"found the method {method!r}; expected one of {', '.join(METHODS)}.")
+
+
+def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return Ad and Φ of x(t + T) = Ad x + Φ g for ẋ = A x + g with g held over T.
+
+    Parameters
+    ----------
+    A : (n, n) ndarray
+        System matrix.
+    T : float
+        Sample time in s.
+    method : {"exact", "forward", "semi_implicit"}
+        ``exact`` is the zero-order hold, Ad = exp(A T) and Φ = ∫₀ᵀ exp(A s) ds. ``forward`` is forward Euler.
+        ``semi_implicit`` is Euler with the states renewed from the last to the first, each with those already renewed:
+        for (position, velocity) the velocity first, then the position with the new velocity.
+    """
+    check_method(method)
+    n = len(A)
+    eye = np.eye(n)
+    if method == "forward":
+        return eye + T * A, T * eye
+    if method == "semi_implicit":
+        upper = np.triu(A, 1)
+        solve = np.linalg.inv(eye - T * upper)
+        return solve @ (eye + T * (A - upper)), T * solve
+    from scipy.linalg import expm
+
+    both = expm(np.block([[A, eye], [np.zeros((n, 2 * n))]]) * T)
+    return both[:n, :n], both[:n, n:]

@@ -1,0 +1,145 @@
+"""Ports: what a block declares of its inputs, outputs and states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+
+from ._errors import DefinitionError
+
+if TYPE_CHECKING:
+    from ._block import Block
+    from ._signals import Signal
+
+Shape = tuple[int, ...]
+Unit = str | tuple[str, ...] | None
+
+
+class Port:
+    """An input, an output or a state, declared on a block's class: ``position = Input(shape=(2,), unit="m")``.
+
+    Parameters
+    ----------
+    shape : tuple of int or None
+        Shape of the signal, ``()`` for a scalar. None takes any shape (an input), or that which the equations give (an
+        output).
+    unit : str, tuple of str or None
+        Unit as FMI spells it; a tuple gives one per entry. None: not declared, and not checked.
+    description : str
+        One line for people.
+    """
+
+    def __init__(self, shape: Shape | None = (), unit: Unit = None, description: str = "", name: str = ""):
+        self.shape, self.unit, self.description, self.name = shape, unit, description, name
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        if name.startswith("_") or name in {"name", "inputs", "outputs", "states", "replace", "parameters", "T"}:
+            raise DefinitionError(f"a port can't be called {name!r}; choose another name.", block=owner.__name__)
+        self.name = name
+
+    def __repr__(self) -> str:
+        unit = "" if self.unit is None else f", unit={self.unit!r}"
+        return f"{type(self).__name__}({self.name}, shape={self.shape}{unit})"
+
+
+class Input(Port):
+    """An input. With ``default`` it may stay unwired."""
+
+    def __init__(
+        self, shape: Shape | None = (), unit: Unit = None, description: str = "", *, default: Any = None, name: str = ""
+    ):
+        super().__init__(shape, unit, description, name)
+        self.default = None if default is None else np.asarray(default, dtype=float)
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        if instance is None:
+            return self
+        raise AttributeError(
+            f"{self.name!r} is an input of {instance!r}: it is wired by calling the block, and can't be read."
+        )
+
+
+class Output(Port):
+    """An output; read on a block it is a `Signal`.
+
+    Parameters
+    ----------
+    like : str, optional
+        Name of the input whose unit (and shape, where none is given) it takes over.
+    secondary : bool, optional
+        True for an output that is read by name only (``saturation.excess``): it is recorded as any other, but the
+        block's call neither unpacks into it nor stands for it.
+    """
+
+    def __init__(
+        self,
+        shape: Shape | None = (),
+        unit: Unit = None,
+        description: str = "",
+        *,
+        like: str | None = None,
+        secondary: bool = False,
+        name: str = "",
+    ):
+        super().__init__(None if like and shape == () else shape, unit, description, name)
+        self.like, self.secondary = like, secondary
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> Output: ...
+    @overload
+    def __get__(self, instance: Block, owner: type | None = None) -> Signal: ...
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        if instance is None:
+            return self
+        from ._signals import Signal
+
+        return Signal(instance, self.name)
+
+
+class State(Port):
+    """A state: continuous with a `derivative`, sampled with an `update`.
+
+    Parameters
+    ----------
+    start : float, array_like, str or callable
+        Start value; a string names the parameter that holds it, a callable computes it from the block. It sets the
+        shape.
+    like : str, optional
+        Name of the input whose shape the state takes.
+    output : bool, optional
+        True when the state is an output as well, under the same name.
+    """
+
+    def __init__(
+        self,
+        unit: Unit = None,
+        description: str = "",
+        *,
+        start: float | Any | str | Callable[[Any], Any] = 0.0,
+        like: str | None = None,
+        output: bool = False,
+        name: str = "",
+    ):
+        super().__init__(None, unit, description, name)
+        self.start, self.like, self.output = start, like, output
+
+    def start_value(self, block: Block, shapes: Mapping[str, Shape]) -> np.ndarray:
+        """Return the start value on ``block``, with inputs of the given shapes, as a float64 array."""
+        start = self.start
+        if isinstance(start, str):
+            start = getattr(block, start)
+        elif callable(start):
+            start = start(block)
+        value = np.asarray(0.0 if start is None else start, dtype=float)
+        return np.array(np.broadcast_to(value, shapes[self.like])) if self.like else value
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        if instance is None:
+            return self
+        if self.output:
+            from ._signals import Signal
+
+            return Signal(instance, self.name)
+        raise AttributeError(f"{self.name!r} is a state of {instance!r}: it lives in the run, not on the block.")

@@ -1,0 +1,251 @@
+"""Values: frozen objects whose parameters are their attributes.
+
+Blocks, paths and models are values. The constructor takes parameters and nothing else, `==` compares them,
+`replace` gives a variant, and pickling is that of a plain object.
+"""
+
+from __future__ import annotations
+
+import inspect
+import numbers
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self, TypeAlias, dataclass_transform
+
+import numpy as np
+
+from ._errors import ParameterError, near
+
+Array: TypeAlias = Any
+"""A number or a NumPy array of floats; inside an equation that is being traced, its symbolic stand-in."""
+
+_MISSING: Any = object()
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """What is declared of one parameter; made by `parameter`."""
+
+    default: Any = _MISSING
+    unit: str | None = None
+    description: str = ""
+    above: float | None = None
+    minimum: float | None = None
+    maximum: float | None = None
+    shape: tuple[int, ...] | None = None
+    structural: bool = False
+    kw_only: bool = True
+    annotation: str = "Any"
+
+    @property
+    def required(self) -> bool:
+        """Whether the constructor must be given it."""
+        return self.default is _MISSING
+
+
+def parameter(
+    *,
+    default: Any = _MISSING,
+    unit: str | None = None,
+    description: str = "",
+    above: float | None = None,
+    minimum: float | None = None,
+    maximum: float | None = None,
+    shape: tuple[int, ...] | None = None,
+    structural: bool = False,
+    kw_only: bool = True,
+) -> Any:
+    """Declare a parameter of a value: ``mass: float = parameter(unit="kg", above=0.0)``.
+
+    Parameters
+    ----------
+    default : object, optional
+        The default; without one the parameter is required.
+    unit : str, optional
+        Unit, as FMI spells it (``"N.s/m"``).
+    description : str, optional
+        One line for people.
+    above, minimum, maximum : float, optional
+        Bounds that every entry must respect: strictly above, at least, at most.
+    shape : tuple of int, optional
+        Shape that a numeric value is broadcast to.
+    structural : bool, optional
+        True when the equations branch on the value in Python; it is then a constant of the trace and not a symbol.
+        Values that are no floats are structural by nature.
+    kw_only : bool, optional
+        False for the one defining object that may come first by position.
+    """
+    return ParameterSpec(default, unit, description, above, minimum, maximum, shape, structural, kw_only)
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(parameter,))
+class Value:
+    """Base of everything that is given by its parameters: blocks, paths, models."""
+
+    parameter_specs: ClassVar[Mapping[str, ParameterSpec]] = {}
+    _keywords: ClassVar[frozenset[str]] = frozenset()  # constructor keywords that are no parameters (a block's name)
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        specs = dict(cls.parameter_specs)
+        for name, annotation in inspect.get_annotations(cls).items():
+            text = annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
+            if "ClassVar" in text or name.startswith("_") or name in cls._keywords:
+                continue
+            declared = cls.__dict__.get(name, _MISSING)
+            spec = declared if isinstance(declared, ParameterSpec) else ParameterSpec(default=declared)
+            if name in cls.__dict__:
+                delattr(cls, name)  # the instance attribute is the only one
+            specs[name] = ParameterSpec(**{**spec.__dict__, "annotation": text})
+        cls.parameter_specs = specs
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        cls = type(self)
+        who = kwargs.get("name") or cls.__name__
+        positional = [name for name, spec in cls.parameter_specs.items() if not spec.kw_only]
+        if len(args) > len(positional):
+            allowed = f"only {', '.join(positional)} may come by position" if positional else "all go by keyword"
+            raise ParameterError(
+                f"{len(args)} positional arguments were given; {allowed}. "
+                f"Write {cls.__name__}({', '.join(f'{k}=…' for k in cls.parameter_specs)}).",
+                block=who,
+            )
+        for name, value in zip(positional, args, strict=False):
+            if name in kwargs:
+                raise ParameterError("it is given twice, by position and by keyword; give it once.", block=who, port=name)
+            kwargs[name] = value
+        for name in kwargs:
+            if name not in cls.parameter_specs and name not in cls._keywords:
+                raise ParameterError(
+                    f"{cls.__name__} has no parameter {name!r}. {near(name, cls.parameter_specs)}", block=who, port=name
+                )
+        for name, spec in cls.parameter_specs.items():
+            if name not in kwargs and spec.required:
+                unit = f" in {spec.unit}" if spec.unit else ""
+                raise ParameterError(
+                    f"it is required and was not given: {cls.__name__}({name}=…){unit}. {spec.description}",
+                    block=who,
+                    port=name,
+                )
+            object.__setattr__(self, name, convert(kwargs.get(name, spec.default), spec, who, name))
+        self.check()
+
+    def check(self) -> None:
+        """Check what concerns several parameters at once; override it and raise `ParameterError`."""
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Name and value of every parameter, in the order of declaration."""
+        return {name: self.__dict__[name] for name in type(self).parameter_specs}
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a variant with some parameters changed.
+
+        Raises
+        ------
+        ParameterError
+            For an unknown name or a value out of its bounds.
+        """
+        return type(self)(**{**self.parameters, **changes})
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise ParameterError(
+            f"a {type(self).__name__} is a value and can't be changed; use .replace({name}=…) and keep the result.",
+            port=name,
+        )
+
+    def __delattr__(self, name: str) -> None:
+        self.__setattr__(name, None)
+
+    def __eq__(self, other: object) -> bool:
+        if type(self) is not type(other):
+            return NotImplemented
+        return bool(identity(self) == identity(other))
+
+    def __hash__(self) -> int:
+        return hash(identity(self))
+
+    def __repr__(self) -> str:
+        shown = (
+            f"{name}={short(value)}"
+            for name, value in self.parameters.items()
+            if identity(value) != identity(type(self).parameter_specs[name].default)
+        )
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+
+def identity(value: Any) -> Any:
+    """Return a hashable stand-in for a parameter value that is equal exactly when the values are."""
+    if isinstance(value, Value):
+        return type(value), tuple((k, identity(v)) for k, v in value.parameters.items())
+    if isinstance(value, np.ndarray):
+        return value.shape, value.tobytes()
+    if isinstance(value, Mapping):
+        return tuple(sorted((k, identity(v)) for k, v in value.items()))
+    if isinstance(value, list | tuple):
+        return tuple(identity(v) for v in value)
+    return value
+
+
+def short(value: Any) -> str:
+    """Write a parameter value in a few characters, numbers as people type them."""
+    if isinstance(value, np.ndarray):
+        return repr(value.tolist()) if value.size <= 12 else f"<{'×'.join(map(str, value.shape))} numbers>"
+    if isinstance(value, float) and value == int(value or 0) and abs(value) < 1e6:
+        return str(int(value))
+    return repr(value)
+
+
+def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
+    """Bring one parameter value into its stored form and check it against its declaration.
+
+    Numbers become float, sequences of numbers read-only float64 arrays, integers stay integers where the declaration
+    says ``int``.
+
+    Raises
+    ------
+    ParameterError
+        Wrong kind, wrong shape, not finite, or out of bounds.
+    """
+
+    def bad(found: str, expected: str) -> ParameterError:
+        unit = f" in {spec.unit}" if spec.unit else ""
+        return ParameterError(f"found {found}; expected {expected}{unit}. {spec.description}".rstrip(), block=who, port=name)
+
+    numeric = "float" in spec.annotation or "Array" in spec.annotation
+    if value is None and ("None" in spec.annotation or not numeric):
+        return None
+    if "int" in spec.annotation.split(" | ") and not numeric:
+        if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+            raise bad(repr(value), "an integer")
+        result: Any = int(value)
+    elif numeric and not isinstance(value, str | Value):
+        try:
+            result = np.array(value, dtype=float)
+        except (TypeError, ValueError):
+            raise bad(repr(value), "numbers") from None
+        if spec.shape is not None:
+            try:
+                result = np.array(np.broadcast_to(result, spec.shape))
+            except ValueError:
+                raise bad(f"shape {result.shape}", f"shape {spec.shape}") from None
+        elif result.ndim and "Array" not in spec.annotation:
+            raise bad(f"{result.size} numbers", "a single number")
+        if not np.all(np.isfinite(result)):
+            raise bad(repr(value), "finite numbers")
+    elif numeric:
+        raise bad(repr(value), "a number")
+    else:
+        return value
+    for bound, holds, words in (
+        (spec.above, np.greater, "above"),
+        (spec.minimum, np.greater_equal, "at least"),
+        (spec.maximum, np.less_equal, "at most"),
+    ):
+        if bound is not None and not np.all(holds(result, bound)):
+            raise bad(short(value), f"a value {words} {bound:g}")
+    if isinstance(result, np.ndarray):
+        if result.ndim == 0:
+            return float(result)
+        result.flags.writeable = False
+    return result

@@ -1,0 +1,11 @@
+"""Diagrams: wiring, scheduling, simulation; the diagram of Fig. 3 and its experiments; the command line."""
+
+from . import experiments
+from ._diagram import Diagram
+from ._flat import FlatDiagram, Layout
+from ._run import Run, Snapshot
+from ._structure import Frame, Wire
+from ._subsystem import Subsystem, subsystem
+from .fig3 import fig3
+
+__all__ = ["Diagram", "FlatDiagram", "Frame", "Layout", "Run", "Snapshot", "Subsystem", "Wire", "experiments", "fig3", "subsystem"]

@@ -1,0 +1,309 @@
+"""The scheduler: integer ticks, in one order.
+
+At tick k, t = k · base exactly:
+
+1. The outputs of the FMUs are those at the end of their last step (at k = 0, of initialization): a co-simulation FMU has
+   no feedthrough between communication points (FMI 3.0, Step Mode).
+2. All blocks are evaluated once, each port after what it depends on: `FlatDiagram`. A sampled subsystem acts in the ticks
+   of its own rate; between them its outputs are held.
+3. Everything is recorded.
+4. The inputs of the FMUs are set and held, and every FMU steps to tick k + 1; the blocks' next states take effect.
+
+Time never accumulates: tick k is at k·numerator / denominator, rounded once. The last tick is evaluated and recorded, and
+nothing steps beyond it. If a value is not finite or a guard fails, the tick is evaluated again block by block to name the
+first one that is concerned; the run until then is kept in the error.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..blocks._errors import LoopwrightError, NonFiniteError, OptionError, SimulationError
+from ..blocks._tracing import GUARDS, NEXT, bundle
+from ._flat import FlatDiagram
+from ._run import Run
+from ._structure import join
+from ._subsystem import exact_time
+
+if TYPE_CHECKING:
+    from ._diagram import Diagram
+
+_CHUNK = 1000  # ticks between two looks at the progress bar
+
+
+def simulate(diagram: Diagram, duration: float, *, step: float | Fraction | None, progress: bool | None) -> Run:
+    """Run a diagram; see `Diagram.simulate`."""
+    flat = diagram.flatten(step)
+    n = _ticks(duration, flat.base, diagram.name)
+    times = [k * flat.base.numerator / flat.base.denominator for k in range(n + 1)]
+    width = flat.log.total + flat.states.total + flat.held.total
+    recorded = _Recorded(diagram, flat, np.array(times), np.empty((n + 1, width)))
+    with ExitStack() as stack:
+        plants = []
+        for path in sorted(diagram.blocks):
+            block: Any = diagram.blocks[path]
+            if not block.opaque:
+                continue
+            try:
+                wired = [port for port in block.inputs if (path, port) in diagram.wires]
+                plants.append((path, stack.enter_context(block.instantiate(wired, times[-1]))))
+            except SimulationError as error:
+                error.run = recorded.until(0, 0.0)
+                raise error.at(block=path, t=0.0)
+            except LoopwrightError as error:
+                raise error.at(block=path)
+        tick = stack.enter_context(_progress(diagram.name, times[-1], progress))
+        return _Loop(flat, plants, recorded).run(times, tick)
+
+
+class _Recorded:
+    """The samples while they are being made."""
+
+    def __init__(self, diagram: Diagram, flat: FlatDiagram, t: np.ndarray, data: np.ndarray):
+        self.diagram, self.flat, self.t, self.data = diagram, flat, t, data
+
+    def until(self, n: int, elapsed: float, messages: tuple[str, ...] = ()) -> Run:
+        """Return the run of the first ``n`` samples."""
+        units = {join(*port): unit for port, unit in self.flat.checked.units.items()}
+        whole = n == len(self.t)
+        return Run(
+            t=self.t if whole else self.t[:n].copy(),
+            data=self.data if whole else self.data[:n].copy(),
+            layout=self.flat.log,
+            wires=dict(self.diagram.names),
+            units=units,
+            diagram=self.diagram,
+            elapsed=elapsed,
+            messages=messages,
+        )
+
+
+class _Loop:
+    """The state of a run, and its loop."""
+
+    def __init__(self, flat: FlatDiagram, plants: list[tuple[str, Any]], recorded: _Recorded):
+        self.flat, self.plants, self.recorded = flat, plants, recorded
+        self.t = np.zeros(1)
+        self.x = flat.x0.copy()
+        self.x_next = np.zeros_like(self.x)
+        self.w = np.zeros(flat.plant_outputs.total)
+        self.z = np.zeros(flat.plant_inputs.total)
+        self.log = np.zeros(recorded.data.shape[1])
+        self.ok = np.zeros(1)
+        for path, plant in plants:
+            plant.bind(self._part(flat.plant_inputs, path, self.z), self._part(flat.plant_outputs, path, self.w))
+
+    @staticmethod
+    def _part(layout: Any, path: str, vector: np.ndarray) -> np.ndarray:
+        mine = [s for name, s in layout.slices.items() if name.rpartition(".")[0] == path]
+        return vector[mine[0].start : mine[-1].stop] if mine else vector[:0]
+
+    def run(self, times: list[float], progress: Any) -> Run:
+        started = time.perf_counter()
+        k = 0
+        try:
+            self.start()
+            evaluate = self._evaluators()
+            k = self._first(evaluate, progress, times)
+        except _Stopped as stop:
+            k = stop.tick
+            error = stop.error
+            error.run = self.recorded.until(k, time.perf_counter() - started)
+            raise error.at(t=times[k]) from stop.__cause__
+        except KeyboardInterrupt as interrupt:
+            interrupt.run = self.recorded.until(self.done, time.perf_counter() - started)  # type: ignore[attr-defined]
+            raise
+        elapsed = time.perf_counter() - started
+        messages = tuple(m for _, plant in self.plants for m in plant.messages)
+        return self.recorded.until(k + 1, elapsed, messages)
+
+    def _evaluators(self) -> list[Any]:
+        """Return one call per tick of the hyperperiod; all share the run's vectors."""
+        made: dict[int, Any] = {}
+        calls = []
+        for k in range(self.flat.hyperperiod):
+            function = self.flat.at_tick(k)
+            if id(function) not in made:
+                buffer, trigger = function.buffer()
+                for i, vector in enumerate((self.t, self.x, self.w, self.flat.p)):
+                    buffer.set_arg(i, memoryview(vector))
+                for i, vector in enumerate((self.x_next, self.z, self.log, self.ok)):
+                    buffer.set_res(i, memoryview(vector))
+                made[id(function)] = (trigger, buffer)
+            calls.append(made[id(function)][0])
+        self._keep = made
+        return calls
+
+    def _first(self, evaluate: list[Any], progress: Any, times: list[float]) -> int:
+        """Run all ticks and return the last one."""
+        t, ok, x, x_next = memoryview(self.t), memoryview(self.ok), self.x, self.x_next
+        log, data, plants = self.log, self.recorded.data, [plant for _, plant in self.plants]
+        h, period, last = float(self.flat.base), len(evaluate), len(times) - 1
+        single = evaluate[0] if period == 1 else None
+        only = plants[0].step if len(plants) == 1 else None
+        self.done = 0
+        k = 0
+        while True:
+            end = min(last, k + _CHUNK)
+            for k in range(k, end):  # noqa: B020 - continues where the last chunk ended
+                t[0] = now = times[k]
+                (single or evaluate[k % period])()
+                if not ok[0]:
+                    raise _Stopped(k, self.failure(now, k))
+                data[k] = log
+                self.done = k + 1
+                try:
+                    if only is not None:
+                        only(now, h)
+                    else:
+                        for plant in plants:
+                            plant.step(now, h)
+                except SimulationError as error:
+                    raise _Stopped(k + 1, self._who(error)) from error
+                x[:] = x_next
+            k = end
+            progress(times[k])
+            if k == last:
+                break
+        t[0] = times[k]
+        evaluate[k % period]()
+        if not ok[0]:
+            raise _Stopped(k, self.failure(times[k], k))
+        data[k] = log
+        self.done = k + 1
+        return k
+
+    def _who(self, error: SimulationError) -> SimulationError:
+        for path, plant in self.plants:
+            if plant.failed:
+                error.block = path
+        return error
+
+    # --- the start, and the replay of a failed tick: block by block, with numbers -----------------------------------
+
+    def start(self) -> None:
+        """Compute the initial states of the blocks that ask for their inputs first."""
+        table = self.flat.table
+        if not any(table.blocks[path].starts_from_inputs for path in self.flat.checked.traced):
+            return
+        for _ in self._blocks(self.flat.start_order, 0.0, 0, initialize=True):
+            pass
+
+    def failure(self, t: float, k: int) -> SimulationError:
+        """Return the error of the first block that made a value that is not finite or whose guard fails."""
+        for name, where in self.flat.plant_outputs.slices.items():
+            if not np.all(np.isfinite(self.w[where])):
+                path, _, port = name.rpartition(".")
+                return _non_finite(path, port, self.w[where], "It comes out of the FMU.")
+        for path, names, inputs, made in self._blocks(self.flat.order, t, k):
+            block = self.flat.table.blocks[path]
+            shapes = self.flat.checked.traced[path].outputs
+            u = bundle("u", inputs)
+            for name in names:
+                values = made[name]
+                if name == GUARDS:
+                    for guard, value in zip(self.flat.checked.traced[path].guards, values, strict=True):
+                        if not value > 0:
+                            y = bundle("y", {n: made.get(n) for n in shapes})
+                            return block.guard_error(guard, float(value), u, y).at(block=path)  # type: ignore[return-value]
+                elif not np.all(np.isfinite(values)):
+                    what = "the next state" if name == NEXT else name
+                    return _non_finite(path, what, values, _inputs_text(inputs))
+        return NonFiniteError("a value is not finite; expected finite numbers. Look at the last samples of error.run.")
+
+    def _blocks(
+        self, order: list[Any], t: float, k: int, *, initialize: bool = False
+    ) -> Iterator[tuple[str, tuple[str, ...], dict[str, np.ndarray], dict[str, np.ndarray]]]:
+        """Evaluate block by block; yield path, names, inputs and results of each."""
+        flat, table = self.flat, self.flat.table
+        values: dict[tuple[str, str], np.ndarray] = {}
+        for name, where in flat.plant_outputs.slices.items():
+            path, _, port = name.rpartition(".")
+            values[path, port] = self.w[where]
+        for name, where in flat.held.slices.items():
+            path, _, port = name.rpartition(".")
+            values[path, port] = self.x[where]
+        ready: set[str] = set()
+        for path, names in order:
+            if k % flat.divisors[table.frame_of[path]]:
+                continue
+            trace, block = flat.checked.traced[path], table.blocks[path]
+            known = {p: flat.source(path, p, values) for p in trace.inputs if self._is_known(path, p, values)}
+            shaped = {p: np.reshape(known[p], trace.inputs[p]) if p in known else None for p in trace.inputs}
+            if initialize and block.starts_from_inputs and path not in ready:
+                ready.add(path)
+                initial: Any = block.initial(bundle("u", shaped))  # type: ignore[attr-defined]
+                parts = (initial,) if len(trace.states) == 1 else initial
+                self.x[flat.states.slices[path]] = np.concatenate([np.ravel(p) for p in parts])
+            columns = [known.get(p, np.zeros(int(np.prod(s)))) for p, s in trace.inputs.items()]
+            result = flat.block_function(path, names).call(
+                [t, self.x[flat.states.slices[path]], *columns, flat.p[flat.parameters.slices[path]]]
+            )
+            made = {n: np.ravel(np.array(r)) for n, r in zip(names, result, strict=True)}
+            values.update({(path, n): v for n, v in made.items()})
+            shaped_known: Any = {p: v for p, v in shaped.items()}
+            yield path, names, shaped_known, made
+
+    def _is_known(self, path: str, port: str, values: Any) -> bool:
+        wire = self.flat.table.wires.get((path, port))
+        return wire is None or (wire.block, wire.port) in values
+
+
+class _Stopped(Exception):  # noqa: N818 - not an error of its own
+    """Carries an error out of the loop with the tick at which it happened."""
+
+    def __init__(self, tick: int, error: SimulationError):
+        self.tick, self.error = tick, error
+
+
+def _inputs_text(inputs: dict[str, Any]) -> str:
+    shown = ", ".join(f"{n} = {np.asarray(v).tolist()}" for n, v in inputs.items() if v is not None)
+    return f"Its inputs then: {shown}." if shown else "It has no inputs."
+
+
+def _non_finite(path: str, port: str, values: np.ndarray, hint: str) -> NonFiniteError:
+    return NonFiniteError(
+        f"found {values.tolist()}; expected finite numbers. This is the first block that made such a value. {hint}",
+        block=path,
+        port=port,
+    )
+
+
+def _ticks(duration: float, base: Fraction, name: str) -> int:
+    span = exact_time(duration, block=name) if duration > 0 else None
+    if span is None:
+        raise OptionError(f"found a duration of {duration!r} s; expected a positive one.", block=name, port="duration")
+    if (span / base).denominator != 1:
+        nearest = round(span / base) or 1
+        raise OptionError(
+            f"found a duration of {duration!r} s, no multiple of the {float(base):g} s between ticks; take "
+            f"{float(nearest * base)!r} s.",
+            block=name,
+            port="duration",
+        )
+    return int(span / base)
+
+
+@contextmanager
+def _progress(name: str, end: float, show: bool | None) -> Iterator[Any]:
+    """Yield a function that is told the simulated time, and draws it where that is wanted."""
+    if show is None:
+        import sys
+
+        show = sys.stderr.isatty() or "ipykernel" in sys.modules
+    if not show:
+        yield lambda t: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.2f} / {task.total:g} s"))
+    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(name, total=end)
+        yield lambda t: bar.update(task, completed=t)

@@ -1,0 +1,22 @@
+"""FMUs: plants written as Python equations and exported, and FMUs of anyone's as blocks."""
+
+from . import gantry
+from ._build import build_fmu, clear_cache
+from ._description_reading import FmuDescription, FmuVariable, read_description
+from ._export import build, model_spec
+from ._fmu import Fmu
+from ._spec import ModelSpec, Variable
+
+__all__ = [
+    "Fmu",
+    "FmuDescription",
+    "FmuVariable",
+    "ModelSpec",
+    "Variable",
+    "build",
+    "build_fmu",
+    "clear_cache",
+    "gantry",
+    "model_spec",
+    "read_description",
+]

@@ -1,0 +1,142 @@
+"""Reading an FMU's description: what a diagram needs to know before anything is loaded."""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..blocks._errors import FmuFileError, UnitError
+from ..blocks._units import parse_unit
+from ._compiler import native_platform
+
+
+@dataclass(frozen=True, eq=False)
+class FmuVariable:
+    """A Float64 variable of an FMU."""
+
+    name: str
+    reference: int
+    causality: str
+    shape: tuple[int, ...]
+    unit: str | None
+    start: Any
+    description: str
+    minimum: float | None
+    maximum: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class FmuDescription:
+    """What is read from ``modelDescription.xml``."""
+
+    file: Path
+    digest: str
+    """SHA-256 of the file."""
+    model_name: str
+    identifier: str
+    token: str
+    variables: dict[str, FmuVariable]
+    other: dict[str, str]
+    """Variables of other types, with their type."""
+
+    def of(self, causality: str) -> dict[str, FmuVariable]:
+        """Return the variables of a causality, in the file's order."""
+        return {name: v for name, v in self.variables.items() if v.causality == causality}
+
+
+def read_description(file: str | Path) -> FmuDescription:
+    """Read and check an FMU, without loading its library.
+
+    Raises
+    ------
+    FmuFileError
+        No such file, no FMU, not FMI 3.0 co-simulation, no binary for this platform.
+    """
+    path = Path(file).expanduser()
+    if not path.is_file():
+        raise FmuFileError(f"there is no file {str(path)!r}; expected an FMU. Check the path.")
+    stat = path.stat()
+    return _read(path.resolve(), stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=256)
+def _read(path: Path, mtime: int, length: int) -> FmuDescription:
+    import fmpy
+
+    data = path.read_bytes()
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = set(archive.namelist())
+    except zipfile.BadZipFile:
+        raise FmuFileError(
+            f"{str(path)!r} is no FMU: it is no zip archive (it starts with {data[:8]!r}). Give the .fmu that the tool exported."
+        ) from None
+    if "modelDescription.xml" not in entries:
+        raise FmuFileError(f"{str(path)!r} is a zip archive without modelDescription.xml, so it is no FMU.")
+    try:
+        model = fmpy.read_model_description(str(path))
+    except Exception as error:  # FMPy raises bare exceptions
+        raise FmuFileError(f"the modelDescription.xml of {str(path)!r} can't be read: {error}") from error
+    if not model.fmiVersion.startswith("3."):
+        raise FmuFileError(
+            f"{str(path)!r} is an FMU of FMI {model.fmiVersion}; expected FMI 3.0. Export it again with FMI 3.0 co-simulation."
+        )
+    if model.coSimulation is None:
+        raise FmuFileError(f"{str(path)!r} has no co-simulation interface; export it with one.")
+    identifier, platform = model.coSimulation.modelIdentifier, native_platform()
+    if not any(e.startswith(f"binaries/{platform}/{identifier}.") for e in entries):
+        found = sorted({e.split("/")[1] for e in entries if e.startswith("binaries/") and e.count("/") > 1})
+        raise FmuFileError(
+            f"{str(path)!r} has no binary for this platform, {platform} (it has: {', '.join(found) or 'none'}). Export or build "
+            "it for this platform."
+        )
+    variables, other = {}, {}
+    for v in model.modelVariables:
+        if v.causality == "independent":
+            continue
+        if v.type != "Float64":
+            other[v.name] = v.type
+            continue
+        shape = _shape(v, model)
+        start = None if v.start is None else _start(v.start, shape)
+        variables[v.name] = FmuVariable(
+            v.name, v.valueReference, v.causality or "local", shape, _unit(v.unit), start, v.description or "",
+            None if v.min is None else float(v.min), None if v.max is None else float(v.max),
+        )  # fmt: skip
+    return FmuDescription(
+        path, hashlib.sha256(data).hexdigest(), model.modelName, identifier, model.instantiationToken, variables, other
+    )
+
+
+def _shape(variable: Any, model: Any) -> tuple[int, ...]:
+    sizes = []
+    for dimension in variable.dimensions or ():
+        if dimension.start is not None:
+            sizes.append(int(dimension.start))
+        else:
+            parameters = {v.valueReference: v for v in model.modelVariables}
+            sizes.append(int(parameters[dimension.valueReference].start))
+    return tuple(sizes)
+
+
+def _start(text: Any, shape: tuple[int, ...]) -> np.ndarray:
+    values = np.array([float(x) for x in (text.split() if isinstance(text, str) else np.ravel(text))])
+    full = np.broadcast_to(values, (int(np.prod(shape, dtype=int)),)) if values.size == 1 else values
+    return np.array(full).reshape(shape)
+
+
+def _unit(text: str | None) -> str | None:
+    """Return a unit that can be checked, None for one that this library can't read."""
+    if text is None:
+        return None
+    try:
+        parse_unit(text)
+    except UnitError:
+        return None
+    return text

@@ -1,0 +1,223 @@
+/* FMI 3.0 for Co-Simulation: the functions of fmi3Functions.h that exported FMUs support. The others: fmi3_refused.c. */
+#include "fmi3Functions.h"
+
+#define LW_OK(call) ((call) ? fmi3OK : fmi3Error)
+#define LW_SELF lw_instance *self = instance; if (!self) return fmi3Error
+
+static void lw_write_fmi3(lw_instance *self, lw_category category, const char *message) {
+    fmi3LogMessageCallback log = (fmi3LogMessageCallback)self->sink;
+    bool error = category == LW_LOG_ERROR;
+    log(self->environment, error ? fmi3Error : fmi3Warning, error ? "logStatusError" : "logStatusWarning", message);
+}
+
+/* ---- versions and logging (FMI 3.0, 2.3.1) ---- */
+
+const char *fmi3GetVersion(void) { return fmi3Version; }
+
+fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean loggingOn, size_t nCategories, const fmi3String categories[]) {
+    LW_SELF;
+    unsigned chosen = nCategories ? 0 : LW_LOG_WARNING | LW_LOG_ERROR, known = LW_LOG_WARNING | LW_LOG_ERROR;
+    bool all_known = true;
+    for (size_t i = 0; i < nCategories; i++) {
+        if (!strcmp(categories[i], "logStatusError")) chosen |= LW_LOG_ERROR;
+        else if (!strcmp(categories[i], "logStatusWarning")) chosen |= LW_LOG_WARNING;
+        else all_known = false;
+    }
+    self->categories = loggingOn ? known : 0;
+    for (size_t i = 0; i < nCategories && !all_known; i++)
+        if (strcmp(categories[i], "logStatusError") && strcmp(categories[i], "logStatusWarning"))
+            lw_warn(self, "fmi3SetDebugLogging: there is no log category %s, only logStatusWarning and logStatusError.", categories[i]);
+    self->categories = loggingOn ? chosen : 0;
+    return all_known ? fmi3OK : fmi3Warning;
+}
+
+/* ---- life (FMI 3.0, 2.3.1 to 2.3.3) ---- */
+
+static bool lw_is_blank(const char *text) { return !text || text[strspn(text, " \t\r\n")] == 0; }
+
+fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
+        fmi3Boolean visible, fmi3Boolean loggingOn, fmi3Boolean eventModeUsed, fmi3Boolean earlyReturnAllowed,
+        const fmi3ValueReference requiredIntermediateVariables[], size_t nRequiredIntermediateVariables,
+        fmi3InstanceEnvironment instanceEnvironment, fmi3LogMessageCallback logMessage,
+        fmi3IntermediateUpdateCallback intermediateUpdate) {
+    (void)resourcePath, (void)visible, (void)earlyReturnAllowed, (void)requiredIntermediateVariables, (void)intermediateUpdate;
+    const char *name = lw_is_blank(instanceName) ? LW_MODEL_NAME : instanceName;
+    lw_instance *self = lw_create(name, strlen(name));
+    if (!self) return NULL;
+    self->categories = loggingOn ? LW_LOG_WARNING | LW_LOG_ERROR : 0;
+    self->environment = instanceEnvironment;
+    self->write = logMessage ? lw_write_fmi3 : NULL;
+    self->sink = (void (*)(void))logMessage;
+    bool ok = true;
+    if (lw_is_blank(instanceName)) ok = lw_fail(self, "the instance name is empty. Give one.");
+    else if (!instantiationToken || strcmp(instantiationToken, LW_TOKEN))
+        ok = lw_fail(self, "the instantiation token is %s, expected " LW_TOKEN ". The modelDescription.xml that was read "
+                     "doesn't belong to this binary: unzip the FMU again.", instantiationToken ? instantiationToken : "missing");
+    else if (eventModeUsed) ok = lw_fail(self, "this FMU has no Event Mode. Instantiate it with eventModeUsed = fmi3False.");
+    else if (nRequiredIntermediateVariables)
+        ok = lw_fail(self, "this FMU has no intermediate update. Instantiate it without requiredIntermediateVariables.");
+    if (ok) return self;
+    lw_destroy(self);
+    return NULL;
+}
+
+void fmi3FreeInstance(fmi3Instance instance) { lw_destroy(instance); }
+
+fmi3Status fmi3Reset(fmi3Instance instance) {
+    LW_SELF;
+    lw_reset(self);
+    return fmi3OK;
+}
+
+fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean toleranceDefined, fmi3Float64 tolerance,
+        fmi3Float64 startTime, fmi3Boolean stopTimeDefined, fmi3Float64 stopTime) {
+    LW_SELF;
+    (void)toleranceDefined, (void)tolerance; /* a fixed internal step has no error control */
+    if (!lw_in_mode(self, "fmi3EnterInitializationMode", LW_INSTANTIATED)) return fmi3Error;
+    if (!isfinite(startTime) || (stopTimeDefined && !(stopTime >= startTime)))
+        return LW_OK(lw_fail(self, "fmi3EnterInitializationMode: startTime is %g s, stopTime is %g s, expected finite times "
+                             "in this order.", startTime, stopTime));
+    self->s.values[0] = startTime;
+    self->s.stop_time_defined = stopTimeDefined;
+    self->s.stop_time = stopTimeDefined ? stopTime : 0.0;
+    self->s.mode = LW_INITIALIZING;
+    self->s.have_outputs = self->s.have_derivatives = 0;
+    return fmi3OK;
+}
+
+fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
+    LW_SELF;
+    if (!lw_in_mode(self, "fmi3ExitInitializationMode", LW_INITIALIZING)) return fmi3Error;
+    if (!lw_update_outputs(self)) return fmi3Error;
+    self->s.mode = LW_STEPPING;
+    return fmi3OK;
+}
+
+fmi3Status fmi3Terminate(fmi3Instance instance) {
+    LW_SELF;
+    if (!lw_in_mode(self, "fmi3Terminate", LW_STEPPING)) return fmi3Error;
+    self->s.mode = LW_TERMINATED;
+    return fmi3OK;
+}
+
+/* ---- variables (FMI 3.0, 2.2.6.2) ---- */
+
+fmi3Status fmi3GetFloat64(fmi3Instance instance, const fmi3ValueReference valueReferences[], size_t nValueReferences,
+                          fmi3Float64 values[], size_t nValues) {
+    LW_SELF;
+    return LW_OK(lw_get(self, "fmi3GetFloat64", valueReferences, nValueReferences, values, nValues));
+}
+
+fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference valueReferences[], size_t nValueReferences,
+                          const fmi3Float64 values[], size_t nValues) {
+    LW_SELF;
+    return LW_OK(lw_set(self, "fmi3SetFloat64", valueReferences, nValueReferences, values, nValues));
+}
+
+/* ---- stepping (FMI 3.0, 4.2.1) ---- */
+
+static bool lw_check_step(lw_instance *self, double t, double h) {
+    double now = self->s.values[0], tolerance = 1e-12 * fabs(now) + 1e-6 * fabs(h);
+    if (!lw_in_mode(self, "fmi3DoStep", LW_STEPPING)) return false;
+    if (!(isfinite(h) && h > 0))
+        return lw_fail(self, "fmi3DoStep: the communication step is %g s at t = %.9g s, expected a positive number.", h, now);
+    if (!(fabs(t - now) <= tolerance))
+        return lw_fail(self, "fmi3DoStep: currentCommunicationPoint is %.17g s, but this FMU is at %.17g s. Step from where "
+                       "the last step ended, or set an FMU state first.", t, now);
+    if (self->s.stop_time_defined && t + h > self->s.stop_time + tolerance)
+        return lw_fail(self, "fmi3DoStep: a step of %g s from t = %.9g s passes the stop time of %.9g s. Give a later stopTime "
+                       "to fmi3EnterInitializationMode, or none.", h, t, self->s.stop_time);
+    return true;
+}
+
+fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoint, fmi3Float64 communicationStepSize,
+        fmi3Boolean noSetFMUStatePriorToCurrentPoint, fmi3Boolean *eventHandlingNeeded, fmi3Boolean *terminateSimulation,
+        fmi3Boolean *earlyReturn, fmi3Float64 *lastSuccessfulTime) {
+    LW_SELF;
+    (void)noSetFMUStatePriorToCurrentPoint; /* nothing is buffered */
+    bool ok = lw_check_step(self, currentCommunicationPoint, communicationStepSize)
+              && lw_step(self, currentCommunicationPoint, communicationStepSize);
+    if (eventHandlingNeeded) *eventHandlingNeeded = fmi3False;
+    if (terminateSimulation) *terminateSimulation = fmi3False;
+    if (earlyReturn) *earlyReturn = fmi3False;
+    if (lastSuccessfulTime) *lastSuccessfulTime = self->s.values[0];
+    return LW_OK(ok);
+}
+
+/* ---- states (FMI 3.0, 2.2.6.4) ---- */
+
+fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *FMUState) {
+    LW_SELF;
+    lw_state *copy = *FMUState ? *FMUState : malloc(sizeof *copy);
+    if (!copy) return LW_OK(lw_fail(self, "fmi3GetFMUState: out of memory."));
+    *copy = self->s;
+    *FMUState = copy;
+    return fmi3OK;
+}
+
+fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState FMUState) {
+    LW_SELF;
+    if (!FMUState) return LW_OK(lw_fail(self, "fmi3SetFMUState: the state is NULL. Get one first."));
+    return LW_OK(lw_accept_state(self, "fmi3SetFMUState", FMUState));
+}
+
+fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *FMUState) {
+    LW_SELF;
+    if (FMUState) {
+        free(*FMUState);
+        *FMUState = NULL;
+    }
+    return fmi3OK;
+}
+
+/* Serialized: the token, then the state as it is in memory (same machine type). */
+#define LW_SERIALIZED (sizeof LW_TOKEN + sizeof(lw_state))
+
+fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState FMUState, size_t *size) {
+    LW_SELF;
+    (void)FMUState;
+    *size = LW_SERIALIZED;
+    return fmi3OK;
+}
+
+fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState FMUState, fmi3Byte serializedState[], size_t size) {
+    LW_SELF;
+    if (!FMUState || size < LW_SERIALIZED)
+        return LW_OK(lw_fail(self, "fmi3SerializeFMUState: %s. Ask fmi3SerializedFMUStateSize for the size.",
+                             FMUState ? "too few bytes" : "the state is NULL"));
+    memcpy(serializedState, LW_TOKEN, sizeof LW_TOKEN);
+    memcpy(serializedState + sizeof LW_TOKEN, FMUState, sizeof(lw_state));
+    return fmi3OK;
+}
+
+fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte serializedState[], size_t size, fmi3FMUState *FMUState) {
+    LW_SELF;
+    if (size != LW_SERIALIZED || memcmp(serializedState, LW_TOKEN, sizeof LW_TOKEN))
+        return LW_OK(lw_fail(self, "fmi3DeserializeFMUState: these %zu bytes are no state of this FMU (%zu bytes that begin "
+                             "with its instantiation token). Give what fmi3SerializeFMUState wrote.", size, LW_SERIALIZED));
+    lw_state *copy = *FMUState ? *FMUState : malloc(sizeof *copy);
+    if (!copy) return LW_OK(lw_fail(self, "fmi3DeserializeFMUState: out of memory."));
+    memcpy(copy, serializedState + sizeof LW_TOKEN, sizeof *copy);
+    *FMUState = copy;
+    return fmi3OK;
+}
+
+/* ---- partial derivatives (FMI 3.0, 2.2.11) ---- */
+
+#if LW_HAS_DERIVATIVES
+fmi3Status fmi3GetDirectionalDerivative(fmi3Instance instance, const fmi3ValueReference unknowns[], size_t nUnknowns,
+        const fmi3ValueReference knowns[], size_t nKnowns, const fmi3Float64 seed[], size_t nSeed, fmi3Float64 sensitivity[],
+        size_t nSensitivity) {
+    LW_SELF;
+    return LW_OK(lw_derive(self, "fmi3GetDirectionalDerivative", false, unknowns, nUnknowns, knowns, nKnowns, seed, nSeed,
+                           sensitivity, nSensitivity));
+}
+
+fmi3Status fmi3GetAdjointDerivative(fmi3Instance instance, const fmi3ValueReference unknowns[], size_t nUnknowns,
+        const fmi3ValueReference knowns[], size_t nKnowns, const fmi3Float64 seed[], size_t nSeed, fmi3Float64 sensitivity[],
+        size_t nSensitivity) {
+    LW_SELF;
+    return LW_OK(lw_derive(self, "fmi3GetAdjointDerivative", true, unknowns, nUnknowns, knowns, nKnowns, seed, nSeed,
+                           sensitivity, nSensitivity));
+}
+#endif

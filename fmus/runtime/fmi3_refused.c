@@ -1,0 +1,128 @@
+/* FMI 3.0: the functions that these FMUs don't support. Every symbol of the standard is exported (some importers ask for
+ * all of them); each of these returns fmi3Error and logs why. */
+#if defined(__GNUC__)
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#endif
+
+static fmi3Status lw_refuse(lw_instance *self, const char *function, const char *why) {
+    if (self) lw_fail(self, "%s: %s.", function, why);
+    return fmi3Error;
+}
+
+#define LW_REFUSE(name, why, ...) fmi3Status name(__VA_ARGS__) { return lw_refuse(instance, #name, why); }
+
+/* ---- variables of other types: there are none, so asking for none is fine ---- */
+
+#define LW_NO_TYPE(name, ...) \
+    fmi3Status name(fmi3Instance instance, const fmi3ValueReference v[], size_t n, __VA_ARGS__) { \
+        return instance && n == 0 ? fmi3OK : lw_refuse(instance, #name, "all variables of this FMU are Float64"); \
+    }
+#define LW_NO_NUMBERS(type) \
+    LW_NO_TYPE(fmi3Get##type, fmi3##type values[], size_t nValues) \
+    LW_NO_TYPE(fmi3Set##type, const fmi3##type values[], size_t nValues)
+
+LW_NO_NUMBERS(Float32)
+LW_NO_NUMBERS(Int8)
+LW_NO_NUMBERS(UInt8)
+LW_NO_NUMBERS(Int16)
+LW_NO_NUMBERS(UInt16)
+LW_NO_NUMBERS(Int32)
+LW_NO_NUMBERS(UInt32)
+LW_NO_NUMBERS(Int64)
+LW_NO_NUMBERS(UInt64)
+LW_NO_NUMBERS(Boolean)
+LW_NO_NUMBERS(String)
+LW_NO_TYPE(fmi3GetBinary, size_t valueSizes[], fmi3Binary values[], size_t nValues)
+LW_NO_TYPE(fmi3SetBinary, const size_t valueSizes[], const fmi3Binary values[], size_t nValues)
+LW_NO_TYPE(fmi3GetClock, fmi3Clock values[])
+LW_NO_TYPE(fmi3SetClock, const fmi3Clock values[])
+
+/* ---- other interface types ---- */
+
+static fmi3Instance lw_refuse_instance(fmi3String instanceName, fmi3Boolean loggingOn, fmi3InstanceEnvironment environment,
+                                       fmi3LogMessageCallback logMessage, const char *message) {
+    if (loggingOn && logMessage) logMessage(environment, fmi3Error, "logStatusError", message);
+    return NULL;
+}
+
+fmi3Instance fmi3InstantiateModelExchange(fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
+        fmi3Boolean visible, fmi3Boolean loggingOn, fmi3InstanceEnvironment instanceEnvironment,
+        fmi3LogMessageCallback logMessage) {
+    return lw_refuse_instance(instanceName, loggingOn, instanceEnvironment, logMessage, LW_MODEL_NAME
+                              ": this FMU has no Model Exchange. Use fmi3InstantiateCoSimulation.");
+}
+
+fmi3Instance fmi3InstantiateScheduledExecution(fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
+        fmi3Boolean visible, fmi3Boolean loggingOn, fmi3InstanceEnvironment instanceEnvironment,
+        fmi3LogMessageCallback logMessage, fmi3ClockUpdateCallback clockUpdate, fmi3LockPreemptionCallback lockPreemption,
+        fmi3UnlockPreemptionCallback unlockPreemption) {
+    return lw_refuse_instance(instanceName, loggingOn, instanceEnvironment, logMessage, LW_MODEL_NAME
+                              ": this FMU has no Scheduled Execution. Use fmi3InstantiateCoSimulation.");
+}
+
+#define LW_NO_ME "this FMU has no Model Exchange (see modelDescription.xml)"
+LW_REFUSE(fmi3EnterContinuousTimeMode, LW_NO_ME, fmi3Instance instance)
+LW_REFUSE(fmi3CompletedIntegratorStep, LW_NO_ME, fmi3Instance instance, fmi3Boolean noSetFMUStatePriorToCurrentPoint,
+          fmi3Boolean *enterEventMode, fmi3Boolean *terminateSimulation)
+LW_REFUSE(fmi3SetTime, LW_NO_ME, fmi3Instance instance, fmi3Float64 time)
+LW_REFUSE(fmi3SetContinuousStates, LW_NO_ME, fmi3Instance instance, const fmi3Float64 continuousStates[], size_t n)
+LW_REFUSE(fmi3GetContinuousStateDerivatives, LW_NO_ME, fmi3Instance instance, fmi3Float64 derivatives[], size_t n)
+LW_REFUSE(fmi3GetEventIndicators, LW_NO_ME, fmi3Instance instance, fmi3Float64 eventIndicators[], size_t n)
+LW_REFUSE(fmi3GetContinuousStates, LW_NO_ME, fmi3Instance instance, fmi3Float64 continuousStates[], size_t n)
+LW_REFUSE(fmi3GetNominalsOfContinuousStates, LW_NO_ME, fmi3Instance instance, fmi3Float64 nominals[], size_t n)
+LW_REFUSE(fmi3GetNumberOfEventIndicators, LW_NO_ME, fmi3Instance instance, size_t *nEventIndicators)
+LW_REFUSE(fmi3GetNumberOfContinuousStates, LW_NO_ME, fmi3Instance instance, size_t *nContinuousStates)
+LW_REFUSE(fmi3ActivateModelPartition, "this FMU has no Scheduled Execution (see modelDescription.xml)", fmi3Instance instance,
+          fmi3ValueReference clockReference, fmi3Float64 activationTime)
+
+/* ---- capabilities that the model description doesn't claim ---- */
+
+#define LW_NO_EVENTS "this FMU has no Event Mode (hasEventMode = false)"
+LW_REFUSE(fmi3EnterEventMode, LW_NO_EVENTS, fmi3Instance instance)
+LW_REFUSE(fmi3EnterStepMode, LW_NO_EVENTS, fmi3Instance instance)
+LW_REFUSE(fmi3EvaluateDiscreteStates, LW_NO_EVENTS, fmi3Instance instance)
+LW_REFUSE(fmi3UpdateDiscreteStates, LW_NO_EVENTS, fmi3Instance instance, fmi3Boolean *discreteStatesNeedUpdate,
+          fmi3Boolean *terminateSimulation, fmi3Boolean *nominalsOfContinuousStatesChanged,
+          fmi3Boolean *valuesOfContinuousStatesChanged, fmi3Boolean *nextEventTimeDefined, fmi3Float64 *nextEventTime)
+
+#define LW_NO_STRUCTURE "this FMU has no structural parameters"
+LW_REFUSE(fmi3EnterConfigurationMode, LW_NO_STRUCTURE, fmi3Instance instance)
+LW_REFUSE(fmi3ExitConfigurationMode, LW_NO_STRUCTURE, fmi3Instance instance)
+
+#define LW_NO_PER_ELEMENT "dependencies are in modelDescription.xml (providesPerElementDependencies = false)"
+LW_REFUSE(fmi3GetNumberOfVariableDependencies, LW_NO_PER_ELEMENT, fmi3Instance instance, fmi3ValueReference valueReference,
+          size_t *nDependencies)
+LW_REFUSE(fmi3GetVariableDependencies, LW_NO_PER_ELEMENT, fmi3Instance instance, fmi3ValueReference dependent,
+          size_t elementIndicesOfDependent[], fmi3ValueReference independents[], size_t elementIndicesOfIndependents[],
+          fmi3DependencyKind dependencyKinds[], size_t nDependencies)
+
+LW_REFUSE(fmi3GetOutputDerivatives, "maxOutputDerivativeOrder is 0", fmi3Instance instance,
+          const fmi3ValueReference valueReferences[], size_t nValueReferences, const fmi3Int32 orders[], fmi3Float64 values[],
+          size_t nValues)
+
+#define LW_NO_CLOCKS "this FMU has no clocks"
+LW_REFUSE(fmi3GetIntervalDecimal, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n,
+          fmi3Float64 intervals[], fmi3IntervalQualifier qualifiers[])
+LW_REFUSE(fmi3GetIntervalFraction, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n,
+          fmi3UInt64 counters[], fmi3UInt64 resolutions[], fmi3IntervalQualifier qualifiers[])
+LW_REFUSE(fmi3GetShiftDecimal, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n, fmi3Float64 shifts[])
+LW_REFUSE(fmi3GetShiftFraction, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n,
+          fmi3UInt64 counters[], fmi3UInt64 resolutions[])
+LW_REFUSE(fmi3SetIntervalDecimal, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n,
+          const fmi3Float64 intervals[])
+LW_REFUSE(fmi3SetIntervalFraction, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n,
+          const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
+LW_REFUSE(fmi3SetShiftDecimal, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n,
+          const fmi3Float64 shifts[])
+LW_REFUSE(fmi3SetShiftFraction, LW_NO_CLOCKS, fmi3Instance instance, const fmi3ValueReference v[], size_t n,
+          const fmi3UInt64 counters[], const fmi3UInt64 resolutions[])
+
+#if !LW_HAS_DERIVATIVES
+#define LW_NO_DERIVATIVES "providesDirectionalDerivatives and providesAdjointDerivatives are false"
+LW_REFUSE(fmi3GetDirectionalDerivative, LW_NO_DERIVATIVES, fmi3Instance instance, const fmi3ValueReference unknowns[],
+          size_t nUnknowns, const fmi3ValueReference knowns[], size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
+          fmi3Float64 sensitivity[], size_t nSensitivity)
+LW_REFUSE(fmi3GetAdjointDerivative, LW_NO_DERIVATIVES, fmi3Instance instance, const fmi3ValueReference unknowns[],
+          size_t nUnknowns, const fmi3ValueReference knowns[], size_t nKnowns, const fmi3Float64 seed[], size_t nSeed,
+          fmi3Float64 sensitivity[], size_t nSensitivity)
+#endif

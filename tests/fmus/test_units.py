@@ -1,0 +1,105 @@
+"""Unit strings: read, compared, described."""
+
+import math
+
+import pytest
+from loopwright.blocks._errors import UnitError
+from loopwright.blocks._units import Unit, describe_mismatch, parse_unit, rate_of, same_unit
+
+# By hand, from the definitions of the SI units: (kg, m, s, A, K, mol, cd, rad), factor.
+KNOWN = {
+    "1": ((0, 0, 0, 0, 0, 0, 0, 0), 1.0),
+    "m": ((0, 1, 0, 0, 0, 0, 0, 0), 1.0),
+    "mm": ((0, 1, 0, 0, 0, 0, 0, 0), 1e-3),
+    "m/s": ((0, 1, -1, 0, 0, 0, 0, 0), 1.0),
+    "m/s2": ((0, 1, -2, 0, 0, 0, 0, 0), 1.0),
+    "m^2": ((0, 2, 0, 0, 0, 0, 0, 0), 1.0),
+    "s-1": ((0, 0, -1, 0, 0, 0, 0, 0), 1.0),
+    "1/s": ((0, 0, -1, 0, 0, 0, 0, 0), 1.0),
+    "Hz": ((0, 0, -1, 0, 0, 0, 0, 0), 1.0),
+    "kg": ((1, 0, 0, 0, 0, 0, 0, 0), 1.0),
+    "g": ((1, 0, 0, 0, 0, 0, 0, 0), 1e-3),
+    "kg.m2": ((1, 2, 0, 0, 0, 0, 0, 0), 1.0),
+    "N": ((1, 1, -2, 0, 0, 0, 0, 0), 1.0),
+    "N.m": ((1, 2, -2, 0, 0, 0, 0, 0), 1.0),
+    "N.s/m": ((1, 0, -1, 0, 0, 0, 0, 0), 1.0),
+    "N s/m": ((1, 0, -1, 0, 0, 0, 0, 0), 1.0),
+    "kN/mm": ((1, 0, -2, 0, 0, 0, 0, 0), 1e6),
+    "Pa": ((1, -1, -2, 0, 0, 0, 0, 0), 1.0),
+    "J": ((1, 2, -2, 0, 0, 0, 0, 0), 1.0),
+    "W": ((1, 2, -3, 0, 0, 0, 0, 0), 1.0),
+    "V": ((1, 2, -3, -1, 0, 0, 0, 0), 1.0),
+    "Ohm": ((1, 2, -3, -2, 0, 0, 0, 0), 1.0),
+    "H": ((1, 2, -2, -2, 0, 0, 0, 0), 1.0),
+    "A": ((0, 0, 0, 1, 0, 0, 0, 0), 1.0),
+    "rad/s": ((0, 0, -1, 0, 0, 0, 0, 1), 1.0),
+    "deg": ((0, 0, 0, 0, 0, 0, 0, 1), math.pi / 180),
+    "rpm": ((0, 0, -1, 0, 0, 0, 0, 1), math.pi / 30),
+    "J/(kg.K)": ((0, 2, -2, 0, -1, 0, 0, 0), 1.0),
+    "min": ((0, 0, 1, 0, 0, 0, 0, 0), 60.0),
+    "ms": ((0, 0, 1, 0, 0, 0, 0, 0), 1e-3),
+    "m.s": ((0, 1, 1, 0, 0, 0, 0, 0), 1.0),
+}
+
+
+@pytest.mark.parametrize("text", KNOWN)
+def test_reads_units(text):
+    exponents, factor = KNOWN[text]
+    unit = parse_unit(text)
+    assert unit.exponents == exponents
+    assert unit.factor == pytest.approx(factor, rel=1e-15)
+    assert unit.offset == 0.0
+    assert unit.text == text
+
+
+def test_temperature_has_an_offset():
+    assert parse_unit("degC") == Unit("degC", (0, 0, 0, 0, 1, 0, 0, 0), 1.0, 273.15)
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("Nm", "unknown symbol 'Nm'. Did you mean"),
+        ("foo", "Write it as FMI does: 'm/s2'"),
+        ("", "can't be read at ''"),
+        ("m/s/s", "ambiguous after '/'"),
+        ("N/m.s", "parentheses: 'J/(kg.K)'"),
+        ("m2s", "can't be read at 'm2s'"),
+        ("degC.m", "Use 'K' for differences"),
+    ],
+)
+def test_refuses_what_it_cant_read(text, part):
+    with pytest.raises(UnitError) as error:
+        parse_unit(text)
+    assert part in str(error.value)
+    assert repr(text) in str(error.value)
+
+
+def test_same_unit():
+    assert same_unit("N.m", "J")
+    assert same_unit("N s/m", "kg/s")
+    assert not same_unit("mm", "m")
+    assert not same_unit("degC", "K")
+    assert not same_unit("rad/s", "Hz")
+
+
+def test_describes_a_mismatch():
+    assert describe_mismatch("mm", "m") == "mm and m differ by a factor of 0.001: put Gain(gain=0.001) between"
+    assert "Gain(gain=57.2957795131)" in describe_mismatch("rad", "deg")
+    assert describe_mismatch("N", "m") == (
+        "N (kg.m.s-2) and m (m) are of different dimensions: check which ports are meant"
+    )
+    assert "offset of 273.15" in describe_mismatch("degC", "K")
+    assert describe_mismatch("N.m", "J") == "N.m and J are the same"
+
+
+@pytest.mark.parametrize("text", [*KNOWN, "degC"])
+def test_rate_is_a_unit_per_second(text):
+    unit, rate = parse_unit(text), parse_unit(rate_of(text))
+    assert rate.exponents == tuple(n - (i == 2) for i, n in enumerate(unit.exponents))
+    assert rate.factor == pytest.approx(unit.factor, rel=1e-15)
+    assert rate.offset == 0.0
+
+
+def test_rate_reads_well():
+    assert [rate_of(u) for u in ("m", "m/s", "m/s2", "1", "N.s/m")] == ["m/s", "m/s2", "m/s3", "1/s", "N.s/(m.s)"]
