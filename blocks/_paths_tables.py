@@ -17,6 +17,7 @@ UNLIMITED = 1e6
 """What a path's reach is where there is no limit, m."""
 
 _DEGREE = 12  # of the polynomials that are fitted to the speed
+_MOST_MINIMA = 256  # of a sampled distance: more of them are rounding errors, as at the centre of an arc
 _CROWDED = 1e9  # 1/m, the largest inverse reach that is tabulated: where a path meets itself
 _SLACK = 5e-4  # relative error of the inverse reach between two nodes that is let pass, and then added to it
 _GENEROUS = 1e-2  # the same where the error is on the safe side
@@ -113,18 +114,22 @@ def invert(path: Path, s: np.ndarray) -> np.ndarray:
 def nearest(path: Path, y: np.ndarray) -> float:
     """Return the parameter of the point of the path nearest to y, among all of it.
 
-    Every local minimum of the sampled distance is resampled twice, 16 times as fine, then polished by Newton steps
-    within its bracket; the best of all is taken.
+    Every local minimum of the sampled distance that may be the least is resampled twice, 16 times as fine, then
+    polished by Newton steps within its bracket; the best of all is taken.
     """
-    theta, _ = path.sampling
+    if not np.all(np.isfinite(y)):
+        return float("nan")
+    theta, lengths = path.sampling
     squared = np.sum((path.sampled - y[:, None]) ** 2, axis=0)
+    bound = (np.sqrt(np.min(squared)) + np.max(np.diff(lengths))) ** 2
     if path.period is not None:
         theta = np.concatenate([[theta[-2] - path.period], theta])
         squared = np.concatenate([[squared[-2]], squared])
         ends: list[float] = []
     else:
         ends = [theta[0], theta[-1]]
-    i = 1 + np.flatnonzero((squared[1:-1] <= squared[:-2]) & (squared[1:-1] <= squared[2:]))
+    dips = (squared[1:-1] <= squared[:-2]) & (squared[1:-1] <= squared[2:]) & (squared[1:-1] <= bound)
+    i = 1 + np.flatnonzero(dips)
     low, high = theta[i - 1], theta[i + 1]
     for _ in range(2):
         fine = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 33)
@@ -132,7 +137,8 @@ def nearest(path: Path, y: np.ndarray) -> float:
         row, column = np.nonzero((d[:, 1:-1] <= d[:, :-2]) & (d[:, 1:-1] <= d[:, 2:]))
         if not len(row):  # an open path whose nearest point is an end
             break
-        low, high = fine[row, column], fine[row, column + 2]
+        best = np.argsort(d[row, column + 1], kind="stable")[:_MOST_MINIMA]
+        low, high = fine[row[best], column[best]], fine[row[best], column[best] + 2]
     candidates = np.concatenate([polish(path, y, low, high), ends])
     distance = np.sum((path.sigma(candidates) - y[:, None]) ** 2, axis=0)
     return float(candidates[np.argmin(distance)])

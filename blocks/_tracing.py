@@ -375,11 +375,13 @@ def evaluate(
 
 
 def _expanded(function: Any) -> Any:
-    """Return the function in scalar (SX) operations, or as it is where it looks up tables."""
+    """Return the function in scalar (SX) operations, each done once, or as it is where it looks up tables."""
     try:
-        return function.expand()
+        scalar = function.expand()
     except RuntimeError:
         return function
+    arguments = scalar.sx_in()
+    return ca.Function(function.name(), arguments, ca.cse(scalar.call(arguments)))
 
 
 def _with(block: Any, values: Mapping[str, Any]) -> Any:

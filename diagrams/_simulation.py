@@ -128,7 +128,7 @@ class _Loop:
         made: dict[int, Any] = {}
         calls = []
         for k in range(self.flat.hyperperiod):
-            function = self.flat.at_tick(k)
+            function = self.flat.evaluator(k)
             if id(function) not in made:
                 buffer, trigger = function.buffer()
                 for i, vector in enumerate((self.t, self.x, self.w, self.flat.p)):

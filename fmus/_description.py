@@ -86,12 +86,11 @@ def _second_order(knowns: Any, unknowns: Any) -> dict[tuple[int, int], set[int]]
         return None
     v = f.sx_in(0)
     jacobian = ca.jacobian(f(v), v)
-    elements = ca.Function("elements", [v], [ca.vertcat(*map(ca.SX, jacobian.nonzeros()))]) if jacobian.nnz() else None
+    elements = ca.sparsity_cast(jacobian, ca.Sparsity.dense(jacobian.nnz(), 1))
     found: dict[tuple[int, int], set[int]] = {pair: set() for pair in _pairs(jacobian.sparsity())}
-    if elements is not None:
-        order = _pairs(jacobian.sparsity())
-        for row, known in _pairs(elements.jac_sparsity(0, 0)):
-            found[order[row]].add(known)
+    order = list(found)
+    for row, known in _pairs(ca.Function("elements", [v], [elements]).jac_sparsity(0, 0)):
+        found[order[row]].add(known)
     return found
 
 

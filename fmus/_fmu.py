@@ -198,26 +198,24 @@ class FmuInstance:
         """Take the vectors that hold the inputs to set and the outputs to get, and get the outputs once."""
         lib, component = self._fmu.dll, ctypes.c_void_p(self._fmu.component)
         set_values, get_values, do_step = lib["fmi3SetFloat64"], lib["fmi3GetFloat64"], lib["fmi3DoStep"]
-        for function in (set_values, get_values):
-            function.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_size_t]
-            function.restype = ctypes.c_int
-        do_step.argtypes = [ctypes.c_void_p, ctypes.c_double, ctypes.c_double, ctypes.c_bool] + [ctypes.c_void_p] * 4
-        do_step.restype = ctypes.c_int
+        for function in (set_values, get_values, do_step):
+            function.restype = ctypes.c_int  # arguments are made once, so their types need no checks at each call
         flags = (ctypes.c_bool * 3)()
         reached = ctypes.c_double()
         ins = (ctypes.c_uint * max(1, len(self._inputs)))(*[v.reference for v in self._inputs])
         outs = (ctypes.c_uint * max(1, len(self._outputs)))(*[v.reference for v in self._outputs])
         self._kept = (ins, outs, flags, reached, inputs, outputs)  # alive as long as their addresses are used
-        at = ctypes.addressof
-        set_arguments = (component, at(ins), len(self._inputs), inputs.ctypes.data, inputs.size)
-        get_arguments = (component, at(outs), len(self._outputs), outputs.ctypes.data, outputs.size)
-        tail = (True, at(flags), at(flags) + 1, at(flags) + 2, at(reached))
+        address, size, number = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_double
+        set_arguments = (component, ins, size(len(self._inputs)), address(inputs.ctypes.data), size(inputs.size))
+        get_arguments = (component, outs, size(len(self._outputs)), address(outputs.ctypes.data), size(outputs.size))
+        at = ctypes.addressof(flags)
+        tail = (ctypes.c_bool(True), address(at), address(at + 1), address(at + 2), ctypes.byref(reached))
         has_inputs, has_outputs = bool(self._inputs), bool(self._outputs)
 
         def step(t: float, h: float) -> None:
             if has_inputs and set_values(*set_arguments) > 1:
                 raise self._error("setting the inputs", t)
-            if do_step(component, t, h, *tail) > 1:
+            if do_step(component, number(t), number(h), *tail) > 1:
                 raise self._error(f"the step from t = {t:.9g} s by {h:g} s", t)
             if flags[1]:
                 raise self._error("the FMU asks to end the simulation: the step", t)

@@ -176,14 +176,14 @@ static const lw_variable *lw_variable_at(lw_instance *self, const char *function
     }
     const lw_variable *variable = &lw_variables[reference];
     if (variable->size <= left) return variable;
-    lw_fail(self, "%s: %s has %u elements, but only %zu values are left. Give nValues = the sum of all sizes.", function,
+    lw_fail(self, "%s: %s takes %u value(s), but %zu are left. Give nValues = the sum of all sizes.", function,
             variable->name, (unsigned)variable->size, left);
     return NULL;
 }
 
 static bool lw_all_used(lw_instance *self, const char *function, const lw_variable *last, size_t left) {
     if (!left) return true;
-    return lw_fail(self, "%s: %zu values are left over after %s. Give nValues = the sum of all sizes.", function, left,
+    return lw_fail(self, "%s: %zu value(s) are left over after %s. Give nValues = the sum of all sizes.", function, left,
                    last ? last->name : "no variable");
 }
 

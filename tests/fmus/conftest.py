@@ -1,0 +1,32 @@
+"""A cache of its own for all tests of FMUs, and exported FMUs."""
+
+import pytest
+from exported import Instance, mass_spring_damper
+from loopwright.fmus._build import build_fmu
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cache(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LOOPWRIGHT_CACHE", str(folder))
+        patch.delenv("LOOPWRIGHT_CC", raising=False)
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def msd(cache):
+    return build_fmu(mass_spring_damper())
+
+
+@pytest.fixture
+def instance(tmp_path):
+    made = []
+
+    def make(path, **options):
+        made.append(Instance(path, tmp_path / str(len(made)), **options))
+        return made[-1]
+
+    yield make
+    for item in made:
+        item.fmu.freeInstance()

@@ -1,0 +1,135 @@
+"""Models to export, and an FMU under FMPy's low-level interface: for the tests of export."""
+
+import casadi as ca
+import fmpy
+import fmpy.fmi3
+import numpy as np
+import pytest
+from loopwright.fmus._spec import ModelSpec, Variable
+
+M, D, K = 2.0, 0.5, 10.0
+
+
+def mass_spring_damper(**changes):
+    t, x, u, p = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("u"), ca.SX.sym("p", 3)
+    acceleration = (u - p[1] * x[1] - p[2] * x[0]) / p[0]
+    given = {
+        "name": "mass_spring_damper",
+        "description": "A mass on a spring & a damper, x < 1",
+        "inputs": (Variable("force", "input", unit="N", description='Force "from outside"'),),
+        "outputs": (Variable("acceleration", "output", unit="m/s2"),),
+        "parameters": (
+            Variable("mass", "parameter", "fixed", unit="kg", start=M, minimum=1e-6),
+            Variable("damping", "parameter", "tunable", unit="N.s/m", start=D),
+            Variable("stiffness", "parameter", "fixed", unit="N/m", start=K),
+        ),
+        "states": (
+            Variable("position", "output", unit="m", start=0.1, state=True),
+            Variable("velocity", "local", unit="m/s", start=0.0, state=True),
+        ),
+        "derivative": ca.Function("f", [t, x, u, p], [ca.vertcat(x[1], acceleration)]),
+        "output": ca.Function("g", [t, x, u, p], [acceleration]),
+    }
+    return ModelSpec(**(given | changes))
+
+
+def pendulums():
+    """Array states, an MX model with a structural zero, time in it; two pendulums, one frozen clock."""
+    t, x, u, p = ca.MX.sym("t"), ca.MX.sym("x", 5), ca.MX.sym("u", 2), ca.MX.sym("p", 4)
+    angle, rate = x[:2], x[2:4]
+    torque = ca.reshape(p, 2, 2).T @ u  # p is a 2 x 2 matrix, row by row
+    acceleration = torque - 9.81 * ca.sin(angle) - 0.1 * rate + 0.5 * ca.sin(3 * t)
+    derivative = ca.Function("f", [t, x, u, p], [ca.vertcat(rate, acceleration, ca.MX(1, 1))])
+    output = ca.Function("g", [t, x, u, p], [ca.vertcat(ca.sin(angle), ca.if_else(u[0] > 0, 1.0, 0.0))])
+    return ModelSpec(
+        name="pendulums",
+        description="",
+        inputs=(Variable("torque", "input", shape=(2,)),),
+        outputs=(Variable("deflection", "output", shape=(2,)), Variable("positive", "output")),
+        parameters=(Variable("gain", "parameter", "tunable", (2, 2), start=[[1.0, 2.0], [3.0, 4.0]]),),
+        states=(
+            Variable("angle", "output", shape=(2,), start=[0.3, -0.2], state=True),
+            Variable("rate", shape=(2,), start=0.0, state=True),
+            Variable("clock", start=7.0, state=True),
+        ),
+        derivative=derivative,
+        output=output,
+        internal_step=1e-2,
+    )
+
+
+def explosive():
+    """x' = x^2 has no solution after t = 1 / x(0); the output is 1 / (2 - x)."""
+    t, x, u, p = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("u", 0), ca.SX.sym("p", 0)
+    f = ca.Function("f", [t, x, u, p], [ca.vertcat(1.0, x[1] ** 2)])
+    g = ca.Function("g", [t, x, u, p], [1 / (2 - x[1])])
+    states = (Variable("calm", start=0.0, state=True), Variable("x", start=1.0, state=True))
+    return ModelSpec("explosive", "", (), (Variable("y", "output"),), (), states, f, g, internal_step=1e-3)
+
+
+class Instance:
+    """An FMU under FMPy's low-level interface, by names, with what it logs."""
+
+    def __init__(self, path, folder, name="plant", token=None, start_time=0.0, stop_time=None):
+        description = fmpy.read_model_description(str(path))
+        self.references = {v.name: v.valueReference for v in description.modelVariables}
+        self.sizes = {v.name: int(np.prod([d.start for d in v.dimensions] or [1])) for v in description.modelVariables}
+        self.log = []
+        self.folder, self.start_time, self.stop_time = folder, start_time, stop_time
+        fmpy.extract(str(path), str(folder))
+        self.fmu = fmpy.fmi3.FMU3Slave(
+            guid=token or description.guid,
+            unzipDirectory=str(folder),
+            modelIdentifier=description.modelName,
+            instanceName=name,
+        )
+        self.fmu.instantiate(loggingOn=True, logMessage=self._logged)
+
+    def _logged(self, environment, status, category, message):
+        self.log.append((status, category.decode(), message.decode()))
+
+    def initialize(self, **start):
+        for name, value in start.items():
+            self[name] = value
+        self.fmu.enterInitializationMode(startTime=self.start_time, stopTime=self.stop_time)
+        self.fmu.exitInitializationMode()
+        return self
+
+    def __getitem__(self, name):
+        values = self.fmu.getFloat64([self.references[name]], self.sizes[name])
+        return values[0] if self.sizes[name] == 1 else np.array(values)
+
+    def __setitem__(self, name, value):
+        self.fmu.setFloat64([self.references[name]], np.ravel(value).tolist())
+
+    def step(self, t, h, **inputs):
+        for name, value in inputs.items():
+            self[name] = value
+        return self.fmu.doStep(t, h)
+
+    def directional(self, unknown, known, seed):
+        vr = self.references
+        return self.fmu.getDirectionalDerivative([vr[unknown]], [vr[known]], seed, self.sizes[unknown])
+
+    def adjoint(self, unknown, known, seed):
+        vr = self.references
+        return self.fmu.getAdjointDerivative([vr[unknown]], [vr[known]], seed, self.sizes[known])
+
+
+def fails(item, call, *parts):
+    """The call fails, and the log says why; the FMU is reset."""
+    before = len(item.log)
+    with pytest.raises(fmpy.fmi1.FMICallException):
+        call()
+    assert len(item.log) == before + 1, item.log[before:]
+    status, category, message = item.log[-1]
+    assert (status, category) == (fmpy.fmi3.fmi3Error, "logStatusError")
+    for part in parts:
+        assert part in message
+    item.fmu.reset()
+
+
+def run(item, t, n, h=0.01):
+    for k in range(n):
+        item.step(t + k * h, h, force=np.sin(t + k * h))
+    return [item[name] for name in ("time", "position", "velocity", "acceleration", "der(velocity)")]
