@@ -70,8 +70,8 @@ class Block(Value, Wireable):
     inputs: ClassVar[Mapping[str, Input]] = {}
     outputs: ClassVar[Mapping[str, Output | State]] = {}
     states: ClassVar[Mapping[str, State]] = {}
-    name: str | None
-    _hint: str | None
+    name: str | None = None
+    _hint: ClassVar[str | None] = None
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -95,7 +95,6 @@ class Block(Value, Wireable):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         name = kwargs.get("name")
         object.__setattr__(self, "name", None if name is None else check_name(name))
-        object.__setattr__(self, "_hint", None)
         super().__init__(*args, **kwargs)
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -18,8 +18,8 @@ class ErrorDynamics(Block):
     """PID error dynamics (12): v = r̈ − a₂ ė − a₁ e − a₀ ∫e dt, e = y − r.
 
     Behind `FeedbackLinearization` it makes e⁽³⁾ + a₂ ë + a₁ ė + a₀ e = 0 (E5). Inputs are the coordinate (y, ẏ) and
-    the path reference (r, ṙ, r̈). Anti-windup: while ``excess``, the part of the motor force that a saturation cut off, is
-    not zero, the integral holds.
+    the path reference (r, ṙ, r̈). Anti-windup: while ``excess``, the part of the motor force that a saturation cut
+    off, is not zero, the integral holds.
     """
 
     a2: float = parameter(unit="1/s", description="gain of the rate error")
@@ -49,9 +49,14 @@ class ErrorDynamics(Block):
         """
         p = np.asarray(poles, dtype=complex)
         coefficients = np.poly(p)
-        if p.shape != (3,) or np.any(p.real >= 0) or np.max(np.abs(np.imag(coefficients))) > 1e-9 * np.abs(p).max() ** 3:
+        if (
+            p.shape != (3,)
+            or np.any(p.real >= 0)
+            or np.max(np.abs(np.imag(coefficients))) > 1e-9 * np.abs(p).max() ** 3
+        ):
             raise ParameterError(
-                f"found {list(poles)}; expected three poles in the left half plane, complex ones in conjugate pairs, such as "
+                f"found {list(poles)}; expected three poles in the left half plane, complex ones in conjugate pairs, "
+                f"such as "
                 "[-20, -20, -20].",
                 block=name or cls.__name__,
                 port="poles",
@@ -78,11 +83,12 @@ class AdmittanceFilter(Block):
     """Admittance control law (15): the path reference that yields to a force like m ë + d ė + k e = F − F^d, (14).
 
     e = r^p − r^d is the deviation of the path reference from the given reference; d = 2 ζ √(m k) (E7). Force tracking
-    (section IV-B) is the case k = 0 with a desired force; the damping must then be given (E8). ``offset`` is a set-point
-    without derivatives, measured from the reference: it adds k·offset to the force (E27).
+    (section IV-B) is the case k = 0 with a desired force; the damping must then be given (E8). ``offset`` is a
+    set-point without derivatives, measured from the reference: it adds k·offset to the force (E27).
 
     ``velocity_limit`` and ``acceleration_limit`` bound the path reference by conditional integration (end of section
-    IV-A): in a tick in which one would be exceeded the acceleration is cut to the admissible value and held over the tick.
+    IV-A): in a tick in which one would be exceeded the acceleration is cut to the admissible value and held over the
+    tick.
     """
 
     mass: float = parameter(unit="kg", above=0.0, description="rendered mass m")
@@ -96,6 +102,8 @@ class AdmittanceFilter(Block):
     desired_force = Input(unit="N", default=0.0, description="F^d, subtracted from the force (E16)")
     offset = Input(unit="m", default=0.0, description="set-point without derivatives, relative to the reference")
     path_reference = Output(shape=(3,), unit=("m", "m/s", "m/s2"), description="r^p: value, rate, acceleration")
+    transition: ClassVar[Array]  # computed by constants
+    forcing: ClassVar[Array]
     error = State(unit="m", description="e")
     error_rate = State(unit="m/s", description="ė")
 
@@ -105,7 +113,8 @@ class AdmittanceFilter(Block):
             raise ParameterError("give either damping_ratio or damping.", block=self.label, port="damping")
         if self.stiffness == 0 and self.damping is None:
             raise ParameterError(
-                f"found stiffness=0 with damping_ratio={self.damping_ratio:g}; 2 ζ √(m k) would be no damping at all. Give "
+                f"found stiffness=0 with damping_ratio={self.damping_ratio:g}; 2 ζ √(m k) would be no damping at all. "
+                f"Give "
                 "damping=… in N.s/m, for instance the value that it had before.",
                 block=self.label,
                 port="damping",
@@ -114,7 +123,9 @@ class AdmittanceFilter(Block):
     @property
     def effective_damping(self) -> Array:
         """Damping d in N s/m, 2 ζ √(m k) where the ratio is given."""
-        return self.damping if self.damping is not None else 2.0 * self.damping_ratio * np.sqrt(self.mass * self.stiffness)
+        if self.damping_ratio is None:
+            return self.damping
+        return 2.0 * self.damping_ratio * np.sqrt(self.mass * self.stiffness)
 
     def constants(self, T: float, method: str) -> dict[str, np.ndarray]:
         """Return transition and forcing of the free filter over one sample."""

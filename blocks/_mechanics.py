@@ -15,8 +15,8 @@ class PlanarModel(Block):
 
     Equation (1), with F the force on the end effector (E1, E6): ẋ_c = x_v, ẋ_v = f_v(x_c, x_v) + G_v(x_c)(u + dhᵀ F),
     and (3): y = h(x_c). A subclass gives `f_v` and `G_v`, and `h` with its first two derivatives where h is not the
-    identity. It is a block too where it declares ports and states: the plant and the model that a controller inverts are
-    then one definition.
+    identity. It is a block too where it declares ports and states: the plant and the model that a controller inverts
+    are then one definition.
     """
 
     coordinate_unit: ClassVar[str] = "m"
@@ -56,5 +56,3 @@ class PlanarModel(Block):
         """Return ÿ = dh ẋ_v + (dh)˙ x_v."""
         a = self.coordinate_acceleration(x_c, x_v, motor_force, force)
         return self.dh(x_c) @ a + self.dh_rate(x_c, x_v) @ x_v
-
-

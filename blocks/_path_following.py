@@ -1,8 +1,8 @@
 """Path following by transverse feedback linearization: section III of Flixeder, Glück, Böck, Kugi (2014).
 
-Numbers in parentheses are the paper's equations, E1 to E27 its errata (docs/paper.md). F is the force on the robot, t and
-n the unit tangent and normal (to the left), κ the signed curvature (the paper's φ′), κ_s its derivative with respect to
-the arc length, q = 1 − κ ξ₁.
+Numbers in parentheses are the paper's equations, E1 to E27 its errata (docs/paper.md). F is the force on the robot, t
+and n the unit tangent and normal (to the left), κ the signed curvature (the paper's φ′), κ_s its derivative with
+respect to the arc length, q = 1 − κ ξ₁.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _CONVERGED = 1e-9  # largest remaining Newton step, as a part of the path's para
 class PathTracking(Block):
     """Base of blocks that follow the foot point of a position on a path.
 
-    At the start the foot point is the global arg min of (4); from then on Newton's method on (6) starts from the last one,
-    so that θ counts laps (E17). Leaving the domain of the path's coordinates stops the run with a `PathDomainError`: q
-    below ``minimum_q``, at or beyond the medial axis, or beyond an end of an open path.
+    At the start the foot point is the global arg min of (4); from then on Newton's method on (6) starts from the last
+    one, so that θ counts laps (E17). Leaving the domain of the path's coordinates stops the run with a
+    `PathDomainError`: q below ``minimum_q``, at or beyond the medial axis, or beyond an end of an open path.
     """
 
     memory = True
@@ -44,7 +44,7 @@ class PathTracking(Block):
         if period is None:
             return theta
         theta -= period * np.floor(theta / period)
-        return theta - period if theta > period * (1.0 - 1e-6) else theta
+        return float(theta - period if theta > period * (1.0 - 1e-6) else theta)
 
     def foot_point(self, x: Any, u: Any) -> tuple[Array, Array]:
         """Return the path parameter θ̂ of the foot point, from (6), and Newton's remaining step."""
@@ -61,7 +61,7 @@ class PathTracking(Block):
         frame = self.path.frame(theta)
         xi = frame.normal @ (u.position - frame.sigma)
         left, right = self.path.reach(theta)
-        low, high = self.path.domain or (0.0, self.path.period)
+        low, high = self.path.domain or (0.0, self.path.period or 1.0)
         checks = {
             "newton": _CONVERGED * (high - low) - np.abs(residual),
             "q": 1.0 - frame.curvature * xi - self.minimum_q,
@@ -82,7 +82,8 @@ class PathTracking(Block):
         left, right = (float(r) for r in self.path.reach(theta))
         reach = left if xi > 0 else right
         why = {
-            "newton": "the foot point jumped: the position moved too far within one tick, or it is near the medial axis",
+            "newton": "the foot point jumped: the position moved too far within one tick, or it is near the medial "
+            "axis",
             "q": f"q = 1 − κ ξ = {1 - float(frame.curvature) * xi:.4g} is below {self.minimum_q:g}",
             "left": "it is at or beyond the medial axis, where the nearest point of the path is not unique",
             "right": "it is at or beyond the medial axis, where the nearest point of the path is not unique",
@@ -91,7 +92,8 @@ class PathTracking(Block):
         }[name]
         error = PathDomainError(
             f"position {position.tolist()} m has no valid path coordinates: {why}. Nearest foot point θ = {theta:.6g}, "
-            f"ξ = {xi:.6g} m, local reach on that side {reach:.6g} m. Start nearer to the path, or limit what drives it off."
+            f"ξ = {xi:.6g} m, local reach on that side {reach:.6g} m. Start nearer to the path, or limit what "
+            f"drives it off."
         )
         error.position, error.theta, error.xi, error.reach = tuple(position.tolist()), theta, xi, reach
         return error
@@ -123,7 +125,9 @@ class TransverseTransform(Block):
     """
 
     path: Path = parameter(kw_only=False, description="the path")
-    model: PlanarModel | None = parameter(default=None, kw_only=False, description="output map h, where it is not identity")
+    model: PlanarModel | None = parameter(
+        default=None, kw_only=False, description="output map h, where it is not identity"
+    )
     eta = Output(shape=(2,), unit=("m", "m/s"), description="tangential state η")
     xi = Output(shape=(2,), unit=("m", "m/s"), description="transversal state ξ")
 
@@ -164,8 +168,8 @@ class FeedbackLinearization(Block):
 
         u = (dh G_v)⁻¹ { n (v⊥ + κ q η₂²) + t (q v∥ − 2 κ η₂ ξ₂ − κ_s ξ₁ η₂²) − dh f_v − (dh)˙ x_v } − dhᵀ F.
 
-    For any fully actuated planar model with ẋ_v = f_v + G_v (u + dhᵀ F), y = h(x_c); the gantry is the case h = identity.
-    The measured force F on the robot is cancelled with the sign of E6.
+    For any fully actuated planar model with ẋ_v = f_v + G_v (u + dhᵀ F), y = h(x_c); the gantry is the case h =
+    identity. The measured force F on the robot is cancelled with the sign of E6.
     """
 
     path: Path = parameter(kw_only=False, description="the path")

@@ -106,13 +106,11 @@ class Path(Value):
         if self.period is not None:
             return np.array([0.0, self.period])
         if self.domain is None:
-            raise self._undefined("a period or a domain")
+            raise self._undefined("period and no domain")
         return np.array(self.domain)
 
     def _undefined(self, what: str) -> DefinitionError:
-        return DefinitionError(
-            f"found no {what}; expected every path to define it. Write it.", block=type(self).__name__
-        )
+        return DefinitionError(f"found no {what}; expected a path to define it. Write it.", block=type(self).__name__)
 
     @cached_property
     def closed(self) -> bool:

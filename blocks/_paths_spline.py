@@ -28,7 +28,7 @@ class CubicSpline(Path):
 
     def check(self) -> None:
         """Refuse too few points, points that coincide, and a curve that comes to a halt."""
-        points, least = self.points, 3 if self.closed else 2
+        points, least = np.asarray(self.points), 3 if self.closed else 2
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < least:
             raise self._bad(
                 f"found an array of shape {np.shape(points)}; expected (N, 2) with at least {least} points for "

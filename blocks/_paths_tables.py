@@ -76,12 +76,16 @@ def integral(speed: Callable[[np.ndarray], np.ndarray], knots: np.ndarray) -> tu
 # --- sampling and searches --------------------------------------------------------------------------------------------
 
 
+def _subdivided(knots: np.ndarray) -> np.ndarray:
+    """Return the knots and equally many points between each two of them, at least 64 intervals in all."""
+    cells = max(4, -(-64 // (len(knots) - 1)))
+    parts = [np.linspace(a, b, cells, endpoint=False) for a, b in pairwise(knots)]
+    return np.append(np.concatenate(parts), knots[-1])
+
+
 def grid(path: Path) -> np.ndarray:
     """Return path parameters so dense that no cell turns by more than 0.05 rad or is longer than length/400."""
-    knots = path.knots
-    cells = max(4, -(-64 // (len(knots) - 1)))
-    theta = np.concatenate([np.linspace(a, b, cells, endpoint=False) for a, b in pairwise(knots)])
-    theta = np.append(theta, knots[-1])
+    theta = _subdivided(path.knots)
     for _ in range(14):
         middle = (theta[1:] + theta[:-1]) / 2.0
         ends, mids = path.frame(theta), path.frame(middle)
@@ -242,27 +246,29 @@ def reach_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return breaks and coefficients (pieces, 2, 2) of the inverse reach, left and right, linear between the nodes.
 
     The inverse reach is a maximum of smooth functions: where it has kinks, straight lines lie above it, on the safe
-    side. Intervals are halved until the line is near enough at the middle, and the slack is added everywhere.
+    side. Intervals are cut in three until the line is near enough at both thirds, and the slack is added everywhere.
     """
     contact = _Contact(path)
-    knots = path.knots
-    theta = np.unique(np.concatenate([np.linspace(a, b, 5) for a, b in pairwise(knots)]))
+    theta = _subdivided(path.knots)
     values = contact.inverse_reach(theta)
     open_ = np.ones(len(theta) - 1, dtype=bool)  # intervals still to be examined
-    size = np.pi / path.length
-    for _ in range(12):
+    for _ in range(8):
         index = np.flatnonzero(open_)
-        middle = (theta[index] + theta[index + 1]) / 2.0
-        exact, line = contact.inverse_reach(middle), (values[index] + values[index + 1]) / 2.0
-        scale = np.maximum(exact, 0.05 * size)
-        bad = np.any((exact - line > _SLACK * scale) | (line - exact > _GENEROUS * scale), axis=1)
+        thirds, exact, bad = [], [], np.zeros(len(index), dtype=bool)
+        for part in (1.0 / 3.0, 2.0 / 3.0):
+            thirds.append(theta[index] + part * (theta[index + 1] - theta[index]))
+            exact.append(contact.inverse_reach(thirds[-1]))
+            excess = exact[-1] - (values[index] + part * (values[index + 1] - values[index]))
+            scale = np.maximum(exact[-1], 0.15 / path.length)
+            bad |= np.any((excess > _SLACK * scale) | (excess < -_GENEROUS * scale), axis=1)
         if not bad.any():
             break
-        theta = np.insert(theta, index[bad] + 1, middle[bad])
-        values = np.insert(values, index[bad] + 1, exact[bad], axis=0)
+        place = np.repeat(index[bad] + 1, 2)
+        theta = np.insert(theta, place, np.stack(thirds, axis=1)[bad].ravel())
+        values = np.insert(values, place, np.stack(exact, axis=1)[bad].reshape(-1, 2), axis=0)
+        first = index[bad] + 2 * np.arange(bad.sum())
         open_ = np.zeros(len(theta) - 1, dtype=bool)
-        first = index[bad] + np.arange(bad.sum())
-        open_[first] = open_[first + 1] = True
+        open_[np.concatenate([first, first + 1, first + 2])] = True
     values = np.where(values > 1.0 / UNLIMITED, values * (1.0 + 2.0 * _SLACK), values)
     slope = np.diff(values, axis=0) / np.diff(theta)[:, None]
     return theta, np.stack([values[:-1], slope], axis=2)

@@ -1,7 +1,7 @@
 """Signals and calls: wiring as values.
 
-``block(u)`` is a `Call`: the block with its inputs. It changes nothing. A `Signal` is one output port, or a part of one.
-Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` and ``*``.
+``block(u)`` is a `Call`: the block with its inputs. It changes nothing. A `Signal` is one output port, or a part of
+one. Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` and ``*``.
 """
 
 from __future__ import annotations
@@ -71,7 +71,9 @@ class Signal(Wireable):
 
     __slots__ = ("call", "index", "port", "source", "wire")
 
-    def __init__(self, source: Any, port: str, index: int | slice | None = None, wire: str | None = None, call: Any = None):
+    def __init__(
+        self, source: Any, port: str, index: int | slice | None = None, wire: str | None = None, call: Any = None
+    ):
         self.source, self.port, self.index, self.wire, self.call = source, port, index, wire, call
 
     def _signal(self) -> Signal:
@@ -102,7 +104,9 @@ class Signal(Wireable):
 class Call(Wireable):
     """A block with its inputs: one node of a diagram."""
 
-    def __init__(self, block: Block, wires: dict[str, Signal], names: tuple[str | None, ...] = (), origin: Call | None = None):
+    def __init__(
+        self, block: Block, wires: dict[str, Signal], names: tuple[str | None, ...] = (), origin: Call | None = None
+    ):
         self.block, self.wires, self.names = block, wires, names
         self.origin = origin or self
         if origin is None:
@@ -145,7 +149,9 @@ class Call(Wireable):
             raise AttributeError(name)
         if name in self.block.outputs:
             return self._output(name)
-        raise UnknownAttribute(f"it has no output {name!r}. {near(name, self.block.outputs)}", block=self.block.label)
+        raise UnknownAttributeError(
+            f"it has no output {name!r}. {near(name, self.block.outputs)}", block=self.block.label
+        )
 
     def __getitem__(self, index: Any) -> Signal:
         return self._output(index) if isinstance(index, str) and index in self.block.outputs else self._signal()[index]
@@ -154,7 +160,7 @@ class Call(Wireable):
         return f"<call of {self.block.label}>"
 
 
-class UnknownAttribute(UnknownNameError, AttributeError):
+class UnknownAttributeError(UnknownNameError, AttributeError):
     """An output that is not there, asked for as an attribute."""
 
 

@@ -12,7 +12,9 @@ from ._ports import Output
 from ._values import Array, parameter
 
 
-def smooth_step(t: Array, start_time: Array, duration: Array, initial: Array, final: Array) -> tuple[Array, Array, Array]:
+def smooth_step(
+    t: Array, start_time: Array, duration: Array, initial: Array, final: Array
+) -> tuple[Array, Array, Array]:
     """Return the 7th-order smooth step with its two time derivatives.
 
     s = r₀ + (r₁ − r₀)(35 z⁴ − 84 z⁵ + 70 z⁶ − 20 z⁷), z = (t − t₀)/D clipped to [0, 1]; s, ṡ, s̈ and the third

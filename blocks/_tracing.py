@@ -99,7 +99,7 @@ def constants_of(block: Block, T: float, method: str) -> dict[str, Any]:
 
 @lru_cache(maxsize=4096)
 def _tuple_type(kind: str, names: tuple[str, ...]) -> Any:
-    return namedtuple(kind, names)  # type: ignore[misc]
+    return namedtuple(kind, names)
 
 
 def bundle(kind: str, values: Mapping[str, Any]) -> Any:
@@ -138,7 +138,8 @@ def trace(
         try:
             found = _Tracer(block, dict(shapes), sampled, method, zeros).run()
         except LoopwrightError as error:
-            raise error.at(block=block.label)
+            error.at(block=block.label)
+            raise
         if len(_CACHE) > 2048:
             _CACHE.clear()
         _CACHE[key] = found
@@ -197,7 +198,15 @@ class _Tracer:
         }
         self._compare(function)
         return Traced(
-            function, self.shapes, self.output_shapes, self.states, self.guard_names, depends, advance, matrix, self.method
+            function,
+            self.shapes,
+            self.output_shapes,
+            self.states,
+            self.guard_names,
+            depends,
+            advance,
+            matrix,
+            self.method,
         )
 
     # --- the equations, called with symbols -------------------------------------------------------------------------
@@ -216,13 +225,14 @@ class _Tracer:
         for name, value in self.constants.items():
             values[name] = _wrap(p[position : position + np.size(value)], np.shape(value))
             position += np.size(value)
-        return _with(self.block, values)
+        shadow: Block = _with(self.block, values)
+        return shadow
 
     def _call(self, what: str, t: Any, x: Any, u: Any, p: Any, entries: list[tuple[str, Any]]) -> Any:
         T = p[sum(np.size(v) for _, v in entries)]
         method = getattr(self._shadow(p, entries, T), what)
         args = (_wrap(t, ()), self._bundle("x", self.states, x), self._bundle("u", self.shapes, u))
-        keywords = {"T": _wrap(T, ())} if self._wants_T(what) else {}
+        keywords = {"T": _wrap(T, ())} if self._wants_sample_time(what) else {}
         try:
             return method(*args, **keywords)
         except LoopwrightError:
@@ -230,7 +240,7 @@ class _Tracer:
         except Exception as error:
             raise TraceError(_where(error, self.block, what)) from error
 
-    def _wants_T(self, what: str) -> bool:
+    def _wants_sample_time(self, what: str) -> bool:
         declared = inspect.signature(getattr(type(self.block), what)).parameters.get("T")
         if declared is None:
             return False
@@ -289,10 +299,14 @@ class _Tracer:
 
         if update and (self.sampled or not derivative):
             if not self.sampled and not self.block.memory:
-                raise SampleTimeError("a sampled block stands in a continuous frame; put it into a @subsystem(sample_time=…).")
+                raise SampleTimeError(
+                    "a sampled block stands in a continuous frame; put it into a @subsystem(sample_time=…)."
+                )
             return "update", None, 0, states_from("update", x)
         if not derivative:
-            raise TraceError(f"it has states ({', '.join(self.states)}) but neither derivative(t, x, u) nor update(t, x, u).")
+            raise TraceError(
+                f"it has states ({', '.join(self.states)}) but neither derivative(t, x, u) nor update(t, x, u)."
+            )
         dx = states_from("derivative", x)
         if not self.sampled:
             return "derivative", None, 0, dx
@@ -424,7 +438,9 @@ def _split(result: Any, declared: Mapping[str, Shape | None], what: str) -> tupl
     names = list(declared)
     parts = (result,) if len(names) == 1 else result
     if isinstance(parts, ArrayInterface | np.ndarray) or len(parts) != len(names):
-        raise TraceError(f"its {what} returned {len(parts)} values; expected a tuple of {len(names)}: {', '.join(names)}.")
+        raise TraceError(
+            f"its {what} returned {len(parts)} values; expected a tuple of {len(names)}: {', '.join(names)}."
+        )
     made, shapes = {}, {}
     for name, part in zip(names, parts, strict=True):
         shape = tuple(part.shape) if isinstance(part, ArrayInterface) else np.shape(part)
@@ -433,7 +449,9 @@ def _split(result: Any, declared: Mapping[str, Shape | None], what: str) -> tupl
             raise ShapeError(f"its {what} gives shape {shape}; expected {expected} as declared.", port=name)
         flat = _flat(part)
         if flat.numel() != size(shape):
-            raise ShapeError(f"its {what} gives {flat.numel()} entries for shape {shape}; index it explicitly.", port=name)
+            raise ShapeError(
+                f"its {what} gives {flat.numel()} entries for shape {shape}; index it explicitly.", port=name
+            )
         made[name], shapes[name] = ca.densify(flat), shape
     return made, shapes
 
@@ -447,6 +465,7 @@ def _where(error: Exception, block: Block, what: str) -> str:
             line = f" in line {step.tb_lineno} of {step.tb_frame.f_code.co_filename}"
         step = step.tb_next
     return (
-        f"its {what} can't be traced{line}: {type(error).__name__}: {error}. Use NumPy functions of (t, x, u): np.where for "
+        f"its {what} can't be traced{line}: {type(error).__name__}: {error}. Use NumPy functions of (t, x, "
+        f"u): np.where for "
         "branches, np.stack for vectors, np.sqrt and not math.sqrt."
     )

@@ -112,7 +112,9 @@ class Value:
             )
         for name, value in zip(positional, args, strict=False):
             if name in kwargs:
-                raise ParameterError("it is given twice, by position and by keyword; give it once.", block=who, port=name)
+                raise ParameterError(
+                    "it is given twice, by position and by keyword; give it once.", block=who, port=name
+                )
             kwargs[name] = value
         for name in kwargs:
             if name not in cls.parameter_specs and name not in cls._keywords:
@@ -210,7 +212,9 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
 
     def bad(found: str, expected: str) -> ParameterError:
         unit = f" in {spec.unit}" if spec.unit else ""
-        return ParameterError(f"found {found}; expected {expected}{unit}. {spec.description}".rstrip(), block=who, port=name)
+        return ParameterError(
+            f"found {found}; expected {expected}{unit}. {spec.description}".rstrip(), block=who, port=name
+        )
 
     numeric = "float" in spec.annotation or "Array" in spec.annotation
     if value is None and ("None" in spec.annotation or not numeric):

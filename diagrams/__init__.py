@@ -8,4 +8,16 @@ from ._structure import Frame, Wire
 from ._subsystem import Subsystem, subsystem
 from .fig3 import fig3
 
-__all__ = ["Diagram", "FlatDiagram", "Frame", "Layout", "Run", "Snapshot", "Subsystem", "Wire", "experiments", "fig3", "subsystem"]
+__all__ = [
+    "Diagram",
+    "FlatDiagram",
+    "Frame",
+    "Layout",
+    "Run",
+    "Snapshot",
+    "Subsystem",
+    "Wire",
+    "experiments",
+    "fig3",
+    "subsystem",
+]

@@ -51,7 +51,9 @@ def part_shape(shape: Shape, wire: Wire, who: str, port: str) -> Shape:
     if wire.index is None:
         return shape
     if not shape:
-        raise ShapeError(f"{wire} takes a part of a scalar; wire the whole of {wire.block}.{wire.port}.", block=who, port=port)
+        raise ShapeError(
+            f"{wire} takes a part of a scalar; wire the whole of {wire.block}.{wire.port}.", block=who, port=port
+        )
     try:
         return np.empty(shape)[wire.index].shape
     except IndexError:
@@ -63,7 +65,8 @@ def _check_ports(table: Structure) -> None:
         for (consumer, port), wire in table.wires.items():
             if wire.block == path and wire.port not in block.outputs:
                 raise UnknownNameError(
-                    f"it has no output {wire.port!r}, which {consumer}.{port} is wired to. {near(wire.port, block.outputs)}",
+                    f"it has no output {wire.port!r}, which {consumer}.{port} is wired to. "
+                    f"{near(wire.port, block.outputs)}",
                     block=path,
                 )
         for port, spec in block.inputs.items():
@@ -99,7 +102,8 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[tuple[str, 
                 shapes.update({(path, name): shape for name, shape in traced[path].outputs.items()})
         if len(still) == len(waiting):
             raise ShapeError(
-                f"the shapes around {', '.join(still[:4])} depend on each other in a circle, so they can't be found. Give one "
+                f"the shapes around {', '.join(still[:4])} depend on each other in a circle, so they can't be found. "
+                f"Give one "
                 "of them, for instance UnitDelay(initial_value=…).",
                 block=still[0],
             )
@@ -174,7 +178,9 @@ def _check_units(table: Structure, shapes: dict[tuple[str, str], Shape]) -> dict
                 expected, what = seen[1], f"{seen[0]} beside it is"
             problem = _mismatch(unit, expected)
             if problem:
-                raise UnitError(f"{wire} is in {_text(unit)}; {what} in {_text(expected)}: {problem}", block=path, port=name)
+                raise UnitError(
+                    f"{wire} is in {_text(unit)}; {what} in {_text(expected)}: {problem}", block=path, port=name
+                )
     return units
 
 

@@ -80,7 +80,7 @@ class Diagram:
 
     @property
     def frames(self) -> Mapping[str, Frame]:
-        """Every subsystem by its dotted path; the diagram itself is "". """
+        """Every subsystem by its dotted path; the diagram itself is ""."""
         return dict(self._table.frames)
 
     @property
@@ -137,7 +137,8 @@ class Diagram:
             table.blocks[full] = value.replace(name=full.rpartition(".")[2])
         elif head in table.frames and last in ("sample_time", "method"):
             new = exact_time(value, block=head) if last == "sample_time" else value
-            table.frames[head] = replace_fields(table.frames[head], **{last: new})
+            changed: dict[str, Any] = {last: new}
+            table.frames[head] = replace_fields(table.frames[head], **changed)
         else:
             full, keys = self._split(table, path)
             table.blocks[full] = _changed(table.blocks[full], keys, value)
@@ -157,7 +158,9 @@ class Diagram:
             raise UnknownNameError(
                 f"{path!r} is a parameter of {', '.join(owners)}; write the path, such as '{owners[0]}.{path}'."
             )
-        known = {f"{p}.{q}" for p, block in table.blocks.items() for q in type(block).parameter_specs} | set(table.blocks)
+        known = {f"{p}.{q}" for p, block in table.blocks.items() for q in type(block).parameter_specs} | set(
+            table.blocks
+        )
         raise UnknownNameError(f"nothing is called {path!r} in diagram {self.name!r}. {near(path, known)}")
 
     def flatten(self, step: float | Fraction | None = None) -> FlatDiagram:
@@ -181,8 +184,8 @@ class Diagram:
         duration : float
             Simulated time in s, a multiple of the step between ticks.
         step : float or Fraction, optional
-            Seconds between two ticks (and communication points of the FMUs). Without one it is the greatest common divisor of
-            all sample times.
+            Seconds between two ticks (and communication points of the FMUs). Without one it is the greatest common
+            divisor of all sample times.
         progress : bool, optional
             Show a progress bar; by default on a terminal or in a notebook.
 
@@ -194,8 +197,8 @@ class Diagram:
         Raises
         ------
         SimulationError
-            `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`; ``error.run`` holds what was recorded
-            until then.
+            `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`; ``error.run`` holds what was
+            recorded until then.
         OptionError
             A duration that is not positive, or no multiple of the step.
         """

@@ -2,9 +2,9 @@
 
     (x_next, z, log, ok) = F(t, x, w, p)
 
-``x`` holds the states of all blocks, ``w`` the outputs of the FMUs, ``z`` their inputs, ``p`` all parameters; ``log`` is
-(w, all outputs, x); ``ok`` is 1 while everything is finite and every guard positive. F calls one function per block, shared
-among blocks of equal structure. It is what is evaluated, differentiated and compiled.
+``x`` holds the states of all blocks, ``w`` the outputs of the FMUs, ``z`` their inputs, ``p`` all parameters; ``log``
+is (w, all outputs, x); ``ok`` is 1 while everything is finite and every guard positive. F calls one function per block,
+shared among blocks of equal structure. It is what is evaluated, differentiated and compiled.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 from ..blocks._errors import SampleTimeError
 from ..blocks._ports import Shape
-from ..blocks._tracing import GUARDS, NEXT, Traced, size
+from ..blocks._tracing import GUARDS, NEXT, size
 from ._check import Checked
 from ._order import Step, evaluation_order
 from ._structure import Structure, Wire, join
@@ -155,13 +155,12 @@ class FlatDiagram:
         )
         values: dict[tuple[str, str], Any] = {}
         for name, where in self.plant_outputs.slices.items():
-            path, _, port = name.rpartition(".")
-            values[path, port] = w[where]
+            values[_path_and_port(name)] = w[where]
         new: dict[str, Any] = {}
         guards: list[Any] = []
         acts = {path: self.divisors[table.frame_of[path]] in acting for path in traced}
         for name, where in self.held.slices.items():
-            path, _, port = name.rpartition(".")
+            path, port = _path_and_port(name)
             if not acts[path]:
                 values[path, port] = x[where]
         for path, names in self.order:
@@ -179,12 +178,12 @@ class FlatDiagram:
                 else:
                     values[path, name] = column
         outputs = [values[path, name] for path in sorted(traced) for name in traced[path].outputs]
-        kept = [values[tuple(name.rsplit(".", 1))] for name in self.held.slices]  # type: ignore[index]
+        kept = [values[_path_and_port(name)] for name in self.held.slices]
         x_next = ca.vertcat(*(new.get(path, x[where]) for path, where in self.states.slices.items()), *kept)
         z = ca.vertcat(
             *(
                 ca.MX(ca.densify(ca.DM(column))) if isinstance(column, np.ndarray) else column
-                for column in (self.source(*name.rsplit(".", 1), values) for name in self.plant_inputs.slices)  # type: ignore[arg-type]
+                for column in (self.source(*_path_and_port(name), values) for name in self.plant_inputs.slices)
             )
         )
         log = ca.vertcat(w, *outputs, x)
@@ -216,7 +215,8 @@ def flatten(table: Structure, checked: Checked, step: Fraction | None = None) ->
     for path, trace in traced.items():
         if trace.advance == "derivative":
             raise SampleTimeError(
-                "a continuous state stands outside of any sampled subsystem, and there is no solver for it yet. Put the block "
+                "a continuous state stands outside of any sampled subsystem, and there is no solver for it yet. Put "
+                "the block "
                 "into a @subsystem(sample_time=…), which discretizes it.",
                 block=path,
             )
@@ -234,7 +234,12 @@ def flatten(table: Structure, checked: Checked, step: Fraction | None = None) ->
     opaque = sorted(path for path in table.blocks if path not in traced)
     plant_outputs = Layout.of({join(p, q): checked.shapes[p, q] for p in opaque for q in table.blocks[p].outputs})
     plant_inputs = Layout.of(
-        {join(p, q): port.shape or () for p in opaque for q, port in table.blocks[p].inputs.items() if (p, q) in table.wires}
+        {
+            join(p, q): port.shape or ()
+            for p in opaque
+            for q, port in table.blocks[p].inputs.items()
+            if (p, q) in table.wires
+        }
     )
     packed = {path: traced[path].pack(table.blocks[path], _period(table, path, base)) for path in paths}
     parameters = Layout.of({path: v.shape for path, v in packed.items()})
@@ -269,6 +274,11 @@ def flatten(table: Structure, checked: Checked, step: Fraction | None = None) ->
     )
 
 
+def _path_and_port(name: str) -> tuple[str, str]:
+    path, _, port = name.rpartition(".")
+    return path, port
+
+
 def _period(table: Structure, path: str, base: Fraction) -> float:
     rate = table.frames[table.frame_of[path]].sample_time
     return float(rate if rate is not None else base)
@@ -288,7 +298,8 @@ def _clock(table: Structure, step: Fraction | None) -> tuple[Fraction, dict[str,
     for path, rate in rates.items():
         if (rate / base).denominator != 1:
             raise SampleTimeError(
-                f"its sample time {float(rate):g} s is no multiple of the step {float(base):g} s; choose a step that divides it.",
+                f"its sample time {float(rate):g} s is no multiple of the step {float(base):g} s; choose a step that "
+                f"divides it.",
                 block=path,
             )
     return base, {path: int(rates[path] / base) if path in rates else 1 for path in table.frames}

@@ -1,8 +1,8 @@
 """The order of evaluation, from feedthrough between ports.
 
-A block's outputs, its next state and its guards are ordered one by one: each waits only for the inputs that it depends on.
-So a cycle in the drawing is no algebraic loop as long as no port waits for itself. Blocks are taken by path, so the order
-never depends on how a diagram was written down.
+A block's outputs, its next state and its guards are ordered one by one: each waits only for the inputs that it
+depends on. So a cycle in the drawing is no algebraic loop as long as no port waits for itself. Blocks are taken by
+path, so the order never depends on how a diagram was written down.
 """
 
 from __future__ import annotations

@@ -158,8 +158,8 @@ def resolve(name: str, wires: Any, ports: Any) -> str:
         return name
     for group in (wires, ports):
         found = sorted(n for n in group if n.endswith("." + name))
-        if len(found) == 1:
-            return found[0]
+        if found and (len(found) == 1 or (group is wires and len({wires[n] for n in found}) == 1)):
+            return str(found[0])
         if found:
             raise UnknownNameError(f"{name!r} stands for several signals: {', '.join(found)}. Write more of the path.")
     short = {n.rpartition(".")[2] for n in (*wires, *ports)}

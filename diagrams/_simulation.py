@@ -2,16 +2,18 @@
 
 At tick k, t = k · base exactly:
 
-1. The outputs of the FMUs are those at the end of their last step (at k = 0, of initialization): a co-simulation FMU has
+1. The outputs of the FMUs are those at the end of their last step (at k = 0, of initialization): a co-simulation FMU
+has
    no feedthrough between communication points (FMI 3.0, Step Mode).
-2. All blocks are evaluated once, each port after what it depends on: `FlatDiagram`. A sampled subsystem acts in the ticks
+2. All blocks are evaluated once, each port after what it depends on: `FlatDiagram`. A sampled subsystem acts in the
+ticks
    of its own rate; between them its outputs are held.
 3. Everything is recorded.
 4. The inputs of the FMUs are set and held, and every FMU steps to tick k + 1; the blocks' next states take effect.
 
-Time never accumulates: tick k is at k·numerator / denominator, rounded once. The last tick is evaluated and recorded, and
-nothing steps beyond it. If a value is not finite or a guard fails, the tick is evaluated again block by block to name the
-first one that is concerned; the run until then is kept in the error.
+Time never accumulates: tick k is at k·numerator / denominator, rounded once. The last tick is evaluated and recorded,
+and nothing steps beyond it. If a value is not finite or a guard fails, the tick is evaluated again block by block to
+name the first one that is concerned; the run until then is kept in the error.
 """
 
 from __future__ import annotations
@@ -55,9 +57,11 @@ def simulate(diagram: Diagram, duration: float, *, step: float | Fraction | None
                 plants.append((path, stack.enter_context(block.instantiate(wired, times[-1]))))
             except SimulationError as error:
                 error.run = recorded.until(0, 0.0)
-                raise error.at(block=path, t=0.0)
+                error.at(block=path, t=0.0)
+                raise
             except LoopwrightError as error:
-                raise error.at(block=path)
+                error.at(block=path)
+                raise
         tick = stack.enter_context(_progress(diagram.name, times[-1], progress))
         return _Loop(flat, plants, recorded).run(times, tick)
 
@@ -132,9 +136,9 @@ class _Loop:
             if id(function) not in made:
                 buffer, trigger = function.buffer()
                 for i, vector in enumerate((self.t, self.x, self.w, self.flat.p)):
-                    buffer.set_arg(i, memoryview(vector))
+                    buffer.set_arg(i, _view(vector))
                 for i, vector in enumerate((self.x_next, self.z, self.log, self.ok)):
-                    buffer.set_res(i, memoryview(vector))
+                    buffer.set_res(i, _view(vector))
                 made[id(function)] = (trigger, buffer)
             calls.append(made[id(function)][0])
         self._keep = made
@@ -142,7 +146,7 @@ class _Loop:
 
     def _first(self, evaluate: list[Any], progress: Any, times: list[float]) -> int:
         """Run all ticks and return the last one."""
-        t, ok, x, x_next = memoryview(self.t), memoryview(self.ok), self.x, self.x_next
+        t, ok, x, x_next = _view(self.t), _view(self.ok), self.x, self.x_next
         log, data, plants = self.log, self.recorded.data, [plant for _, plant in self.plants]
         h, period, last = float(self.flat.base), len(evaluate), len(times) - 1
         single = evaluate[0] if period == 1 else None
@@ -247,12 +251,17 @@ class _Loop:
             )
             made = {n: np.ravel(np.array(r)) for n, r in zip(names, result, strict=True)}
             values.update({(path, n): v for n, v in made.items()})
-            shaped_known: Any = {p: v for p, v in shaped.items()}
+            shaped_known: Any = dict(shaped)
             yield path, names, shaped_known, made
 
     def _is_known(self, path: str, port: str, values: Any) -> bool:
         wire = self.flat.table.wires.get((path, port))
         return wire is None or (wire.block, wire.port) in values
+
+
+def _view(vector: np.ndarray) -> Any:
+    """Return the memory of a vector, as CasADi's buffers take it."""
+    return memoryview(vector)  # type: ignore[arg-type]
 
 
 class _Stopped(Exception):  # noqa: N818 - not an error of its own

@@ -93,7 +93,8 @@ class Collector:
             known = self.calls.setdefault(id(item.block), item.origin)
             if known is not item.origin:
                 raise DoubleDriveError(
-                    "this block is called twice in one diagram, so its inputs would be driven twice. Make a second block: "
+                    "this block is called twice in one diagram, so its inputs would be driven twice. Make a second "
+                    "block: "
                     f"{item.block.label}.replace().",
                     block=item.block.label,
                 )
@@ -170,7 +171,8 @@ class Collector:
                     needed = [n for n, port in block.inputs.items() if port.default is None]
                     raise UnwiredInputError(
                         f"an output of this block is used, but the block is never called, so nothing is wired to "
-                        f"{', '.join(map(repr, needed))}. Call it, and give the call (or what it drives) to the Diagram.",
+                        f"{', '.join(map(repr, needed))}. Call it, and give the call (or what it drives) to the "
+                        f"Diagram.",
                         block=block.label,
                         port=needed[0],
                     )

@@ -9,7 +9,7 @@ from typing import Any, overload
 
 from ..blocks._discretization import check_method
 from ..blocks._errors import DoubleDriveError, SampleTimeError, UnknownNameError, UnwiredInputError, WiringError, near
-from ..blocks._signals import Call, Signal, UnknownAttribute, Wireable, as_signal, check_name, recorder
+from ..blocks._signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, recorder
 
 FINEST = Fraction(1, 10**9)
 
@@ -25,7 +25,9 @@ def exact_time(value: Any, *, block: str = "") -> Fraction:
     try:
         time = value if isinstance(value, Fraction) else Fraction(repr(float(value)))
     except (TypeError, ValueError, OverflowError):
-        raise SampleTimeError(f"found the sample time {value!r}; expected seconds, such as 1e-3.", block=block) from None
+        raise SampleTimeError(
+            f"found the sample time {value!r}; expected seconds, such as 1e-3.", block=block
+        ) from None
     if time <= 0:
         raise SampleTimeError(f"found a sample time of {float(time):g} s; expected a positive one.", block=block)
     if (time / FINEST).denominator != 1:
@@ -137,7 +139,8 @@ class SubsystemCall(Wireable):
     def _signal(self) -> Signal:
         if len(self.results) != 1:
             raise WiringError(
-                f"it has {len(self.results)} outputs ({', '.join(self.results) or 'none'}); unpack the call, or name one.",
+                f"it has {len(self.results)} outputs ({', '.join(self.results) or 'none'}); unpack the call, or name "
+                f"one.",
                 block=self.label,
             )
         return Signal(self, self.outputs[0], None, None, self)
@@ -157,7 +160,7 @@ class SubsystemCall(Wireable):
             raise AttributeError(name)
         if name in self.outputs:
             return Signal(self, name, None, None, self)
-        raise UnknownAttribute(f"it has no output {name!r}. {near(name, self.outputs)}", block=self.label)
+        raise UnknownAttributeError(f"it has no output {name!r}. {near(name, self.outputs)}", block=self.label)
 
 
 @overload
@@ -179,11 +182,11 @@ def subsystem(
     Parameters
     ----------
     sample_time : float or Fraction, optional
-        Sample time in s. Inputs are sampled at its ticks, outputs held between them, continuous blocks inside discretized.
-        A float is read as its shortest decimal. Without one the box has the rate of what surrounds it.
+        Sample time in s. Inputs are sampled at its ticks, outputs held between them, continuous blocks inside
+        discretized. A float is read as its shortest decimal. Without one the box has the rate of what surrounds it.
     method : {"exact", "forward", "semi_implicit"}
-        How continuous blocks inside are discretized: ``exact`` is the zero-order hold for blocks that are linear in their
-        states, forward Euler for others; see `loopwright.blocks.hold`.
+        How continuous blocks inside are discretized: ``exact`` is the zero-order hold for blocks that are linear in
+        their states, forward Euler for others; see `loopwright.blocks.hold`.
     name : str, optional
         Name of the box; without one, the function's.
 

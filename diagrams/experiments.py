@@ -105,11 +105,11 @@ DEFAULTS: Mapping[str, Any] = MappingProxyType(
 )
 """Options of every experiment, with their defaults.
 
-``plant``: path of an FMU, or an `Fmu`, in place of the gantry. ``coulomb_scale``, ``viscous_scale``: factors on the plant's
-friction only. ``friction_width``: w of plant and model, m/s. ``tool_mass``: kg beyond the force sensor. ``encoder``: quantum in
-m. ``delay``: 0 or 1 samples. ``motor_force_limit``: N, a number or one for each axis. ``velocity_limit``,
-``acceleration_limit``: of the path reference, m/s and m/s², a number or one for each direction (∥, ⊥); experiments with
-admittance only. ``sample_time``: s. ``admittance_method``: ``exact`` or ``semi_implicit``.
+``plant``: path of an FMU, or an `Fmu`, in place of the gantry. ``coulomb_scale``, ``viscous_scale``: factors on the
+plant's friction only. ``friction_width``: w of plant and model, m/s. ``tool_mass``: kg beyond the force sensor.
+``encoder``: quantum in m. ``delay``: 0 or 1 samples. ``motor_force_limit``: N, a number or one for each axis.
+``velocity_limit``, ``acceleration_limit``: of the path reference, m/s and m/s², a number or one for each direction
+(∥, ⊥); experiments with admittance only. ``sample_time``: s. ``admittance_method``: ``exact`` or ``semi_implicit``.
 """
 
 
@@ -154,8 +154,8 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float | np.number) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
-def _admittance(options: Mapping[str, Any], side: int, **impedance: float) -> AdmittanceFilter:
-    limits = {}
+def _admittance(options: Mapping[str, Any], side: int, **impedance: Any) -> AdmittanceFilter:
+    limits: dict[str, Any] = {}
     for name in ("velocity_limit", "acceleration_limit"):
         if options[name] is not None:
             limits[name] = float(np.broadcast_to(np.asarray(options[name], dtype=float), (2,))[side])
@@ -201,8 +201,8 @@ def _build(
 def path_following(**options: Any) -> Experiment:
     """Return experiment A: path following without admittance.
 
-    Starts at rest at η₁ = 0.10 m, ξ₁ = 0.01 m, off the references; then set-point changes along and across the path, one of
-    them over the seam of the closed curve. 11 s.
+    Starts at rest at η₁ = 0.10 m, ξ₁ = 0.01 m, off the references; then set-point changes along and across the path,
+    one of them over the seam of the closed curve. 11 s.
 
     Parameters
     ----------
@@ -220,10 +220,14 @@ def path_following(**options: Any) -> Experiment:
     for name in ("velocity_limit", "acceleration_limit"):
         if o[name] is not None:
             raise OptionError(
-                "experiment A has no admittance whose path reference could be limited; use B, C or D.", block="experiment A", port=name
+                "experiment A has no admittance whose path reference could be limited; use B, C or D.",
+                block="experiment A",
+                port=name,
             )
     par = SmoothStep(levels=(0.12, 0.75, 1.60), start_times=(1.0, 5.5), durations=(2.0, 2.0), name="eta_d")
-    perp = SmoothStep(levels=(0.0, -0.03, 0.03, 0.0), start_times=(4.0, 8.5, 9.5), durations=(0.5, 0.5, 0.5), name="xi_d")
+    perp = SmoothStep(
+        levels=(0.0, -0.03, 0.03, 0.0), start_times=(4.0, 8.5, 9.5), durations=(0.5, 0.5, 0.5), name="xi_d"
+    )
     return _build("A", "path_following: experiment A", 11.0, o, (0.10, 0.01), Channel(par), Channel(perp))
 
 
@@ -235,8 +239,8 @@ def compliance(*, smooth_reference: bool = False, **options: Any) -> Experiment:
     Parameters
     ----------
     smooth_reference : bool
-        Give the change along the path as a smooth reference with its derivatives, 1 s long, instead of a set-point: it is then
-        followed exactly, and the impedance does not show (E27).
+        Give the change along the path as a smooth reference with its derivatives, 1 s long, instead of a set-point:
+        it is then followed exactly, and the impedance does not show (E27).
     **options
         See `DEFAULTS`.
 
@@ -289,7 +293,9 @@ def hand_guiding(**options: Any) -> Experiment:
         + Pulse(start_time=6.5, end_time=7.5, amplitude=-6.0)
         + Pulse(start_time=8.5, end_time=9.7, amplitude=-6.0)
     )
-    par = Channel(Reference(0.2, name="eta_d"), _admittance(o, 0, mass=0.5, stiffness=0.0, damping=_damping(IMPEDANCE_PAR)))
+    par = Channel(
+        Reference(0.2, name="eta_d"), _admittance(o, 0, mass=0.5, stiffness=0.0, damping=_damping(IMPEDANCE_PAR))
+    )
     perp = Channel(Reference(0.0, name="xi_d"), _admittance(o, 1, **IMPEDANCE_PERP))
     path = o["path"]
 
@@ -316,7 +322,8 @@ def force_tracking(*, cubic: bool = False, **options: Any) -> Experiment:
     """
     o = _options("D", {**options, "cubic": cubic}, cubic=False)
     par = Channel(
-        SmoothStep(levels=(0.2, 1.0), start_times=(3.0,), durations=(3.0,), name="eta_d"), _admittance(o, 0, **IMPEDANCE_PAR)
+        SmoothStep(levels=(0.2, 1.0), start_times=(3.0,), durations=(3.0,), name="eta_d"),
+        _admittance(o, 0, **IMPEDANCE_PAR),
     )
     perp = Channel(
         Reference(0.0, name="xi_d"),
@@ -324,7 +331,7 @@ def force_tracking(*, cubic: bool = False, **options: Any) -> Experiment:
         Step(times=0.5, values=-5.0, unit="N", name="desired_force_perp"),
     )
     path = o["path"]
-    law = {"cubic_stiffness": 5.0 / 0.005**3} if cubic else {"stiffness": 1000.0}
+    law: dict[str, Any] = {"cubic_stiffness": 5.0 / 0.005**3} if cubic else {"stiffness": 1000.0}
 
     def spring(position: Any) -> Any:
         return PathSpring(path, **law, name="spring")(position)

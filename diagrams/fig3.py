@@ -95,7 +95,7 @@ def fig3(
     *,
     environment: Callable[[Any], Any] | None = None,
     model: PlanarModel = gantry.nominal,
-    rig: Rig = Rig(),  # noqa: B008 - a frozen value
+    rig: Rig = Rig(),
     name: str = "fig3",
 ) -> Diagram:
     """Wire the diagram of the paper's Fig. 3.
@@ -120,10 +120,9 @@ def fig3(
     Returns
     -------
     Diagram
-        With the wires ``eta``, ``xi``, ``theta``, ``q``, ``position``, ``velocity``, ``force``, ``motor_force``, ``v_par``,
-        ``v_perp``, ``eta_p`` and ``xi_p``.
+        With the wires ``eta``, ``xi``, ``theta``, ``q``, ``position``, ``velocity``, ``force``, ``motor_force``,
+        ``v_par``, ``v_perp``, ``eta_p`` and ``xi_p``.
     """
-
     position, velocity = plant.position.named("position"), plant.velocity.named("velocity")
     if environment is None:
         external_force = Constant(value=(0.0, 0.0), unit="N", name="free_space")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import zipfile
 from dataclasses import dataclass
 from functools import lru_cache
@@ -50,7 +51,7 @@ class FmuDescription:
         return {name: v for name, v in self.variables.items() if v.causality == causality}
 
 
-def read_description(file: str | Path) -> FmuDescription:
+def read_description(file: str | os.PathLike[str]) -> FmuDescription:
     """Read and check an FMU, without loading its library.
 
     Raises
@@ -75,7 +76,8 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
             entries = set(archive.namelist())
     except zipfile.BadZipFile:
         raise FmuFileError(
-            f"{str(path)!r} is no FMU: it is no zip archive (it starts with {data[:8]!r}). Give the .fmu that the tool exported."
+            f"{str(path)!r} is no FMU: it is no zip archive (it starts with {data[:8]!r}). Give the .fmu that the "
+            f"tool exported."
         ) from None
     if "modelDescription.xml" not in entries:
         raise FmuFileError(f"{str(path)!r} is a zip archive without modelDescription.xml, so it is no FMU.")
@@ -85,7 +87,8 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
         raise FmuFileError(f"the modelDescription.xml of {str(path)!r} can't be read: {error}") from error
     if not model.fmiVersion.startswith("3."):
         raise FmuFileError(
-            f"{str(path)!r} is an FMU of FMI {model.fmiVersion}; expected FMI 3.0. Export it again with FMI 3.0 co-simulation."
+            f"{str(path)!r} is an FMU of FMI {model.fmiVersion}; expected FMI 3.0. Export it again with FMI 3.0 "
+            f"co-simulation."
         )
     if model.coSimulation is None:
         raise FmuFileError(f"{str(path)!r} has no co-simulation interface; export it with one.")
@@ -93,7 +96,8 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
     if not any(e.startswith(f"binaries/{platform}/{identifier}.") for e in entries):
         found = sorted({e.split("/")[1] for e in entries if e.startswith("binaries/") and e.count("/") > 1})
         raise FmuFileError(
-            f"{str(path)!r} has no binary for this platform, {platform} (it has: {', '.join(found) or 'none'}). Export or build "
+            f"{str(path)!r} has no binary for this platform, {platform} (it has: {', '.join(found) or 'none'}). "
+            f"Export or build "
             "it for this platform."
         )
     variables, other = {}, {}

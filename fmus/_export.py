@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,17 @@ from ._spec import ModelSpec, Variable
 
 
 def model_spec(
-    block: Block, *, name: str | None = None, internal_step: float = 1e-3, stop_time: float = 1.0, step_size: float = 1e-3
+    block: Block,
+    *,
+    name: str | None = None,
+    internal_step: float = 1e-3,
+    stop_time: float = 1.0,
+    step_size: float = 1e-3,
 ) -> ModelSpec:
     """Return what an FMU of a continuous block consists of: its variables, and its equations as CasADi functions.
 
-    States that are outputs become output variables; the other outputs are computed. All parameters are symbols, so that each
-    can be set in the FMU.
+    States that are outputs become output variables; the other outputs are computed. All parameters are symbols, so
+    that each can be set in the FMU.
 
     Raises
     ------
@@ -35,7 +41,9 @@ def model_spec(
     """
     name = name or type(block).__name__.lower()
     if not hasattr(block, "derivative"):
-        raise DefinitionError("it has no derivative(t, x, u), so it is no continuous model; an FMU is made from one.", block=name)
+        raise DefinitionError(
+            "it has no derivative(t, x, u), so it is no continuous model; an FMU is made from one.", block=name
+        )
     shapes = {}
     for port, spec in block.inputs.items():
         if spec.shape is None:
@@ -44,10 +52,14 @@ def model_spec(
     traced = trace(block, shapes, sampled=False, zeros=False)
     entries = list(traced_parameters(block))
     f = traced.function
-    t, x, u = ca.MX.sym("t"), ca.MX.sym("x", f.numel_in(1)), ca.MX.sym("u", sum(f.numel_in(2 + i) for i in range(len(shapes))))
+    t, x, u = (
+        ca.MX.sym("t"),
+        ca.MX.sym("x", f.numel_in(1)),
+        ca.MX.sym("u", sum(f.numel_in(2 + i) for i in range(len(shapes)))),
+    )
     p = ca.MX.sym("p", sum(np.size(v) for _, v in entries))
     offsets = np.cumsum([0, *(f.numel_in(2 + i) for i in range(len(shapes)))])
-    parts = [u[int(a) : int(b)] for a, b in zip(offsets[:-1], offsets[1:], strict=True)]
+    parts = [u[int(a) : int(b)] for a, b in itertools.pairwise(offsets)]
     made = f.call([t, x, *parts, ca.vertcat(p, 0.0)])  # the sample time does not enter a continuous model
     results = dict(zip((*traced.outputs, NEXT), made[: len(traced.outputs) + 1], strict=True))
     computed = [n for n in block.outputs if n not in block.states]
@@ -60,7 +72,11 @@ def model_spec(
         parameters=tuple(_parameter(block, n, v) for n, v in entries),
         states=tuple(
             _variable(
-                port, "output" if port.output else "local", shape=traced.states[n], state=True, start=port.start_value(block, shapes)
+                port,
+                "output" if port.output else "local",
+                shape=traced.states[n],
+                state=True,
+                start=port.start_value(block, shapes),
             )
             for n, port in block.states.items()
         ),
@@ -96,7 +112,8 @@ def build(
     name : str, optional
         The model's name; the class name in lower case without one.
     internal_step : float
-        Start value, in s, of the FMU's parameter ``internal_step``: the longest step of its Runge-Kutta integrator (order 4).
+        Start value, in s, of the FMU's parameter ``internal_step``: the longest step of its Runge-Kutta integrator
+        (order 4).
     stop_time, step_size : float
         Default experiment, s.
     platform : str or iterable of str, optional

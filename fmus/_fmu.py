@@ -16,7 +16,7 @@ import numpy as np
 from ..blocks._block import Block
 from ..blocks._errors import FmuError, FmuFileError, FmuRuntimeError, ParameterError, UnknownNameError, near
 from ..blocks._ports import Input, Output
-from ..blocks._signals import Signal, UnknownAttribute
+from ..blocks._signals import Signal, UnknownAttributeError
 from ..blocks._values import parameter
 from ._compiler import cache_folder
 from ._description_reading import FmuDescription, FmuVariable, read_description
@@ -49,11 +49,14 @@ class Fmu(Block):
         try:
             description = read_description(self.file)
         except FmuError as error:
-            raise error.at(block=who)
+            error.at(block=who)
+            raise
         ports = {**description.of("input"), **description.of("output")}
         for old in self.rename:
             if old not in ports:
-                raise UnknownNameError(f"it has no port {old!r} to rename. {near(old, ports)}", block=who, port="rename")
+                raise UnknownNameError(
+                    f"it has no port {old!r} to rename. {near(old, ports)}", block=who, port="rename"
+                )
         object.__setattr__(self, "start", {k: self._start_value(description, k, v) for k, v in self.start.items()})
         new = [self.rename.get(name, name) for name in ports]
         if len(set(new)) < len(new):
@@ -62,7 +65,9 @@ class Fmu(Block):
     def _start_value(self, description: FmuDescription, name: str, value: Any) -> Any:
         who, port = self.label, f"start.{name}"
         if name in description.other:
-            raise ParameterError(f"it is {description.other[name]}; only Float64 can be set so far.", block=who, port=port)
+            raise ParameterError(
+                f"it is {description.other[name]}; only Float64 can be set so far.", block=who, port=port
+            )
         variable = description.variables.get(name)
         if variable is None:
             raise UnknownNameError(
@@ -77,7 +82,9 @@ class Fmu(Block):
         try:
             array = np.array(np.broadcast_to(np.asarray(value, dtype=float), variable.shape))
         except (TypeError, ValueError):
-            raise ParameterError(f"found {value!r}; expected numbers of shape {variable.shape}.", block=who, port=port) from None
+            raise ParameterError(
+                f"found {value!r}; expected numbers of shape {variable.shape}.", block=who, port=port
+            ) from None
         if not np.all(np.isfinite(array)):
             raise ParameterError(f"found {value!r}; expected finite numbers{_in(variable)}.", block=who, port=port)
         for bound, wrong in ((variable.minimum, np.less), (variable.maximum, np.greater)):
@@ -99,7 +106,9 @@ class Fmu(Block):
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
         """The FMU's inputs."""
         return {
-            self.rename.get(n, n): Input(v.shape, v.unit, v.description, default=self.start.get(n), name=self.rename.get(n, n))
+            self.rename.get(n, n): Input(
+                v.shape, v.unit, v.description, default=self.start.get(n), name=self.rename.get(n, n)
+            )
             for n, v in self.description.of("input").items()
         }
 
@@ -117,7 +126,7 @@ class Fmu(Block):
         outputs = self.outputs
         if name in outputs:
             return Signal(self, name)
-        raise UnknownAttribute(f"it has no output {name!r}. {near(name, outputs)}", block=self.label)
+        raise UnknownAttributeError(f"it has no output {name!r}. {near(name, outputs)}", block=self.label)
 
     def __getitem__(self, name: Any) -> Signal:
         if isinstance(name, str):
@@ -151,7 +160,8 @@ class FmuInstance:
     def __init__(self, block: Fmu, wired: Sequence[str]):
         from fmpy.fmi3 import FMU3Slave
 
-        self.block, self.messages, self.failed = block, [], False
+        self.block, self.failed = block, False
+        self.messages: list[str] = []
         description = block.description
         back = {new: old for old, new in block.rename.items()}
         self._inputs = [description.variables[back.get(name, name)] for name in wired]
@@ -191,7 +201,9 @@ class FmuInstance:
         except Exception as error:
             self.failed = True
             raise FmuRuntimeError(
-                f"initialization failed ({error}){self._quoted()} Check its start values.", block=self.block.label, t=0.0
+                f"initialization failed ({error}){self._quoted()} Check its start values.",
+                block=self.block.label,
+                t=0.0,
             ) from error
 
     def bind(self, inputs: np.ndarray, outputs: np.ndarray) -> None:
@@ -231,7 +243,8 @@ class FmuInstance:
         inputs = ", ".join(f"{v.name}" for v in self._inputs)
         values = self._kept[4].tolist()
         return FmuRuntimeError(
-            f"{what} failed{self._quoted()} The inputs ({inputs}) were {values}. Look at the last samples of error.run, or take "
+            f"{what} failed{self._quoted()} The inputs ({inputs}) were {values}. Look at the last samples of "
+            f"error.run, or take "
             "a smaller step.",
             block=self.block.label,
             t=t,

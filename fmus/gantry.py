@@ -1,7 +1,7 @@
 """The biaxial gantry robot of Flixeder, Glück, Böck, Kugi (2014), section II, with the parameters of their Table II.
 
-Two linear axes, y and z, each driven through a ball screw that is stiff and without backlash. With F the force on the end
-effector (E1, E6):
+Two linear axes, y and z, each driven through a ball screw that is stiff and without backlash. With F the force on the
+end effector (E1, E6):
 
     (m_t,i + m_J,i) s̈_i = u_i − F_F,i(ṡ_i) − F_G,i + F_i,        i ∈ {y, z}
     F_F,i(v) = F_c,i tanh(v / w) + c_v,i v,   F_G,y = 0,   F_G,z = g m_t,z
@@ -33,7 +33,11 @@ class Gantry(PlanarModel):
         default=(7.61, 4.41), shape=(2,), unit="kg", above=0.0, description="moved translational mass m_t (E10)"
     )
     equivalent_mass: Array = parameter(
-        default=(29.26, 16.79), shape=(2,), unit="kg", minimum=0.0, description="equivalent mass m_J of motor and ball screw"
+        default=(29.26, 16.79),
+        shape=(2,),
+        unit="kg",
+        minimum=0.0,
+        description="equivalent mass m_J of motor and ball screw",
     )
     coulomb_friction: Array = parameter(
         default=(65.42, 37.69), shape=(2,), unit="N", minimum=0.0, description="Coulomb friction F_c"
@@ -43,9 +47,13 @@ class Gantry(PlanarModel):
     )
     coulomb_scale: float = parameter(default=1.0, unit="1", minimum=0.0, description="factor on the Coulomb friction")
     viscous_scale: float = parameter(default=1.0, unit="1", minimum=0.0, description="factor on the viscous friction")
-    friction_width: float = parameter(default=0.01, unit="m/s", above=0.0, description="width w of the friction's sign change (E23)")
+    friction_width: float = parameter(
+        default=0.01, unit="m/s", above=0.0, description="width w of the friction's sign change (E23)"
+    )
     gravity: float = parameter(default=9.81, unit="m/s2", description="gravitational acceleration g, against z")
-    start_position: Array = parameter(default=(0.8, 0.5), shape=(2,), unit="m", structural=True, description="position at the start")
+    start_position: Array = parameter(
+        default=(0.8, 0.5), shape=(2,), unit="m", structural=True, description="position at the start"
+    )
     start_velocity: Array = parameter(
         default=(0.0, 0.0), shape=(2,), unit="m/s", structural=True, description="velocity at the start"
     )
@@ -97,8 +105,8 @@ def build(
 ) -> Path:
     """Export the gantry as an FMU, ``gantry.fmu``, and return the file; it is built once and then cached.
 
-    Every number of Table II is a parameter of the FMU, besides ``coulomb_scale``, ``viscous_scale``, ``friction_width``,
-    ``gravity`` and ``internal_step``; ``position`` and ``velocity`` take start values.
+    Every number of Table II is a parameter of the FMU, besides ``coulomb_scale``, ``viscous_scale``,
+    ``friction_width``, ``gravity`` and ``internal_step``; ``position`` and ``velocity`` take start values.
 
     Parameters
     ----------
