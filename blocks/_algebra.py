@@ -55,7 +55,7 @@ class Gain(Block):
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the product."""
-        return self.gain @ u.u if np.ndim(self.gain) == 2 else self.gain * u.u
+        return self.gain @ u.u if getattr(self.gain, "ndim", 0) == 2 else self.gain * u.u
 
 
 class Product(Block):

@@ -368,7 +368,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate a block's equations with NumPy: outputs by name, the updated states flat, the guards flat."""
     shadow = _with(block, dict(constants))
-    bx, bu = bundle("x", x), bundle("u", u)
+    bx, bu = (bundle(k, {n: float(v) if np.ndim(v) == 0 else v for n, v in d.items()}) for k, d in (("x", x), ("u", u)))
 
     def call(what: str) -> Any:
         wants = "T" in inspect.signature(getattr(type(block), what)).parameters and np.isfinite(T)

@@ -89,11 +89,12 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[tuple[str, 
         if port.shape is not None
     }
     waiting = sorted(table.blocks)
+    assumed: dict[tuple[str, str], Shape] = {}
     while waiting:
         still = []
         for path in waiting:
             block = table.blocks[path]
-            inputs = _input_shapes(table, shapes, path)
+            inputs = _input_shapes(table, shapes, path, assumed)
             if inputs is None:
                 still.append(path)
             elif not block.opaque:
@@ -101,13 +102,18 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[tuple[str, 
                 traced[path] = _trace(block, inputs, frame.sample_time is not None, frame.method, path)
                 shapes.update({(path, name): shape for name, shape in traced[path].outputs.items()})
         if len(still) == len(waiting):
-            raise ShapeError(
-                f"the shapes around {', '.join(still[:4])} depend on each other in a circle, so they can't be found. "
-                f"Give one "
-                "of them, for instance UnitDelay(initial_value=…).",
-                block=still[0],
-            )
+            assumed.update(_assume(table, shapes, still))
         waiting = still
+    for (path, port), shape in assumed.items():
+        wire = table.wires[path, port]
+        found = part_shape(shapes[wire.block, wire.port], wire, path, port)
+        if found != shape:
+            raise ShapeError(
+                f"{wire} has shape {found}, where the loop that it closes asks for {shape}. Give the loop's shape where it "
+                "starts, for instance UnitDelay(initial_value=…).",
+                block=path,
+                port=port,
+            )
     return traced, shapes
 
 
@@ -119,7 +125,39 @@ def _trace(block: Block, shapes: dict[str, Shape], sampled: bool, method: str, p
         raise
 
 
-def _input_shapes(table: Structure, shapes: dict[tuple[str, str], Shape], path: str) -> dict[str, Shape] | None:
+def _assume(
+    table: Structure, shapes: dict[tuple[str, str], Shape], stuck: list[str]
+) -> dict[tuple[str, str], Shape]:
+    """Return an assumption that lets a loop of unknown shapes go on; it is checked once the shapes are known.
+
+    A block's unknown inputs are assumed to have the shape of a known one beside them, else of its first state.
+    """
+
+    def known(path: str) -> list[Shape]:
+        wires = ((port, table.wires.get((path, port))) for port in table.blocks[path].inputs)
+        return [
+            part_shape(shapes[w.block, w.port], w, path, port)
+            for port, w in wires
+            if w is not None and (w.block, w.port) in shapes
+        ]
+
+    path = min(stuck, key=lambda p: (not known(p), not table.blocks[p].states, p))
+    block = table.blocks[path]
+    starts = [port.start_value(block, dict.fromkeys(block.inputs, ())).shape for port in block.states.values()]
+    shape = next(iter([*known(path), *starts]), ())
+    return {
+        (path, port): shape
+        for port, spec in block.inputs.items()
+        if spec.shape is None and (w := table.wires.get((path, port))) is not None and (w.block, w.port) not in shapes
+    }
+
+
+def _input_shapes(
+    table: Structure,
+    shapes: dict[tuple[str, str], Shape],
+    path: str,
+    assumed: dict[tuple[str, str], Shape],
+) -> dict[str, Shape] | None:
     found: dict[str, Shape] = {}
     unknown = False
     for port, spec in table.blocks[path].inputs.items():
@@ -129,6 +167,9 @@ def _input_shapes(table: Structure, shapes: dict[tuple[str, str], Shape], path: 
             found[port] = np.shape(spec.default)
             continue
         whole = shapes.get((wire.block, wire.port))
+        if (path, port) in assumed:
+            found[port] = assumed[path, port]
+            continue
         if whole is None:
             if spec.shape is None:
                 unknown = True

@@ -115,6 +115,11 @@ class FlatDiagram:
                 self._slices[id(function)] = function
         return self._slices[id(function)]
 
+    def is_made(self, path: str, port: str, values: Mapping[tuple[str, str], Any]) -> bool:
+        """Whether the signal at an input is among ``values``, or a default."""
+        wire = self.table.wires.get((path, port))
+        return wire is None or (wire.block, wire.port) in values
+
     def source(self, path: str, port: str, values: Mapping[tuple[str, str], Any]) -> Any:
         """Return the flat column at an input of a block, from the columns of all outputs."""
         wire = self.table.wires.get((path, port))
@@ -167,7 +172,10 @@ class FlatDiagram:
             if not acts[path]:
                 continue
             trace = traced[path]
-            arguments = [self.source(path, port, values) for port in trace.inputs]
+            arguments = [
+                self.source(path, port, values) if self.is_made(path, port, values) else np.zeros(size(shape))
+                for port, shape in trace.inputs.items()  # what is not made yet is not depended on
+            ]
             state = x[self.states.slices[path]]
             made = self.block_function(path, names).call([t, state, *arguments, p[self.parameters.slices[path]]])
             for name, column in zip(names, map(ca.densify, made), strict=True):

@@ -163,4 +163,4 @@ def resolve(name: str, wires: Any, ports: Any) -> str:
         if found:
             raise UnknownNameError(f"{name!r} stands for several signals: {', '.join(found)}. Write more of the path.")
     short = {n.rpartition(".")[2] for n in (*wires, *ports)}
-    raise UnknownNameError(f"no signal {name!r} was recorded. {near(name, short | set(wires))}")
+    raise UnknownNameError(f"no signal {name!r} was recorded. {near(name, short | set(wires) | set(ports))}")

@@ -146,7 +146,7 @@ class _Loop:
 
     def _first(self, evaluate: list[Any], progress: Any, times: list[float]) -> int:
         """Run all ticks and return the last one."""
-        t, ok, x, x_next = _view(self.t), _view(self.ok), self.x, self.x_next
+        t, ok, x, x_next = _view(self.t), _view(self.ok), _view(self.x), _view(self.x_next)
         log, data, plants = self.log, self.recorded.data, [plant for _, plant in self.plants]
         h, period, last = float(self.flat.base), len(evaluate), len(times) - 1
         single = evaluate[0] if period == 1 else None
@@ -161,7 +161,6 @@ class _Loop:
                 if not ok[0]:
                     raise _Stopped(k, self.failure(now, k))
                 data[k] = log
-                self.done = k + 1
                 try:
                     if only is not None:
                         only(now, h)
@@ -171,6 +170,7 @@ class _Loop:
                 except SimulationError as error:
                     raise _Stopped(k + 1, self._who(error)) from error
                 x[:] = x_next
+                self.done = k + 1
             k = end
             progress(times[k])
             if k == last:
@@ -238,7 +238,7 @@ class _Loop:
             if k % flat.divisors[table.frame_of[path]]:
                 continue
             trace, block = flat.checked.traced[path], table.blocks[path]
-            known = {p: flat.source(path, p, values) for p in trace.inputs if self._is_known(path, p, values)}
+            known = {p: flat.source(path, p, values) for p in trace.inputs if flat.is_made(path, p, values)}
             shaped = {p: np.reshape(known[p], trace.inputs[p]) if p in known else None for p in trace.inputs}
             if initialize and block.starts_from_inputs and path not in ready:
                 ready.add(path)
@@ -253,10 +253,6 @@ class _Loop:
             values.update({(path, n): v for n, v in made.items()})
             shaped_known: Any = dict(shaped)
             yield path, names, shaped_known, made
-
-    def _is_known(self, path: str, port: str, values: Any) -> bool:
-        wire = self.flat.table.wires.get((path, port))
-        return wire is None or (wire.block, wire.port) in values
 
 
 def _view(vector: np.ndarray) -> Any:

@@ -53,7 +53,8 @@ class Subsystem:
     def __init__(self, function: Callable[..., Any], sample_time: Any, method: str, name: str | None):
         check_method(method)
         self.function, self.method = function, method
-        self.name = check_name(name or function.__name__)
+        own = function.__name__ if function.__name__.isidentifier() else "subsystem"
+        self.name = check_name(name or own)
         self.sample_time = None if sample_time is None else exact_time(sample_time, block=self.name)
         every = inspect.signature(function).parameters.values()
         self.parameters = [p for p in every if p.kind is not inspect.Parameter.VAR_KEYWORD]

@@ -120,18 +120,19 @@ def _archive(spec: ModelSpec, platforms: Iterable[str], compiler: Compiler, noti
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Write a file that is either there and complete, or not there."""
+    temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(prefix=".writing-", dir=path.parent)
-    except OSError as error:
-        raise FmuError(f"can't write to {path.parent}: {error}. Set LOOPWRIGHT_CACHE to a folder of yours.") from error
-    try:
         with os.fdopen(handle, "wb") as file:
             file.write(data)
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+    except BaseException as error:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise FmuError(f"can't write {path}: {error}. Give another folder, or set LOOPWRIGHT_CACHE.") from error
         raise
 
 

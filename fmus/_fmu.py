@@ -217,17 +217,21 @@ class FmuInstance:
         ins = (ctypes.c_uint * max(1, len(self._inputs)))(*[v.reference for v in self._inputs])
         outs = (ctypes.c_uint * max(1, len(self._outputs)))(*[v.reference for v in self._outputs])
         self._kept = (ins, outs, flags, reached, inputs, outputs)  # alive as long as their addresses are used
-        address, size, number = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_double
+        address, size, now, width = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_double(), ctypes.c_double()
         set_arguments = (component, ins, size(len(self._inputs)), address(inputs.ctypes.data), size(inputs.size))
         get_arguments = (component, outs, size(len(self._outputs)), address(outputs.ctypes.data), size(outputs.size))
         at = ctypes.addressof(flags)
-        tail = (ctypes.c_bool(True), address(at), address(at + 1), address(at + 2), ctypes.byref(reached))
+        step_arguments = (
+            *(component, now, width, ctypes.c_bool(True)),
+            *(address(at), address(at + 1), address(at + 2), ctypes.byref(reached)),
+        )
         has_inputs, has_outputs = bool(self._inputs), bool(self._outputs)
 
         def step(t: float, h: float) -> None:
             if has_inputs and set_values(*set_arguments) > 1:
                 raise self._error("setting the inputs", t)
-            if do_step(component, number(t), number(h), *tail) > 1:
+            now.value, width.value = t, h
+            if do_step(*step_arguments) > 1:
                 raise self._error(f"the step from t = {t:.9g} s by {h:g} s", t)
             if flags[1]:
                 raise self._error("the FMU asks to end the simulation: the step", t)

@@ -59,10 +59,10 @@ def pendulums():
 
 
 def explosive():
-    """x' = x^2 has no solution after t = 1 / x(0); the output is 1 / (2 - x)."""
+    """x' = x^2 has no solution after t = 1 / x(0); the output is no number at x = 2 or after t = 0.8."""
     t, x, u, p = ca.SX.sym("t"), ca.SX.sym("x", 2), ca.SX.sym("u", 0), ca.SX.sym("p", 0)
     f = ca.Function("f", [t, x, u, p], [ca.vertcat(1.0, x[1] ** 2)])
-    g = ca.Function("g", [t, x, u, p], [1 / (2 - x[1])])
+    g = ca.Function("g", [t, x, u, p], [1 / (2 - x[1]) + ca.sqrt(0.8 - x[0])])
     states = (Variable("calm", start=0.0, state=True), Variable("x", start=1.0, state=True))
     return ModelSpec("explosive", "", (), (Variable("y", "output"),), (), states, f, g, internal_step=1e-3)
 

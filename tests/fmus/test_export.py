@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from exported import mass_spring_damper, pendulums, run
 from fmpy.validation import validate_fmu
-from loopwright.blocks._errors import CompilerError, DefinitionError, ParameterError, UnitError
+from loopwright.blocks._errors import CompilerError, DefinitionError, FmuError, ParameterError, UnitError
 from loopwright.fmus import _build, _compiler
 from loopwright.fmus._build import build_fmu
 from loopwright.fmus._codegen import runtime
@@ -115,6 +115,8 @@ def test_same_input_same_bytes(tmp_path, monkeypatch, cache):
         monkeypatch.setenv("ZIG_LOCAL_CACHE_DIR", str(tmp_path / name / "local"))
         built.append(build_fmu(mass_spring_damper(), tmp_path / f"{name}.fmu"))
     assert built[0].read_bytes() == built[1].read_bytes()
+    with zipfile.ZipFile(built[0]) as archive:
+        assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 
 
 @pytest.mark.slow
@@ -232,6 +234,16 @@ def test_a_failed_build_leaves_nothing(tmp_path, monkeypatch, cache):
     with pytest.raises(CompilerError, match="broken"):
         build_fmu(mass_spring_damper(), tmp_path / "out.fmu")
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == []
+
+
+def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
+    def fail(*args):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(_build.os, "replace", fail)
+    with pytest.raises(FmuError, match="disk full"):
+        _build.write_atomically(tmp_path / "a.fmu", b"data")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_no_compiler(monkeypatch, tmp_path):

@@ -1,5 +1,6 @@
 """Exported FMUs at run time: the numbers, communication points, states, derivatives, errors."""
 
+import re
 import threading
 
 import fmpy
@@ -114,7 +115,7 @@ def test_setting_an_input_changes_no_output_before_the_next_step(msd, instance):
 
 def test_derivatives_read_late_are_still_those_of_the_step(msd, instance):
     """Also when they are first read after the input and a tunable parameter have changed."""
-    early, late = instance(msd).initialize(force=1.0), instance(msd).initialize(force=1.0)
+    early, late = instance(msd).initialize(force=2.0), instance(msd).initialize(force=2.0)
     for item in (early, late):
         item.step(0.0, 0.1)
     expected = early["der(velocity)"]
@@ -153,6 +154,14 @@ def test_states_of_others_are_refused(msd, instance):
     fails(item, lambda: item.fmu.deserializeFMUState(data), "no state of this FMU")
     fails(item, lambda: item.fmu.deserializeFMUState(b"nonsense"), "these 8 bytes are no state of this FMU")
     fails(item, lambda: item.fmu.setFMUState(None), "the state is NULL")
+    like = instance(build_fmu(mass_spring_damper(internal_step=2e-3)))  # same size, another model
+    state = like.fmu.getFMUState()
+    data = like.fmu.serializeFMUState(state)
+    like.fmu.freeFMUState(state)
+    fails(item, lambda: item.fmu.deserializeFMUState(data), "no state of this FMU")
+    state = like.fmu.deserializeFMUState(data[:34] + b"?" + data[35:])
+    fails(like, lambda: like.fmu.setFMUState(state), "no state of this FMU")
+    like.fmu.freeFMUState(state)
 
 
 def test_a_state_brings_a_failed_fmu_back(msd, instance):
@@ -299,7 +308,7 @@ def test_calls_out_of_order(msd, instance):
 
 
 def test_steps_that_are_refused(msd, instance):
-    item = instance(msd, stop_time=1.0)
+    item = instance(msd, stop_time=0.3)
     item.initialize()
     fails(item, lambda: item.step(0.5, 0.1), "currentCommunicationPoint is 0.5 s, but this FMU is at 0 s")
     item.initialize()
@@ -307,9 +316,9 @@ def test_steps_that_are_refused(msd, instance):
     item.initialize()
     fails(item, lambda: item.step(0.0, -0.1), "communication step is -0.1 s")
     item.initialize()
-    for k in range(10):
-        item.step(k * 0.1, 0.1)  # up to the stop time, rounding and all
-    fails(item, lambda: item.step(1.0, 0.1), "passes the stop time of 1 s")
+    for k in range(3):
+        item.step(k * 0.1, 0.1)  # 0.2 + 0.1 > 0.3: rounding doesn't count
+    fails(item, lambda: item.step(0.3, 0.1), "passes the stop time of 0.3 s")
 
 
 def test_a_state_that_explodes_stops_the_step(instance):
@@ -328,6 +337,12 @@ def test_a_state_that_explodes_stops_the_step(instance):
 def test_an_output_that_is_not_finite_stops_the_step(instance):
     item = instance(build_fmu(explosive()))
     fails(item, lambda: item.initialize(x=2.0), "y (element 0) became inf at t = 0 s")
+    item.initialize()
+    before = item["y"]
+    with pytest.raises(fmpy.fmi1.FMICallException):
+        item.step(0.0, 0.9)
+    assert re.search(r"y \(element 0\) became -?nan at t = 0.9 s", item.log[-1][2])
+    assert (item["time"], item["calm"], item["x"], item["y"]) == (0.0, 0.0, 1.0, before)
 
 
 def test_logging_is_quiet_unless_asked(msd, instance):
@@ -347,6 +362,12 @@ def test_logging_is_quiet_unless_asked(msd, instance):
     assert "no log category logAll" in item.log[-1][2]
 
 
-def test_wrong_token_is_refused(msd, tmp_path, capfd):
+def test_wrong_token_is_refused(msd, instance):
+    item = instance(msd)
+    item.fmu.fmi3FreeInstance(item.fmu.component)
+    right, item.fmu.guid, item.fmu.instanceName = item.fmu.guid, "another", "x#1"
     with pytest.raises(Exception, match="Failed to instantiate"):
-        Instance(msd, tmp_path, token="another", name="x#1")
+        item.fmu.instantiate(loggingOn=True, logMessage=item._logged)
+    assert f"x##1: the instantiation token is another, expected {right}" in item.log[-1][2]  # '#' marks a reference
+    item.fmu.guid = right
+    item.fmu.instantiate()

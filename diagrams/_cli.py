@@ -1,0 +1,295 @@
+"""The command line, ``loopwright``.
+
+Exit status: 0 done, 1 a run failed (its files are kept), 2 wrong usage, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from inspect import signature
+from pathlib import Path
+from typing import IO, Any
+
+from ..blocks._errors import FmuError, FmuFileError, LoopwrightError, OptionError, near
+from ..fmus import gantry
+from ._keynumbers import DEFINITIONS, key_numbers
+from ._run import Run
+from .experiments import DEFAULTS, EXPERIMENTS, Experiment
+
+SIGNALS = "eta xi position velocity force motor_force v_par v_perp theta q eta_p xi_p".split()
+"""Signals of the CSV file, in order."""
+
+_INTERRUPTED = "interrupted"
+_SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0), "m/s2": ("m/s²", 1.0)}
+_PLAIN = str.maketrans(
+    {"η": "eta", "ξ": "xi", "θ": "theta", "σ": "sigma", "κ": "kappa", "ζ": "zeta", "∥": "_par", "⊥": "_perp", "²": "2"}
+    | {"…": "...", "·": "*", "−": "-", "→": "->", "∞": "inf", "√": "sqrt", "—": "-", "–": "-", "’": "'", "′": "'"}
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit status.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        The arguments; those of the process without it.
+    """
+    parser = _parser()
+    try:
+        arguments = parser.parse_args(argv)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    if arguments.command is None:
+        parser.print_help(sys.stderr)
+        return 2
+    try:
+        return _run(arguments)
+    except OptionError as error:
+        _say(f"loopwright: error: {error}", sys.stderr)
+        return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="loopwright", description="Block diagrams and co-simulation for control engineers.")
+    parser.add_argument("--version", action="version", version=f"loopwright {_version()}")
+    commands = parser.add_subparsers(dest="command", metavar="command")
+    width = max(len(name) for name in DEFINITIONS)
+    run = commands.add_parser(
+        "run",
+        help="run the experiments of the paper",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Run experiments of the paper: A path following, B compliance, C hand guiding, D force tracking.\n"
+        "Writes the samples (A.csv), the key numbers (A.json, SI units) and two figures (A_path, A_signals;\n"
+        ".png and .svg) of each.",
+        epilog="options (--option), with their defaults:\n  "
+        + "\n  ".join(_option_lines())
+        + "\n  An option that only some experiments have is given to those.\n\nkey numbers:\n"
+        + "\n".join(f"  {name:{width}}  [{unit}] {text}" for name, (unit, text) in DEFINITIONS.items())
+        + "\n\nexit status: 0 done, 1 a run failed (its files are kept), 2 wrong usage",
+    )
+    run.add_argument("letters", nargs="*", metavar="LETTER", help="A, B, C, D; all four without one")
+    run.add_argument("--out", metavar="DIR", default="out", help="folder for the files (default: out)")
+    run.add_argument("--plant", metavar="FILE.fmu", help="another plant in place of the gantry")
+    run.add_argument(
+        "--option",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        dest="options",
+        help="an option of the experiments; repeat it for several",
+    )
+    return parser
+
+
+def _version() -> str:
+    try:
+        return version("loopwright")
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
+# --- what is asked for ----------------------------------------------------------------------------------------------
+
+
+def _known(letter: str) -> dict[str, Any]:
+    """Return the options of an experiment with their defaults."""
+    own = {p.name: p.default for p in signature(EXPERIMENTS[letter]).parameters.values() if p.kind is p.KEYWORD_ONLY}
+    limits = ("velocity_limit", "acceleration_limit") if letter == "A" else ()  # it has no admittance to limit
+    return {name: value for name, value in {**DEFAULTS, **own}.items() if name not in limits}
+
+
+def _option_lines() -> Iterable[str]:
+    for name, value in {name: value for letter in EXPERIMENTS for name, value in _known(letter).items()}.items():
+        if name not in ("plant", "path"):
+            owners = [letter for letter in EXPERIMENTS if name in _known(letter)]
+            only = "" if len(owners) == len(EXPERIMENTS) else f"  ({', '.join(owners)} only)"
+            yield f"{name}={value}{only}"
+
+
+def _letters(given: Sequence[str]) -> list[str]:
+    for letter in given:
+        if letter.upper() not in EXPERIMENTS:
+            raise OptionError(f"there is no experiment {letter!r}. {near(letter.upper(), EXPERIMENTS)}")
+    return list(dict.fromkeys(letter.upper() for letter in given)) or list(EXPERIMENTS)
+
+
+def _options(arguments: argparse.Namespace) -> dict[str, Any]:
+    options: dict[str, Any] = {}
+    for text in arguments.options:
+        name, equals, value = text.partition("=")
+        name = name.strip().replace("-", "_")
+        if not equals or not name:
+            raise OptionError(f"found --option {text!r}; expected NAME=VALUE, such as --option delay=1.")
+        if name in options:
+            raise OptionError("it is given twice; give it once.", port=f"--option {name}")
+        options[name] = _value(value.strip())
+    if arguments.plant is not None:
+        if "plant" in options:
+            raise OptionError("the plant is given twice; give it once.", port="--plant")
+        options["plant"] = arguments.plant
+    return options
+
+
+def _value(text: str) -> Any:
+    """Read a Python or JSON literal; anything else is text."""
+    words = {"true": True, "false": False, "none": None, "null": None}
+    if text.lower() in words:
+        return words[text.lower()]
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        return text
+
+
+def _share(letters: Sequence[str], options: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Give every experiment the options that it has."""
+    for name in options:
+        owners = [letter for letter in EXPERIMENTS if name in _known(letter)]
+        without = [letter for letter in letters if letter not in owners]
+        if not owners:
+            known = {name for letter in EXPERIMENTS for name in _known(letter)}
+            raise OptionError(f"no experiment has such an option. {near(name, known)}", port=f"--option {name}")
+        if len(without) == len(letters):
+            raise OptionError(
+                f"experiment {', '.join(without)} has no such option. Only {', '.join(owners)} has it.", port=f"--option {name}"
+            )
+        if without:
+            _say(f"{', '.join(without)}: without {name}, which only {', '.join(owners)} has.", sys.stderr)
+    return {letter: {k: v for k, v in options.items() if k in _known(letter)} for letter in letters}
+
+
+def _folder(name: str) -> Path:
+    folder = Path(name).expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OptionError(f"the folder {name!r} can't be made: {error}. Name another one.", port="--out") from error
+    return folder
+
+
+# --- running --------------------------------------------------------------------------------------------------------
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    """Build all experiments first, so that wrong usage is found before anything runs; then run them."""
+    letters = _letters(arguments.letters)
+    chosen = _share(letters, _options(arguments))
+    try:
+        if any(options.get("plant") is None for options in chosen.values()):
+            gantry.build(notify=lambda line: _say(line, sys.stderr))
+        experiments = [EXPERIMENTS[letter](**options) for letter, options in chosen.items()]
+    except LoopwrightError as error:
+        _say(f"loopwright: error: {error}", sys.stderr)
+        return 1 if isinstance(error, FmuError) and not isinstance(error, FmuFileError) else 2
+    folder = _folder(arguments.out)
+    table: dict[str, dict[str, float | None]] = {}
+    written: list[list[str]] = []
+    failed: dict[str, str] = {}
+    for experiment in experiments:
+        letter = experiment.letter
+        run, problem = _simulate(experiment)
+        if problem is not None:
+            failed[letter] = problem
+            _say(f"loopwright: experiment {letter} failed: {problem}", sys.stderr)
+        try:
+            numbers, names = _write(experiment, run, problem, folder)
+        except OSError as error:
+            failed[letter] = f"its files can't be written: {error}"
+            _say(f"loopwright: experiment {letter}: {failed[letter]}", sys.stderr)
+            continue
+        table[letter] = numbers
+        written.append(names)
+        if problem == _INTERRUPTED:
+            break
+    _print_table(table, failed)
+    if written:
+        _say(f"Written to {folder}:")
+    for names in written:
+        _say(f"  {'  '.join(names)}")
+    return 130 if _INTERRUPTED in failed.values() else int(bool(failed))
+
+
+def _simulate(experiment: Experiment) -> tuple[Run | None, str | None]:
+    """Run an experiment; return what it recorded and, where it failed, why."""
+    try:
+        return experiment.simulate(), None
+    except LoopwrightError as error:
+        return getattr(error, "run", None), str(error)
+    except KeyboardInterrupt as interrupt:
+        return getattr(interrupt, "run", None), _INTERRUPTED
+
+
+def _write(
+    experiment: Experiment, run: Run | None, problem: str | None, folder: Path
+) -> tuple[dict[str, float | None], list[str]]:
+    """Write all files of a run; return its key numbers and the files' names. Older files of the experiment go."""
+    letter = experiment.letter
+    for ending in (".csv", ".json", *(f"_{kind}.{form}" for kind in ("path", "signals") for form in ("png", "svg"))):
+        (folder / f"{letter}{ending}").unlink(missing_ok=True)
+    numbers = dict.fromkeys(DEFINITIONS) if run is None else key_numbers(experiment, run)
+    content: dict[str, Any] = {n: v if v is None or math.isfinite(v) else None for n, v in numbers.items()}
+    if problem is not None:
+        content["error"] = problem
+    names = [f"{letter}.json"]
+    (folder / names[0]).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    if run is not None:
+        from ._figures import plot_experiment, plot_path, save
+
+        run.to_csv(folder / f"{letter}.csv", *SIGNALS)
+        names.insert(0, f"{letter}.csv")
+        for name, plot in (("path", plot_path), ("signals", plot_experiment)):
+            names += [file.name for file in save(plot(experiment, run), folder / f"{letter}_{name}")]
+    return numbers, names
+
+
+# --- printing -------------------------------------------------------------------------------------------------------
+
+
+def _print_table(table: Mapping[str, Mapping[str, float | None]], failed: Mapping[str, str]) -> None:
+    """Print the key numbers, one column for each experiment."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    if not table:
+        return
+    shown = Table(box=box.SIMPLE_HEAD, pad_edge=False, highlight=False)
+    shown.add_column("key number", no_wrap=True)
+    shown.add_column("unit", no_wrap=True)
+    for letter in table:
+        shown.add_column(f"{letter} failed" if letter in failed else letter, justify="right", no_wrap=True)
+    for name, (unit, _) in DEFINITIONS.items():
+        label, factor = ("", 1.0) if name == "real_time_factor" else _SHOWN.get(unit, (unit, 1.0))
+        values = [_number(numbers[name], factor) for numbers in table.values()]
+        if set(values) != {"-"}:
+            shown.add_row(name, _fit(label, sys.stdout), *values)
+    console = Console(file=sys.stdout, width=None if sys.stdout.isatty() else 80, highlight=False)
+    console.print(shown)
+
+
+def _number(value: float | None, factor: float) -> str:
+    if value is None:
+        return "-"
+    return f"{value * factor:.4g}" if math.isfinite(value) else "never"
+
+
+def _say(text: str, stream: IO[str] | None = None) -> None:
+    stream = stream or sys.stdout
+    print(_fit(text, stream), file=stream, flush=True)
+
+
+def _fit(text: str, stream: IO[str]) -> str:
+    """Return the text as the stream can print it."""
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    try:
+        text.encode(encoding)
+    except UnicodeEncodeError:
+        return text.translate(_PLAIN).encode(encoding, "replace").decode(encoding)
+    return text
