@@ -113,9 +113,7 @@ class Ellipse(Path):
             v = -v
         p, q = np.abs(u), np.abs(v)
         low, high = np.zeros(np.shape(u)), np.full(np.shape(u), np.pi / 2.0)
-        theta = np.clip(
-            np.arctan2(a * q, b * p), 1e-3, np.pi / 2.0 - 1e-3
-        )  # inside: both axes are roots where y is on them
+        theta = np.clip(np.arctan2(a * q, b * p), 1e-3, 1.57)  # not on the axes: if y is on one, that is a root
         for _ in range(80):
             c, s = np.cos(theta), np.sin(theta)
             slope = (b * b - a * a) * s * c + a * p * s - b * q * c

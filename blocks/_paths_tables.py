@@ -127,25 +127,35 @@ def nearest(path: Path, y: np.ndarray) -> float:
     squared = np.sum((path.sampled - y[:, None]) ** 2, axis=0)
     bound = (np.sqrt(np.min(squared)) + np.max(np.diff(lengths))) ** 2
     if path.period is not None:
-        theta = np.concatenate([[theta[-2] - path.period], theta])
-        squared = np.concatenate([[squared[-2]], squared])
+        theta, squared = np.append(theta[-2] - path.period, theta), np.append(squared[-2], squared)
         ends: list[float] = []
     else:
+        theta, squared = _padded(theta, theta[0], theta[-1]), _padded(squared, np.inf, np.inf)
         ends = [theta[0], theta[-1]]
-    dips = (squared[1:-1] <= squared[:-2]) & (squared[1:-1] <= squared[2:]) & (squared[1:-1] <= bound)
-    i = 1 + np.flatnonzero(dips)
+    i = 1 + np.flatnonzero(_dips(squared) & (squared[1:-1] <= bound))
     low, high = theta[i - 1], theta[i + 1]
     for _ in range(2):
         fine = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 33)
         d = np.sum((path.sigma(fine) - y[:, None, None]) ** 2, axis=0)
-        row, column = np.nonzero((d[:, 1:-1] <= d[:, :-2]) & (d[:, 1:-1] <= d[:, 2:]))
-        if not len(row):  # an open path whose nearest point is an end
-            break
-        best = np.argsort(d[row, column + 1], kind="stable")[:_MOST_MINIMA]
-        low, high = fine[row[best], column[best]], fine[row[best], column[best] + 2]
+        row, column = np.nonzero(_dips(_padded(d, np.inf, np.inf)))  # the ends may be the path's own
+        best = np.argsort(d[row, column], kind="stable")[:_MOST_MINIMA]
+        row, column = row[best], column[best]
+        low, high = fine[row, np.maximum(column - 1, 0)], fine[row, np.minimum(column + 1, 32)]
     candidates = np.concatenate([polish(path, y, low, high), ends])
     distance = np.sum((path.sigma(candidates) - y[:, None]) ** 2, axis=0)
     return float(candidates[np.argmin(distance)])
+
+
+def _padded(values: np.ndarray, before: float, after: float) -> np.ndarray:
+    """Return ``values`` with one more number at both ends of the last axis."""
+    widths = [(0, 0)] * (values.ndim - 1) + [(1, 1)]
+    return np.pad(values, widths, constant_values=(before, after))
+
+
+def _dips(values: np.ndarray) -> np.ndarray:
+    """Say which values, but the first and the last of the last axis, are no larger than both neighbours."""
+    dips: np.ndarray = (values[..., 1:-1] <= values[..., :-2]) & (values[..., 1:-1] <= values[..., 2:])
+    return dips
 
 
 def polish(path: Path, y: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -249,6 +259,7 @@ def reach_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
     side. Intervals are cut in three until the line is near enough at both thirds, and the slack is added everywhere.
     """
     contact = _Contact(path)
+    flat = 0.15 / path.length  # what hardly matters: a reach of many times the path's size
     theta = _subdivided(path.knots)
     values = contact.inverse_reach(theta)
     open_ = np.ones(len(theta) - 1, dtype=bool)  # intervals still to be examined
@@ -259,7 +270,7 @@ def reach_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
             thirds.append(theta[index] + part * (theta[index + 1] - theta[index]))
             exact.append(contact.inverse_reach(thirds[-1]))
             excess = exact[-1] - (values[index] + part * (values[index + 1] - values[index]))
-            scale = np.maximum(exact[-1], 0.15 / path.length)
+            scale = np.maximum(exact[-1], flat)
             bad |= np.any((excess > _SLACK * scale) | (excess < -_GENEROUS * scale), axis=1)
         if not bad.any():
             break
@@ -269,6 +280,6 @@ def reach_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
         first = index[bad] + 2 * np.arange(bad.sum())
         open_ = np.zeros(len(theta) - 1, dtype=bool)
         open_[np.concatenate([first, first + 1, first + 2])] = True
-    values = np.where(values > 1.0 / UNLIMITED, values * (1.0 + 2.0 * _SLACK), values)
+    values = np.where(values > 1.0 / UNLIMITED, values + 2.0 * _SLACK * np.maximum(values, flat), values)
     slope = np.diff(values, axis=0) / np.diff(theta)[:, None]
     return theta, np.stack([values[:-1], slope], axis=2)

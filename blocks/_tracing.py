@@ -349,6 +349,11 @@ class _Tracer:
                     continue
                 index = [*self.block.outputs, NEXT, GUARDS].index(name)
                 got, want = traced[index], np.ravel(np.asarray(value, dtype=float))
+                if got.size != want.size:
+                    raise TraceError(
+                        f"its traced equation gives {got.size} numbers for {name!r} where NumPy gives {want.size}. An "
+                        "operation in it traces to another shape; build arrays with np.stack and plain indexing."
+                    )
                 with np.errstate(all="ignore"):
                     wrong = (
                         ~(np.abs(got - want) <= 1e-9 * (1.0 + np.abs(want)))

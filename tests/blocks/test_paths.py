@@ -445,6 +445,16 @@ def test_projection_undoes_going_off_the_path_within_reach(path):
         np.testing.assert_allclose(projected, theta, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["open spline", "two points", "line"])
+def test_projection_finds_foot_points_close_to_an_end(name):
+    path = PATHS[name]
+    span = path.domain[1]
+    for part in (1e-7, 1e-5, 1e-4, 1e-3, 5e-3):
+        for theta in (part * span, (1.0 - part) * span):
+            frame = path.frame(theta)
+            assert path.project(frame.sigma + 0.02 * frame.normal) == pytest.approx(theta, abs=1e-12)
+
+
 def test_projection_takes_the_right_one_of_two_branches_beside_the_medial_axis():
     """Inside the evolute (6) has two minima, mirrored at the major axis."""
     for path in (PAPER, PlainEllipse(semi_axes=(A, B), center=(0.5, 0.5)), PAPER.replace(clockwise=True)):

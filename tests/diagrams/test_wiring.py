@@ -470,15 +470,27 @@ def test_an_equation_that_cannot_be_traced_says_the_line():
 
 
 def test_an_equation_that_traces_wrongly_is_found_by_comparison_with_numpy():
-    class Masked(Block):
+    class Halves(Block):
         u = Input(shape=(4,))
-        y = Output()
+        y = Output(shape=(4,))
 
         def output(self, t, x, u):
-            return np.sum(u.u[u.u > 0])  # a mask: silently another thing in a trace
+            return np.round(np.floor(u.u) + 0.5)  # NumPy rounds halves to even, the trace away from zero
 
-    with pytest.raises(TraceError, match=r"masked: its traced equation gives .* for 'y' where NumPy gives .*masks"):
-        Diagram("d", Masked()(Constant(value=(1.0, 2.0, 3.0, 4.0))))
+    with pytest.raises(TraceError, match=r"halves: its traced equation gives .* for 'y' where NumPy gives .*masks"):
+        Diagram("d", Halves()(Constant(value=(1.0, 2.0, 3.0, 4.0))))
+
+
+def test_an_equation_that_traces_to_another_shape_is_found():
+    class Blocked(Block):
+        u = Input(shape=(4,))
+        y = Output(shape=None)
+
+        def output(self, t, x, u):
+            return np.block([[u.u], [u.u]])[0]
+
+    with pytest.raises(TraceError, match=r"blocked: its traced equation gives 1 numbers for 'y' where NumPy gives 4"):
+        Diagram("d", Blocked()(Constant(value=(1.0, 2.0, 3.0, 4.0))))
 
 
 def test_an_equation_of_another_shape_than_declared():

@@ -7,7 +7,7 @@ import fmpy
 import fmpy.fmi3
 import numpy as np
 import pytest
-from exported import D, Instance, K, M, explosive, fails, pendulums, run
+from exported import D, Instance, K, M, explosive, fails, mass_spring_damper, pendulums, run
 from loopwright.fmus._build import build_fmu
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
