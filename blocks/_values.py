@@ -247,7 +247,7 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
         (spec.maximum, np.less_equal, "at most"),
     ):
         if bound is not None and not np.all(holds(result, bound)):
-            raise bad(short(value), f"a value {words} {bound:g}")
+            raise bad(short(result.tolist() if result.ndim else float(result)) if isinstance(result, np.ndarray) else repr(result), f"a value {words} {bound:g}")
     if isinstance(result, np.ndarray):
         if result.ndim == 0:
             return float(result)

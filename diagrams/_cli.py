@@ -158,7 +158,7 @@ def _share(letters: Sequence[str], options: Mapping[str, Any]) -> dict[str, dict
             raise OptionError(f"no experiment has such an option. {near(name, known)}", port=f"--option {name}")
         if len(without) == len(letters):
             raise OptionError(
-                f"experiment {', '.join(without)} has no such option. Only {', '.join(owners)} has it.", port=f"--option {name}"
+                f"{' and '.join(without)} can't take it; an option of {', '.join(owners)} only.", port=f"--option {name}"
             )
         if without:
             _say(f"{', '.join(without)}: without {name}, which only {', '.join(owners)} has.", sys.stderr)
@@ -195,6 +195,8 @@ def _run(arguments: argparse.Namespace) -> int:
     for experiment in experiments:
         letter = experiment.letter
         run, problem = _simulate(experiment)
+        if run is not None and len(run.t):
+            _say(f"{letter}: {run.t[-1]:g} s simulated in {run.elapsed:.2f} s", sys.stderr)
         if problem is not None:
             failed[letter] = problem
             _say(f"loopwright: experiment {letter} failed: {problem}", sys.stderr)

@@ -182,7 +182,8 @@ def _readable(unit: str) -> str:
 
 def _limit_time(ax: Axes, run: Run) -> None:
     if len(run.t) > 1:
-        ax.set_xlim(float(run.t[0]), float(run.t[-1]))
+        margin = 0.015 * float(run.t[-1] - run.t[0])  # what happens at the first tick is not hidden by the frame
+        ax.set_xlim(float(run.t[0]) - margin, float(run.t[-1]) + margin)
 
 
 # --- the plane ------------------------------------------------------------------------------------------------------
@@ -202,29 +203,59 @@ def plot_path(experiment: Experiment, run: Run) -> Figure:
     theta = np.linspace(*((0.0, path.period) if path.period is not None else path.domain or (0.0, 1.0)), 721)
     curve = np.asarray(path.sigma(theta))
     reference = _in_plane(path, run["eta_p"][:, 0], run["xi_p"][:, 0])
-    points = np.hstack([curve, position.T, reference])
-    low, high = points.min(axis=1), points.max(axis=1)
-    size = float(np.max(high - low))
-    low, high = low - 0.07 * size, high + 0.07 * size
+    size = float(np.max(np.ptp(np.hstack([curve, position.T]), axis=1)))
+    ticks, scale = _arrows(position, run["force"], size)
+    tips = position[ticks] + run["force"][ticks] * scale
+    points = np.hstack([curve, position.T, reference, tips.T])
+    low, high = points.min(axis=1) - 0.04 * size, points.max(axis=1) + 0.04 * size
     with _style():
-        figure = _figure(min(0.65 + (WIDTH - 0.6) * float((high[1] - low[1]) / (high[0] - low[0])), 8.0))
+        figure = _figure(min(1.0 + (WIDTH - 0.62) * float((high[1] - low[1]) / (high[0] - low[0])), 8.5))
         ax = figure.subplots()
         ax.set_aspect("equal")
         ax.set_xlim(low[0], high[0])
         ax.set_ylim(low[1], high[1])
         ax.set_xlabel("y [m]")
         ax.set_ylabel("z [m]")
+        ax.set_title(_title(experiment, run), loc="left")
         ax.plot(*curve, color=GREY, linewidth=2.6, solid_capstyle="round", label="path", zorder=2)
-        _mark_start_of_path(ax, path, size)
+        _mark_path(ax, path, size)
         if len(run.t):
             ax.plot(*position.T, color=BLUE, linewidth=1.2, label="end effector", zorder=4)
-            ax.plot(*reference, color=VERMILION, linestyle=(0, (4, 2.5)), linewidth=1.0, label="path reference", zorder=5)
-            _force_arrows(ax, run, size)
-            ends = {"marker": "o", "markersize": 5.5, "color": BLUE, "linestyle": "none", "zorder": 7}
+            dashes = (0, (3, 3))
+            ax.plot(*reference, color=VERMILION, linestyle=dashes, linewidth=1.0, label="path reference", zorder=5)
+            ends: dict[str, Any] = {"marker": "o", "markersize": 5.5, "color": BLUE, "linestyle": "none", "zorder": 7}
             ax.plot(*position[0], markerfacecolor="white", markeredgewidth=1.2, label="start", **ends)
             ax.plot(*position[-1], label="end", **ends)
-        ax.legend(loc="center", ncols=1, fontsize=7.5)
+        if len(ticks):
+            arrows = ax.quiver(
+                *position[ticks].T,
+                *run["force"][ticks].T,
+                angles="xy",
+                scale_units="xy",
+                scale=1.0 / scale,
+                color=GREEN,
+                width=0.0022,
+                headwidth=4,
+                zorder=6,
+            )
+            nice = _nice(0.08 * size / scale)
+            label = f"measured force on the robot, {nice:g} N"
+            ax.quiverkey(arrows, 1.0 - nice * scale / float(high[0] - low[0]), 1.03, nice, label, labelpos="W")
+        figure.legend(loc="outside lower center", ncols=5)
     return figure
+
+
+def _title(experiment: Experiment, run: Run) -> str:
+    """Return the experiment's name, the options that are not the usual ones, and when it stopped if that was early."""
+    from .experiments import DEFAULTS
+
+    text = f"Experiment {experiment.letter}: {experiment.title.partition(':')[0].replace('_', ' ')}"
+    for name, value in experiment.options.items():
+        if name not in ("plant", "path") and value != DEFAULTS.get(name, False):
+            text += f", {name} = {value}"
+    if not len(run.t):
+        return text + ", no sample"
+    return text if run.t[-1] >= experiment.duration * (1.0 - 1e-9) else text + f", stopped after {run.t[-1]:g} s"
 
 
 def _in_plane(path: Any, eta: np.ndarray, xi: np.ndarray) -> np.ndarray:
@@ -235,35 +266,31 @@ def _in_plane(path: Any, eta: np.ndarray, xi: np.ndarray) -> np.ndarray:
     return np.asarray(frame.sigma + frame.normal * xi)
 
 
-def _mark_start_of_path(ax: Axes, path: Any, size: float) -> None:
-    """Draw a bar across the path at η = 0, and an arrow the way that η grows."""
+def _mark_path(ax: Axes, path: Any, size: float) -> None:
+    """Draw a bar across the path at η = 0, and an arrowhead the way that η grows."""
     start = 0.0 if path.period is not None else path.domain[0]
     frame = path.frame(start)
     sigma, n = np.asarray(frame.sigma), np.asarray(frame.normal)
-    bar = np.stack([sigma - 0.02 * size * n, sigma + 0.02 * size * n])
-    ax.plot(*bar.T, color=DARK, linewidth=1.2, zorder=3)
-    label = r"$\eta_1 = 0$" + (r"$\,,\; L$" if path.closed else "")
-    ax.annotate(label, sigma - 0.045 * size * n, ha="center", va="center", fontsize=7.5, color=DARK, rotation=0)
+    ax.plot(*np.stack([sigma - 0.018 * size * n, sigma + 0.018 * size * n]).T, color=DARK, linewidth=1.2, zorder=3)
+    ax.annotate(r"$\eta_1 = 0$", sigma + 0.06 * size * n, ha="center", va="center", fontsize=7.5, color=DARK, zorder=3)
+    tip, tail = (np.asarray(path.sigma(path.parameter_at(part * path.length))) for part in (0.905, 0.9))
+    look = {"arrowstyle": "-|>", "color": DARK, "linewidth": 0.0, "mutation_scale": 14, "shrinkA": 0, "shrinkB": 0}
+    ax.annotate("", tip, tail, arrowprops=look, zorder=3)
 
 
-def _force_arrows(ax: Axes, run: Run, size: float) -> None:
-    """Draw the measured force at some instants, a legible distance apart in time and place."""
-    force, position = run["force"], run["position"]
+def _arrows(position: np.ndarray, force: np.ndarray, size: float) -> tuple[list[int], float]:
+    """Return the ticks whose force is drawn, a legible distance apart in place or direction, and the scale in m/N."""
     strength = np.linalg.norm(force, axis=1)
-    largest = float(strength.max())
-    if largest <= 1e-9:
-        return
+    largest = float(strength.max(initial=0.0))
     chosen: list[int] = []
-    for k in np.arange(0, len(run.t), max(1, len(run.t) // 400)):
-        near = [i for i in chosen if np.hypot(*(position[k] - position[i])) < 0.03 * size]
-        if strength[k] > 0.05 * largest and not any(force[k] @ force[i] > 0.5 * strength[k] * strength[i] for i in near):
-            chosen.append(int(k))
-    scale = largest / (0.16 * size)
-    arrows = ax.quiver(
-        *position[chosen].T, *force[chosen].T, angles="xy", scale_units="xy", scale=scale, color=GREEN, width=0.0028, zorder=6
-    )
-    nice = _nice(0.6 * largest)
-    ax.quiverkey(arrows, 0.86, 0.94, nice, f"force on the robot: {nice:g} N", labelpos="W", fontproperties={"size": 7.5})
+    if largest <= 1e-9:
+        return chosen, 1.0
+    for k in range(0, len(force), max(1, len(force) // 600)):
+        close = [i for i in chosen if np.hypot(*(position[k] - position[i])) < 0.035 * size]
+        alike = any(force[k] @ force[i] > 0.5 * strength[k] * strength[i] for i in close)
+        if strength[k] > 0.05 * largest and not alike:
+            chosen.append(k)
+    return chosen, 0.11 * size / largest
 
 
 def _nice(value: float) -> float:
@@ -275,13 +302,17 @@ def _nice(value: float) -> float:
 # --- the signals of an experiment, in the manner of Fig. 4 to 6 -----------------------------------------------------
 
 _PREFIXES = ((1.0, ""), (1e3, "m"), (1e6, "µ"), (1e9, "n"))
+_ACTUAL: Mapping[str, Any] = MappingProxyType({"color": BLUE, "linewidth": 1.2})
+_PATH_REFERENCE: Mapping[str, Any] = MappingProxyType({"color": VERMILION, "linewidth": 1.0, "linestyle": (0, (3, 3))})
+_DESIRED: Mapping[str, Any] = MappingProxyType({"color": DARK, "linewidth": 1.0, "linestyle": (0, (1, 1.5))})
 
 
 def plot_experiment(experiment: Experiment, run: Run) -> Figure:
     """Draw the signals of an experiment in the manner of the paper's Fig. 4 to 6.
 
     Left the direction along the path, right the one across it; from top to bottom the coordinate with its references,
-    the tracking error, the virtual input, the projected force with the desired one. At the bottom the motor forces.
+    the tracking error (its magnitude on a logarithmic axis where the initial error towers over all that follows), the
+    virtual input, the projected force with the desired one (left out where there is none), the motor forces.
 
     Parameters
     ----------
@@ -290,59 +321,75 @@ def plot_experiment(experiment: Experiment, run: Run) -> Figure:
     run : Run
         Its run, a complete one or what ``error.run`` holds.
     """
+    from matplotlib.lines import Line2D
+
+    forces = [run["controller.force_projection.f_par"], run["controller.force_projection.f_perp"]]
+    wanted = [run[name] if (name := f"desired_force_{side}.y") in run else None for side in ("par", "perp")]
+    has_force = bool(np.any(forces)) or any(f is not None for f in wanted)
+    admittance = "controller.admittance_par.path_reference" in run
+    rows = 5 if has_force else 4
     with _style():
-        figure = _figure(7.6)
-        axes = figure.subplots(5, 2, sharex=True)
+        figure = _figure(0.75 + 1.4 * rows)
+        axes = figure.subplots(rows, 2, sharex=True)
         for column, side, coordinate, symbol in ((0, "par", "eta", r"\eta"), (1, "perp", "xi", r"\xi")):
             end = {"par": r"\parallel", "perp": r"\perp"}[side]
-            _draw_coordinate(axes[0, column], run, coordinate, symbol, side)
-            error = run[coordinate][:, 0] - run[f"{coordinate}_p"][:, 0]
-            _draw(axes[1, column], run, rf"${symbol}_1 - {symbol}_1^p$", "m", [(error, BLUE, "-", None)])
-            v = run[f"v_{side}"]
-            _draw(axes[2, column], run, rf"$v_{end}$", "m/s²", [(v, BLUE, "-", None)])
-            forces = [(run[f"controller.force_projection.f_{side}"], BLUE, "-", rf"measured $F_{end}$")]
-            if f"desired_force_{side}.y" in run:
-                forces.append((run[f"desired_force_{side}.y"], VERMILION, "--", rf"desired $F_{end}^d$"))
-            _draw(axes[3, column], run, rf"$F_{end}$", "N", forces, floor=1.0)
-            _draw(axes[4, column], run, f"motor force {'yz'[column]}", "N", [(run["motor_force"][:, column], BLUE, "-", None)])
-            axes[4, column].set_xlabel("t [s]")
-        axes[0, 0].set_title(r"along the path ($\parallel$)")
-        axes[0, 1].set_title(r"across the path ($\perp$)")
+            value, reference = run[coordinate][:, 0], run[f"{coordinate}_p"][:, 0]
+            lines = [(value, _ACTUAL), (reference, _PATH_REFERENCE)]
+            if admittance:
+                desired = run[f"{coordinate}_d.y"][:, 0]
+                moved = side == "par" and "set_point.y" in run
+                lines.insert(0, (desired + run["set_point.y"] if moved else desired, _DESIRED))
+            panels = iter(axes[:, column])
+            _draw(next(panels), run, f"${symbol}_1$", "m", lines)
+            _draw_error(next(panels), run, f"{symbol}_1 - {symbol}_1^p", value - reference)
+            _draw(next(panels), run, f"$v_{end}$", "m/s²", [(run[f"v_{side}"], _ACTUAL)])
+            if has_force:
+                force = wanted[column]
+                lines = [(force, _DESIRED)] if force is not None else []
+                _draw(next(panels), run, f"$F_{end}$", "N", [*lines, (forces[column], _ACTUAL)], floor=1.0)
+            _draw(next(panels), run, f"motor force {'yz'[column]}", "N", [(run["motor_force"][:, column], _ACTUAL)])
+            axes[-1, column].set_xlabel("t [s]")
+        axes[0, 0].set_title(r"along the path, $\parallel$")
+        axes[0, 1].set_title(r"across the path, $\perp$")
+        figure.suptitle(_title(experiment, run), fontsize=9)
+        used = [("actual", _ACTUAL), (r"path reference $\eta^p$, $\xi^p$", _PATH_REFERENCE)]
+        if admittance:
+            used.append((r"desired $\eta^d$, $\xi^d$" + (", $F^d$" if any(f is not None for f in wanted) else ""), _DESIRED))
+        keys = [Line2D([], [], label=label, **look) for label, look in used]
+        figure.legend(handles=keys, loc="outside lower center", ncols=len(keys), handlelength=2.4)
         figure.align_ylabels()
     return figure
 
 
-def _draw_coordinate(ax: Axes, run: Run, name: str, symbol: str, side: str) -> None:
-    """Draw a coordinate, its path reference and, where an admittance lies between, its reference."""
-    lines = [(run[name][:, 0], BLUE, "-", rf"${symbol}_1$"), (run[f"{name}_p"][:, 0], VERMILION, "--", rf"${symbol}_1^p$")]
-    if f"controller.admittance_{side}.path_reference" in run:
-        desired = run[f"{name}_d.y"][:, 0]
-        if side == "par" and "set_point.y" in run:
-            desired = desired + run["set_point.y"]
-        lines.insert(0, (desired, DARK, ":", rf"${symbol}_1^d$"))
-    _draw(ax, run, rf"${symbol}_1$", "m", lines)
+def _draw_error(ax: Axes, run: Run, label: str, error: np.ndarray) -> None:
+    """Draw a tracking error; its magnitude on a logarithmic axis where the first value is far above the usual ones."""
+    if len(error) > 1 and abs(error[0]) > 100.0 * np.median(np.abs(error)) and abs(error[0]) > 1e-4:
+        magnitude = np.maximum(np.abs(error), 1e-12)
+        factor, prefix = _prefix(float(magnitude.max()))
+        ax.plot(run.t, magnitude * factor, **_ACTUAL)
+        ax.set_yscale("log")
+        ax.set_ylim(max(magnitude.min(), 1e-8) * factor, 3.0 * magnitude.max() * factor)
+        ax.set_ylabel(f"$|{label}|$ [{prefix}m]")
+        _limit_time(ax, run)
+    else:
+        _draw(ax, run, f"${label}$", "m", [(error, _ACTUAL)])
+
+
+def _prefix(largest: float) -> tuple[float, str]:
+    """Return the factor and the prefix that suit a length."""
+    return next((p for p in _PREFIXES if largest * p[0] >= 0.1), _PREFIXES[-1]) if largest > 0 else _PREFIXES[0]
 
 
 def _draw(
-    ax: Axes,
-    run: Run,
-    label: str,
-    unit: str,
-    lines: Sequence[tuple[np.ndarray, str, str, str | None]],
-    *,
-    floor: float = 0.0,
+    ax: Axes, run: Run, label: str, unit: str, lines: Sequence[tuple[np.ndarray, Mapping[str, Any]]], *, floor: float = 0.0
 ) -> None:
     """Draw lines into one axis; lengths get the prefix that suits them."""
-    largest = max((float(np.max(np.abs(values))) for values, *_ in lines if len(values)), default=0.0)
-    factor, prefix = 1.0, ""
-    if unit == "m" and largest > 0:
-        factor, prefix = next((p for p in _PREFIXES if largest * p[0] >= 0.1), _PREFIXES[-1])
-    for values, colour, dashes, name in lines:
-        ax.plot(run.t, values * factor, color=colour, linestyle=dashes, label=name, linewidth=1.0 if dashes != "-" else 1.2)
+    largest = max((float(np.max(np.abs(values))) for values, _ in lines if len(values)), default=0.0)
+    factor, prefix = _prefix(largest) if unit == "m" else (1.0, "")
+    for values, look in lines:
+        ax.plot(run.t, values * factor, **look)
     ax.set_ylabel(f"{label} [{prefix}{unit}]")
+    ax.margins(y=0.08)
     if largest < floor:
         ax.set_ylim(-floor, floor)
-    ax.margins(y=0.08)
     _limit_time(ax, run)
-    if len(lines) > 1:
-        ax.legend(loc="best", ncols=len(lines))

@@ -166,7 +166,7 @@ def _response(t: np.ndarray, start: int | None, response: np.ndarray, changes: n
     window = response[start : _next(changes, start, len(t))]
     outside = np.flatnonzero(np.abs(window - 1.0) > BAND)
     settled = int(outside[-1]) + 1 if outside.size else 0
-    settling = float(t[start + settled] - t[start]) if settled < len(window) else float("inf")
+    settling = round(float(t[start + settled] - t[start]), 12) if settled < len(window) else float("inf")
     return settling, max(0.0, float(np.max(window)) - 1.0)
 
 

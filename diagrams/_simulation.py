@@ -209,7 +209,7 @@ class _Loop:
             block = self.flat.table.blocks[path]
             shapes = self.flat.checked.traced[path].outputs
             u = bundle("u", inputs)
-            for name in names:
+            for name in sorted(names, key=lambda n: n != GUARDS):  # a guard says more than the NaN behind it
                 values = made[name]
                 if name == GUARDS:
                     for guard, value in zip(self.flat.checked.traced[path].guards, values, strict=True):
@@ -219,7 +219,16 @@ class _Loop:
                 elif not np.all(np.isfinite(values)):
                     what = "the next state" if name == NEXT else name
                     return _non_finite(path, what, values, _inputs_text(inputs))
-        return NonFiniteError("a value is not finite; expected finite numbers. Look at the last samples of error.run.")
+        layout = self.flat.log
+        largest = max(layout.slices, key=lambda name: float(np.max(np.abs(self.log[layout.slices[name]]), initial=0.0)))
+        value = float(np.max(np.abs(self.log[layout.slices[largest]])))
+        path, _, port = largest.rpartition(".")
+        return NonFiniteError(
+            f"found {value:g}; the signals of this tick overflow when they are added up, and this is the largest. Look at "
+            "what drives it in the last samples of error.run.",
+            block=path,
+            port=port,
+        )
 
     def _blocks(
         self, order: list[Any], t: float, k: int, *, initialize: bool = False

@@ -1,0 +1,30 @@
+"""Runs of the experiments and their independent solutions, each made once."""
+
+from functools import cache, lru_cache
+
+import oracle
+import pytest
+from loopwright.diagrams import experiments
+
+
+@pytest.fixture(scope="session")
+def runs():
+    """runs(letter, **options) -> (experiment, run)."""
+
+    @lru_cache(maxsize=16)  # a run holds some 10 MB
+    def run(letter, **options):
+        experiment = experiments.EXPERIMENTS[letter](**options)
+        return experiment, experiment.simulate(progress=False)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def solutions():
+    """solutions(letter, **options) -> arrays by name, by the independent solution of `oracle`."""
+
+    @cache
+    def solve(letter, **options):
+        return oracle.simulate(letter, oracle.Options(**options))
+
+    return solve
