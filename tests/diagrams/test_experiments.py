@@ -171,7 +171,9 @@ def test_narrow_friction_acts_as_in_the_independent_solution(runs, solutions, le
 
 
 @pytest.mark.parametrize("letter", ["A", "B", "C", "D"])
-@pytest.mark.parametrize("options", [*(o for o, _ in OPTIONS.values()), ENCODER, NARROW], ids=[*OPTIONS, "encoder", "narrow"])
+@pytest.mark.parametrize(
+    "options", [*(o for o, _ in OPTIONS.values()), ENCODER, NARROW], ids=[*OPTIONS, "encoder", "narrow"]
+)
 def test_no_option_makes_a_run_unbounded(runs, letter, options):
     if letter == "A" and LIMITS & options.keys():
         with pytest.raises(OptionError, match="experiment A has no admittance"):

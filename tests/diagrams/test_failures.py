@@ -4,7 +4,6 @@ import zipfile
 
 import numpy as np
 import pytest
-
 from loopwright.blocks import (
     Block,
     Constant,
@@ -62,7 +61,9 @@ def test_a_nan_stops_the_run_at_the_first_block_that_made_it():
     diagram = Diagram("d", Saturation(limit=5, name="after")(Root(name="root")(level)))
     with pytest.raises(NonFiniteError) as error:
         diagram.simulate(3.0, progress=False)
-    assert str(error.value).startswith("root.y, t = 1.1 s: found [nan]; expected finite numbers. This is the first block")
+    assert str(error.value).startswith(
+        "root.y, t = 1.1 s: found [nan]; expected finite numbers. This is the first block"
+    )
     assert "u = -0.1" in str(error.value).replace("-0.09999999999999987", "-0.1").replace("-0.1000", "-0.1")
     assert (error.value.block, error.value.port, error.value.t) == ("root", "y", 1.1)
     assert len(error.value.run.t) == 11
@@ -83,7 +84,9 @@ def test_saturation_passes_nan_on():
 
 def test_a_guard_stops_the_run_with_the_blocks_own_words():
     diagram = Diagram("d", Root(guarded=True, name="root")(ramp()))
-    with pytest.raises(GuardError, match=r"^root, t = 1\.1 s: guard 'radicand' is -0\.1; expected a positive value.*u = -0\.") as e:
+    with pytest.raises(
+        GuardError, match=r"^root, t = 1\.1 s: guard 'radicand' is -0\.1; expected a positive value.*u = -0\."
+    ) as e:
         diagram.simulate(3.0, progress=False)
     assert len(e.value.run.t) == 11
 
@@ -120,7 +123,9 @@ def test_a_start_beyond_the_reach():
 def test_an_unreachable_start_of_the_plant_is_refused_at_t_0():
     experiment = experiments.path_following()
     lost = experiment.diagram.replace({"plant.start.position": (0.5, 0.5)})  # the centre, on the medial axis
-    with pytest.raises(PathDomainError, match=r"^controller\.path_projection, t = 0 s: position \[0\.5, 0\.5\] m") as error:
+    with pytest.raises(
+        PathDomainError, match=r"^controller\.path_projection, t = 0 s: position \[0\.5, 0\.5\] m"
+    ) as error:
         lost.simulate(1.0, progress=False)
     assert len(error.value.run.t) == 0
 
@@ -186,7 +191,9 @@ def test_an_fmu_for_other_platforms_only(file, tmp_path):
 
 
 def test_an_unknown_start_value_offers_near_names(file):
-    with pytest.raises(UnknownNameError, match=r"plant\.start: the FMU has no variable 'positon'\. Did you mean 'position'"):
+    with pytest.raises(
+        UnknownNameError, match=r"plant\.start: the FMU has no variable 'positon'\. Did you mean 'position'"
+    ):
         Fmu(file, name="plant", start={"positon": (0, 0)})
 
 
@@ -209,7 +216,9 @@ def test_a_start_value_out_of_the_fmus_range(file):
 
 
 def test_a_non_positive_mass():
-    with pytest.raises(ParameterError, match=r"Gantry\.translational_mass: found \[7\.61, 0\.0\]; expected a value above 0 in kg"):
+    with pytest.raises(
+        ParameterError, match=r"Gantry\.translational_mass: found \[7\.61, 0\.0\]; expected a value above 0 in kg"
+    ):
         gantry.Gantry(translational_mass=(7.61, 0.0))
 
 
@@ -284,7 +293,9 @@ def test_options_of_the_run_and_of_the_experiment_are_kept_apart():
         experiment.simulate(progres=False)
 
 
-@pytest.mark.parametrize(("duration", "words"), [(0, "positive"), (-1, "positive"), (0.0005, "no multiple of the 0.001 s")])
+@pytest.mark.parametrize(
+    ("duration", "words"), [(0, "positive"), (-1, "positive"), (0.0005, "no multiple of the 0.001 s")]
+)
 def test_a_wrong_duration(duration, words):
     with pytest.raises(OptionError, match=words):
         experiments.path_following().diagram.simulate(duration, progress=False)

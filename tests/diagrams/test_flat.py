@@ -3,12 +3,13 @@
 import casadi as ca
 import numpy as np
 import pytest
-
 from loopwright.blocks import CubicSpline, Pulse
 from loopwright.diagrams import experiments
 from loopwright.fmus._compiler import compile_shared
 
-SPLINE = CubicSpline(points=[(0.8, 0.5), (0.65, 0.63), (0.35, 0.62), (0.2, 0.5), (0.35, 0.37), (0.66, 0.38)], closed=True)
+SPLINE = CubicSpline(
+    points=[(0.8, 0.5), (0.65, 0.63), (0.35, 0.62), (0.2, 0.5), (0.35, 0.37), (0.66, 0.38)], closed=True
+)
 
 
 def columns(flat, run, k):
@@ -66,9 +67,10 @@ def test_a_path_with_tables_compiles_to_the_same_bits(tmp_path):
     run = experiment.diagram.simulate(2.0, progress=False)
     flat = experiment.diagram.flatten()
     ticks = range(0, len(run.t), 7)
-    assert replay(compiled(flat.function, tmp_path), flat, run, ticks).tobytes() == replay(
-        flat.function, flat, run, ticks
-    ).tobytes()
+    assert (
+        replay(compiled(flat.function, tmp_path), flat, run, ticks).tobytes()
+        == replay(flat.function, flat, run, ticks).tobytes()
+    )
 
 
 @pytest.mark.parametrize("tick", [731, 2750, 5230, 7100, 9111])

@@ -5,7 +5,6 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-
 from loopwright.blocks import (
     AlgebraicLoopError,
     Block,
@@ -77,12 +76,16 @@ def test_a_required_input_left_out_is_named_with_the_call_that_was_expected():
 
 def test_an_output_used_of_a_block_that_is_never_called():
     lag = Lag(time_constant=1, name="lag")
-    with pytest.raises(UnwiredInputError, match=r"^lag\.u: an output of this block is used, but the block is never called"):
+    with pytest.raises(
+        UnwiredInputError, match=r"^lag\.u: an output of this block is used, but the block is never called"
+    ):
         Diagram("d", Gain(gain=2)(lag.y))
 
 
 def test_an_unknown_input_offers_near_names():
-    with pytest.raises(UnknownNameError, match=r"it has no input 'u3'\. Did you mean 'u2' or 'u1'\?|Did you mean 'u1' or 'u2'"):
+    with pytest.raises(
+        UnknownNameError, match=r"it has no input 'u3'\. Did you mean 'u2' or 'u1'\?|Did you mean 'u1' or 'u2'"
+    ):
         Sum(signs="+-")(u1=Constant(value=1), u3=Constant(value=1))
 
 
@@ -109,7 +112,9 @@ def test_too_many_signals():
 
 
 def test_something_that_is_no_signal():
-    with pytest.raises(WiringError, match=r"gain\.u: found 'speed'; expected a signal, a call, a block with one output, or numbers"):
+    with pytest.raises(
+        WiringError, match=r"gain\.u: found 'speed'; expected a signal, a call, a block with one output, or numbers"
+    ):
         Gain(gain=1)("speed")
 
 
@@ -258,7 +263,9 @@ def test_a_name_that_stands_for_several_lists_them():
     def a(u):
         return Gain(gain=2)(u)
 
-    run = Diagram("d", Sum()(a(Constant(value=1)), a.replace(name="b")(Constant(value=2)))).simulate(0.1, progress=False)
+    run = Diagram("d", Sum()(a(Constant(value=1)), a.replace(name="b")(Constant(value=2)))).simulate(
+        0.1, progress=False
+    )
     with pytest.raises(UnknownNameError, match=r"'gain\.y' stands for several signals: a\.gain\.y, b\.gain\.y"):
         run["gain.y"]
     with pytest.raises(UnknownNameError, match="Did you mean"):
@@ -322,12 +329,15 @@ def test_initial_values_that_wait_for_each_other_are_an_error_of_their_own():
 
 
 def test_a_sampled_block_in_a_continuous_frame():
-    with pytest.raises(SampleTimeError, match=r"delay: a sampled block stands in a continuous frame; put it into a @subsystem"):
+    with pytest.raises(
+        SampleTimeError, match=r"delay: a sampled block stands in a continuous frame; put it into a @subsystem"
+    ):
         Diagram("d", UnitDelay(initial_value=0, name="delay")(Constant(value=1)))
 
 
 @pytest.mark.parametrize(
-    ("value", "words"), [(0, "positive"), (-1e-3, "positive"), ("fast", "expected seconds"), (1e-10, "multiple of 1 ns")]
+    ("value", "words"),
+    [(0, "positive"), (-1e-3, "positive"), ("fast", "expected seconds"), (1e-10, "multiple of 1 ns")],
 )
 def test_a_bad_sample_time(value, words):
     with pytest.raises(SampleTimeError, match=words):
@@ -465,7 +475,9 @@ def test_an_equation_that_cannot_be_traced_says_the_line():
         def output(self, t, x, u):
             return math.sin(u.u)
 
-    with pytest.raises(TraceError, match=r"bad: its output can't be traced in line \d+ of .*test_wiring\.py.*not math\.sqrt"):
+    with pytest.raises(
+        TraceError, match=r"bad: its output can't be traced in line \d+ of .*test_wiring\.py.*not math\.sqrt"
+    ):
         Diagram("d", Bad()(Constant(value=1.0)))
 
 
