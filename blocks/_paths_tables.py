@@ -141,7 +141,10 @@ def nearest(path: Path, y: np.ndarray) -> float:
         best = np.argsort(d[row, column], kind="stable")[:_MOST_MINIMA]
         row, column = row[best], column[best]
         low, high = fine[row, np.maximum(column - 1, 0)], fine[row, np.minimum(column + 1, 32)]
-    candidates = np.concatenate([polish(path, y, low, high), ends])
+    candidates = polish(path, y, low, high)
+    for end in ends:
+        candidates = np.where(np.abs(candidates - end) <= 1e-15 * (theta[-1] - theta[0]), end, candidates)
+    candidates = np.concatenate([ends, candidates])
     distance = np.sum((path.sigma(candidates) - y[:, None]) ** 2, axis=0)
     return float(candidates[np.argmin(distance)])
 

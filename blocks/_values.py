@@ -247,7 +247,8 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
         (spec.maximum, np.less_equal, "at most"),
     ):
         if bound is not None and not np.all(holds(result, bound)):
-            raise bad(short(result.tolist() if result.ndim else float(result)) if isinstance(result, np.ndarray) else repr(result), f"a value {words} {bound:g}")
+            shown = short(result if np.ndim(result) else result.item() if isinstance(result, np.ndarray) else result)
+            raise bad(shown, f"a value {words} {bound:g}")
     if isinstance(result, np.ndarray):
         if result.ndim == 0:
             return float(result)

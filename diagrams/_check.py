@@ -109,8 +109,8 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[tuple[str, 
         found = part_shape(shapes[wire.block, wire.port], wire, path, port)
         if found != shape:
             raise ShapeError(
-                f"{wire} has shape {found}, where the loop that it closes asks for {shape}. Give the loop's shape where it "
-                "starts, for instance UnitDelay(initial_value=…).",
+                f"{wire} has shape {found}, where the loop that it closes asks for {shape}. Give the loop's shape "
+                "where it starts, for instance UnitDelay(initial_value=…).",
                 block=path,
                 port=port,
             )
@@ -125,9 +125,7 @@ def _trace(block: Block, shapes: dict[str, Shape], sampled: bool, method: str, p
         raise
 
 
-def _assume(
-    table: Structure, shapes: dict[tuple[str, str], Shape], stuck: list[str]
-) -> dict[tuple[str, str], Shape]:
+def _assume(table: Structure, shapes: dict[tuple[str, str], Shape], stuck: list[str]) -> dict[tuple[str, str], Shape]:
     """Return an assumption that lets a loop of unknown shapes go on; it is checked once the shapes are known.
 
     A block's unknown inputs are assumed to have the shape of a known one beside them, else of its first state.

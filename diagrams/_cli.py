@@ -22,7 +22,20 @@ from ._keynumbers import DEFINITIONS, key_numbers
 from ._run import Run
 from .experiments import DEFAULTS, EXPERIMENTS, Experiment
 
-SIGNALS = "eta xi position velocity force motor_force v_par v_perp theta q eta_p xi_p".split()
+SIGNALS = (
+    "eta",
+    "xi",
+    "position",
+    "velocity",
+    "force",
+    "motor_force",
+    "v_par",
+    "v_perp",
+    "theta",
+    "q",
+    "eta_p",
+    "xi_p",
+)
 """Signals of the CSV file, in order."""
 
 _INTERRUPTED = "interrupted"
@@ -57,7 +70,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="loopwright", description="Block diagrams and co-simulation for control engineers.")
+    parser = argparse.ArgumentParser(
+        prog="loopwright", description="Block diagrams and co-simulation for control engineers."
+    )
     parser.add_argument("--version", action="version", version=f"loopwright {_version()}")
     commands = parser.add_subparsers(dest="command", metavar="command")
     width = max(len(name) for name in DEFINITIONS)
@@ -158,7 +173,8 @@ def _share(letters: Sequence[str], options: Mapping[str, Any]) -> dict[str, dict
             raise OptionError(f"no experiment has such an option. {near(name, known)}", port=f"--option {name}")
         if len(without) == len(letters):
             raise OptionError(
-                f"{' and '.join(without)} can't take it; an option of {', '.join(owners)} only.", port=f"--option {name}"
+                f"{' and '.join(without)} can't take it; an option of {', '.join(owners)} only.",
+                port=f"--option {name}",
             )
         if without:
             _say(f"{', '.join(without)}: without {name}, which only {', '.join(owners)} has.", sys.stderr)
@@ -240,7 +256,9 @@ def _write(
     if problem is not None:
         content["error"] = problem
     names = [f"{letter}.json"]
-    (folder / names[0]).write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    (folder / names[0]).write_text(
+        json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
     if run is not None:
         from ._figures import plot_experiment, plot_path, save
 

@@ -187,7 +187,7 @@ class Diagram:
             Seconds between two ticks (and communication points of the FMUs). Without one it is the greatest common
             divisor of all sample times.
         progress : bool, optional
-            Show a progress bar; by default on a terminal or in a notebook.
+            Show a progress bar; by default on a terminal, and in a notebook where ipywidgets is installed.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Figures of a run: signals over time, and the plane with the path; drawn without pyplot and without its global state."""
+"""Figures of a run: signals over time, and the plane with the path; drawn without pyplot and its global state."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from textwrap import wrap
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -74,12 +75,27 @@ def _style() -> Iterator[None]:
     import matplotlib
     from matplotlib import rcParamsDefault
 
-    plain = {k: v for k, v in rcParamsDefault.items() if k.split(".")[0] in _OWN}
-    with matplotlib.rc_context({**plain, **STYLE}):
+    plain: dict[Any, Any] = {k: v for k, v in rcParamsDefault.items() if k.split(".")[0] in _OWN}
+    with matplotlib.rc_context(plain | dict(STYLE)):
         yield
 
 
-_OWN = frozenset("axes figure font grid legend lines mathtext patch path savefig svg text xtick ytick".split())
+_OWN = {
+    "axes",
+    "figure",
+    "font",
+    "grid",
+    "legend",
+    "lines",
+    "mathtext",
+    "patch",
+    "path",
+    "savefig",
+    "svg",
+    "text",
+    "xtick",
+    "ytick",
+}
 
 
 @cache
@@ -144,7 +160,9 @@ def plot_signals(run: Run, names: Sequence[str], axes: Any = None) -> Figure:
     """
     if not names:
         raise OptionError('found no signal to draw; expected names, such as run.plot("eta", "xi").')
-    signals = [(name, run[name].reshape(len(run.t), -1), run[name].ndim > 1, _units(run, name)) for name in names]
+    signals = [
+        (name, run[name].reshape(len(run.t), _size(run, name)), run[name].ndim > 1, _units(run, name)) for name in names
+    ]
     with _style():
         if axes is None:
             figure = _figure(0.5 + 1.35 * len(names))
@@ -155,7 +173,7 @@ def plot_signals(run: Run, names: Sequence[str], axes: Any = None) -> Figure:
         for ax, (name, values, vector, units) in zip(axes, signals, strict=True):
             for i, column in enumerate(values.T):
                 unit = f" [{units[i]}]" if vector and len(set(units)) > 1 and units[i] else ""
-                ax.plot(run.t, column, label=f"{name}[{i + 1}]{unit}" if vector else name)
+                ax.plot(run.t, column, marker=_dot(run), label=f"{name}[{i + 1}]{unit}" if vector else name)
             common = units[0] if units and len(set(units)) == 1 else None
             ax.set_ylabel(f"{name} [{common}]" if common else name)
             if vector:
@@ -168,10 +186,15 @@ def plot_signals(run: Run, names: Sequence[str], axes: Any = None) -> Figure:
     return result
 
 
+def _size(run: Run, name: str) -> int:
+    """Return the number of entries of a signal."""
+    return int(np.prod(run[name].shape[1:]))
+
+
 def _units(run: Run, name: str) -> list[str]:
     """Return the unit of every entry, as it is to be read."""
-    unit, size = run.unit(name), int(np.prod(run[name].shape[1:]))
-    units = [u or "" for u in unit] if isinstance(unit, tuple) else [unit or ""] * size
+    unit = run.unit(name)
+    units = [u or "" for u in unit] if isinstance(unit, tuple) else [unit or ""] * _size(run, name)
     return [_readable(u) for u in units]
 
 
@@ -180,7 +203,15 @@ def _readable(unit: str) -> str:
     return "" if unit == "1" else unit.translate(str.maketrans("23", "²³")).replace(".", " ")
 
 
+def _dot(run: Run) -> str:
+    """Return the marker of a line: a single sample is a dot."""
+    return "." if len(run.t) == 1 else ""
+
+
 def _limit_time(ax: Axes, run: Run) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    ax.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10]))
     if len(run.t) > 1:
         margin = 0.015 * float(run.t[-1] - run.t[0])  # what happens at the first tick is not hidden by the frame
         ax.set_xlim(float(run.t[0]) - margin, float(run.t[-1]) + margin)
@@ -209,14 +240,16 @@ def plot_path(experiment: Experiment, run: Run) -> Figure:
     points = np.hstack([curve, position.T, reference, tips.T])
     low, high = points.min(axis=1) - 0.04 * size, points.max(axis=1) + 0.04 * size
     with _style():
-        figure = _figure(min(1.0 + (WIDTH - 0.62) * float((high[1] - low[1]) / (high[0] - low[0])), 8.5))
+        figure = _figure(
+            min((1.2 if ticks else 1.0) + (WIDTH - 0.62) * float((high[1] - low[1]) / (high[0] - low[0])), 8.5)
+        )
         ax = figure.subplots()
         ax.set_aspect("equal")
         ax.set_xlim(low[0], high[0])
         ax.set_ylim(low[1], high[1])
         ax.set_xlabel("y [m]")
         ax.set_ylabel("z [m]")
-        ax.set_title(_title(experiment, run), loc="left")
+        figure.suptitle(_title(experiment, run), fontsize=9)
         ax.plot(*curve, color=GREY, linewidth=2.6, solid_capstyle="round", label="path", zorder=2)
         _mark_path(ax, path, size)
         if len(run.t):
@@ -240,22 +273,27 @@ def plot_path(experiment: Experiment, run: Run) -> Figure:
             )
             nice = _nice(0.08 * size / scale)
             label = f"measured force on the robot, {nice:g} N"
+            ax.set_title(" ")  # room for the key
             ax.quiverkey(arrows, 1.0 - nice * scale / float(high[0] - low[0]), 1.03, nice, label, labelpos="W")
         figure.legend(loc="outside lower center", ncols=5)
     return figure
 
 
 def _title(experiment: Experiment, run: Run) -> str:
-    """Return the experiment's name, the options that are not the usual ones, and when it stopped if that was early."""
+    """Return the experiment's name, when it stopped if that was early, and the options that are not the usual ones."""
     from .experiments import DEFAULTS
 
     text = f"Experiment {experiment.letter}: {experiment.title.partition(':')[0].replace('_', ' ')}"
-    for name, value in experiment.options.items():
-        if name not in ("plant", "path") and value != DEFAULTS.get(name, False):
-            text += f", {name} = {value}"
     if not len(run.t):
-        return text + ", no sample"
-    return text if run.t[-1] >= experiment.duration * (1.0 - 1e-9) else text + f", stopped after {run.t[-1]:g} s"
+        text += ", no sample"
+    elif run.t[-1] < experiment.duration * (1.0 - 1e-9):
+        text += f", stopped after {run.t[-1]:g} s"
+    changed = [
+        f"{n} = {v}"
+        for n, v in experiment.options.items()
+        if n not in ("plant", "path") and v != DEFAULTS.get(n, False)
+    ]
+    return "\n".join([text, *wrap(", ".join(changed), 100)])
 
 
 def _in_plane(path: Any, eta: np.ndarray, xi: np.ndarray) -> np.ndarray:
@@ -272,10 +310,13 @@ def _mark_path(ax: Axes, path: Any, size: float) -> None:
     frame = path.frame(start)
     sigma, n = np.asarray(frame.sigma), np.asarray(frame.normal)
     ax.plot(*np.stack([sigma - 0.018 * size * n, sigma + 0.018 * size * n]).T, color=DARK, linewidth=1.2, zorder=3)
-    ax.annotate(r"$\eta_1 = 0$", sigma + 0.06 * size * n, ha="center", va="center", fontsize=7.5, color=DARK, zorder=3)
-    tip, tail = (np.asarray(path.sigma(path.parameter_at(part * path.length))) for part in (0.905, 0.9))
-    look = {"arrowstyle": "-|>", "color": DARK, "linewidth": 0.0, "mutation_scale": 14, "shrinkA": 0, "shrinkB": 0}
-    ax.annotate("", tip, tail, arrowprops=look, zorder=3)
+    ax.annotate(
+        r"$\eta_1 = 0$", tuple(sigma + 0.06 * size * n), ha="center", va="center", fontsize=7.5, color=DARK, zorder=3
+    )
+    frame = path.frame(path.parameter_at(0.9 * path.length))
+    sigma, t, n = np.asarray(frame.sigma), 0.01 * size * frame.tangent, 0.01 * size * frame.normal
+    head = np.stack([sigma + 1.6 * t, sigma - t + n, sigma - 0.6 * t, sigma - t - n])
+    ax.fill(*head.T, color=DARK, linewidth=0.0, zorder=3)
 
 
 def _arrows(position: np.ndarray, force: np.ndarray, size: float) -> tuple[list[int], float]:
@@ -354,7 +395,9 @@ def plot_experiment(experiment: Experiment, run: Run) -> Figure:
         figure.suptitle(_title(experiment, run), fontsize=9)
         used = [("actual", _ACTUAL), (r"path reference $\eta^p$, $\xi^p$", _PATH_REFERENCE)]
         if admittance:
-            used.append((r"desired $\eta^d$, $\xi^d$" + (", $F^d$" if any(f is not None for f in wanted) else ""), _DESIRED))
+            used.append(
+                (r"desired $\eta^d$, $\xi^d$" + (", $F^d$" if any(f is not None for f in wanted) else ""), _DESIRED)
+            )
         keys = [Line2D([], [], label=label, **look) for label, look in used]
         figure.legend(handles=keys, loc="outside lower center", ncols=len(keys), handlelength=2.4)
         figure.align_ylabels()
@@ -366,7 +409,7 @@ def _draw_error(ax: Axes, run: Run, label: str, error: np.ndarray) -> None:
     if len(error) > 1 and abs(error[0]) > 100.0 * np.median(np.abs(error)) and abs(error[0]) > 1e-4:
         magnitude = np.maximum(np.abs(error), 1e-12)
         factor, prefix = _prefix(float(magnitude.max()))
-        ax.plot(run.t, magnitude * factor, **_ACTUAL)
+        ax.plot(run.t, magnitude * factor, marker=_dot(run), **_ACTUAL)
         ax.set_yscale("log")
         ax.set_ylim(max(magnitude.min(), 1e-8) * factor, 3.0 * magnitude.max() * factor)
         ax.set_ylabel(f"$|{label}|$ [{prefix}m]")
@@ -381,13 +424,19 @@ def _prefix(largest: float) -> tuple[float, str]:
 
 
 def _draw(
-    ax: Axes, run: Run, label: str, unit: str, lines: Sequence[tuple[np.ndarray, Mapping[str, Any]]], *, floor: float = 0.0
+    ax: Axes,
+    run: Run,
+    label: str,
+    unit: str,
+    lines: Sequence[tuple[np.ndarray, Mapping[str, Any]]],
+    *,
+    floor: float = 0.0,
 ) -> None:
     """Draw lines into one axis; lengths get the prefix that suits them."""
     largest = max((float(np.max(np.abs(values))) for values, _ in lines if len(values)), default=0.0)
     factor, prefix = _prefix(largest) if unit == "m" else (1.0, "")
     for values, look in lines:
-        ax.plot(run.t, values * factor, **look)
+        ax.plot(run.t, values * factor, marker=_dot(run), **look)
     ax.set_ylabel(f"{label} [{prefix}{unit}]")
     ax.margins(y=0.08)
     if largest < floor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,10 @@ DEFINITIONS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
         "settling_par": ("s", "time from the step along the path until its response stays within 2 % of the step"),
         "settling_perp": ("s", "the same across the path"),
-        "overshoot_par": ("1", "how far that response goes beyond its final value, as a part of the step; 0 if it does not"),
+        "overshoot_par": (
+            "1",
+            "how far that response goes beyond its final value, as a part of the step; 0 if it does not",
+        ),
         "overshoot_perp": ("1", "the same across the path"),
         "rms_par": ("m", "root mean square of the tracking error eta_1 - eta_1^p over the whole run"),
         "rms_perp": ("m", "root mean square of the tracking error xi_1 - xi_1^p over the whole run"),
@@ -32,8 +35,14 @@ DEFINITIONS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "offset_par": ("m", "eta_1 minus its set-point under the first F_par^d, at the last tick before that changes"),
         "offset_perp": ("m", "xi_1 minus its set-point under the first F_perp^d, at the last tick before that changes"),
         "xi_step_motion": ("m", "peak to peak of xi_1 from the first step of F_par^d to the next step of any"),
-        "force_error_final": ("N", "|F_perp - F_perp^d| at the last tick, where the force is what is tracked (k_perp = 0)"),
-        "force_error_moving": ("N", "largest |F_perp - F_perp^d| while eta^d moves, where the force is what is tracked"),
+        "force_error_final": (
+            "N",
+            "|F_perp - F_perp^d| at the last tick, where the force is what is tracked (k_perp = 0)",
+        ),
+        "force_error_moving": (
+            "N",
+            "largest |F_perp - F_perp^d| while eta^d moves, where the force is what is tracked",
+        ),
         "end_time": ("s", "time of the last tick that was recorded"),
         "real_time_factor": ("1", "simulated over elapsed time of the loop"),
     }
@@ -46,14 +55,15 @@ def key_numbers(experiment: Experiment, run: Run) -> dict[str, float | None]:
 
     The *step* of a direction, whose settling time and overshoot are given, is the first one that acts on it:
 
-    * without admittance (A): the initial tracking error, and the response is the way from it to zero. Its closed form is
-      1 − (1 + p t − p² t²) e^{−pt} for a triple pole at −p, with an overshoot of 0.248935.
+    * without admittance (A): the initial tracking error, and the response is the way from it to zero. Its closed form
+      is 1 − (1 + p t − p² t²) e^{−pt} for a triple pole at −p, with an overshoot of 0.248935.
     * with stiffness k (B): the first step of the rest position, set-point − F^d/k, and the response is that of the
       coordinate, η₁ or ξ₁, relative to η^d or ξ^d. The closed form of the overshoot is exp(−π ζ/√(1 − ζ²)).
     * without stiffness, with a desired force (D, ⊥): the first step of F^d, and the response is that of the measured
       force.
 
-    It is looked at from the tick of the step until any reference, set-point or desired force changes next.
+    It is looked at from the tick of the step until any reference, set-point or desired force changes next, or the
+    experiment ends; a run that stopped before tells nothing about it.
 
     Parameters
     ----------
@@ -65,20 +75,22 @@ def key_numbers(experiment: Experiment, run: Run) -> dict[str, float | None]:
     Returns
     -------
     dict
-        Every name of `DEFINITIONS`. None where there is nothing to measure; an infinite settling time where the
-        response does not settle before the next change.
+        Every name of `DEFINITIONS`. None where there is nothing to measure, or the run stopped too early; an infinite
+        settling time where the response does not settle before the next change.
     """
     numbers: dict[str, float | None] = dict.fromkeys(DEFINITIONS)
     if not len(run.t):
         return numbers
     sides = {side: _Side(experiment, run, side) for side in ("par", "perp")}
+    complete = bool(run.t[-1] >= experiment.duration * (1.0 - 1e-9))
     changes = np.flatnonzero(np.any([side.changes for side in sides.values()], axis=0))
+    ends = [*changes.tolist(), *([len(run.t)] if complete else [])]
     for name, side in sides.items():
         error = side.y - side.path_reference
         numbers[f"rms_{name}"] = float(np.sqrt(np.mean(error**2)))
         numbers[f"max_error_{name}"] = float(np.max(np.abs(error)))
-        numbers[f"settling_{name}"], numbers[f"overshoot_{name}"] = _response(run.t, *side.step(), changes)
-        numbers[f"offset_{name}"] = side.offset()
+        numbers[f"settling_{name}"], numbers[f"overshoot_{name}"] = _response(run.t, *side.step(), ends)
+        numbers[f"offset_{name}"] = side.offset(complete)
     force = np.max(np.abs(run["motor_force"]), axis=0)
     numbers |= {
         "peak_speed": _largest(run["velocity"]),
@@ -89,12 +101,12 @@ def key_numbers(experiment: Experiment, run: Run) -> dict[str, float | None]:
         "real_time_factor": run.real_time_factor if np.isfinite(run.real_time_factor) else None,
     }
     par, perp = sides["par"], sides["perp"]
-    if par.admittance and perp.admittance and (steps := np.flatnonzero(np.diff(par.desired_force))).size:
-        start = int(steps[0]) + 1
-        numbers["xi_step_motion"] = float(np.ptp(perp.y[start : _next(changes, start, len(run.t))]))
+    steps = np.flatnonzero(np.diff(par.desired_force))
+    if par.admittance and perp.admittance and steps.size and (end := _end(ends, int(steps[0]) + 1)):
+        numbers["xi_step_motion"] = float(np.ptp(perp.y[int(steps[0]) + 1 : end]))
     if perp.tracks_force:
         error = np.abs(perp.force - perp.desired_force)
-        numbers["force_error_final"] = float(error[-1])
+        numbers["force_error_final"] = float(error[-1]) if complete else None
         if np.any(moving := par.reference[:, 1] != 0.0):
             numbers["force_error_moving"] = float(np.max(error[moving]))
     return numbers
@@ -144,26 +156,27 @@ class _Side:
             return None, y
         return start, (y - y[start]) / (target[start] - y[start])
 
-    def offset(self) -> float | None:
+    def offset(self, complete: bool) -> float | None:
         """Return where the first desired force has moved the coordinate to."""
         ticks = np.flatnonzero(np.diff(self.desired_force, prepend=0.0))
-        if not self.stiffness or not ticks.size:
+        if not self.stiffness or ticks.size + complete < 2:
             return None
         last = (int(ticks[1]) if ticks.size > 1 else len(self.y)) - 1
         return float(self.y[last] - self.reference[last, 0] - self.set_point[last])
 
 
-def _next(changes: np.ndarray, start: int, end: int) -> int:
-    """Return the tick of the next change after ``start``, or the end."""
-    later = changes[changes > start]
-    return int(later[0]) if later.size else end
+def _end(ends: Sequence[int], start: int) -> int | None:
+    """Return the tick at which what began at ``start`` ends; None if the run stopped before."""
+    return next((end for end in ends if end > start), None)
 
 
-def _response(t: np.ndarray, start: int | None, response: np.ndarray, changes: np.ndarray) -> tuple[float | None, float | None]:
+def _response(
+    t: np.ndarray, start: int | None, response: np.ndarray, ends: Sequence[int]
+) -> tuple[float | None, float | None]:
     """Return settling time and overshoot of a response that goes from 0 to 1."""
-    if start is None:
+    if start is None or (end := _end(ends, start)) is None:
         return None, None
-    window = response[start : _next(changes, start, len(t))]
+    window = response[start:end]
     outside = np.flatnonzero(np.abs(window - 1.0) > BAND)
     settled = int(outside[-1]) + 1 if outside.size else 0
     settling = round(float(t[start + settled] - t[start]), 12) if settled < len(window) else float("inf")

@@ -140,9 +140,10 @@ class Run:
         chosen = names or tuple(sorted(self.wires))
         columns, header = [self.t[:, None]], ["t"]
         for name in chosen:
-            values = self[name].reshape(len(self.t), -1)
-            header += [name] if self[name].ndim == 1 else [f"{name}[{i + 1}]" for i in range(values.shape[1])]
-            columns.append(values)
+            values = self[name]
+            size = int(np.prod(values.shape[1:]))
+            header += [name] if values.ndim == 1 else [f"{name}[{i + 1}]" for i in range(size)]
+            columns.append(values.reshape(len(self.t), size))
         np.savetxt(path, np.hstack(columns), fmt="%.17g", delimiter=",", header=",".join(header), comments="")
 
 

@@ -22,6 +22,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -220,12 +221,12 @@ class _Loop:
                     what = "the next state" if name == NEXT else name
                     return _non_finite(path, what, values, _inputs_text(inputs))
         layout = self.flat.log
-        largest = max(layout.slices, key=lambda name: float(np.max(np.abs(self.log[layout.slices[name]]), initial=0.0)))
-        value = float(np.max(np.abs(self.log[layout.slices[largest]])))
+        sizes = {name: float(np.max(np.abs(self.log[where]), initial=0.0)) for name, where in layout.slices.items()}
+        largest = max(sizes, key=lambda name: sizes[name])
         path, _, port = largest.rpartition(".")
         return NonFiniteError(
-            f"found {value:g}; the signals of this tick overflow when they are added up, and this is the largest. Look at "
-            "what drives it in the last samples of error.run.",
+            f"found {sizes[largest]:g}; the signals of this tick overflow when they are added up, and this "
+            "is the largest. Look at what drives it in the last samples of error.run.",
             block=path,
             port=port,
         )
@@ -310,7 +311,8 @@ def _progress(name: str, end: float, show: bool | None) -> Iterator[Any]:
     if show is None:
         import sys
 
-        show = sys.stderr.isatty() or "ipykernel" in sys.modules
+        widgets = "ipykernel" in sys.modules and find_spec("ipywidgets") is not None
+        show = sys.stderr.isatty() or widgets
     if not show:
         yield lambda t: None
         return

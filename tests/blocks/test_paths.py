@@ -446,6 +446,15 @@ def test_projection_undoes_going_off_the_path_within_reach(path):
 
 
 @pytest.mark.parametrize("name", ["open spline", "two points", "line"])
+def test_projection_beyond_an_end_is_exactly_the_end(name):
+    path = PATHS[name]
+    for theta, sign in zip(path.domain, (-1.0, 1.0), strict=True):
+        frame = path.frame(theta)
+        for distance in (1e-3, 0.01, 0.02):
+            assert path.project(frame.sigma + sign * distance * frame.tangent + 0.01 * frame.normal) == theta
+
+
+@pytest.mark.parametrize("name", ["open spline", "two points", "line"])
 def test_projection_finds_foot_points_close_to_an_end(name):
     path = PATHS[name]
     span = path.domain[1]
@@ -473,6 +482,16 @@ def test_the_ellipses_own_projection_agrees_with_the_general_one():
         own = PAPER.replace(clockwise=clockwise).project(y)
         general = PlainEllipse(semi_axes=(A, B), center=(0.5, 0.5), clockwise=clockwise).project(y)
         np.testing.assert_allclose(own, general, atol=1e-13)
+
+
+@EVERY
+def test_the_samples_that_searches_start_from_are_dense(path):
+    theta, lengths = path.sampling
+    frame = path.frame(theta)
+    assert np.all(np.diff(lengths) > 0)
+    assert np.max(np.diff(lengths)) < 1.01 * path.length / 400.0
+    turn = np.abs(np.sum(frame.tangent[:, :-1] * frame.normal[:, 1:], axis=0))
+    assert np.max(turn) < 0.0501
 
 
 def test_projection_of_special_points():

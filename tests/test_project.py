@@ -1,0 +1,166 @@
+"""The house itself: walls between rooms, public names, lint, types, the wheel, the README's code, the notebooks."""
+
+import ast
+import doctest
+import importlib
+import importlib.metadata
+import inspect
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import loopwright.blocks
+import loopwright.diagrams
+import loopwright.fmus
+import matplotlib
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+ROOT = Path(__file__).parent.parent
+ROOMS = {"blocks": set(), "fmus": {"blocks"}, "diagrams": {"blocks", "fmus"}}
+SOURCES = sorted(p for room in ROOMS for p in (ROOT / room).rglob("*.py"))
+
+
+def call(*arguments, **options):
+    return subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, check=False, **options)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_rooms_import_only_what_stands_below_them(room):
+    for path in (ROOT / room).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom):
+                assert not (node.module or "").startswith("loopwright"), f"{path}: rooms import relatively"
+                if node.level >= 2:
+                    assert (node.module or "").split(".")[0] in ROOMS[room], f"{path}:{node.lineno}"
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_everything_public_is_exported_on_purpose_and_documented(room):
+    module = importlib.import_module(f"loopwright.{room}")
+    assert module.__all__ == sorted(module.__all__)
+    public = {n for n, v in vars(module).items() if not n.startswith("_") and not inspect.ismodule(v)}
+    assert public - {"annotations"} == {n for n in module.__all__ if not inspect.ismodule(getattr(module, n))}
+    for name in module.__all__:
+        assert inspect.getdoc(getattr(module, name)) or name == "Array", f"{room}.{name} has no docstring"
+
+
+def test_every_parameter_of_a_block_is_described_and_has_bounds_or_a_unit_where_it_is_physical():
+    for name in loopwright.blocks.__all__:
+        cls = getattr(loopwright.blocks, name)
+        if inspect.isclass(cls) and issubclass(cls, loopwright.blocks.Value):
+            for parameter, spec in cls.parameter_specs.items():
+                assert spec.description, f"{name}.{parameter} has no description"
+
+
+def test_files_and_blocks_fit_on_a_screen():
+    for path in SOURCES:
+        assert len(path.read_text(encoding="utf-8").splitlines()) <= 480, path  # 400 is the guide
+
+
+@pytest.mark.parametrize("arguments", [["check", "."], ["format", "--check", "."]], ids=["lint", "format"])
+def test_ruff(arguments):
+    done = call(sys.executable, "-m", "ruff", *arguments)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_types(tmp_path):
+    (tmp_path / "loopwright").mkdir()
+    for room in ROOMS:
+        (tmp_path / "loopwright" / room).symlink_to(ROOT / room)
+    packages = [argument for room in ROOMS for argument in ("-p", f"loopwright.{room}")]
+    environment = {**os.environ, "MYPYPATH": str(tmp_path)}
+    done = call(sys.executable, "-m", "mypy", *packages, "--cache-dir", str(tmp_path / "cache"), env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_every_subpackage_is_listed_for_the_wheel():
+    setup = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+    folders = {str(p.parent.relative_to(ROOT)).replace(os.sep, ".") for p in SOURCES}
+    assert {f"loopwright.{f}" for f in folders} == set(setup["packages"])
+    assert importlib.metadata.version("loopwright")
+
+
+@pytest.mark.slow
+def test_the_built_wheel_imports_runs_and_holds_the_c_runtime(tmp_path):
+    copy = tmp_path / "source"
+    assert call("git", "clone", "-q", str(ROOT), str(copy)).returncode == 0
+    done = call(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(tmp_path), str(copy))
+    assert done.returncode == 0, done.stdout + done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    site = tmp_path / "site"
+    done = call(sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", str(site), str(wheel))
+    assert done.returncode == 0, done.stdout + done.stderr
+    script = (
+        "import loopwright.blocks, loopwright.fmus, loopwright.diagrams as d, sys; "
+        f"assert d.__file__.startswith({str(site)!r}), d.__file__; "
+        "run = d.experiments.path_following().diagram.simulate(0.1, progress=False); print(run['eta'][0, 0])"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(site), "LOOPWRIGHT_CACHE": str(tmp_path / "cache")}
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout) == pytest.approx(0.1, abs=1e-12)
+    for room in ROOMS:
+        assert (site / "loopwright" / room / "py.typed").is_file()
+
+
+def test_importing_changes_no_global_state():
+    script = """
+import sys, warnings, numpy, casadi, matplotlib
+def state():
+    return (list(warnings.filters), numpy.geterr(), numpy.get_printoptions(), {k: matplotlib.rcParams[k] for k in matplotlib.rcParams if k != "backend"},
+            [getattr(casadi, n, None) for n in ("GlobalOptions",)], casadi.GlobalOptions.getMaxNumDir())
+before = state()
+import loopwright.blocks, loopwright.fmus, loopwright.diagrams
+loopwright.diagrams.experiments.path_following().diagram.simulate(0.01, progress=False)
+assert state() == before
+late = [m for m in ("control", "matplotlib.pyplot", "scipy.integrate") if m in sys.modules]
+assert not late, late
+"""
+    done = call(sys.executable, "-c", script)
+    assert done.returncode == 0, done.stderr
+
+
+def blocks_of_code(text):
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+def test_the_readme_opens_with_a_closed_loop_in_ten_lines_that_runs():
+    first, *more = blocks_of_code((ROOT / "README.md").read_text(encoding="utf-8"))
+    lines = [line for line in first.splitlines() if line.strip()]
+    assert len(lines) <= 10
+    scope = {}
+    exec("\n".join([*lines[:-1], f"figure = {lines[-1]}"]), scope)
+    assert isinstance(scope["figure"], matplotlib.figure.Figure)
+    for snippet in more:
+        exec(snippet, scope)
+
+
+def test_the_notebooks_run():
+    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
+        notebook = nbformat.read(path, as_version=4)
+        NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(path.parent)}}).execute()
+        shown = [o for cell in notebook.cells for o in cell.get("outputs", [])]
+        assert any("image/png" in o.get("data", {}) for o in shown), path
+
+
+def test_doctests():
+    results = []
+    for path in SOURCES:
+        name = ".".join(("loopwright", *path.relative_to(ROOT).with_suffix("").parts)).removesuffix(".__init__")
+        if not name.endswith("__main__"):
+            results.append(doctest.testmod(importlib.import_module(name)))
+    assert sum(r.failed for r in results) == 0
+    assert sum(r.attempted for r in results) >= 5
+
+
+def test_equation_numbers_stand_in_the_code():
+    text = "\n".join(p.read_text(encoding="utf-8") for p in SOURCES)
+    missing = [n for n in range(1, 17) if f"({n})" not in text]
+    assert not missing
