@@ -752,7 +752,7 @@ def test_the_admittance_is_discretized_exactly(free):
         for force, row in zip(forces, got, strict=True):
             drive = force - desired + k * offset
             acceleration = (drive - d * e[1] - k * e[0]) / m
-            np.testing.assert_allclose(row, [*reference, *e, acceleration], rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(row, np.add(reference, [*e, acceleration]), rtol=1e-12, atol=1e-12)
             e = (phi @ [*e, drive])[:2]
 
 
