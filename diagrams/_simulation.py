@@ -28,7 +28,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..blocks._errors import LoopwrightError, NonFiniteError, OptionError, SimulationError
-from ..blocks._tracing import GUARDS, NEXT, bundle
+from ..blocks._symbols import bundle
+from ..blocks._tracing import GUARDS, NEXT
 from ._flat import FlatDiagram
 from ._run import Run
 from ._structure import join

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path as File
 from types import MappingProxyType
 from typing import Any
@@ -113,7 +112,6 @@ plant's friction only. ``friction_width``: w of plant and model, m/s. ``tool_mas
 """
 
 
-@cache
 def _gantry() -> File:
     return gantry.build()
 

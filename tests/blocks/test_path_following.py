@@ -727,12 +727,13 @@ def test_a_spring_presses_back_on_its_side_only(kind):
 
 def filtered(block, forces, T, method="exact", reference=(0.0, 0.0, 0.0), **inputs):
     """The path reference at every tick."""
-    state, out = np.zeros(2), []
+    given = all_inputs(block, force=0.0, reference=np.array(reference), **inputs)
+    made = trace(block, {name: np.shape(v) for name, v in given.items()}, sampled=True, method=method)
+    p, state, out = ca.DM(made.pack(block, T)), ca.DM.zeros(2), []
     for force in forces:
-        given = all_inputs(block, force=force, reference=np.array(reference), **inputs)
-        made = evaluate(block, state, T=T, method=method, **given)
-        out.append(made["path_reference"])
-        state = made[NEXT]
+        columns = [float(force) if name == "force" else v for name, v in given.items()]
+        path_reference, state, _ = made.function.call([0.0, state, *columns, p])
+        out.append(np.array(path_reference).ravel())
     return np.array(out)
 
 

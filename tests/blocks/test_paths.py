@@ -13,6 +13,7 @@ from casadi import ArrayInterface
 from loopwright.blocks import DefinitionError, ParameterError, PathDomainError, TraceError, parameter
 from loopwright.blocks._lookup import is_traced, jet, piecewise, wrap
 from loopwright.blocks._paths import UNLIMITED, Circle, CubicSpline, Ellipse, Line, Path
+from loopwright.blocks._paths_tables import _Contact
 from scipy.integrate import quad
 from scipy.interpolate import CubicSpline as Interpolant
 from scipy.interpolate import PPoly
@@ -366,13 +367,27 @@ def test_a_tabulated_reach_is_close_to_the_medial_axis_and_on_the_safe_side(cloc
 
 
 def test_contact_curvatures_are_exact_where_they_are_tabulated():
-    from loopwright.blocks._paths_tables import _Contact
-
     path = PlainEllipse(semi_axes=(A, B), center=(0.5, 0.5))
     theta = np.linspace(0.0, 2 * np.pi, 500)
     inverse = _Contact(path).inverse_reach(theta)
     np.testing.assert_allclose(1.0 / inverse[:, 0], PAPER.reach(theta)[0], rtol=1e-7)
     assert np.all(inverse[:, 1] == 1.0 / UNLIMITED)
+
+
+def test_contact_curvature_is_smooth_where_its_series_takes_over():
+    contact = _Contact(PAPER)
+    x, y = exact_ellipse(PAPER)
+    theta = 0.6
+    phi = theta + np.array([-1.0, 1.0])[:, None] * contact.near * np.array([0.03, 0.5, 0.99, 1.01, 3.0, 9.0]) / 0.21
+    found = contact.curvature(np.array([theta]), phi.reshape(1, -1), PAPER.sigma(phi.reshape(1, -1)))[0]
+    assert np.any(np.abs(found - PAPER.frame(theta).curvature) > 1e-4)
+    with mp.workdps(50):
+        t = mp.mpf(theta)
+        dx, dy = mp.diff(x, t), mp.diff(y, t)
+        for value, p in zip(found, phi.ravel(), strict=True):
+            d = x(mp.mpf(float(p))) - x(t), y(mp.mpf(float(p))) - y(t)
+            exact = 2 * (dx * d[1] - dy * d[0]) / mp.hypot(dx, dy) / (d[0] ** 2 + d[1] ** 2)
+            assert value == pytest.approx(float(exact), rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ["closed spline", "open spline", "bean", "three points, closed"])
@@ -474,6 +489,20 @@ def test_projection_takes_the_right_one_of_two_branches_beside_the_medial_axis()
                 expected = A * A * u / (A * A - B * B)  # foot point for v → 0
                 if abs(u) < 0.2201 and abs(v) < 1e-5:
                     assert path.sigma(theta)[0] - 0.5 == pytest.approx(expected, abs=20.0 * abs(v) + 1e-7)
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.0013, 0.0031, 0.0047])
+def test_projection_separates_two_minima_that_are_closer_than_the_samples(phase):
+    class Shifted(PlainEllipse):
+        def sigma(self, theta, order=0):
+            return super().sigma(theta + phase, order)
+
+    path = Shifted(semi_axes=(A, B))
+    for foot in (0.003, 0.005, 0.007):
+        u = (A * A - B * B) / A * np.cos(foot)
+        for v in (1e-8, -1e-8):
+            theta = path.project(np.array([u, v]))
+            assert path.sigma(theta)[1] == pytest.approx(np.sign(v) * B * np.sin(foot), abs=0.001 * B * foot)
 
 
 def test_the_ellipses_own_projection_agrees_with_the_general_one():
