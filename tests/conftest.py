@@ -2,8 +2,9 @@
 
 from functools import cache, lru_cache
 
-import oracle
 import pytest
+
+import oracle
 from loopwright.diagrams import experiments
 
 

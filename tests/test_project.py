@@ -12,13 +12,14 @@ import sys
 import tomllib
 from pathlib import Path
 
-import loopwright.blocks
-import loopwright.diagrams
-import loopwright.fmus
 import matplotlib
 import nbformat
 import pytest
 from nbclient import NotebookClient
+
+import loopwright.blocks
+import loopwright.diagrams
+import loopwright.fmus
 
 ROOT = Path(__file__).parent.parent
 ROOMS = {"blocks": set(), "fmus": {"blocks"}, "diagrams": {"blocks", "fmus"}}

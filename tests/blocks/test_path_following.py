@@ -13,6 +13,8 @@ import casadi as ca
 import mpmath as mp
 import numpy as np
 import pytest
+from scipy.linalg import expm
+
 from loopwright.blocks import (
     AdmittanceFilter,
     Block,
@@ -37,7 +39,6 @@ from loopwright.blocks import (
 from loopwright.blocks._tracing import GUARDS, NEXT, bundle, trace
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import gantry
-from scipy.linalg import expm
 
 STEP = mp.mpf(10) ** -15  # of differences: they are off by its square, 1e-30, and rounding leaves 1e-60/1e-30
 

@@ -10,14 +10,15 @@ import mpmath as mp
 import numpy as np
 import pytest
 from casadi import ArrayInterface
-from loopwright.blocks import DefinitionError, ParameterError, PathDomainError, TraceError, parameter
-from loopwright.blocks._lookup import is_traced, jet, piecewise, wrap
-from loopwright.blocks._paths import UNLIMITED, Circle, CubicSpline, Ellipse, Line, Path
-from loopwright.blocks._paths_tables import _Contact
 from scipy.integrate import quad
 from scipy.interpolate import CubicSpline as Interpolant
 from scipy.interpolate import PPoly
 from scipy.special import ellipeinc
+
+from loopwright.blocks import DefinitionError, ParameterError, PathDomainError, TraceError, parameter
+from loopwright.blocks._lookup import is_traced, jet, piecewise, wrap
+from loopwright.blocks._paths import UNLIMITED, Circle, CubicSpline, Ellipse, Line, Path
+from loopwright.blocks._paths_tables import _Contact
 
 
 class Bean(Path):

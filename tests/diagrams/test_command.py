@@ -9,6 +9,7 @@ import xml.etree.ElementTree as ET
 import matplotlib
 import numpy as np
 import pytest
+
 from loopwright.blocks import OptionError, PathDomainError
 from loopwright.diagrams import _cli, experiments
 from loopwright.diagrams._cli import main

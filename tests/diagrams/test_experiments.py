@@ -5,8 +5,9 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
-import oracle
 import pytest
+
+import oracle
 from loopwright.blocks import OptionError
 from loopwright.diagrams import experiments
 from loopwright.fmus import Fmu, gantry

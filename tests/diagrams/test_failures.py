@@ -4,6 +4,7 @@ import zipfile
 
 import numpy as np
 import pytest
+
 from loopwright.blocks import (
     Block,
     Constant,

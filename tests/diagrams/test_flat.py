@@ -3,6 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
+
 from loopwright.blocks import CubicSpline, Pulse
 from loopwright.diagrams import experiments
 from loopwright.fmus._compiler import compile_shared

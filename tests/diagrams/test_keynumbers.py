@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from loopwright.diagrams import experiments
 from loopwright.diagrams._keynumbers import DEFINITIONS, key_numbers
 

@@ -1,6 +1,7 @@
 """A cache of its own for all tests of FMUs, and exported FMUs."""
 
 import pytest
+
 from exported import Instance, mass_spring_damper
 from loopwright.fmus._build import build_fmu
 

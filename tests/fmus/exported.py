@@ -5,6 +5,7 @@ import fmpy
 import fmpy.fmi3
 import numpy as np
 import pytest
+
 from loopwright.fmus._spec import ModelSpec, Variable
 
 M, D, K = 2.0, 0.5, 10.0

@@ -16,8 +16,9 @@ import fmpy
 import fmpy.fmi3
 import numpy as np
 import pytest
-from exported import mass_spring_damper, pendulums, run
 from fmpy.validation import validate_fmu
+
+from exported import mass_spring_damper, pendulums, run
 from loopwright.blocks._errors import CompilerError, DefinitionError, FmuError, ParameterError, UnitError
 from loopwright.fmus import _build, _compiler
 from loopwright.fmus._build import build_fmu

@@ -7,10 +7,11 @@ import fmpy
 import fmpy.fmi3
 import numpy as np
 import pytest
-from exported import D, Instance, K, M, explosive, fails, mass_spring_damper, pendulums, run
-from loopwright.fmus._build import build_fmu
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+
+from exported import D, Instance, K, M, explosive, fails, mass_spring_damper, pendulums, run
+from loopwright.fmus._build import build_fmu
 
 
 def exact(t, x0, force=0.0):

@@ -66,7 +66,11 @@ def test_the_ports_are_those_of_the_experiments(file):
 
 def test_it_runs_in_fmpy_on_its_own_and_agrees_with_scipy(file):
     result = fmpy.simulate_fmu(
-        str(file), stop_time=0.5, output_interval=0.01, start_values={"motor_force": list(FORCE)}, output=["position", "velocity"]
+        str(file),
+        stop_time=0.5,
+        output_interval=0.01,
+        start_values={"motor_force": list(FORCE)},
+        output=["position", "velocity"],
     )
     t = result["time"]
     exact = solution(t)
@@ -95,7 +99,9 @@ def test_its_parameters_act_although_they_were_other_numbers_when_it_was_built(f
 def test_the_external_force_acts_like_the_motor_force(file):
     def position(motor, external):
         plant = Fmu(file, name="plant")
-        return Diagram("d", plant(motor_force=motor, external_force=external)).simulate(0.3, step=1e-3, progress=False)["position"]
+        return Diagram("d", plant(motor_force=motor, external_force=external)).simulate(0.3, step=1e-3, progress=False)[
+            "position"
+        ]
 
     assert np.array_equal(position(FORCE, (0, 0)), position((0, 0), FORCE))
 

@@ -3,6 +3,7 @@
 import math
 
 import pytest
+
 from loopwright.blocks._errors import UnitError
 from loopwright.blocks._units import Unit, describe_mismatch, parse_unit, rate_of, same_unit
 
