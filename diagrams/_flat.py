@@ -20,6 +20,7 @@ import numpy as np
 
 from ..blocks._errors import SampleTimeError
 from ..blocks._ports import Shape
+from ..blocks._symbols import size
 from ..blocks._tracing import GUARDS, NEXT
 from ._check import Checked
 from ._order import Step, evaluation_order
