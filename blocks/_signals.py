@@ -24,6 +24,8 @@ recorder: ContextVar[list[Any] | None] = ContextVar("loopwright_calls", default=
 class Wireable:
     """What can stand at the source end of a wire: a signal, a call, a block with one output."""
 
+    __array_ufunc__ = None  # NumPy leaves its operators to ours: array * signal is a Gain
+
     def _signal(self) -> Signal:
         raise NotImplementedError
 
@@ -47,6 +49,11 @@ class Wireable:
 
     def __rmul__(self, other: Any) -> Signal:
         return _product(self, other)
+
+    def __truediv__(self, other: Any) -> Signal:
+        if isinstance(other, Wireable):
+            raise WiringError("a signal can't be divided by a signal; write a Block whose equation does it.")
+        return self * (1.0 / np.asarray(other, dtype=float))
 
     def __getitem__(self, index: int | slice) -> Signal:
         return self._signal()[index]
@@ -263,6 +270,6 @@ def _product(left: Any, right: Any) -> Signal:
     if isinstance(right, Wireable):
         name = f"{_operand(left, 'constant')}_times_{_operand(right, 'constant')}"
         return hinted(Product(), name)(left, right)._signal()
-    if not isinstance(right, int | float | np.number):
-        raise ShapeError("a signal is multiplied by a number or another signal; for a matrix use Gain(gain=…).")
+    if not isinstance(right, int | float | np.number | np.ndarray) or np.ndim(right) > 1:
+        raise ShapeError("a signal is multiplied by a number, a vector or another signal; for a matrix use Gain(gain=…).")
     return hinted(Gain(gain=right), f"gain_of_{_operand(left, 'constant')}")(left)._signal()

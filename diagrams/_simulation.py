@@ -94,7 +94,7 @@ class _Loop:
     """The state of a run, and its loop."""
 
     def __init__(self, flat: FlatDiagram, plants: list[tuple[str, Any]], recorded: _Recorded):
-        self.flat, self.plants, self.recorded = flat, plants, recorded
+        self.flat, self.plants, self.recorded, self.done = flat, plants, recorded, 0
         self.t = np.zeros(1)
         self.x = flat.x0.copy()
         self.x_next = np.zeros_like(self.x)
@@ -153,7 +153,6 @@ class _Loop:
         h, period, last = float(self.flat.base), len(evaluate), len(times) - 1
         single = evaluate[0] if period == 1 else None
         only = plants[0].step if len(plants) == 1 else None
-        self.done = 0
         k = 0
         while True:
             end = min(last, k + _CHUNK)

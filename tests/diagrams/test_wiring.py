@@ -379,6 +379,17 @@ def test_two_rates_hold_between_their_ticks_and_never_drift():
     assert np.array_equal(run.t, k / 10000)
 
 
+def test_signals_in_sums_products_and_quotients():
+    a, b = Constant(value=(6.0, 8.0), name="a"), Constant(value=(1.0, 2.0), name="b")
+    y = (-(a - b) * b + 2 * a / 4 + np.array([10.0, 20.0]) - np.ones(2) * a[1]).named("y")
+    run = Diagram("d", y).simulate(0.1, step=0.1, progress=False)
+    assert run["y"][-1].tolist() == [0.0, 4.0]
+    with pytest.raises(WiringError, match="can't be divided by a signal"):
+        _ = a / b
+    with pytest.raises(ShapeError, match=r"for a matrix use Gain\(gain=…\)"):
+        _ = a.y * np.eye(2)
+
+
 def test_a_change_at_t0_acts_at_the_first_tick_at_or_after_t0():
     run = Diagram("d", Step(times=(0.3, 0.65), values=(1, 2)).y.named("y")).simulate(0.8, step=0.1, progress=False)
     assert run["y"].tolist() == [0, 0, 0, 1, 1, 1, 1, 2, 2]
