@@ -118,29 +118,28 @@ def invert(path: Path, s: np.ndarray) -> np.ndarray:
 def nearest(path: Path, y: np.ndarray) -> float:
     """Return the parameter of the point of the path nearest to y, among all of it.
 
-    Every local minimum of the sampled distance that may be the least is resampled twice, 16 times as fine, then
-    polished by Newton steps within its bracket; the best of all is taken.
+    Around every dip of the sampled distance that may be the least, three cells to both sides are resampled 16 times as
+    fine, twice: two minima may share a cell, as they do near a cusp of the evolute. What is then a dip is polished by
+    Newton steps within its bracket, and the best of all is taken.
     """
     if not np.all(np.isfinite(y)):
         return float("nan")
     theta, lengths = path.sampling
     squared = np.sum((path.sampled - y[:, None]) ** 2, axis=0)
     bound = (np.sqrt(np.min(squared)) + np.max(np.diff(lengths))) ** 2
+    ends = [theta[0], theta[-1]] if path.period is None else []
     if path.period is not None:
-        theta, squared = np.append(theta[-2] - path.period, theta), np.append(squared[-2], squared)
-        ends: list[float] = []
-    else:
-        theta, squared = _padded(theta, theta[0], theta[-1]), _padded(squared, np.inf, np.inf)
-        ends = [theta[0], theta[-1]]
-    i = 1 + np.flatnonzero(_dips(squared) & (squared[1:-1] <= bound))
-    low, high = theta[i - 1], theta[i + 1]
-    for _ in range(2):
-        fine = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 33)
+        theta = np.concatenate([theta[-4:-1] - path.period, theta, theta[1:4] + path.period])
+        squared = np.concatenate([squared[-4:-1], squared, squared[1:4]])
+    i = np.flatnonzero(_dips(squared) & (squared <= bound))
+    low, high = theta[np.maximum(i - 3, 0)], theta[np.minimum(i + 3, len(theta) - 1)]
+    for margin in (3, 1):
+        fine = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, 97)
         d = np.sum((path.sigma(fine) - y[:, None, None]) ** 2, axis=0)
-        row, column = np.nonzero(_dips(_padded(d, np.inf, np.inf)))  # the ends may be the path's own
+        row, column = np.nonzero(_dips(d))
         best = np.argsort(d[row, column], kind="stable")[:_MOST_MINIMA]
         row, column = row[best], column[best]
-        low, high = fine[row, np.maximum(column - 1, 0)], fine[row, np.minimum(column + 1, 32)]
+        low, high = fine[row, np.maximum(column - margin, 0)], fine[row, np.minimum(column + margin, 96)]
     candidates = polish(path, y, low, high)
     for end in ends:
         candidates = np.where(np.abs(candidates - end) <= 1e-15 * (theta[-1] - theta[0]), end, candidates)
@@ -149,15 +148,10 @@ def nearest(path: Path, y: np.ndarray) -> float:
     return float(candidates[np.argmin(distance)])
 
 
-def _padded(values: np.ndarray, before: float, after: float) -> np.ndarray:
-    """Return ``values`` with one more number at both ends of the last axis."""
-    widths = [(0, 0)] * (values.ndim - 1) + [(1, 1)]
-    return np.pad(values, widths, constant_values=(before, after))
-
-
 def _dips(values: np.ndarray) -> np.ndarray:
-    """Say which values, but the first and the last of the last axis, are no larger than both neighbours."""
-    dips: np.ndarray = (values[..., 1:-1] <= values[..., :-2]) & (values[..., 1:-1] <= values[..., 2:])
+    """Say which values are no larger than their neighbours along the last axis."""
+    padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(1, 1)], constant_values=np.inf)
+    dips: np.ndarray = (values <= padded[..., :-2]) & (values <= padded[..., 2:])
     return dips
 
 
