@@ -271,5 +271,7 @@ def _product(left: Any, right: Any) -> Signal:
         name = f"{_operand(left, 'constant')}_times_{_operand(right, 'constant')}"
         return hinted(Product(), name)(left, right)._signal()
     if not isinstance(right, int | float | np.number | np.ndarray) or np.ndim(right) > 1:
-        raise ShapeError("a signal is multiplied by a number, a vector or another signal; for a matrix use Gain(gain=…).")
+        raise ShapeError(
+            "a signal is multiplied by a number, a vector or another signal; for a matrix use Gain(gain=…)."
+        )
     return hinted(Gain(gain=right), f"gain_of_{_operand(left, 'constant')}")(left)._signal()

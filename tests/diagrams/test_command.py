@@ -13,7 +13,7 @@ import pytest
 from loopwright.blocks import OptionError, PathDomainError
 from loopwright.diagrams import _cli, experiments
 from loopwright.diagrams._cli import main
-from loopwright.diagrams._figures import plot_experiment, plot_path, save
+from loopwright.diagrams._figures import STYLE, plot_experiment, plot_path, save
 from loopwright.diagrams._keynumbers import DEFINITIONS, key_numbers
 
 HEADER = (
@@ -82,6 +82,7 @@ def test_figures_are_pictures_and_reproducible(done, tmp_path):
 
 def test_drawing_leaves_matplotlib_alone(done):
     _, experiment, run = done
+    assert all(matplotlib.rcParams[name] == matplotlib.rcParamsOrig[name] for name in STYLE)  # after the command, too
     before = dict(matplotlib.rcParams)
     figure = run.plot("eta", "v_par")
     plot_path(experiment, run)
@@ -117,6 +118,13 @@ def test_options_change_the_run(tmp_path, capsys):
     content = json.loads((tmp_path / "A.json").read_text())
     assert content["peak_motor_force_y"] == 300.0
     assert content["peak_motor_force_z"] == 250.0
+
+
+def test_what_never_settles_is_null(tmp_path, capsys):
+    assert main(["run", "A", "--out", str(tmp_path), "--option", "motor_force_limit=5"]) == 0
+    row = next(line for line in capsys.readouterr().out.splitlines() if "settling_par" in line)
+    assert row.split() == ["settling_par", "s", "never"]
+    assert json.loads((tmp_path / "A.json").read_text(), parse_constant=finite)["settling_par"] is None
 
 
 @pytest.mark.parametrize(

@@ -74,6 +74,16 @@ def test_step_responses_of_b(numbers, side, impedance):
     assert numbers["B"][f"settling_{side}"] == pytest.approx(settling, abs=2e-3)
 
 
+def test_the_first_step_is_what_counts(runs, numbers):
+    experiment, run = runs["B"]
+    data = run.data.copy()
+    data[7000:, run.layout.slices["controller.transverse_transform.eta"]] = 0.0  # all but the first window
+    found = key_numbers(experiment, replace(run, data=data))
+    assert found["settling_par"] == numbers["B"]["settling_par"]
+    assert found["overshoot_par"] == numbers["B"]["overshoot_par"]
+    assert found["offset_par"] == pytest.approx(-0.3)
+
+
 def test_offsets_of_b(numbers):
     assert numbers["B"]["offset_par"] == pytest.approx(-2.0 / 10.0, rel=1e-3)
     assert numbers["B"]["offset_perp"] == pytest.approx(-5.0 / 200.0, rel=1e-3)
