@@ -3,11 +3,9 @@
 At tick k, t = k · base exactly:
 
 1. The outputs of the FMUs are those at the end of their last step (at k = 0, of initialization): a co-simulation FMU
-has
-   no feedthrough between communication points (FMI 3.0, Step Mode).
+   has no feedthrough between communication points (FMI 3.0, Step Mode).
 2. All blocks are evaluated once, each port after what it depends on: `FlatDiagram`. A sampled subsystem acts in the
-ticks
-   of its own rate; between them its outputs are held.
+   ticks of its own rate; between them its outputs are held.
 3. Everything is recorded.
 4. The inputs of the FMUs are set and held, and every FMU steps to tick k + 1; the blocks' next states take effect.
 

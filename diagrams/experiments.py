@@ -116,6 +116,11 @@ def _gantry() -> File:
     return gantry.build()
 
 
+def _internal_step(width: float) -> float:
+    """Return a step that resolves the friction's sign change: its rate is F_c/(M w), w its width."""
+    return float(gantry.INTERNAL_STEP * min(1.0, width / DEFAULTS["friction_width"]))
+
+
 def _options(letter: str, given: Mapping[str, Any], **own: Any) -> dict[str, Any]:
     """Merge options with their defaults and check them."""
     known = {**DEFAULTS, **own}
@@ -182,6 +187,8 @@ def _build(
     for name in ("coulomb_scale", "viscous_scale", "friction_width"):
         if options[name] != DEFAULTS[name] or name in plant.description.variables:
             values[name] = options[name]
+    if options["plant"] is None:
+        values["internal_step"] = _internal_step(options["friction_width"])
     plant = plant.replace(name="plant", start={**values, **plant.start} if options["plant"] is not None else values)
     rig = Rig(
         tool_mass=options["tool_mass"],

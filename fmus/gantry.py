@@ -22,8 +22,8 @@ from ..blocks._ports import Input, Output, State
 from ..blocks._values import Array, parameter
 from ._export import build as _build
 
-INTERNAL_STEP = 1.0 / 10000.0
-"""Start value of the FMU's internal Runge-Kutta step in s: ten per millisecond."""
+INTERNAL_STEP = 1.0 / 5000.0
+"""Start value of the FMU's internal Runge-Kutta step in s, for the friction width of 0.01 m/s: five per millisecond."""
 
 
 class Gantry(PlanarModel):
