@@ -48,8 +48,8 @@ static const char *const lw_mode_names[] = {"Instantiated", "Initialization Mode
 
 static bool lw_in_mode(lw_instance *self, const char *function, lw_mode expected) {
     if (self->s.mode == (int32_t)expected) return true;
-    return lw_fail(self, "%s was called in state %s, expected %s. Call the functions in the order of FMI 3.0, 2.3 and 4.2, "
-                   "or reset the FMU.", function, lw_mode_names[self->s.mode], lw_mode_names[expected]);
+    return lw_fail(self, "%s was called in state %s, expected %s. Call the functions in the order of " LW_ORDER
+                   ", or reset the FMU.", function, lw_mode_names[self->s.mode], lw_mode_names[expected]);
 }
 
 /* ---- equations ---- */
@@ -194,7 +194,7 @@ static bool lw_get(lw_instance *self, const char *function, const uint32_t *refe
         lw_kind kind = variable->kind;
         if (self->s.mode == LW_INSTANTIATED && (kind == LW_OUTPUT || kind == LW_DERIVATIVE))
             return lw_fail(self, "%s: %s is calculated, and has no value before initialization. Call "
-                           "fmi3EnterInitializationMode first.", function, variable->name);
+                           LW_API "EnterInitializationMode first.", function, variable->name);
         if (kind == LW_OUTPUT && !lw_update_outputs(self)) return false;
         if (kind == LW_DERIVATIVE && !lw_update_derivatives(self)) return false;
         memcpy(values, self->s.values + variable->first, variable->size * sizeof(double));
@@ -206,12 +206,12 @@ static bool lw_get(lw_instance *self, const char *function, const uint32_t *refe
 
 /* May it be set now (FMI 3.0, 2.3 and 4.2)? NULL, or why not. */
 static const char *lw_why_not_set(lw_mode mode, lw_kind kind) {
-    if (kind == LW_TIME) return "is the independent variable; fmi3DoStep advances it";
+    if (kind == LW_TIME) return "is the independent variable; " LW_API "DoStep advances it";
     if (kind == LW_OUTPUT || kind == LW_DERIVATIVE) return "is calculated";
     if (mode == LW_TERMINATED) return "can't be set in state Terminated; reset the FMU, or set an FMU state first";
     if (mode != LW_STEPPING) return NULL;
-    if (kind == LW_FIXED) return "is a fixed parameter; set it before fmi3ExitInitializationMode";
-    if (kind == LW_STATE) return "is a state; set its start value before fmi3ExitInitializationMode";
+    if (kind == LW_FIXED) return "is a fixed parameter; set it before " LW_API "ExitInitializationMode";
+    if (kind == LW_STATE) return "is a state; set its start value before " LW_API "ExitInitializationMode";
     return NULL;
 }
 
@@ -338,5 +338,5 @@ static bool lw_accept_state(lw_instance *self, const char *function, const lw_st
         self->s = *state;
         return true;
     }
-    return lw_fail(self, "%s: this is no state of this FMU. Give one that fmi3GetFMUState or fmi3DeserializeFMUState made.", function);
+    return lw_fail(self, "%s: this is no state of this FMU. Give one that it has made itself.", function);
 }
