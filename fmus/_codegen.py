@@ -173,7 +173,9 @@ def _starts(entries: Iterable[Entry]) -> str:
     return "static const double lw_start_values[] = {\n    " + ",\n    ".join(lines) + "\n};\n"
 
 
-def _dimensions(spec: ModelSpec, token: str, functions: Sequence[ca.Function], derivatives: bool, n: int, fmi: int) -> str:
+def _dimensions(
+    spec: ModelSpec, token: str, functions: Sequence[ca.Function], derivatives: bool, n: int, fmi: int
+) -> str:
     groups = {"P": spec.parameters, "U": spec.inputs, "X": spec.states, "Y": spec.outputs}
     lines = [f'#define LW_MODEL_NAME "{spec.name}"', f'#define LW_TOKEN "{token}"']
     lines += [f'#define LW_API "fmi{fmi}"', f'#define LW_ORDER "{_ORDER[fmi]}"']
