@@ -15,13 +15,19 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
 
 from ..blocks._errors import FmuError
 from ._codegen import generate, runtime
 from ._compiler import (
     SUFFIXES,
+    TARGETS,
     Compiler,
     cache_folder,
     check_platform,
@@ -31,18 +37,42 @@ from ._compiler import (
     native_platform,
 )
 from ._description import build_description, model_description, package_version
+from ._description2 import model_description2
+from ._documentation import index_html
+from ._scalars import scalarized
 from ._spec import ModelSpec
 
 _TOKEN = "{instantiation-token}"
 _DATE = (1980, 1, 1, 0, 0, 0)
+# Folders of binaries in FMI 2.0 (2.3.1), where they differ from FMI 3.0's platform tuples.
+_FOLDERS2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What an FMU is built as, beside its model.
+
+    Parameters
+    ----------
+    fmi : {3, 2}
+        Version of FMI.
+    platforms : tuple of str
+        FMI 3.0 platform tuples.
+    documentation : str
+        Text of the documentation.
+    """
+
+    fmi: int
+    platforms: tuple[str, ...]
+    documentation: str = ""
 
 
 @lru_cache(maxsize=1)
 def fmi_headers() -> tuple[Path, str]:
-    """Find the folder of the FMI 3.0 header files, which FMPy brings, and its version."""
+    """Find the folder of FMI's header files, which FMPy brings, and its version."""
     spec = importlib.util.find_spec("fmpy")
     folder = Path(spec.origin).parent / "c-code" if spec is not None and spec.origin is not None else None
-    if folder is None or not (folder / "fmi3Functions.h").is_file():
+    if folder is None or not all((folder / f"fmi{v}Functions.h").is_file() for v in (2, 3)):
         raise FmuError(
             f"FMI's header files are not in {folder}. Install FMPy anew: pip install --force-reinstall fmpy."
         )
@@ -57,28 +87,32 @@ def _hash(*parts: str) -> str:
     return digest.hexdigest()
 
 
-def _spec_parts(spec: ModelSpec) -> list[str]:
-    groups = (spec.parameters, spec.inputs, spec.states, spec.outputs)
-    variables = [
-        repr([getattr(v, f) for f in v.__dataclass_fields__ if f != "start"] + v.flat_start) for g in groups for v in g
-    ]
-    sizes = repr([len(g) for g in groups])
-    experiment = repr((float(spec.internal_step), float(spec.stop_time), float(spec.step_size)))
-    functions = [spec.derivative.serialize(), spec.output.serialize()]
-    return [spec.name, spec.description, sizes, *variables, experiment, *functions]
+def _text(value: Any) -> str:
+    """Write a model down, all of it, to be hashed."""
+    if isinstance(value, ca.Function):
+        return str(value.serialize())
+    if is_dataclass(value):
+        return repr([(f.name, _text(getattr(value, f.name))) for f in fields(value)])
+    if isinstance(value, (tuple, list)):
+        return repr([_text(item) for item in value])
+    if isinstance(value, (np.ndarray, np.generic)):
+        return repr((np.shape(value), value.tolist()))
+    return repr(value)
 
 
-def _code_parts() -> list[str]:
+def _code_parts(fmi: int) -> list[str]:
     """Give the text of what writes the files, so that a change of it (while developing) builds anew."""
     folder = Path(__file__).parent
-    modules = [(folder / name).read_text(encoding="utf-8") for name in ("_codegen.py", "_description.py", "_build.py")]
-    return [package_version(), *(text for _, text in sorted(runtime().items())), *modules]
+    names = ("_codegen.py", "_description.py", "_description2.py", "_documentation.py", "_scalars.py", "_build.py")
+    modules = [(folder / name).read_text(encoding="utf-8") for name in names]
+    return [package_version(), *(text for _, text in sorted(runtime(fmi).items())), *modules]
 
 
-def build_key(spec: ModelSpec, platforms: Iterable[str], compiler: Compiler) -> str:
+def build_key(spec: ModelSpec, options: Options, compiler: Compiler) -> str:
     """Hash all that goes into a build; nothing is generated for it."""
-    toolchain = [f"{p} {flags(compiler, p)}" for p in platforms]
-    return _hash(*_spec_parts(spec), *_code_parts(), compiler.identity, fmi_headers()[1], *toolchain)
+    toolchain = [f"{p} {flags(compiler, p)}" for p in options.platforms]
+    made = [_text(spec), _text(options), *_code_parts(options.fmi)]
+    return _hash(*made, compiler.identity, fmi_headers()[1], *toolchain)
 
 
 def _zip(files: Mapping[str, bytes]) -> bytes:
@@ -94,27 +128,35 @@ def _zip(files: Mapping[str, bytes]) -> bytes:
     return buffer.getvalue()
 
 
-def _binary(spec: ModelSpec, platform: str, sources: Mapping[str, str], compiler: Compiler) -> tuple[str, bytes]:
+def _binary(
+    spec: ModelSpec, fmi: int, platform: str, sources: Mapping[str, str], compiler: Compiler
+) -> dict[str, bytes]:
     suffix = SUFFIXES.get(platform.rpartition("-")[2], ".so")
     with tempfile.TemporaryDirectory(prefix="loopwright-") as folder:
         library = Path(folder) / f"{spec.name}{suffix}"
         headers = fmi_headers()[0]
         compile_shared(sources, library, platform=platform, compiled=["model.c"], include=[headers], compiler=compiler)
-        return f"binaries/{platform}/{library.name}", library.read_bytes()
+        name = _FOLDERS2.get(platform, platform) if fmi == 2 else platform
+        return {f"binaries/{name}/{library.name}": library.read_bytes()}
 
 
-def _archive(spec: ModelSpec, platforms: Iterable[str], compiler: Compiler, notify: Callable[[str], None]) -> bytes:
-    model, derivatives = generate(spec, _TOKEN)
-    description = model_description(spec, _TOKEN, derivatives=derivatives)
-    token = _hash(description, model, *runtime().values())[:32]
-    sources = {**runtime(), "model.c": model.replace(_TOKEN, token)}
-    files = {"modelDescription.xml": description.replace(_TOKEN, token).encode()}
-    files["sources/buildDescription.xml"] = build_description(spec).encode()
+def _archive(spec: ModelSpec, options: Options, compiler: Compiler, notify: Callable[[str], None]) -> bytes:
+    fmi = options.fmi
+    model, derivatives = generate(spec, _TOKEN, fmi)
+    describe = model_description2 if fmi == 2 else model_description
+    description = describe(spec, _TOKEN, derivatives=derivatives)
+    token = _hash(description, model, *runtime(fmi).values())[:32]
+    sources = {**runtime(fmi), "model.c": model.replace(_TOKEN, token)}
+    files = {
+        "modelDescription.xml": description.replace(_TOKEN, token).encode(),
+        "documentation/index.html": index_html(spec, options.documentation, fmi=fmi).encode(),
+    }
+    if fmi == 3:
+        files["sources/buildDescription.xml"] = build_description(spec).encode()
     files |= {f"sources/{name}": text.encode() for name, text in sources.items()}
-    for platform in platforms:
+    for platform in options.platforms:
         notify(f"compiling {spec.name} for {platform} (the first build on a machine takes longer)")
-        name, data = _binary(spec, platform, sources, compiler)
-        files[name] = data
+        files |= _binary(spec, fmi, platform, sources, compiler)
     return _zip(files)
 
 
@@ -140,10 +182,15 @@ def build_fmu(
     spec: ModelSpec,
     out: Path | str | None = None,
     *,
+    fmi: int = 3,
+    arrays: bool = True,
     platform: str | Iterable[str] | None = None,
+    documentation: str = "",
     notify: Callable[[str], None] | None = None,
 ) -> Path:
-    """Build an FMI 3.0 Co-Simulation FMU, or find it in the cache.
+    """Build an FMU, or find it in the cache.
+
+    Same input, same bytes, on every machine with the same version of the compiler's package.
 
     Parameters
     ----------
@@ -151,8 +198,15 @@ def build_fmu(
         The model.
     out : path, optional
         File to copy it to; a folder gets ``<name>.fmu``. Without it, the file in the cache is returned.
+    fmi : {3, 2}
+        FMI 3.0 or FMI 2.0.
+    arrays : bool
+        Whether vectors and matrices are arrays of FMI 3.0; else, and in FMI 2.0 always, each element is a scalar
+        variable of its own: ``s[1]``, ``s[2]``, ``m[1,2]``.
     platform : str or iterable of str, optional
-        FMI 3.0 platform tuples (2.5.1.4) to build binaries for; native if not given.
+        FMI 3.0 platform tuples (2.5.1.4) to build binaries for, or "all" of them; native if not given.
+    documentation : str
+        Plain text for ``documentation/index.html``, beside the equations and the table of variables.
     notify : callable, optional
         Is told what takes long, in one line.
 
@@ -166,15 +220,20 @@ def build_fmu(
     CompilerError
         If there is no C compiler, or it fails.
     FmuError
-        If the cache or ``out`` can't be written.
+        If ``fmi`` is neither, or the cache or ``out`` can't be written.
     """
-    platforms = sorted({platform} if isinstance(platform, str) else set(platform or (native_platform(),)))
+    if fmi not in (2, 3):
+        raise FmuError(f"found fmi={fmi!r}, expected 3 (FMI 3.0) or 2 (FMI 2.0). Give one of them.")
+    chosen = TARGETS if platform == "all" else (platform,) if isinstance(platform, str) else platform
+    platforms = tuple(sorted(set(chosen or (native_platform(),))))
+    spec = spec if arrays and fmi == 3 else scalarized(spec)
+    options = Options(fmi, platforms, documentation)
     compiler = find_compiler()
     for name in platforms:
         check_platform(compiler, name)
-    cached = cache_folder() / "fmus" / build_key(spec, platforms, compiler)[:32] / f"{spec.name}.fmu"
+    cached = cache_folder() / "fmus" / build_key(spec, options, compiler)[:32] / f"{spec.name}.fmu"
     if not cached.is_file():
-        write_atomically(cached, _archive(spec, platforms, compiler, notify or (lambda message: None)))
+        write_atomically(cached, _archive(spec, options, compiler, notify or (lambda message: None)))
     if out is None:
         return cached
     out = Path(out)

@@ -140,10 +140,10 @@ def test_second_build_is_found(msd, monkeypatch, tmp_path):
 
 
 def test_key_depends_on_everything(msd):
-    compiler, platforms = find_compiler(), [native_platform()]
+    compiler, native = find_compiler(), _build.Options(3, (native_platform(),))
 
     def key(**changes):
-        return _build.build_key(mass_spring_damper(**changes), platforms, compiler)
+        return _build.build_key(mass_spring_damper(**changes), native, compiler)
 
     spec = mass_spring_damper()
     faster = Variable("force", "input", unit="N", start=1.0)
@@ -153,10 +153,12 @@ def test_key_depends_on_everything(msd):
         key(description=""),
         key(inputs=(faster,)),
         key(output=ca.Function("g", spec.derivative.sx_in(), [spec.derivative(*spec.derivative.sx_in())[0]])),
-        _build.build_key(spec, ["aarch64-linux"], compiler),
-        _build.build_key(spec, platforms, _compiler.Compiler(compiler.command, "another", zig=True)),
+        _build.build_key(spec, _build.Options(3, ("aarch64-linux",)), compiler),
+        _build.build_key(spec, _build.Options(2, (native_platform(),)), compiler),
+        _build.build_key(spec, _build.Options(3, (native_platform(),), "text"), compiler),
+        _build.build_key(spec, native, _compiler.Compiler(compiler.command, "another", zig=True)),
     }
-    assert len(keys) == 7
+    assert len(keys) == 9
     assert key() == key()
 
 
@@ -231,7 +233,7 @@ def test_a_failed_build_leaves_nothing(tmp_path, monkeypatch, cache):
     monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(cache / "zig"))
     monkeypatch.setenv("ZIG_LOCAL_CACHE_DIR", str(cache / "zig"))
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "c"))
-    monkeypatch.setattr(_build, "runtime", lambda: runtime() | {"core.c": "#error broken"})
+    monkeypatch.setattr(_build, "runtime", lambda fmi: runtime(fmi) | {"core.c": "#error broken"})
     with pytest.raises(CompilerError, match="broken"):
         build_fmu(mass_spring_damper(), tmp_path / "out.fmu")
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == []

@@ -1,0 +1,151 @@
+"""``documentation/index.html`` of an FMU: what it is, its equations, its variables. One file that needs no other."""
+
+from __future__ import annotations
+
+import inspect
+import textwrap
+from collections.abc import Iterable, Sequence
+from html import escape
+
+import numpy as np
+
+from ..blocks._block import Block
+from ._codegen import Entry, layout
+from ._printing import equations, number
+from ._scalars import scalarized
+from ._spec import ModelSpec, Variable
+
+_STYLE = """
+:root { color-scheme: light dark; }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; }
+pre { overflow-x: auto; padding: 0.75rem 1rem; border: 1px solid #8886; border-radius: 0.3rem; }
+pre.text { white-space: pre-wrap; border: 0; padding: 0; font: inherit; }
+table { border-collapse: collapse; width: 100%; }
+caption { text-align: left; padding-bottom: 0.5rem; }
+th, td { text-align: left; vertical-align: top; padding: 0.3rem 0.75rem 0.3rem 0; border-bottom: 1px solid #8886; }
+code, pre { font-family: ui-monospace, monospace; font-size: 0.9em; }
+"""
+_COLUMNS = ("Name", "Causality", "Variability", "Unit", "Start", "Min", "Max", "Description")
+_CAUSALITY = {"time": "independent", "fixed": "parameter", "tunable": "parameter", "input": "input"}
+_EQUATIONS = ("derivative", "output", "indicators", "jump")
+_MOST = 12  # numbers of a start value that are listed
+
+
+def block_text(block: Block) -> str:
+    """Give the text of a block's documentation: its docstring, and the source of its equations where there is one."""
+    parts = [inspect.cleandoc(type(block).__doc__ or "")]
+    for name in _EQUATIONS:
+        method = getattr(type(block), name, None)
+        if method is None or method is getattr(Block, name, None):
+            continue
+        try:
+            parts.append(textwrap.dedent(inspect.getsource(method)))
+        except (OSError, TypeError):  # typed at a prompt: there is no file to read
+            continue
+    return "\n\n".join(part.strip() for part in parts if part.strip())
+
+
+def _names(variables: Iterable[Variable]) -> list[str]:
+    return [v.name for v in variables]
+
+
+def _equations(spec: ModelSpec) -> list[str]:
+    flat = scalarized(spec)
+    continuous = [v.name for v in flat.states if v.variability != "discrete"]
+    knowns = [["time"], _names(flat.states), _names(flat.inputs), _names(flat.parameters)]
+    found = []
+    for f, unknowns in ((spec.derivative, [f"der({n})" for n in continuous]), (spec.output, _names(flat.outputs))):
+        if not unknowns:
+            continue
+        lines = equations(f, knowns, unknowns)
+        if not lines:
+            return []
+        found.append("\n".join(lines))
+    return found
+
+
+def _start(variable: Variable) -> str:
+    values = np.asarray(variable.flat_start)
+    if values.size > 1 and (values == values[0]).all():
+        return f"all {number(values[0])}"
+    more = ", …" if values.size > _MOST else ""
+    return ", ".join(number(v) for v in values[:_MOST]) + more
+
+
+def _row(e: Entry) -> str:
+    v = e.variable
+    shape = f" ({' × '.join(map(str, v.shape))})" if v.shape else ""
+    cells = [
+        _CAUSALITY.get(e.kind, "output" if e.is_output else "local"),
+        "continuous" if e.kind in ("time", "derivative") else v.variability,
+        v.unit or "",
+        _start(v),
+        "" if v.minimum is None else number(v.minimum),
+        "" if v.maximum is None else number(v.maximum),
+        v.description,
+    ]
+    inner = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
+    return f'<tr><th scope="row"><code>{escape(e.name)}</code>{escape(shape)}</th>{inner}</tr>'
+
+
+def _section(title: str, body: Sequence[str]) -> list[str]:
+    return [f"<h2>{escape(title)}</h2>", *body] if body else []
+
+
+def index_html(spec: ModelSpec, text: str = "", *, fmi: int = 3) -> str:
+    """Write ``documentation/index.html`` (FMI 3.0, 2.5.1; FMI 2.0, 2.3).
+
+    Parameters
+    ----------
+    spec : ModelSpec
+        The model, as it is exported: with arrays or without.
+    text : str
+        Plain text of the author, such as a docstring; shown as it is.
+    fmi : {3, 2}
+        Version of FMI.
+
+    Returns
+    -------
+    str
+        HTML 5 that refers to nothing outside.
+    """
+    rows = [_row(e) for e in layout(spec)]
+    head = "".join(f'<th scope="col">{name}</th>' for name in _COLUMNS)
+    note = "Arrays are listed row by row." if fmi == 3 else "Elements of arrays count from 1."
+    traced = _equations(spec)
+    if traced:
+        printed = [f"<pre>{escape(block)}</pre>" for block in traced]
+        printed.append("<p>As they are compiled; <code>where(c, a, 0)</code> is a where c holds, else 0.</p>")
+    else:
+        printed = ["<p>Too long to print, or with tables; <code>sources/model.c</code> has them.</p>"]
+    lines = [
+        "<!DOCTYPE html>",
+        '<html lang="en">',
+        "<head>",
+        '<meta charset="utf-8"/>',
+        '<meta name="viewport" content="width=device-width, initial-scale=1"/>',
+        f"<title>{escape(spec.name)}</title>",
+        f"<style>{_STYLE}</style>",
+        "</head>",
+        "<body>",
+        f"<h1>{escape(spec.name)}</h1>",
+        *([f"<p>{escape(spec.description)}</p>"] if spec.description else []),
+        f"<p>An FMU of FMI {fmi}.0. It needs no other software to run.</p>",
+        *_section("Description", [f'<pre class="text">{escape(text.strip())}</pre>'] if text.strip() else []),
+        *_section("Equations", printed),
+        *_section(
+            "Variables",
+            [
+                "<table>",
+                f"<caption>{note}</caption>",
+                f"<thead><tr>{head}</tr></thead>",
+                "<tbody>",
+                *rows,
+                "</tbody>",
+                "</table>",
+            ],
+        ),
+        "</body>",
+        "</html>",
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,128 @@
+"""Traced equations as text for people: ``der(velocity) = (force - stiffness*position)/mass``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+
+_SUM, _PRODUCT, _POWER, _ATOM = 1, 2, 3, 4
+_FUNCTIONS = {
+    ca.OP_EXP: "exp", ca.OP_LOG: "log", ca.OP_SQRT: "sqrt", ca.OP_SIN: "sin", ca.OP_COS: "cos", ca.OP_TAN: "tan",
+    ca.OP_ASIN: "asin", ca.OP_ACOS: "acos", ca.OP_ATAN: "atan", ca.OP_NOT: "not", ca.OP_FLOOR: "floor",
+    ca.OP_CEIL: "ceil", ca.OP_FMOD: "fmod", ca.OP_FABS: "abs", ca.OP_SIGN: "sign", ca.OP_COPYSIGN: "copysign",
+    ca.OP_ERF: "erf", ca.OP_FMIN: "min", ca.OP_FMAX: "max", ca.OP_SINH: "sinh", ca.OP_COSH: "cosh",
+    ca.OP_TANH: "tanh", ca.OP_ASINH: "asinh", ca.OP_ACOSH: "acosh", ca.OP_ATANH: "atanh", ca.OP_ATAN2: "atan2",
+    ca.OP_LOG1P: "log1p", ca.OP_EXPM1: "expm1", ca.OP_HYPOT: "hypot", ca.OP_REMAINDER: "remainder",
+    ca.OP_IF_ELSE_ZERO: "where",
+}  # fmt: skip
+# Operator, its precedence, and the least precedence that its left and its right operand need to go without parentheses.
+_OPERATORS = {
+    ca.OP_ADD: (" + ", _SUM, _SUM, _SUM), ca.OP_SUB: (" - ", _SUM, _SUM, _PRODUCT),
+    ca.OP_MUL: ("*", _PRODUCT, _PRODUCT, _PRODUCT), ca.OP_DIV: ("/", _PRODUCT, _PRODUCT, _POWER),
+    ca.OP_POW: ("^", _POWER, _ATOM, _ATOM), ca.OP_CONSTPOW: ("^", _POWER, _ATOM, _ATOM),
+    ca.OP_LT: (" < ", 0, _SUM, _SUM), ca.OP_LE: (" <= ", 0, _SUM, _SUM), ca.OP_EQ: (" == ", 0, _SUM, _SUM),
+    ca.OP_NE: (" != ", 0, _SUM, _SUM), ca.OP_AND: (" and ", -1, 0, 0), ca.OP_OR: (" or ", -1, _ATOM, _ATOM),
+}  # fmt: skip
+
+Term = tuple[str, int]
+
+
+def number(value: float) -> str:
+    """Write a number in full, without a needless ``.0``."""
+    value = float(value)
+    short = f"{value:.12g}"
+    return short if float(short) == value else repr(value)
+
+
+def _within(term: Term, least: int) -> str:
+    return term[0] if term[1] >= least else f"({term[0]})"
+
+
+def _term(op: int, operands: Sequence[Term]) -> Term | None:
+    """Write one operation; None if there is no text for it."""
+    first = operands[0] if operands else ("", _ATOM)
+    if op in _OPERATORS:
+        sign, precedence, left, right = _OPERATORS[op]
+        return f"{_within(first, left)}{sign}{_within(operands[1], right)}", precedence
+    if op == ca.OP_NEG:
+        return f"-{_within(first, _PRODUCT)}", _SUM
+    if op == ca.OP_SQ:
+        return f"{_within(first, _ATOM)}^2", _POWER
+    if op == ca.OP_TWICE:
+        return f"2*{_within(first, _PRODUCT)}", _PRODUCT
+    if op == ca.OP_INV:
+        return f"1/{_within(first, _POWER)}", _PRODUCT
+    if op == ca.OP_IF_ELSE_ZERO:
+        return f"where({first[0]}, {operands[1][0]}, 0)", _ATOM
+    if op in _FUNCTIONS:
+        return f"{_FUNCTIONS[op]}({', '.join(text for text, _ in operands)})", _ATOM
+    return first if op == ca.OP_ASSIGN else None
+
+
+def equations(f: ca.Function, knowns: Sequence[Sequence[str]], unknowns: Sequence[str], limit: int = 400) -> list[str]:
+    """Write a function of scalar operations as equations.
+
+    Parameters
+    ----------
+    f : casadi.Function
+        With dense columns as arguments and one as its result.
+    knowns : sequence of sequences of str
+        For each argument, the names of its elements.
+    unknowns : sequence of str
+        The names of the elements of the result.
+    limit : int
+        Number of operations from which on nobody reads it.
+
+    Returns
+    -------
+    list of str
+        One equation each, shared expressions first; empty if there is no scalar expansion, or it is too long.
+    """
+    try:
+        f = f.expand()
+    except RuntimeError:  # interpolation tables and the like have no scalar expansion
+        return []
+    if f.n_instructions() > limit + f.numel_in() + f.numel_out():
+        return []
+    taken = {name for group in knowns for name in group}
+    uses = _uses(f)
+    work: dict[int, Term] = {}
+    shared: list[str] = []
+    results = dict.fromkeys(range(len(unknowns)), "0")  # a structural zero is no instruction
+    for k in range(f.n_instructions()):
+        op, out, operands = f.instruction_id(k), f.instruction_output(k), f.instruction_input(k)
+        if op == ca.OP_OUTPUT:
+            results[f.sparsity_out(0).row()[out[1]]] = work[operands[0]][0]
+            continue
+        if op == ca.OP_CONST:
+            value = f.instruction_constant(k)
+            work[out[0]] = (number(value), _ATOM if value >= 0 else _SUM)
+            continue
+        if op == ca.OP_INPUT:
+            work[out[0]] = (knowns[operands[0]][operands[1]], _ATOM)
+            continue
+        term = _term(op, [work[i] for i in operands])
+        if term is None:
+            return []
+        if uses[k] > 1 and len(term[0]) > 12:
+            name = next(n for i in range(1, len(taken) + 2) if (n := f"w{i}") not in taken)
+            taken.add(name)
+            shared.append(f"{name} = {term[0]}")
+            term = (name, _ATOM)
+        work[out[0]] = term
+    return [*shared, *(f"{name} = {results[i]}" for i, name in enumerate(unknowns))]
+
+
+def _uses(f: ca.Function) -> dict[int, int]:
+    """Count for each operation how often its result is read (places of work are used again)."""
+    made: dict[int, int] = {}
+    uses = dict.fromkeys(range(f.n_instructions()), 0)
+    for k in range(f.n_instructions()):
+        op = f.instruction_id(k)
+        if op not in (ca.OP_CONST, ca.OP_INPUT):
+            for i in f.instruction_input(k):
+                uses[made[i]] += 1
+        if op != ca.OP_OUTPUT:
+            made[f.instruction_output(k)[0]] = k
+    return uses

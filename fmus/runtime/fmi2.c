@@ -1,0 +1,225 @@
+/* FMI 2.0 for Co-Simulation: the functions of fmi2Functions.h that exported FMUs support. The others: fmi2_refused.c.
+ *
+ * All variables are scalars of type Real, so that n value references take n values. */
+#include "fmi2Functions.h"
+
+#define LW_OK(call) ((call) ? fmi2OK : fmi2Error)
+#define LW_SELF lw_instance *self = c; if (!self) return fmi2Error
+
+/* The logger takes a printf format (FMI 2.0, 2.1.5): a '%' of the text is written as '%%'. */
+static void lw_write_fmi2(lw_instance *self, lw_category category, const char *message) {
+    fmi2CallbackLogger log = (fmi2CallbackLogger)self->sink;
+    bool error = category == LW_LOG_ERROR;
+    char format[4096], *to = format;
+    for (const char *from = message; *from && to < format + sizeof format - 2; *to++ = *from++)
+        if (*from == '%') *to++ = '%';
+    *to = 0;
+    log(self->environment, self->name, error ? fmi2Error : fmi2Warning, error ? "logStatusError" : "logStatusWarning", format);
+}
+
+/* ---- versions and logging (FMI 2.0, 2.1.4 and 2.1.5) ---- */
+
+const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
+
+const char *fmi2GetVersion(void) { return fmi2Version; }
+
+static unsigned lw_category_of(const char *name) {
+    if (!strcmp(name, "logAll")) return LW_LOG_WARNING | LW_LOG_ERROR;
+    if (!strcmp(name, "logStatusError")) return LW_LOG_ERROR;
+    return strcmp(name, "logStatusWarning") ? 0 : LW_LOG_WARNING;
+}
+
+fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean loggingOn, size_t nCategories, const fmi2String categories[]) {
+    LW_SELF;
+    unsigned chosen = nCategories ? 0 : LW_LOG_WARNING | LW_LOG_ERROR;
+    bool all_known = true;
+    self->categories = loggingOn ? LW_LOG_WARNING | LW_LOG_ERROR : 0;
+    for (size_t i = 0; i < nCategories; i++) {
+        unsigned category = lw_category_of(categories[i]);
+        chosen |= category;
+        if (category) continue;
+        all_known = false;
+        lw_warn(self, "fmi2SetDebugLogging: there is no log category %s, only logStatusWarning, logStatusError and logAll.",
+                categories[i]);
+    }
+    self->categories = loggingOn ? chosen : 0;
+    return all_known ? fmi2OK : fmi2Warning;
+}
+
+/* ---- life (FMI 2.0, 2.1.5 and 2.1.6) ---- */
+
+static bool lw_is_blank(const char *text) { return !text || text[strspn(text, " \t\r\n")] == 0; }
+
+fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2String fmuGUID, fmi2String fmuResourceLocation,
+        const fmi2CallbackFunctions *functions, fmi2Boolean visible, fmi2Boolean loggingOn) {
+    (void)fmuResourceLocation, (void)visible;
+    const char *name = lw_is_blank(instanceName) ? LW_MODEL_NAME : instanceName;
+    lw_instance *self = lw_create(name, strlen(name));
+    if (!self) return NULL;
+    self->categories = loggingOn ? LW_LOG_WARNING | LW_LOG_ERROR : 0;
+    if (functions && functions->logger) {
+        self->environment = functions->componentEnvironment;
+        self->write = lw_write_fmi2;
+        self->sink = (void (*)(void))functions->logger;
+    }
+    bool ok = true;
+    if (lw_is_blank(instanceName)) ok = lw_fail(self, "the instance name is empty. Give one.");
+    else if (!fmuGUID || strcmp(fmuGUID, LW_TOKEN))
+        ok = lw_fail(self, "the GUID is %s, expected " LW_TOKEN ". The modelDescription.xml that was read doesn't belong to "
+                     "this binary: unzip the FMU again.", fmuGUID ? fmuGUID : "missing");
+    else if (fmuType != fmi2CoSimulation)
+        ok = lw_fail(self, "this FMU has no Model Exchange. Instantiate it as fmi2CoSimulation.");
+    if (ok) return self;
+    lw_destroy(self);
+    return NULL;
+}
+
+void fmi2FreeInstance(fmi2Component c) { lw_destroy(c); }
+
+fmi2Status fmi2Reset(fmi2Component c) {
+    LW_SELF;
+    lw_reset(self);
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean toleranceDefined, fmi2Real tolerance, fmi2Real startTime,
+        fmi2Boolean stopTimeDefined, fmi2Real stopTime) {
+    LW_SELF;
+    (void)toleranceDefined, (void)tolerance; /* a fixed internal step has no error control */
+    if (!lw_in_mode(self, "fmi2SetupExperiment", LW_INSTANTIATED)) return fmi2Error;
+    if (!isfinite(startTime) || (stopTimeDefined && !(stopTime >= startTime)))
+        return LW_OK(lw_fail(self, "fmi2SetupExperiment: startTime is %g s, stopTime is %g s, expected finite times in this "
+                             "order.", startTime, stopTime));
+    self->s.values[0] = startTime;
+    self->s.stop_time_defined = stopTimeDefined != fmi2False;
+    self->s.stop_time = stopTimeDefined ? stopTime : 0.0;
+    return fmi2OK;
+}
+
+fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
+    LW_SELF;
+    if (!lw_in_mode(self, "fmi2EnterInitializationMode", LW_INSTANTIATED)) return fmi2Error;
+    self->s.mode = LW_INITIALIZING;
+    self->s.have_outputs = self->s.have_derivatives = 0;
+    return fmi2OK;
+}
+
+fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
+    LW_SELF;
+    if (!lw_in_mode(self, "fmi2ExitInitializationMode", LW_INITIALIZING)) return fmi2Error;
+    if (!lw_update_outputs(self)) return fmi2Error;
+    self->s.mode = LW_STEPPING;
+    return fmi2OK;
+}
+
+fmi2Status fmi2Terminate(fmi2Component c) {
+    LW_SELF;
+    if (!lw_in_mode(self, "fmi2Terminate", LW_STEPPING)) return fmi2Error;
+    self->s.mode = LW_TERMINATED;
+    return fmi2OK;
+}
+
+/* ---- variables (FMI 2.0, 2.1.7) ---- */
+
+fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, fmi2Real value[]) {
+    LW_SELF;
+    return LW_OK(lw_get(self, "fmi2GetReal", vr, nvr, value, nvr));
+}
+
+fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, const fmi2Real value[]) {
+    LW_SELF;
+    return LW_OK(lw_set(self, "fmi2SetReal", vr, nvr, value, nvr));
+}
+
+/* ---- stepping (FMI 2.0, 4.2.2) ---- */
+
+static bool lw_check_step(lw_instance *self, double t, double h) {
+    double now = self->s.values[0], tolerance = 1e-12 * fabs(now) + 1e-6 * fabs(h);
+    if (!lw_in_mode(self, "fmi2DoStep", LW_STEPPING)) return false;
+    if (!(isfinite(h) && h > 0))
+        return lw_fail(self, "fmi2DoStep: the communication step is %g s at t = %.9g s, expected a positive number.", h, now);
+    if (!(fabs(t - now) <= tolerance))
+        return lw_fail(self, "fmi2DoStep: currentCommunicationPoint is %.17g s, but this FMU is at %.17g s. Step from where "
+                       "the last step ended, or set an FMU state first.", t, now);
+    if (self->s.stop_time_defined && t + h > self->s.stop_time + tolerance)
+        return lw_fail(self, "fmi2DoStep: a step of %g s from t = %.9g s passes the stop time of %.9g s. Give a later stopTime "
+                       "to fmi2SetupExperiment, or none.", h, t, self->s.stop_time);
+    return true;
+}
+
+fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint, fmi2Real communicationStepSize,
+        fmi2Boolean noSetFMUStatePriorToCurrentPoint) {
+    LW_SELF;
+    (void)noSetFMUStatePriorToCurrentPoint; /* nothing is buffered */
+    return LW_OK(lw_check_step(self, currentCommunicationPoint, communicationStepSize)
+                 && lw_step(self, currentCommunicationPoint, communicationStepSize));
+}
+
+/* ---- states (FMI 2.0, 2.1.8) ---- */
+
+fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *FMUstate) {
+    LW_SELF;
+    lw_state *copy = *FMUstate ? *FMUstate : malloc(sizeof *copy);
+    if (!copy) return LW_OK(lw_fail(self, "fmi2GetFMUstate: out of memory."));
+    *copy = self->s;
+    *FMUstate = copy;
+    return fmi2OK;
+}
+
+fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate FMUstate) {
+    LW_SELF;
+    if (!FMUstate) return LW_OK(lw_fail(self, "fmi2SetFMUstate: the state is NULL. Get one first."));
+    return LW_OK(lw_accept_state(self, "fmi2SetFMUstate", FMUstate));
+}
+
+fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *FMUstate) {
+    LW_SELF;
+    if (FMUstate) {
+        free(*FMUstate);
+        *FMUstate = NULL;
+    }
+    return fmi2OK;
+}
+
+/* Serialized: the token, then the state as it is in memory (same machine type). */
+#define LW_SERIALIZED (sizeof LW_TOKEN + sizeof(lw_state))
+
+fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate FMUstate, size_t *size) {
+    LW_SELF;
+    (void)FMUstate;
+    *size = LW_SERIALIZED;
+    return fmi2OK;
+}
+
+fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate FMUstate, fmi2Byte serializedState[], size_t size) {
+    LW_SELF;
+    if (!FMUstate || size < LW_SERIALIZED)
+        return LW_OK(lw_fail(self, "fmi2SerializeFMUstate: %s. Ask fmi2SerializedFMUstateSize for the size.",
+                             FMUstate ? "too few bytes" : "the state is NULL"));
+    memcpy(serializedState, LW_TOKEN, sizeof LW_TOKEN);
+    memcpy(serializedState + sizeof LW_TOKEN, FMUstate, sizeof(lw_state));
+    return fmi2OK;
+}
+
+fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte serializedState[], size_t size, fmi2FMUstate *FMUstate) {
+    LW_SELF;
+    if (size != LW_SERIALIZED || memcmp(serializedState, LW_TOKEN, sizeof LW_TOKEN))
+        return LW_OK(lw_fail(self, "fmi2DeSerializeFMUstate: these %zu bytes are no state of this FMU (%zu bytes that begin "
+                             "with its GUID). Give what fmi2SerializeFMUstate wrote.", size, LW_SERIALIZED));
+    lw_state *copy = *FMUstate ? *FMUstate : malloc(sizeof *copy);
+    if (!copy) return LW_OK(lw_fail(self, "fmi2DeSerializeFMUstate: out of memory."));
+    memcpy(copy, serializedState + sizeof LW_TOKEN, sizeof *copy);
+    *FMUstate = copy;
+    return fmi2OK;
+}
+
+/* ---- partial derivatives (FMI 2.0, 2.1.9) ---- */
+
+#if LW_HAS_DERIVATIVES
+fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference vUnknown_ref[], size_t nUnknown,
+        const fmi2ValueReference vKnown_ref[], size_t nKnown, const fmi2Real dvKnown[], fmi2Real dvUnknown[]) {
+    LW_SELF;
+    return LW_OK(lw_derive(self, "fmi2GetDirectionalDerivative", false, vUnknown_ref, nUnknown, vKnown_ref, nKnown, dvKnown,
+                           nKnown, dvUnknown, nUnknown));
+}
+#endif

@@ -1,0 +1,90 @@
+/* FMI 2.0: the functions that these FMUs don't support. Every symbol of the standard is exported (some importers ask for
+ * all of them); each of these returns an error, or fmi2Discard where that does no harm, and logs why. */
+#if defined(__GNUC__)
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#endif
+
+static fmi2Status lw_refuse(lw_instance *self, const char *function, const char *why) {
+    if (self) lw_fail(self, "%s: %s.", function, why);
+    return fmi2Error;
+}
+
+static fmi2Status lw_discard(lw_instance *self, const char *function, const char *why) {
+    if (!self) return fmi2Error;
+    lw_warn(self, "%s: %s.", function, why);
+    return fmi2Discard;
+}
+
+#define LW_REFUSE(name, why, ...) fmi2Status name(fmi2Component c, __VA_ARGS__) { return lw_refuse(c, #name, why); }
+
+/* ---- variables of other types: there are none, so asking for none is fine ---- */
+
+#define LW_NO_TYPE(type) \
+    fmi2Status fmi2Get##type(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, fmi2##type value[]) { \
+        return c && nvr == 0 ? fmi2OK : lw_refuse(c, "fmi2Get" #type, "all variables of this FMU are Real"); \
+    } \
+    fmi2Status fmi2Set##type(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, const fmi2##type value[]) { \
+        return c && nvr == 0 ? fmi2OK : lw_refuse(c, "fmi2Set" #type, "all variables of this FMU are Real"); \
+    }
+LW_NO_TYPE(Integer)
+LW_NO_TYPE(Boolean)
+LW_NO_TYPE(String)
+
+/* ---- derivatives of inputs and outputs by time ---- */
+
+LW_REFUSE(fmi2SetRealInputDerivatives, "inputs are held over a step (canInterpolateInputs = false)", const fmi2ValueReference vr[],
+          size_t nvr, const fmi2Integer order[], const fmi2Real value[])
+LW_REFUSE(fmi2GetRealOutputDerivatives, "maxOutputDerivativeOrder is 0", const fmi2ValueReference vr[], size_t nvr,
+          const fmi2Integer order[], fmi2Real value[])
+
+/* ---- status of a step (FMI 2.0, 4.2.3): every step is complete when fmi2DoStep returns ---- */
+
+#define LW_SYNCHRONOUS "every step is complete when fmi2DoStep returns (canRunAsynchronuously = false)"
+
+fmi2Status fmi2CancelStep(fmi2Component c) { return lw_refuse(c, "fmi2CancelStep", LW_SYNCHRONOUS); }
+
+fmi2Status fmi2GetStatus(fmi2Component c, const fmi2StatusKind s, fmi2Status *value) {
+    return lw_discard(c, "fmi2GetStatus", LW_SYNCHRONOUS);
+}
+
+fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind s, fmi2Real *value) {
+    LW_SELF;
+    if (s != fmi2LastSuccessfulTime) return lw_discard(c, "fmi2GetRealStatus", "the only kind of type Real is fmi2LastSuccessfulTime");
+    *value = self->s.values[0];
+    return fmi2OK;
+}
+
+fmi2Status fmi2GetIntegerStatus(fmi2Component c, const fmi2StatusKind s, fmi2Integer *value) {
+    return lw_discard(c, "fmi2GetIntegerStatus", "there is no status of type Integer");
+}
+
+fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind s, fmi2Boolean *value) {
+    if (!c) return fmi2Error;
+    if (s != fmi2Terminated) return lw_discard(c, "fmi2GetBooleanStatus", "the only kind of type Boolean is fmi2Terminated");
+    *value = fmi2False; /* the model itself never asks for an end */
+    return fmi2OK;
+}
+
+fmi2Status fmi2GetStringStatus(fmi2Component c, const fmi2StatusKind s, fmi2String *value) {
+    return lw_discard(c, "fmi2GetStringStatus", LW_SYNCHRONOUS);
+}
+
+/* ---- Model Exchange ---- */
+
+#define LW_NO_ME "this FMU has no Model Exchange (see modelDescription.xml)"
+fmi2Status fmi2EnterEventMode(fmi2Component c) { return lw_refuse(c, "fmi2EnterEventMode", LW_NO_ME); }
+fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) { return lw_refuse(c, "fmi2EnterContinuousTimeMode", LW_NO_ME); }
+LW_REFUSE(fmi2NewDiscreteStates, LW_NO_ME, fmi2EventInfo *eventInfo)
+LW_REFUSE(fmi2CompletedIntegratorStep, LW_NO_ME, fmi2Boolean noSetFMUStatePriorToCurrentPoint, fmi2Boolean *enterEventMode,
+          fmi2Boolean *terminateSimulation)
+LW_REFUSE(fmi2SetTime, LW_NO_ME, fmi2Real time)
+LW_REFUSE(fmi2SetContinuousStates, LW_NO_ME, const fmi2Real x[], size_t nx)
+LW_REFUSE(fmi2GetDerivatives, LW_NO_ME, fmi2Real derivatives[], size_t nx)
+LW_REFUSE(fmi2GetEventIndicators, LW_NO_ME, fmi2Real eventIndicators[], size_t ni)
+LW_REFUSE(fmi2GetContinuousStates, LW_NO_ME, fmi2Real x[], size_t nx)
+LW_REFUSE(fmi2GetNominalsOfContinuousStates, LW_NO_ME, fmi2Real x_nominal[], size_t nx)
+
+#if !LW_HAS_DERIVATIVES
+LW_REFUSE(fmi2GetDirectionalDerivative, "providesDirectionalDerivative is false", const fmi2ValueReference vUnknown_ref[],
+          size_t nUnknown, const fmi2ValueReference vKnown_ref[], size_t nKnown, const fmi2Real dvKnown[], fmi2Real dvUnknown[])
+#endif
