@@ -16,6 +16,7 @@ from ..blocks._ports import Port
 from ..blocks._tracing import NEXT, trace, traced_parameters
 from ..blocks._values import ParameterSpec
 from ._build import build_fmu
+from ._documentation import block_text
 from ._spec import ModelSpec, Variable
 
 
@@ -96,10 +97,13 @@ def build(
     internal_step: float = 1e-3,
     stop_time: float = 1.0,
     step_size: float = 1e-3,
+    fmi: int = 3,
+    arrays: bool = True,
     platform: str | Iterable[str] | None = None,
+    documentation: str | None = None,
     notify: Callable[[str], None] | None = None,
 ) -> Path:
-    """Export a continuous block as an FMI 3.0 co-simulation FMU and return the file.
+    """Export a continuous block as an FMU and return the file.
 
     The equations become C, compiled without Python inside; the build is cached by content.
 
@@ -116,8 +120,15 @@ def build(
         (order 4).
     stop_time, step_size : float
         Default experiment, s.
+    fmi : {3, 2}
+        FMI 3.0 or FMI 2.0.
+    arrays : bool
+        Whether vectors and matrices are arrays; else, and in FMI 2.0 always, each element is a variable: ``s[1]``.
     platform : str or iterable of str, optional
-        FMI platform tuples, such as ``"x86_64-linux"``; this machine's without one.
+        FMI 3.0 platform tuples, such as ``"x86_64-linux"``, or ``"all"``; this machine's without one.
+    documentation : str, optional
+        Plain text for the FMU's page of documentation; the block's docstring and the source of its equations if not
+        given.
     notify : callable, optional
         Called with a line of text when a compilation starts.
 
@@ -129,7 +140,8 @@ def build(
         No compiler, or one that failed.
     """
     spec = model_spec(block, name=name, internal_step=internal_step, stop_time=stop_time, step_size=step_size)
-    return build_fmu(spec, out, platform=platform, notify=notify)
+    text = block_text(block) if documentation is None else documentation
+    return build_fmu(spec, out, fmi=fmi, arrays=arrays, platform=platform, documentation=text, notify=notify)
 
 
 def _variable(port: Port, causality: Any, **more: Any) -> Variable:
