@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import inspect
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ _STYLE = """
 :root { color-scheme: light dark; }
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; }
 pre { overflow-x: auto; padding: 0.75rem 1rem; border: 1px solid #8886; border-radius: 0.3rem; }
-pre.text { white-space: pre-wrap; border: 0; padding: 0; font: inherit; }
+pre.text { white-space: pre-wrap; border: 0; padding: 0; }
 table { border-collapse: collapse; width: 100%; }
 caption { text-align: left; padding-bottom: 0.5rem; }
 th, td { text-align: left; vertical-align: top; padding: 0.3rem 0.75rem 0.3rem 0; border-bottom: 1px solid #8886; }
@@ -27,22 +28,29 @@ code, pre { font-family: ui-monospace, monospace; font-size: 0.9em; }
 """
 _COLUMNS = ("Name", "Causality", "Variability", "Unit", "Start", "Min", "Max", "Description")
 _CAUSALITY = {"time": "independent", "fixed": "parameter", "tunable": "parameter", "input": "input"}
-_EQUATIONS = ("derivative", "output", "indicators", "jump")
+_EQUATIONS = ("derivative", "output", "indicators", "jump")  # they may be inherited
 _MOST = 12  # numbers of a start value that are listed
 
 
 def block_text(block: Block) -> str:
-    """Give the text of a block's documentation: its docstring, and the source of its equations where there is one."""
-    parts = [inspect.cleandoc(type(block).__doc__ or "")]
-    for name in _EQUATIONS:
-        method = getattr(type(block), name, None)
-        if method is None or method is getattr(Block, name, None):
-            continue
-        try:
-            parts.append(textwrap.dedent(inspect.getsource(method)))
-        except (OSError, TypeError):  # typed at a prompt: there is no file to read
-            continue
+    """Give the text of a block's documentation: its docstrings, and the source of its equations where there is one."""
+    cls = type(block)
+    module = inspect.getmodule(cls)
+    about = module.__doc__ if module is not None and module.__name__ != "__main__" else None
+    parts = [inspect.cleandoc(cls.__doc__ or ""), inspect.cleandoc(about or "")]
+    inherited = {name: getattr(cls, name) for name in _EQUATIONS if getattr(cls, name, None) is not None}
+    for member in {**inherited, **vars(cls)}.values():
+        function = member.fget if isinstance(member, property) else member
+        if inspect.isfunction(function) and not function.__name__.startswith("_"):
+            parts.append(_source(function))
     return "\n\n".join(part.strip() for part in parts if part.strip())
+
+
+def _source(function: Callable[..., Any]) -> str:
+    try:
+        return textwrap.dedent(inspect.getsource(function))
+    except (OSError, TypeError):  # typed at a prompt: there is no file to read
+        return ""
 
 
 def _names(variables: Iterable[Variable]) -> list[str]:

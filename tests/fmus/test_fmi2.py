@@ -14,12 +14,12 @@ import fmpy.build
 import fmpy.fmi2
 import numpy as np
 import pytest
-from exported2 import Instance2, fails2
 from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from exported import D, K, M, explosive, mass_spring_damper, pendulums, run
+from exported2 import Instance2, fails2
 from loopwright.blocks._errors import DefinitionError, FmuError
 from loopwright.fmus import _build, gantry
 from loopwright.fmus._build import build_fmu
