@@ -24,13 +24,14 @@ import platformdirs
 
 from ..blocks._errors import CompilerError, near
 
-#: FMI 3.0 platform tuples (2.5.1.4) that can be built for, and zig's name of each. glibc is fixed at 2.17.
+#: FMI 3.0 platform tuples (2.5.1.4) that can be built for, and zig's name of each with the oldest system:
+#: glibc 2.17, macOS 11. On Windows the C library is the system's own since version 10.
 TARGETS = {
     "x86_64-linux": "x86_64-linux-gnu.2.17",
     "aarch64-linux": "aarch64-linux-gnu.2.17",
     "x86_64-windows": "x86_64-windows-gnu",
-    "x86_64-darwin": "x86_64-macos",
-    "aarch64-darwin": "aarch64-macos",
+    "x86_64-darwin": "x86_64-macos.11.0",
+    "aarch64-darwin": "aarch64-macos.11.0",
 }
 SUFFIXES = {"linux": ".so", "windows": ".dll", "darwin": ".dylib"}
 
