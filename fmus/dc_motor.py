@@ -1,8 +1,10 @@
-"""A direct current motor with permanent magnets, driven by a voltage against a load:
+"""A direct current motor with permanent magnets, driven by a voltage against a load.
 
-L i̇ = u − R i − K ω
-J ω̇ = K i − b ω − τ_L
-φ̇ = ω
+    L i̇ = u − R i − K ω
+    J ω̇ = K i − b ω − τ_L
+    φ̇ = ω
+
+Rotor and load are one inertia, J.
 """
 
 from __future__ import annotations

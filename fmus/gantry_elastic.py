@@ -10,10 +10,10 @@ F_F and F_G are the gantry's; ρ is the share of the friction that acts on the s
 motor's side (nut, bearings). At k → ∞ this is the gantry.
 
 The paper gives no number for the screws. Our choice: k puts the free resonance ω² = k (1/m_t + 1/m_J) at 100 Hz in
-both axes, d damps it by 12 %. Both are at the upper end of what such drives show, for a reason: the loop over the
-slide's position with a triple pole at −p has the gain 3 p/(2 ζ ω) at the resonance and needs it below 1, so that the
-paper's p = 40 1/s demands ζ > 60/ω = 9.5 % at 100 Hz. With less damping, or a softer screw, the paper's gains are
-unstable on this plant.
+both axes, d damps it by 12 %, both high for such a drive. The reason: a loop over the slide's position with a triple
+pole at −p has the gain 3 p/(2 ζ ω) at the resonance, which must stay below 1, so that the paper's p = 40 1/s demands
+ζ > 60/ω, 9.5 % at 100 Hz, friction aside. With a softer screw, or half of the damping, the paper's gains are unstable
+on this plant.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class GantryElastic(Gantry):
         slide = (screw - on_slide - self.weight + u.external_force) / self.translational_mass
         return slide, (u.motor_force - screw - on_motor) / self.equivalent_mass
 
-    def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, Array, Array, Array]:
+    def derivative(self, t: Array, x: Any, u: Any) -> Any:
         """Return the right-hand side of the equations above."""
         slide, motor = self.accelerations(x, u)
         return x.velocity, slide, x.deflection_rate, motor - slide

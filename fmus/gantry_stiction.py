@@ -1,4 +1,4 @@
-"""The gantry with stiction: LuGre friction in place of the smooth Coulomb friction, equation (3) of the paper's section II.
+"""The gantry with stiction: LuGre friction in place of the paper's smooth Coulomb friction.
 
 Canudas de Wit, Olsson, Åström, Lischinsky, "A new model for control of systems with friction", IEEE TAC 40 (1995).
 Each axis carries a state z, the mean deflection of the bristles in the contact:

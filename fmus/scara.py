@@ -166,8 +166,8 @@ class Scara(PlanarModel):
         cosine = (y**2 + z**2 - l1**2 - l2**2) / (2.0 * l1 * l2)
         if not -1.0 < cosine < 1.0:
             raise ParameterError(
-                f"found the position {[float(y), float(z)]} m, at {np.hypot(y, z):.6g} m from the base; expected a distance "
-                f"between {abs(l1 - l2):.6g} and {l1 + l2:.6g} m, both excluded. Move it, or lengthen the links.",
+                f"found the position {[float(y), float(z)]} m, at {np.hypot(y, z):.6g} m from the base; expected "
+                f"a distance between {abs(l1 - l2):.6g} and {l1 + l2:.6g} m; move it, or lengthen the links.",
                 block=self.label,
                 port="position",
             )
