@@ -17,17 +17,25 @@ import casadi as ca
 
 from ..blocks._errors import DefinitionError
 from ..blocks._units import rate_of
-from ._spec import ModelSpec, Variable
+from ._spec import DIRECTIONS, INTEGRATORS, ModelSpec, Variable
 
-Kind = Literal["time", "fixed", "tunable", "input", "state", "derivative", "output"]
-RUNTIME = {3: ("model.h", "core.c", "fmi3.c", "fmi3_refused.c"), 2: ("model.h", "core.c", "fmi2.c", "fmi2_refused.c")}
-_ORDER = {3: "FMI 3.0, 2.3 and 4.2", 2: "FMI 2.0, 2.1.6 and 4.2.4"}
+Kind = Literal["time", "fixed", "tunable", "input", "state", "discrete", "derivative", "output", "indicator"]
+_COMMON = ("model.h", "core.c", "integrators.c", "events.c", "stepping.c")
+RUNTIME = {3: (*_COMMON, "fmi3.c", "fmi3_events.c", "fmi3_refused.c"), 2: (*_COMMON, "fmi2.c", "fmi2_refused.c")}
+_ORDER = {3: "FMI 3.0, 2.3, 3.2 and 4.2", 2: "FMI 2.0, 2.1.6 and 4.2.4"}
 
 # Longest function that is expanded: beyond, calls of shared functions keep the code small (compile time grows faster).
 _SCALAR_LIMIT = 20_000
 _STEP_DESCRIPTION = (
-    "Longest step of the internal integrator (explicit Runge-Kutta, order 4); a communication step h takes "
-    "ceil(h / internal_step) equal substeps, at least one"
+    "Longest step of the explicit Runge-Kutta method of order 4 (integrator = 1); a communication step h, or what an event "
+    "leaves of it, takes ceil(h / internal_step) equal substeps, at least one"
+)
+_INTEGRATOR_DESCRIPTION = (
+    "Integrator of Co-Simulation. 1: explicit Runge-Kutta, order 4, fixed step; 2: explicit Runge-Kutta, order 5(4), "
+    "adaptive; 3: implicit (Rosenbrock), order 4(3), adaptive, for stiff models"
+)
+_TOLERANCE_DESCRIPTION = (
+    "Relative tolerance of the adaptive integrators; times a state's nominal value, its absolute one"
 )
 
 
@@ -40,7 +48,7 @@ class Entry:
     reference : int
         Value reference.
     kind : str
-        Which of time, fixed, tunable, input, state, derivative, output it is.
+        Which of time, fixed, tunable, input, state, discrete (state), derivative, output, (event) indicator it is.
     variable : Variable
         What is known of it; of time and of derivatives only name, unit, shape and description count.
     name : str
@@ -61,7 +69,7 @@ class Entry:
     @property
     def is_output(self) -> bool:
         """Whether it is an output, computed or a state."""
-        return self.variable.causality == "output" and self.kind in ("state", "output")
+        return self.variable.causality == "output" and self.kind in ("state", "discrete", "output")
 
     @property
     def last(self) -> int:
@@ -74,10 +82,36 @@ def _rate(state: Variable) -> Variable:
     return Variable("der", shape=state.shape, unit=unit, description=f"Time derivative of {state.name}")
 
 
-def _internal_step(spec: ModelSpec) -> Variable:
-    return Variable(
-        "step", "parameter", "fixed", description=_STEP_DESCRIPTION, start=spec.internal_step, unit="s", minimum=0.0
+def _settings(spec: ModelSpec) -> list[tuple[Kind, Variable, str]]:
+    """Give the parameters of the FMU's own integrator."""
+    step = Variable(
+        "v", "parameter", "tunable", description=_STEP_DESCRIPTION, start=spec.internal_step, unit="s", minimum=0.0
     )
+    integrator = Variable(
+        *("v", "parameter", "fixed"), description=_INTEGRATOR_DESCRIPTION, start=INTEGRATORS[spec.integrator],
+        unit="1", minimum=1.0, maximum=3.0,
+    )  # fmt: skip
+    tolerance = Variable(
+        *("v", "parameter", "tunable"), description=_TOLERANCE_DESCRIPTION, start=spec.tolerance,
+        unit="1", minimum=1e-14, maximum=0.1,
+    )  # fmt: skip
+    return [
+        ("tunable", step, "internal_step"),
+        ("fixed", integrator, "integrator"),
+        ("tunable", tolerance, "tolerance"),
+    ]
+
+
+def _indicators(spec: ModelSpec) -> list[tuple[Kind, Variable, str]]:
+    about = "Event indicator"
+    return [
+        (
+            "indicator",
+            Variable("z", description=f"{about}: {e.description}" if e.description else about, nominal=e.nominal),
+            e.indicator,
+        )
+        for e in spec.events
+    ]
 
 
 def layout(spec: ModelSpec) -> tuple[Entry, ...]:
@@ -86,10 +120,12 @@ def layout(spec: ModelSpec) -> tuple[Entry, ...]:
     rows: list[tuple[Kind, Variable, str]] = [("time", time, "time")]
     rows += [("tunable" if v.variability == "tunable" else "fixed", v, v.name) for v in spec.parameters]
     rows += [("input", v, v.name) for v in spec.inputs]
-    rows += [("state", v, v.name) for v in spec.states]
-    rows += [("derivative", _rate(v), f"der({v.name})") for v in spec.states]
+    rows += [("state", v, v.name) for v in spec.continuous]
+    rows += [("discrete", v, v.name) for v in spec.discrete]
+    rows += [("derivative", _rate(v), f"der({v.name})") for v in spec.continuous]
     rows += [("output", v, v.name) for v in spec.outputs]
-    rows += [("fixed", _internal_step(spec), "internal_step")]
+    rows += _indicators(spec)
+    rows += _settings(spec)
     entries: list[Entry] = []
     first = 0
     for reference, (kind, variable, name) in enumerate(rows):
@@ -110,17 +146,17 @@ def scalar(f: ca.Function) -> ca.Function:
     return expanded if expanded.n_instructions() <= _SCALAR_LIMIT else f
 
 
-def symbolic(spec: ModelSpec) -> tuple[Any, Any, Any]:
-    """All knowns (time, parameters, inputs, states) as one column, and derivatives and outputs of them, inlined.
+def symbolic(spec: ModelSpec) -> tuple[Any, Any]:
+    """All knowns (time, parameters, inputs, states) as one column; derivatives, outputs and indicators of them, inlined.
 
-    SX where both functions have a scalar expansion, else MX.
+    SX where all functions have a scalar expansion, else MX. The unknowns are one column too.
     """
     sizes = [1, *(sum(v.size for v in group) for group in (spec.parameters, spec.inputs, spec.states))]
-    f, g = scalar(spec.derivative), scalar(spec.output)
-    sx = f.is_a("SXFunction") and g.is_a("SXFunction")
+    functions = [scalar(f) for f in (spec.derivative, spec.output, spec.indicators) if f is not None]
+    sx = all(f.is_a("SXFunction") for f in functions)
     knowns = (ca.SX if sx else ca.MX).sym("knowns", sum(sizes))
     t, p, u, x = ca.vertsplit(knowns, [0, *(sum(sizes[: i + 1]) for i in range(4))])
-    return knowns, _call(f, (t, x, u, p)), _call(g, (t, x, u, p))
+    return knowns, ca.vertcat(*(_call(f, (t, x, u, p)) for f in functions))
 
 
 def _call(f: ca.Function, args: Sequence[Any]) -> Any:
@@ -136,22 +172,61 @@ def _plain(name: str, f: ca.Function) -> ca.Function:
     return ca.Function(name, args, [_call(f, args)])
 
 
-def _equations(spec: ModelSpec) -> tuple[list[ca.Function], bool]:
-    """All functions to generate, and whether derivatives are among them."""
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """All functions to generate, and the places of the nonzeros of the Jacobian if there are derivatives."""
+
+    functions: list[ca.Function]
+    nonzeros: list[tuple[int, int]] | None = None
+
+
+def _equations(spec: ModelSpec) -> _Equations:
     functions = [_plain("lw_derivative", spec.derivative), _plain("lw_output", spec.output)]
+    if spec.indicators is not None and spec.jump is not None:
+        functions += [_plain("lw_indicator", spec.indicators), _plain("lw_jump", spec.jump)]
     try:
-        knowns, dx, y = symbolic(spec)
-        unknowns = ca.vertcat(dx, y)
+        knowns, unknowns = symbolic(spec)
         seed, adjoint = knowns.sym("seed", knowns.numel()), knowns.sym("adjoint", unknowns.numel())
         forward = ca.densify(ca.jtimes(unknowns, knowns, seed))
         reverse = ca.densify(ca.jtimes(unknowns, knowns, adjoint, True))
-        functions += [
+        linear, nonzeros = _linear(spec)
+        derived = [
             ca.Function("lw_forward", [knowns, seed], [forward]),
             ca.Function("lw_reverse", [knowns, adjoint], [reverse]),
+            *linear,
         ]
     except (RuntimeError, NotImplementedError):  # an operation that CasADi can't differentiate
-        return functions[:2], False
-    return functions, True
+        if spec.integrator == "rodas":
+            raise DefinitionError(
+                "its equations have no derivatives, which the integrator rodas needs. Choose rk4 or dopri5.",
+                block=spec.name,
+                port="integrator",
+            ) from None
+        return _Equations(functions)
+    return _Equations(functions + derived, nonzeros)
+
+
+def _linear(spec: ModelSpec) -> tuple[list[ca.Function], list[tuple[int, int]]]:
+    """The Jacobian of the derivatives by continuous states and time; the indicators and their rates along a solution."""
+    f = scalar(spec.derivative)
+    kind = ca.SX if f.is_a("SXFunction") else ca.MX
+    t, x, u, p = (kind.sym(name, f.numel_in(i)) for i, name in enumerate("txup"))
+    dx = _call(f, (t, x, u, p))
+    n = dx.numel()
+    jacobian = ca.jacobian(dx, x)[:, :n]
+    slope = ca.densify(ca.jtimes(dx, t, kind.ones(1)))
+    sparsity = jacobian.sparsity()
+    nonzeros = list(zip(*sparsity.get_triplet(), strict=True)) if sparsity.nnz() else []
+    functions = [ca.Function("lw_jacobian", [t, x, u, p], [jacobian, slope])]
+    if spec.indicators is not None:
+        f, g = scalar(spec.derivative), scalar(spec.indicators)
+        kind = ca.SX if f.is_a("SXFunction") and g.is_a("SXFunction") else ca.MX
+        t, x, u, p = (kind.sym(name, f.numel_in(i)) for i, name in enumerate("txup"))
+        z = _call(g, (t, x, u, p))
+        flow = ca.vertcat(kind.ones(1), _call(f, (t, x, u, p)), kind.zeros(x.numel() - n))
+        rate = ca.jtimes(z, t, flow[0]) + (ca.jtimes(z, x, flow[1:]) if x.numel() else 0)
+        functions.append(ca.Function("lw_crossing", [t, x, u, p], [ca.vertcat(z, ca.densify(rate))]))
+    return functions, nonzeros
 
 
 def _number(value: float | None, missing: str) -> str:
@@ -163,26 +238,46 @@ def _table(entries: Iterable[Entry]) -> str:
     for e in entries:
         low, high = _number(e.variable.minimum, "-INFINITY"), _number(e.variable.maximum, "INFINITY")
         output = "true" if e.is_output else "false"
-        rows.append(f'    {{"{e.name}", LW_{e.kind.upper()}, {output}, {e.first}, {e.variable.size}, {low}, {high}}},')
+        discrete = "true" if e.kind == "input" and e.variable.variability == "discrete" else "false"
+        about = f'"{e.name}", LW_{e.kind.upper()}, {output}, {discrete}, {e.first}, {e.variable.size}'
+        rows.append(f"    {{{about}, {low}, {high}}},")
     return "static const lw_variable lw_variables[LW_N_VARIABLES] = {\n" + "\n".join(rows) + "\n};\n"
 
 
 def _starts(entries: Iterable[Entry]) -> str:
     values = [v for e in entries for v in (e.variable.flat_start or [0.0] * e.variable.size)]
-    lines = [", ".join(map(repr, values[i : i + 8])) for i in range(0, len(values), 8)]
-    return "static const double lw_start_values[] = {\n    " + ",\n    ".join(lines) + "\n};\n"
+    return _array("double", "lw_start_values", map(repr, values))
 
 
-def _dimensions(
-    spec: ModelSpec, token: str, functions: Sequence[ca.Function], derivatives: bool, n: int, fmi: int
-) -> str:
-    groups = {"P": spec.parameters, "U": spec.inputs, "X": spec.states, "Y": spec.outputs}
+def _array(of: str, name: str, values: Iterable[object]) -> str:
+    """Write an array, of at least one element (C has no empty ones)."""
+    texts = [str(v) for v in values] or ["0"]
+    lines = [", ".join(texts[i : i + 8]) for i in range(0, len(texts), 8)]
+    return f"static const {of} {name}[] = {{\n    " + ",\n    ".join(lines) + "\n};\n"
+
+
+def _tables(spec: ModelSpec, nonzeros: list[tuple[int, int]] | None) -> Iterable[str]:
+    """Write the nominal values of the continuous states, the events, and where the Jacobian is not zero."""
+    nominals = [1.0 if v.nominal is None else float(v.nominal) for v in spec.continuous for _ in range(v.size)]
+    yield _array("double", "lw_nominals", map(repr, nominals))
+    if spec.events:
+        rows = [f'{{"{e.name}", {DIRECTIONS[e.direction]}, {float(e.nominal)!r}}}' for e in spec.events]
+        yield _array("lw_event", "lw_events", rows)
+    if nonzeros is not None:
+        yield _array("int", "lw_jacobian_rows", (row for row, _ in nonzeros))
+        yield _array("int", "lw_jacobian_columns", (column for _, column in nonzeros))
+
+
+def _dimensions(spec: ModelSpec, token: str, equations: _Equations, n: int, fmi: int) -> str:
+    groups = {"P": spec.parameters, "U": spec.inputs, "X": spec.continuous, "D": spec.discrete, "Y": spec.outputs}
+    nonzeros = equations.nonzeros
     lines = [f'#define LW_MODEL_NAME "{spec.name}"', f'#define LW_TOKEN "{token}"']
     lines += [f'#define LW_API "fmi{fmi}"', f'#define LW_ORDER "{_ORDER[fmi]}"']
     lines += [f"#define LW_N_{letter} {sum(v.size for v in group)}" for letter, group in groups.items()]
-    lines += [f"#define LW_N_VARIABLES {n}", f"#define LW_HAS_DERIVATIVES {int(derivatives)}"]
+    lines += [f"#define LW_N_Z {len(spec.events)}", f"#define LW_N_J {len(nonzeros or ())}"]
+    lines += [f"#define LW_N_VARIABLES {n}", f"#define LW_HAS_DERIVATIVES {int(nonzeros is not None)}"]
     for what in ("arg", "res", "iw", "w"):
-        lines.append(f"#define LW_SZ_{what.upper()} {max(getattr(f, f'sz_{what}')() for f in functions)}")
+        lines.append(f"#define LW_SZ_{what.upper()} {max(getattr(f, f'sz_{what}')() for f in equations.functions)}")
     return "\n".join(lines) + "\n"
 
 
@@ -219,18 +314,19 @@ def generate(spec: ModelSpec, token: str, fmi: int = 3) -> tuple[str, bool]:
         Whether it has directional and adjoint derivatives.
     """
     entries = layout(spec)
-    functions, derivatives = _equations(spec)
+    equations = _equations(spec)
     parts = [
         "/* Generated by Loopwright. */\n",
-        _dimensions(spec, token, functions, derivatives, len(entries), fmi),
+        _dimensions(spec, token, equations, len(entries), fmi),
         '#include "model.h"\n',
-        "/* The equations, written by CasADi. */\n" + _generated(functions),
+        "/* The equations, written by CasADi. */\n" + _generated(equations.functions),
         "#include <math.h>\n",
         _table(entries),
         _starts(entries),
+        *_tables(spec, equations.nonzeros),
         "".join(f'#include "{name}"\n' for name in RUNTIME[fmi] if name.endswith(".c")),
     ]
-    return "\n".join(parts), derivatives
+    return "\n".join(parts), equations.nonzeros is not None
 
 
 @lru_cache(maxsize=2)

@@ -6,6 +6,7 @@ Both are functions of the model alone: no time stamp, no random identifier.
 from __future__ import annotations
 
 import importlib.metadata
+import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,7 +16,7 @@ from xml.sax.saxutils import quoteattr
 import casadi as ca
 
 from ..blocks._units import BASE_UNITS, parse_unit
-from ._codegen import Entry, layout, symbolic
+from ._codegen import Entry, layout, scalar, symbolic
 from ._spec import ModelSpec
 
 #: Log categories (FMI 3.0, 2.4.5) that the runtime uses.
@@ -96,18 +97,18 @@ def _second_order(knowns: Any, unknowns: Any) -> dict[tuple[int, int], set[int]]
 
 def _kind(of: Iterable[set[int] | None], at: list[Entry]) -> str:
     """Say how a known enters, from what the elements of its Jacobian depend on (None: not known)."""
-    kinds = set()
+    kinds: set[str] = set()
     for elements in of:
         if elements is None:
             return "dependent"
         kinds |= {at[i].kind for i in elements}
-    if kinds - {"fixed", "tunable"}:
+    if kinds - {"fixed", "tunable", "discrete"}:
         return "dependent"
-    return "tunable" if "tunable" in kinds else "fixed" if kinds else "constant"
+    return next((kind for kind in ("discrete", "tunable", "fixed") if kind in kinds), "constant")
 
 
 def dependencies(spec: ModelSpec) -> dict[int, tuple[Dependency, ...]]:
-    """Find what each output and each derivative depends on, among time, parameters, inputs and states.
+    """Find what each output, derivative and event indicator depends on, among time, parameters, inputs and states.
 
     Parameters
     ----------
@@ -121,20 +122,22 @@ def dependencies(spec: ModelSpec) -> dict[int, tuple[Dependency, ...]]:
     """
     entries = layout(spec)
     at = _entry_at(entries)
-    knowns, dx, y = symbolic(spec)
-    unknowns = ca.vertcat(dx, y)
-    first = next((e.first for e in entries if e.kind in ("derivative", "output")), 0)
+    knowns, unknowns = symbolic(spec)
+    calculated = ("derivative", "output", "indicator")
+    first = next((e.first for e in entries if e.kind in calculated), 0)
     second = _second_order(knowns, unknowns)
     blocks: dict[tuple[int, int], list[set[int] | None]] = {}
     for row, column in _pairs(ca.Function("f", [knowns], [unknowns]).jac_sparsity(0, 0)):
         pair = (at[first + row].reference, at[column].reference)
         blocks.setdefault(pair, []).append(None if second is None else second.get((row, column)))
-    found: dict[int, list[Dependency]] = {e.reference: [] for e in entries if e.kind in ("derivative", "output")}
+    found: dict[int, list[Dependency]] = {e.reference: [] for e in entries if e.kind in calculated}
     for unknown, known in sorted(blocks):
         found[unknown].append(Dependency(known, _kind(blocks[unknown, known], at)))
     for e in entries:
         if e.kind == "state" and e.is_output:  # it is its own known
             found[e.reference] = [Dependency(e.reference, "constant")]
+        if e.kind == "discrete" and e.is_output:  # it changes between two iterations of an event alone
+            found[e.reference] = []
     return {reference: tuple(items) for reference, items in found.items()}
 
 
@@ -151,12 +154,12 @@ def _unknown(tag: str, reference: int, items: Iterable[Dependency]) -> str:
 def _structure(spec: ModelSpec, entries: tuple[Entry, ...]) -> list[str]:
     """Write the model structure (FMI 3.0, 2.4.8).
 
-    Outputs and derivatives list the knowns that can change between communication points; fixed parameters are frozen
-    then. Derivatives are listed because directional derivatives are provided (for Co-Simulation they would be ignored
-    else). Initial unknowns are computed outputs and derivatives; states have initial = exact and are knowns.
+    Outputs, derivatives and event indicators list the knowns that can change between events or communication points;
+    fixed parameters and discrete states are frozen then. Initial unknowns are computed outputs and derivatives; states
+    have initial = exact and are knowns.
     """
     found = dependencies(spec)
-    frozen = {e.reference for e in entries if e.kind == "fixed"}
+    frozen = {e.reference for e in entries if e.kind in ("fixed", "discrete")}
     rows = []
     for tag, chosen in (
         ("Output", [e for e in entries if e.is_output]),
@@ -167,16 +170,35 @@ def _structure(spec: ModelSpec, entries: tuple[Entry, ...]) -> list[str]:
         if e.kind in ("derivative", "output"):
             items = [Dependency(d.known, d.kind if d.kind == "constant" else "dependent") for d in found[e.reference]]
             rows.append(_unknown("InitialUnknown", e.reference, items))
+    for e in entries:
+        if e.kind == "indicator":
+            items = [d for d in found[e.reference] if d.known not in frozen]
+            rows.append(_unknown("EventIndicator", e.reference, items))
     return rows
+
+
+def _reinitialized(spec: ModelSpec) -> set[str]:
+    """Name the continuous states that a jump may change (FMI 3.0, 2.4.7.4: reinit)."""
+    if spec.jump is None:
+        return set()
+    jump = scalar(spec.jump)
+    if not jump.is_a("SXFunction"):
+        return {v.name for v in spec.continuous}
+    args = jump.sx_in()
+    after = ca.densify(ca.reshape(jump.call(args, True, False)[0], jump.numel_out(0), 1))
+    changed = [not ca.is_equal(after[i], args[1][i], 2) for i in range(after.numel())]
+    offsets = [0, *itertools.accumulate(v.size for v in spec.continuous)]
+    return {v.name for v, first in zip(spec.continuous, offsets, strict=False) if any(changed[first : first + v.size])}
 
 
 # ---- variables and units ----
 
 _CAUSALITY = {"time": "independent", "fixed": "parameter", "tunable": "parameter", "input": "input"}
-_INITIAL = {"fixed": "exact", "tunable": "exact", "state": "exact", "derivative": "calculated", "output": "calculated"}
+_INITIAL = dict.fromkeys(("fixed", "tunable", "state", "discrete"), "exact")
+_INITIAL |= dict.fromkeys(("derivative", "output", "indicator"), "calculated")
 
 
-def _variable(e: Entry) -> str:
+def _variable(e: Entry, reinitialized: set[str]) -> str:
     v = e.variable
     attributes: dict[str, object] = {
         "name": e.name,
@@ -188,8 +210,10 @@ def _variable(e: Entry) -> str:
         "unit": v.unit,
         "min": None if v.minimum is None else float(v.minimum),
         "max": None if v.maximum is None else float(v.maximum),
+        "nominal": None if v.nominal is None else float(v.nominal),
         "start": " ".join(map(repr, v.flat_start)) or None,
         "derivative": e.of,
+        "reinit": True if e.kind == "state" and e.name in reinitialized else None,
     }
     return _element("Float64", attributes, [_element("Dimension", {"start": n}) for n in v.shape])
 
@@ -228,25 +252,35 @@ def model_description(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
         "generationTool": f"Loopwright {package_version()}",
         "variableNamingConvention": "structured",
     }
-    interface = {
+    both: dict[str, object] = {
         "modelIdentifier": spec.name,
         "canGetAndSetFMUState": True,
         "canSerializeFMUState": True,
         "providesDirectionalDerivatives": derivatives,
         "providesAdjointDerivatives": derivatives,
+    }
+    stepping = {
         "canHandleVariableCommunicationStepSize": True,
         "maxOutputDerivativeOrder": 0,
-        "hasEventMode": False,
+        "mightReturnEarlyFromDoStep": bool(spec.events),
+        "hasEventMode": bool(spec.events),
     }
-    experiment = {"startTime": 0.0, "stopTime": float(spec.stop_time), "stepSize": float(spec.step_size)}
+    experiment = {
+        "startTime": 0.0,
+        "stopTime": float(spec.stop_time),
+        "tolerance": float(spec.tolerance),
+        "stepSize": float(spec.step_size),
+    }
+    reinitialized = _reinitialized(spec)
     units = sorted({e.variable.unit for e in entries if e.variable.unit is not None})
     categories = [_element("Category", {"name": n, "description": d}) for n, d in LOG_CATEGORIES.items()]
     children = [
-        _element("CoSimulation", interface),
+        _element("ModelExchange", both | {"needsCompletedIntegratorStep": False}),
+        _element("CoSimulation", both | stepping),
         _element("UnitDefinitions", {}, map(_unit, units)),
         _element("LogCategories", {}, categories),
         _element("DefaultExperiment", experiment),
-        _element("ModelVariables", {}, map(_variable, entries)),
+        _element("ModelVariables", {}, [_variable(e, reinitialized) for e in entries]),
         _element("ModelStructure", {}, _structure(spec, entries)),
     ]
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"

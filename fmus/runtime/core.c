@@ -1,7 +1,7 @@
-/* The part of the runtime that knows no FMI version: logging, variables, equations, the integrator, states.
+/* The part of the runtime that knows no FMI version: logging, variables, equations, derivatives, modes, states.
  *
  * Functions return true when all went well; when not, they have logged why, and the instance is terminated until it is
- * reset or given back a state (FMI 3.0, 2.3.1: a function that returns fmi3Error leads to Terminated).
+ * reset or given back a state (in FMI, a function that returns an error leads to Terminated).
  */
 #include <float.h>
 #include <math.h>
@@ -10,8 +10,9 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define LW_MAGIC UINT64_C(0x4c57303031464d55)
-#define LW_MAX_SUBSTEPS 1e9
+#define LW_MAGIC UINT64_C(0x4c57303032464d55)
+#define LW_MIN_TOLERANCE 1e-14
+#define LW_MAX_TOLERANCE 1e-1
 
 /* ---- logging ---- */
 
@@ -44,12 +45,19 @@ static bool lw_fail(lw_instance *self, const char *format, ...) {
     return false;
 }
 
-static const char *const lw_mode_names[] = {"Instantiated", "Initialization Mode", "Step Mode", "Terminated"};
+static const char *const lw_mode_names[] = {"Instantiated", "Initialization Mode", "Step Mode", "Event Mode",
+                                            "Continuous-Time Mode", "Terminated"};
 
 static bool lw_in_mode(lw_instance *self, const char *function, lw_mode expected) {
     if (self->s.mode == (int32_t)expected) return true;
     return lw_fail(self, "%s was called in state %s, expected %s. Call the functions in the order of " LW_ORDER
                    ", or reset the FMU.", function, lw_mode_names[self->s.mode], lw_mode_names[expected]);
+}
+
+/* Is it in one of Step Mode, Event Mode, Continuous-Time Mode? */
+static bool lw_is_initialized(lw_instance *self, const char *function) {
+    if (self->s.mode > LW_INITIALIZING && self->s.mode < LW_TERMINATED) return true;
+    return lw_in_mode(self, function, self->s.model_exchange ? LW_CONTINUOUS : LW_STEPPING);
 }
 
 /* ---- equations ---- */
@@ -67,7 +75,7 @@ static bool lw_check_finite(lw_instance *self, const double *values, size_t firs
     while (isfinite(values[i])) i++;
     while (first + i >= (size_t)lw_variables[v].first + lw_variables[v].size) v++;
     return lw_fail(self, "%s (element %zu) became %g at t = %.9g s, expected a finite number. Check the inputs and "
-                   "parameters; a stiff model needs a smaller internal_step.", lw_variables[v].name,
+                   "parameters; a stiff model needs a smaller internal_step, or integrator = 3.", lw_variables[v].name,
                    first + i - lw_variables[v].first, values[i], t);
 }
 
@@ -100,70 +108,29 @@ static bool lw_update_derivatives(lw_instance *self) {
     return lw_update(self, &self->s.have_derivatives, lw_derivative, LW_DX, LW_N_X);
 }
 
-/* ---- the integrator: explicit Runge-Kutta of order 4, fixed step, inputs held ---- */
+#if LW_N_Z
+/* The importer sees z with a hysteresis around 0. It stops near the crossing, on either side: the jump is then to happen
+ * once, and no indicator is to be 0 when it restarts (FMI 3.0, 3.2.1; FMI 2.0.5, 3.2.2). */
+#define LW_HYSTERESIS 1e-10
 
-/* The slope k at (t, x + h * previous slope); on the stack, the compiler keeps small models in registers. */
-static inline int lw_slope(lw_instance *self, double t, const double *x, double h, const double *previous, const double *u,
-                           double *k) {
-    LW_SCRATCH(stage);
-    const double *arg[LW_SZ_ARG] = {&t, stage, u, self->s.values + LW_P};
-    double *res[LW_SZ_RES] = {k};
-    for (int i = 0; i < LW_N_X; i++) stage[i] = previous ? x[i] + h * previous[i] : x[i];
-    return lw_derivative(arg, res, self->iw, self->w, 0);
-}
-
-static inline int lw_rk4(lw_instance *self, double t, double h, const double *u, double *x) {
-    LW_SCRATCH(k1);
-    LW_SCRATCH(k2);
-    LW_SCRATCH(k3);
-    LW_SCRATCH(k4);
-    int failed = lw_slope(self, t, x, 0.0, NULL, u, k1);
-    failed |= lw_slope(self, t + h / 2.0, x, h / 2.0, k1, u, k2);
-    failed |= lw_slope(self, t + h / 2.0, x, h / 2.0, k2, u, k3);
-    failed |= lw_slope(self, t + h, x, h, k3, u, k4);
-    for (int i = 0; i < LW_N_X; i++) x[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
-    return failed;
-}
-
-/* Integrate from t0 over h in n substeps into self->next; with `watch`, log the first substep that isn't finite. */
-static bool lw_integrate(lw_instance *self, double t0, double h, long n, bool watch) {
-    const double *u = self->s.values + LW_U;
-    LW_SCRATCH(x);
-    int failed = 0;
-    memcpy(x, self->s.values + LW_X, LW_N_X * sizeof(double));
-    for (long i = 0; i < n; i++) {
-        failed |= lw_rk4(self, t0 + h * ((double)i / (double)n), h / (double)n, u, x);
-        double t = t0 + h * ((double)(i + 1) / (double)n);
-        if (watch && failed) return lw_fail(self, "the equations can't be evaluated at t = %.9g s.", t);
-        if (watch && !lw_check_finite(self, x, LW_X, LW_N_X, t)) return false;
-    }
-    memcpy(self->next, x, LW_N_X * sizeof(double));
-    return !failed && lw_is_finite(x, LW_N_X);
-}
-
-/* Step from t over h. When it fails, nothing has changed: time, states and outputs are those before it. */
-static bool lw_step(lw_instance *self, double t, double h) {
-    double *v = self->s.values, end = t + h, count = ceil(h / v[LW_STEP] - 1e-9);
-    if (!(count <= LW_MAX_SUBSTEPS))
-        return lw_fail(self, "internal_step = %g s cuts the communication step of %g s into more than 1e9 pieces. Set a "
-                       "larger one.", v[LW_STEP], h);
-    long n = count < 1.0 ? 1 : (long)count;
-    if (!lw_integrate(self, t, h, n, false)) {
-        lw_integrate(self, t, h, n, true); /* again, to name the variable and the time */
-        return false;
-    }
-    if (LW_N_Y) {
-        if (lw_call(self, lw_output, &end, self->next, v + LW_U, self->scratch))
-            return lw_fail(self, "the outputs can't be evaluated at t = %.9g s.", end);
-        if (!lw_check_finite(self, self->scratch, LW_Y, LW_N_Y, end)) return false;
-    }
-    memcpy(v + LW_Y, self->scratch, LW_N_Y * sizeof(double));
-    memcpy(v + LW_X, self->next, LW_N_X * sizeof(double));
-    memcpy(v + LW_HELD, v + LW_U, LW_N_U * sizeof(double));
-    v[0] = end;
-    self->s.have_outputs = 1;
-    self->s.have_derivatives = 0;
+static bool lw_update_indicators(lw_instance *self) {
+    uint8_t have = self->s.have_indicators;
+    if (!lw_update(self, &self->s.have_indicators, lw_indicator, LW_Z, LW_N_Z)) return false;
+    for (size_t i = 0; i < LW_N_Z && !have; i++)
+        self->s.values[LW_Z + i] += (self->s.positive[i] ? LW_HYSTERESIS : -LW_HYSTERESIS) * lw_events[i].nominal;
     return true;
+}
+#else
+static bool lw_update_indicators(lw_instance *self) {
+    (void)self;
+    return true;
+}
+#endif
+
+/* Something has changed that outputs, derivatives and event indicators are computed from. */
+static void lw_changed(lw_instance *self) {
+    self->s.have_outputs = self->s.have_derivatives = self->s.have_indicators = 0;
+    memcpy(self->s.values + LW_HELD, self->s.values + LW_U, LW_N_U * sizeof(double));
 }
 
 /* ---- variables ---- */
@@ -192,11 +159,12 @@ static bool lw_get(lw_instance *self, const char *function, const uint32_t *refe
     for (size_t i = 0; i < n; i++) {
         if (!(variable = lw_variable_at(self, function, references[i], left))) return false;
         lw_kind kind = variable->kind;
-        if (self->s.mode == LW_INSTANTIATED && (kind == LW_OUTPUT || kind == LW_DERIVATIVE))
+        if (self->s.mode == LW_INSTANTIATED && kind >= LW_DERIVATIVE)
             return lw_fail(self, "%s: %s is calculated, and has no value before initialization. Call "
                            LW_API "EnterInitializationMode first.", function, variable->name);
         if (kind == LW_OUTPUT && !lw_update_outputs(self)) return false;
         if (kind == LW_DERIVATIVE && !lw_update_derivatives(self)) return false;
+        if (kind == LW_INDICATOR && !lw_update_indicators(self)) return false;
         memcpy(values, self->s.values + variable->first, variable->size * sizeof(double));
         values += variable->size;
         left -= variable->size;
@@ -204,19 +172,24 @@ static bool lw_get(lw_instance *self, const char *function, const uint32_t *refe
     return lw_all_used(self, function, variable, left);
 }
 
-/* May it be set now (FMI 3.0, 2.3 and 4.2)? NULL, or why not. */
-static const char *lw_why_not_set(lw_mode mode, lw_kind kind) {
+/* May it be set now (FMI 3.0, 2.3, 3.2 and 4.2; FMI 2.0.5, 3.2.3 and 4.2.4)? NULL, or why not. */
+static const char *lw_why_not_set(lw_instance *self, const lw_variable *variable) {
+    lw_mode mode = (lw_mode)self->s.mode;
+    lw_kind kind = variable->kind;
+    if (kind == LW_TIME && self->s.model_exchange) return "is the independent variable; " LW_API "SetTime sets it";
     if (kind == LW_TIME) return "is the independent variable; " LW_API "DoStep advances it";
-    if (kind == LW_OUTPUT || kind == LW_DERIVATIVE) return "is calculated";
+    if (kind >= LW_DERIVATIVE) return "is calculated";
     if (mode == LW_TERMINATED) return "can't be set in state Terminated; reset the FMU, or set an FMU state first";
-    if (mode != LW_STEPPING) return NULL;
+    if (mode == LW_INSTANTIATED || mode == LW_INITIALIZING) return NULL;
     if (kind == LW_FIXED) return "is a fixed parameter; set it before " LW_API "ExitInitializationMode";
-    if (kind == LW_STATE) return "is a state; set its start value before " LW_API "ExitInitializationMode";
+    if (kind == LW_STATE || kind == LW_DISCRETE) return "is a state; set its start value before " LW_API "ExitInitializationMode";
+    if (mode == LW_CONTINUOUS && kind == LW_TUNABLE) return "is a tunable parameter; set it in Event Mode";
+    if (mode == LW_CONTINUOUS && variable->is_discrete) return "is a discrete input; set it in Event Mode";
     return NULL;
 }
 
 static bool lw_check_set(lw_instance *self, const char *function, const lw_variable *variable, const double *values) {
-    const char *why = lw_why_not_set((lw_mode)self->s.mode, variable->kind);
+    const char *why = lw_why_not_set(self, variable);
     if (why) return lw_fail(self, "%s: %s %s (t = %.9g s).", function, variable->name, why, self->s.values[0]);
     for (uint32_t k = 0; k < variable->size; k++) {
         if (!isfinite(values[k]))
@@ -227,6 +200,10 @@ static bool lw_check_set(lw_instance *self, const char *function, const lw_varia
                            variable->name, (unsigned)k, values[k], self->s.values[0], variable->min, variable->max);
         if (variable->first == LW_STEP && !(values[k] > 0))
             return lw_fail(self, "%s: internal_step was set to %g s, expected a positive number.", function, values[k]);
+        if (variable->first == LW_INTEGRATOR && values[k] != LW_RK4 && values[k] != LW_DOPRI5 && values[k] != LW_RODAS)
+            return lw_fail(self, "%s: integrator was set to %g, expected 1 (rk4), 2 (dopri5) or 3 (rodas).", function, values[k]);
+        if (variable->first == LW_INTEGRATOR && values[k] == LW_RODAS && !LW_HAS_DERIVATIVES)
+            return lw_fail(self, "%s: integrator was set to 3 (rodas), but these equations have no derivatives. Set 1 or 2.", function);
     }
     return true;
 }
@@ -236,31 +213,49 @@ static bool lw_set(lw_instance *self, const char *function, const uint32_t *refe
     for (size_t i = 0; i < n; i++) {
         if (!(variable = lw_variable_at(self, function, references[i], left))) return false;
         if (!lw_check_set(self, function, variable, values)) return false;
-        /* In Step Mode, what is read until the next step belongs to the end of the last one. */
-        if (self->s.mode == LW_STEPPING && variable->kind == LW_TUNABLE && !lw_update_derivatives(self)) return false;
-        memcpy(self->s.values + variable->first, values, variable->size * sizeof(double));
-        if (self->s.mode != LW_STEPPING) {
-            self->s.have_outputs = self->s.have_derivatives = 0;
-            memcpy(self->s.values + LW_HELD, self->s.values + LW_U, LW_N_U * sizeof(double));
+        if (self->s.mode == LW_STEPPING && variable->kind == LW_TUNABLE) {
+            /* In Step Mode, what is read until the next step belongs to the end of the last one. */
+            if (!lw_update_derivatives(self) || !lw_update_indicators(self)) return false;
+            self->s.step_size = 0.0;
         }
+        memcpy(self->s.values + variable->first, values, variable->size * sizeof(double));
+        if (self->s.mode != LW_STEPPING) lw_changed(self);
+        if (variable->first == LW_TOLERANCE) self->s.tolerance_given = 1;
         values += variable->size;
         left -= variable->size;
     }
     return lw_all_used(self, function, variable, left);
 }
 
+/* Model Exchange: the importer moves time and continuous states. The stop time is no bound: solvers look beyond it. */
+static inline bool lw_set_time(lw_instance *self, const char *function, double t) {
+    if (!isfinite(t)) return lw_fail(self, "%s: time was set to %g s, expected a finite number.", function, t);
+    if (t == self->s.values[0]) return true;
+    self->s.values[0] = t;
+    lw_changed(self);
+    return true;
+}
+
+static inline bool lw_set_states(lw_instance *self, const char *function, const double *x) {
+    if (!lw_in_mode(self, function, LW_CONTINUOUS) || !lw_check_finite(self, x, LW_X, LW_N_X, self->s.values[0])) return false;
+    if (LW_N_X) memcpy(self->s.values + LW_X, x, LW_N_X * sizeof(double));
+    lw_changed(self);
+    return true;
+}
+
 /* ---- derivatives: of outputs and state derivatives, by the knowns, at the current values ---- */
 
 #if LW_HAS_DERIVATIVES
 static bool lw_check_unknown(lw_instance *self, const char *function, const lw_variable *variable) {
-    if (variable->is_output || variable->kind == LW_DERIVATIVE) return true;
+    if (variable->is_output || variable->kind == LW_DERIVATIVE || variable->kind == LW_INDICATOR) return true;
     return lw_fail(self, "%s: %s is no unknown. Ask for outputs and derivatives of states.", function, variable->name);
 }
 
 static bool lw_check_known(lw_instance *self, const char *function, const lw_variable *variable) {
     bool initializing = self->s.mode == LW_INITIALIZING;
     lw_kind kind = variable->kind;
-    if (kind == LW_TIME || kind == LW_INPUT || kind == LW_STATE || kind == LW_TUNABLE || (kind == LW_FIXED && initializing)) return true;
+    if (kind == LW_TIME || kind == LW_INPUT || kind == LW_STATE || kind == LW_TUNABLE) return true;
+    if (initializing && (kind == LW_FIXED || kind == LW_DISCRETE)) return true;
     return lw_fail(self, "%s: %s is no known in %s. Give inputs, states, tunable parameters or time%s.", function,
                    variable->name, lw_mode_names[self->s.mode], initializing ? ", or fixed parameters" : "");
 }
@@ -286,18 +281,17 @@ static bool lw_derive(lw_instance *self, const char *function, bool adjoint, con
                       size_t n_sensitivity) {
     double *in = self->seed, *out = self->sensitivity;
     size_t n_in = adjoint ? n_unknowns : n_knowns, n_out = adjoint ? n_knowns : n_unknowns;
-    if (self->s.mode != LW_INITIALIZING && self->s.mode != LW_STEPPING)
-        return lw_in_mode(self, function, LW_STEPPING);
+    if (self->s.mode != LW_INITIALIZING && !lw_is_initialized(self, function)) return false;
     memset(in, 0, sizeof self->seed);
     if (!lw_transfer(self, function, adjoint ? unknowns : knowns, n_in, adjoint, seed, NULL, in, n_seed)) return false;
     memcpy(out, in, sizeof self->seed); /* a state that is an output depends on itself */
-    if (!adjoint) memset(out + LW_DX, 0, (LW_N_X + LW_N_Y) * sizeof(double));
+    if (!adjoint) memset(out + LW_DX, 0, LW_N_UNKNOWNS * sizeof(double));
     self->arg[0] = self->s.values;
     self->arg[1] = adjoint ? in + LW_DX : in;
     self->res[0] = self->scratch;
     if ((adjoint ? lw_reverse : lw_forward)(self->arg, self->res, self->iw, self->w, 0))
         return lw_fail(self, "%s: the derivatives can't be evaluated at t = %.9g s.", function, self->s.values[0]);
-    size_t first = adjoint ? 0 : LW_DX, n = adjoint ? LW_DX : LW_N_X + LW_N_Y;
+    size_t first = adjoint ? 0 : LW_DX, n = adjoint ? LW_DX : LW_N_UNKNOWNS;
     for (size_t i = 0; i < n; i++) out[first + i] += self->scratch[i];
     return lw_transfer(self, function, adjoint ? knowns : unknowns, n_out, !adjoint, NULL, sensitivity, out, n_sensitivity);
 }
@@ -306,11 +300,13 @@ static bool lw_derive(lw_instance *self, const char *function, bool adjoint, con
 /* ---- life ---- */
 
 static void lw_reset(lw_instance *self) {
+    uint8_t model_exchange = self->s.model_exchange;
     memset(&self->s, 0, sizeof self->s);
     self->s.magic = LW_MAGIC;
     self->s.mode = LW_INSTANTIATED;
+    self->s.model_exchange = model_exchange;
     memcpy(self->s.values, lw_start_values, sizeof lw_start_values);
-    memcpy(self->s.values + LW_HELD, self->s.values + LW_U, LW_N_U * sizeof(double));
+    lw_changed(self);
 }
 
 static lw_instance *lw_create(const char *name, size_t length) {
@@ -328,15 +324,52 @@ static lw_instance *lw_create(const char *name, size_t length) {
 
 static void lw_destroy(lw_instance *self) {
     if (!self) return;
+    free(self->matrix);
     free(self->name);
     free(self);
 }
 
-/* A state from outside: is it one of this very FMU? */
+/* A state from outside: is it one of this very FMU, and of this interface type? */
 static bool lw_accept_state(lw_instance *self, const char *function, const lw_state *state) {
-    if (state->magic == LW_MAGIC && state->mode >= LW_INSTANTIATED && state->mode <= LW_TERMINATED) {
-        self->s = *state;
-        return true;
-    }
-    return lw_fail(self, "%s: this is no state of this FMU. Give one that it has made itself.", function);
+    if (state->magic != LW_MAGIC || state->mode < LW_INSTANTIATED || state->mode > LW_TERMINATED)
+        return lw_fail(self, "%s: this is no state of this FMU. Give one that it has made itself.", function);
+    if (state->model_exchange != self->s.model_exchange)
+        return lw_fail(self, "%s: this is the state of a %s instance. Give one of the same interface type.", function,
+                       state->model_exchange ? "Model Exchange" : "Co-Simulation");
+    self->s = *state;
+    return true;
+}
+
+/* ---- initialization ---- */
+
+static inline bool lw_initialize(lw_instance *self, const char *function, double start, bool stop_defined, double stop) {
+    if (!lw_in_mode(self, function, LW_INSTANTIATED)) return false;
+    if (!isfinite(start) || (stop_defined && !(stop >= start)))
+        return lw_fail(self, "%s: startTime is %g s, stopTime is %g s, expected finite times in this order.", function, start, stop);
+    self->s.values[0] = start;
+    self->s.stop_time_defined = stop_defined;
+    self->s.stop_time = stop_defined ? stop : 0.0;
+    self->s.mode = LW_INITIALIZING;
+    lw_changed(self);
+    return true;
+}
+
+/* The relative tolerance that the importer wishes for, unless the parameter has been set. */
+static inline void lw_suggest_tolerance(lw_instance *self, double tolerance) {
+    if (isfinite(tolerance) && tolerance > 0.0 && !self->s.tolerance_given)
+        self->s.values[LW_TOLERANCE] = fmin(fmax(tolerance, LW_MIN_TOLERANCE), LW_MAX_TOLERANCE);
+}
+
+#if LW_N_Z
+static bool lw_start_domains(lw_instance *self);
+#endif
+
+/* Enter `next`: Step Mode, or Event Mode where it is used. */
+static inline bool lw_start(lw_instance *self, const char *function, lw_mode next) {
+    if (!lw_in_mode(self, function, LW_INITIALIZING) || !lw_update_outputs(self)) return false;
+#if LW_N_Z
+    if (!lw_start_domains(self)) return false;
+#endif
+    self->s.mode = next;
+    return true;
 }

@@ -1,4 +1,5 @@
-/* FMI 3.0 for Co-Simulation: the functions of fmi3Functions.h that exported FMUs support. The others: fmi3_refused.c. */
+/* FMI 3.0: the functions of fmi3Functions.h that exported FMUs support. Those of Model Exchange and of Event Mode alone:
+ * fmi3_events.c. The others: fmi3_refused.c. */
 #include "fmi3Functions.h"
 
 #define LW_OK(call) ((call) ? fmi3OK : fmi3Error)
@@ -35,15 +36,12 @@ fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean loggingOn, siz
 
 static bool lw_is_blank(const char *text) { return !text || text[strspn(text, " \t\r\n")] == 0; }
 
-fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
-        fmi3Boolean visible, fmi3Boolean loggingOn, fmi3Boolean eventModeUsed, fmi3Boolean earlyReturnAllowed,
-        const fmi3ValueReference requiredIntermediateVariables[], size_t nRequiredIntermediateVariables,
-        fmi3InstanceEnvironment instanceEnvironment, fmi3LogMessageCallback logMessage,
-        fmi3IntermediateUpdateCallback intermediateUpdate) {
-    (void)resourcePath, (void)visible, (void)earlyReturnAllowed, (void)requiredIntermediateVariables, (void)intermediateUpdate;
+static lw_instance *lw_instantiate_fmi3(fmi3String instanceName, fmi3String instantiationToken, fmi3Boolean loggingOn,
+        fmi3InstanceEnvironment instanceEnvironment, fmi3LogMessageCallback logMessage, bool model_exchange) {
     const char *name = lw_is_blank(instanceName) ? LW_MODEL_NAME : instanceName;
     lw_instance *self = lw_create(name, strlen(name));
     if (!self) return NULL;
+    self->s.model_exchange = model_exchange;
     self->categories = loggingOn ? LW_LOG_WARNING | LW_LOG_ERROR : 0;
     self->environment = instanceEnvironment;
     self->write = logMessage ? lw_write_fmi3 : NULL;
@@ -53,7 +51,32 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String ins
     else if (!instantiationToken || strcmp(instantiationToken, LW_TOKEN))
         ok = lw_fail(self, "the instantiation token is %s, expected " LW_TOKEN ". The modelDescription.xml that was read "
                      "doesn't belong to this binary: unzip the FMU again.", instantiationToken ? instantiationToken : "missing");
-    else if (eventModeUsed) ok = lw_fail(self, "this FMU has no Event Mode. Instantiate it with eventModeUsed = fmi3False.");
+    if (ok) return self;
+    lw_destroy(self);
+    return NULL;
+}
+
+fmi3Instance fmi3InstantiateModelExchange(fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
+        fmi3Boolean visible, fmi3Boolean loggingOn, fmi3InstanceEnvironment instanceEnvironment,
+        fmi3LogMessageCallback logMessage) {
+    (void)resourcePath, (void)visible;
+    return lw_instantiate_fmi3(instanceName, instantiationToken, loggingOn, instanceEnvironment, logMessage, true);
+}
+
+fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
+        fmi3Boolean visible, fmi3Boolean loggingOn, fmi3Boolean eventModeUsed, fmi3Boolean earlyReturnAllowed,
+        const fmi3ValueReference requiredIntermediateVariables[], size_t nRequiredIntermediateVariables,
+        fmi3InstanceEnvironment instanceEnvironment, fmi3LogMessageCallback logMessage,
+        fmi3IntermediateUpdateCallback intermediateUpdate) {
+    (void)resourcePath, (void)visible, (void)requiredIntermediateVariables, (void)intermediateUpdate;
+    lw_instance *self =
+        lw_instantiate_fmi3(instanceName, instantiationToken, loggingOn, instanceEnvironment, logMessage, false);
+    if (!self) return NULL;
+    self->event_mode_used = eventModeUsed;
+    self->early_return_allowed = earlyReturnAllowed;
+    bool ok = true;
+    if (eventModeUsed && !LW_N_Z)
+        ok = lw_fail(self, "this FMU has no events, and no Event Mode. Instantiate it with eventModeUsed = fmi3False.");
     else if (nRequiredIntermediateVariables)
         ok = lw_fail(self, "this FMU has no intermediate update. Instantiate it without requiredIntermediateVariables.");
     if (ok) return self;
@@ -72,30 +95,20 @@ fmi3Status fmi3Reset(fmi3Instance instance) {
 fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean toleranceDefined, fmi3Float64 tolerance,
         fmi3Float64 startTime, fmi3Boolean stopTimeDefined, fmi3Float64 stopTime) {
     LW_SELF;
-    (void)toleranceDefined, (void)tolerance; /* a fixed internal step has no error control */
-    if (!lw_in_mode(self, "fmi3EnterInitializationMode", LW_INSTANTIATED)) return fmi3Error;
-    if (!isfinite(startTime) || (stopTimeDefined && !(stopTime >= startTime)))
-        return LW_OK(lw_fail(self, "fmi3EnterInitializationMode: startTime is %g s, stopTime is %g s, expected finite times "
-                             "in this order.", startTime, stopTime));
-    self->s.values[0] = startTime;
-    self->s.stop_time_defined = stopTimeDefined;
-    self->s.stop_time = stopTimeDefined ? stopTime : 0.0;
-    self->s.mode = LW_INITIALIZING;
-    self->s.have_outputs = self->s.have_derivatives = 0;
+    if (!lw_initialize(self, "fmi3EnterInitializationMode", startTime, stopTimeDefined, stopTime)) return fmi3Error;
+    if (toleranceDefined) lw_suggest_tolerance(self, tolerance);
     return fmi3OK;
 }
 
 fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
     LW_SELF;
-    if (!lw_in_mode(self, "fmi3ExitInitializationMode", LW_INITIALIZING)) return fmi3Error;
-    if (!lw_update_outputs(self)) return fmi3Error;
-    self->s.mode = LW_STEPPING;
-    return fmi3OK;
+    bool events = self->s.model_exchange || self->event_mode_used;
+    return LW_OK(lw_start(self, "fmi3ExitInitializationMode", events ? LW_EVENT : LW_STEPPING));
 }
 
 fmi3Status fmi3Terminate(fmi3Instance instance) {
     LW_SELF;
-    if (!lw_in_mode(self, "fmi3Terminate", LW_STEPPING)) return fmi3Error;
+    if (!lw_is_initialized(self, "fmi3Terminate")) return fmi3Error;
     self->s.mode = LW_TERMINATED;
     return fmi3OK;
 }
@@ -135,11 +148,12 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoi
         fmi3Boolean *earlyReturn, fmi3Float64 *lastSuccessfulTime) {
     LW_SELF;
     (void)noSetFMUStatePriorToCurrentPoint; /* nothing is buffered */
+    double end = currentCommunicationPoint + communicationStepSize;
     bool ok = lw_check_step(self, currentCommunicationPoint, communicationStepSize)
               && lw_step(self, currentCommunicationPoint, communicationStepSize);
-    if (eventHandlingNeeded) *eventHandlingNeeded = fmi3False;
+    if (eventHandlingNeeded) *eventHandlingNeeded = ok && self->event_found;
     if (terminateSimulation) *terminateSimulation = fmi3False;
-    if (earlyReturn) *earlyReturn = fmi3False;
+    if (earlyReturn) *earlyReturn = ok && self->s.values[0] < end;
     if (lastSuccessfulTime) *lastSuccessfulTime = self->s.values[0];
     return LW_OK(ok);
 }

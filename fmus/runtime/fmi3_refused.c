@@ -45,13 +45,6 @@ static fmi3Instance lw_refuse_instance(fmi3String instanceName, fmi3Boolean logg
     return NULL;
 }
 
-fmi3Instance fmi3InstantiateModelExchange(fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
-        fmi3Boolean visible, fmi3Boolean loggingOn, fmi3InstanceEnvironment instanceEnvironment,
-        fmi3LogMessageCallback logMessage) {
-    return lw_refuse_instance(instanceName, loggingOn, instanceEnvironment, logMessage, LW_MODEL_NAME
-                              ": this FMU has no Model Exchange. Use fmi3InstantiateCoSimulation.");
-}
-
 fmi3Instance fmi3InstantiateScheduledExecution(fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
         fmi3Boolean visible, fmi3Boolean loggingOn, fmi3InstanceEnvironment instanceEnvironment,
         fmi3LogMessageCallback logMessage, fmi3ClockUpdateCallback clockUpdate, fmi3LockPreemptionCallback lockPreemption,
@@ -60,30 +53,13 @@ fmi3Instance fmi3InstantiateScheduledExecution(fmi3String instanceName, fmi3Stri
                               ": this FMU has no Scheduled Execution. Use fmi3InstantiateCoSimulation.");
 }
 
-#define LW_NO_ME "this FMU has no Model Exchange (see modelDescription.xml)"
-LW_REFUSE(fmi3EnterContinuousTimeMode, LW_NO_ME, fmi3Instance instance)
-LW_REFUSE(fmi3CompletedIntegratorStep, LW_NO_ME, fmi3Instance instance, fmi3Boolean noSetFMUStatePriorToCurrentPoint,
-          fmi3Boolean *enterEventMode, fmi3Boolean *terminateSimulation)
-LW_REFUSE(fmi3SetTime, LW_NO_ME, fmi3Instance instance, fmi3Float64 time)
-LW_REFUSE(fmi3SetContinuousStates, LW_NO_ME, fmi3Instance instance, const fmi3Float64 continuousStates[], size_t n)
-LW_REFUSE(fmi3GetContinuousStateDerivatives, LW_NO_ME, fmi3Instance instance, fmi3Float64 derivatives[], size_t n)
-LW_REFUSE(fmi3GetEventIndicators, LW_NO_ME, fmi3Instance instance, fmi3Float64 eventIndicators[], size_t n)
-LW_REFUSE(fmi3GetContinuousStates, LW_NO_ME, fmi3Instance instance, fmi3Float64 continuousStates[], size_t n)
-LW_REFUSE(fmi3GetNominalsOfContinuousStates, LW_NO_ME, fmi3Instance instance, fmi3Float64 nominals[], size_t n)
-LW_REFUSE(fmi3GetNumberOfEventIndicators, LW_NO_ME, fmi3Instance instance, size_t *nEventIndicators)
-LW_REFUSE(fmi3GetNumberOfContinuousStates, LW_NO_ME, fmi3Instance instance, size_t *nContinuousStates)
 LW_REFUSE(fmi3ActivateModelPartition, "this FMU has no Scheduled Execution (see modelDescription.xml)", fmi3Instance instance,
           fmi3ValueReference clockReference, fmi3Float64 activationTime)
 
 /* ---- capabilities that the model description doesn't claim ---- */
 
-#define LW_NO_EVENTS "this FMU has no Event Mode (hasEventMode = false)"
-LW_REFUSE(fmi3EnterEventMode, LW_NO_EVENTS, fmi3Instance instance)
-LW_REFUSE(fmi3EnterStepMode, LW_NO_EVENTS, fmi3Instance instance)
-LW_REFUSE(fmi3EvaluateDiscreteStates, LW_NO_EVENTS, fmi3Instance instance)
-LW_REFUSE(fmi3UpdateDiscreteStates, LW_NO_EVENTS, fmi3Instance instance, fmi3Boolean *discreteStatesNeedUpdate,
-          fmi3Boolean *terminateSimulation, fmi3Boolean *nominalsOfContinuousStatesChanged,
-          fmi3Boolean *valuesOfContinuousStatesChanged, fmi3Boolean *nextEventTimeDefined, fmi3Float64 *nextEventTime)
+LW_REFUSE(fmi3EvaluateDiscreteStates, "providesEvaluateDiscreteStates is false; call fmi3UpdateDiscreteStates",
+          fmi3Instance instance)
 
 #define LW_NO_STRUCTURE "this FMU has no structural parameters"
 LW_REFUSE(fmi3EnterConfigurationMode, LW_NO_STRUCTURE, fmi3Instance instance)

@@ -1,13 +1,13 @@
 /* The runtime of exported FMUs: what a generated model provides, and what an instance holds.
  *
  * One translation unit per FMU: the generated model.c defines the LW_ constants below, includes this header, then holds
- * the equations and tables, then includes core.c (no FMI version in it) and one file of FMI functions. Being one unit,
- * the equations are inlined into the integrator, and all sizes are constants.
+ * the equations and tables, then includes core.c, integrators.c, events.c and stepping.c (no FMI version in them) and the
+ * files of one FMI version. Being one unit, the equations are inlined into the integrator, and all sizes are constants.
  *
- * All values of an instance are doubles in one array, in this order (so that a value reference is an index into
- * lw_variables, and every variable an interval of the array):
+ * All values of an instance are doubles in one array, in this order (every variable is an interval of the array):
  *
- *     time | parameters | inputs | states | derivatives | outputs | internal_step | inputs held in the last step
+ *     time | parameters | inputs | continuous states | discrete states | derivatives | outputs | event indicators |
+ *     internal_step, integrator, tolerance | inputs held in the last step
  */
 #ifndef LW_MODEL_H
 #define LW_MODEL_H
@@ -16,58 +16,90 @@
 #include <stddef.h>
 #include <stdint.h>
 
-/* Generated: LW_MODEL_NAME, LW_TOKEN, LW_N_P, LW_N_U, LW_N_X, LW_N_Y (elements), LW_N_VARIABLES, LW_HAS_DERIVATIVES,
- * LW_SZ_ARG, LW_SZ_RES, LW_SZ_IW, LW_SZ_W (work of the equations, the largest of all). */
+/* Generated: LW_MODEL_NAME, LW_TOKEN; elements: LW_N_P, LW_N_U, LW_N_X (continuous states), LW_N_D (discrete states),
+ * LW_N_Y; LW_N_Z events; LW_N_J nonzeros of the Jacobian; LW_N_VARIABLES; LW_HAS_DERIVATIVES; LW_SZ_ARG, LW_SZ_RES,
+ * LW_SZ_IW, LW_SZ_W (work of the equations, the largest of all); LW_API, how names of FMI's functions begin. */
+#define LW_N_S (LW_N_X + LW_N_D) /* all states, as the equations see them */
 #define LW_P 1
 #define LW_U (LW_P + LW_N_P)
 #define LW_X (LW_U + LW_N_U)
-#define LW_DX (LW_X + LW_N_X)
+#define LW_D (LW_X + LW_N_X)
+#define LW_DX (LW_D + LW_N_D)
 #define LW_Y (LW_DX + LW_N_X)
-#define LW_STEP (LW_Y + LW_N_Y)
-#define LW_HELD (LW_STEP + 1)
+#define LW_Z (LW_Y + LW_N_Y)
+#define LW_STEP (LW_Z + LW_N_Z)
+#define LW_INTEGRATOR (LW_STEP + 1)
+#define LW_TOLERANCE (LW_STEP + 2)
+#define LW_HELD (LW_STEP + 3)
 #define LW_N_VALUES (LW_HELD + LW_N_U)
+#define LW_N_UNKNOWNS (LW_N_X + LW_N_Y + LW_N_Z) /* derivatives, outputs, event indicators: from LW_DX on */
 #define LW_AT_LEAST_1(n) ((n) > 0 ? (n) : 1)
 
 /* Scratch of a state's size: on the stack for small models, else the instance's own. */
-#if LW_N_X <= 64
-#define LW_SCRATCH(name) double name[LW_AT_LEAST_1(LW_N_X)]
+#if LW_N_S <= 64
+#define LW_SCRATCH(name) double name[LW_AT_LEAST_1(LW_N_S)]
 #else
 #define LW_SCRATCH(name) double *const name = self->name
 #endif
 
-typedef enum { LW_TIME, LW_FIXED, LW_TUNABLE, LW_INPUT, LW_STATE, LW_DERIVATIVE, LW_OUTPUT } lw_kind;
+typedef enum {
+    LW_TIME, LW_FIXED, LW_TUNABLE, LW_INPUT, LW_STATE, LW_DISCRETE, LW_DERIVATIVE, LW_OUTPUT, LW_INDICATOR
+} lw_kind;
 
 typedef struct {
     const char *name;
     lw_kind kind;
-    bool is_output; /* a computed output, or a state that is one */
-    uint32_t first; /* index of its first element in the values */
+    bool is_output;   /* a computed output, or a state that is one */
+    bool is_discrete; /* an input that changes at events only */
+    uint32_t first;   /* index of its first element in the values */
     uint32_t size;
     double min, max;
 } lw_variable;
 
+typedef struct {
+    const char *name;
+    int direction; /* 1 rising, -1 falling, 0 both */
+    double nominal;
+} lw_event;
+
 /* An equation, as CasADi generates it: reads arg, writes res; nonzero if it failed. */
 typedef int lw_function(const double **arg, double **res, long long int *iw, double *w, int mem);
 
-typedef enum { LW_INSTANTIATED, LW_INITIALIZING, LW_STEPPING, LW_TERMINATED } lw_mode;
+typedef enum { LW_RK4 = 1, LW_DOPRI5 = 2, LW_RODAS = 3 } lw_integrator;
+typedef enum {
+    LW_INSTANTIATED, LW_INITIALIZING, LW_STEPPING, LW_EVENT, LW_CONTINUOUS, LW_TERMINATED
+} lw_mode;
 typedef enum { LW_LOG_WARNING = 1, LW_LOG_ERROR = 2 } lw_category;
 
 /* What an FMU state is made of: copied and serialized as it is. */
 typedef struct {
     uint64_t magic;
     int32_t mode;
-    uint8_t have_outputs, have_derivatives, stop_time_defined, unused;
+    uint8_t have_outputs, have_derivatives, have_indicators; /* are the values of these those of now? */
+    uint8_t model_exchange;
+    uint8_t stop_time_defined, tolerance_given, iterations, unused[5]; /* iterations in this visit of Event Mode */
     double stop_time;
+    double step_size; /* of the adaptive integrators: to be tried next; 0: to be chosen anew */
     double values[LW_N_VALUES];
+#if LW_N_Z
+    double last_fired[LW_N_Z], last_but_one[LW_N_Z]; /* times at which doStep has found the event */
+    uint8_t positive[(LW_N_Z + 7) / 8 * 8];          /* the domain of each indicator: z > 0? */
+#endif
 } lw_state;
 
 typedef struct lw_instance lw_instance;
 struct lw_instance {
     lw_state s;
-    /* scratch of the integrator and of the equations */
-    double x[LW_AT_LEAST_1(LW_N_X)], stage[LW_AT_LEAST_1(LW_N_X)], next[LW_AT_LEAST_1(LW_N_X)];
+    bool event_mode_used, early_return_allowed; /* as the importer wants it */
+    bool event_found;                           /* the last step ended at an event */
+    /* scratch of the integrators and of the equations */
+    double x[LW_AT_LEAST_1(LW_N_S)], stage[LW_AT_LEAST_1(LW_N_S)], next[LW_AT_LEAST_1(LW_N_S)];
     double k1[LW_AT_LEAST_1(LW_N_X)], k2[LW_AT_LEAST_1(LW_N_X)], k3[LW_AT_LEAST_1(LW_N_X)], k4[LW_AT_LEAST_1(LW_N_X)];
-    double scratch[LW_N_VALUES];
+    double k5[LW_AT_LEAST_1(LW_N_X)], k6[LW_AT_LEAST_1(LW_N_X)], k7[LW_AT_LEAST_1(LW_N_X)];
+    double dense[4][LW_AT_LEAST_1(LW_N_X)]; /* the solution within the last step, see lw_dense */
+    double *matrix;                         /* LU factors and then pivots, of rodas; made when needed */
+    double jacobian[LW_AT_LEAST_1(LW_N_J)], slope[LW_AT_LEAST_1(LW_N_X)]; /* of the derivatives: by states; by time */
+    double scratch[LW_N_VALUES + LW_N_Z];
     double seed[LW_N_VALUES], sensitivity[LW_N_VALUES]; /* in the order of the values */
     const double *arg[LW_SZ_ARG];
     double *res[LW_SZ_RES];

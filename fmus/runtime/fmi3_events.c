@@ -1,0 +1,126 @@
+/* FMI 3.0: Event Mode, and Model Exchange. */
+
+/* ---- Event Mode (FMI 3.0, 2.3.5; in Co-Simulation where there are events) ---- */
+
+static bool lw_has_event_mode(lw_instance *self, const char *function) {
+    if (self->s.model_exchange || self->event_mode_used) return true;
+#if LW_N_Z
+    return lw_fail(self, "%s: this instance has no Event Mode. Instantiate it with eventModeUsed = fmi3True.", function);
+#else
+    return lw_fail(self, "%s: this FMU has no Event Mode in Co-Simulation (hasEventMode = false).", function);
+#endif
+}
+
+fmi3Status fmi3EnterEventMode(fmi3Instance instance) {
+    LW_SELF;
+    return LW_OK(lw_has_event_mode(self, "fmi3EnterEventMode") && lw_enter_event_mode(self, "fmi3EnterEventMode"));
+}
+
+fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *discreteStatesNeedUpdate,
+        fmi3Boolean *terminateSimulation, fmi3Boolean *nominalsOfContinuousStatesChanged,
+        fmi3Boolean *valuesOfContinuousStatesChanged, fmi3Boolean *nextEventTimeDefined, fmi3Float64 *nextEventTime) {
+    LW_SELF;
+    bool again = false, moved = false;
+    bool ok = lw_has_event_mode(self, "fmi3UpdateDiscreteStates")
+              && lw_update_discrete_states(self, "fmi3UpdateDiscreteStates", &again, &moved);
+    if (discreteStatesNeedUpdate) *discreteStatesNeedUpdate = again;
+    if (terminateSimulation) *terminateSimulation = fmi3False;
+    if (nominalsOfContinuousStatesChanged) *nominalsOfContinuousStatesChanged = fmi3False;
+    if (valuesOfContinuousStatesChanged) *valuesOfContinuousStatesChanged = moved;
+    if (nextEventTimeDefined) *nextEventTimeDefined = fmi3False;
+    if (nextEventTime) *nextEventTime = 0.0;
+    return LW_OK(ok);
+}
+
+fmi3Status fmi3EnterStepMode(fmi3Instance instance) {
+    LW_SELF;
+    if (self->s.model_exchange)
+        return LW_OK(lw_fail(self, "fmi3EnterStepMode: this is a Model Exchange instance. Call fmi3EnterContinuousTimeMode."));
+    return LW_OK(lw_has_event_mode(self, "fmi3EnterStepMode") && lw_leave_event_mode(self, "fmi3EnterStepMode", LW_STEPPING));
+}
+
+/* ---- Model Exchange (FMI 3.0, 3.2) ---- */
+
+static bool lw_is_model_exchange(lw_instance *self, const char *function) {
+    if (self->s.model_exchange) return true;
+    return lw_fail(self, "%s: this is a Co-Simulation instance. Use fmi3InstantiateModelExchange.", function);
+}
+
+/* Is the call allowed, and are there as many values as there are? */
+static bool lw_check_vector(lw_instance *self, const char *function, bool initializing, size_t found, size_t expected) {
+    if (!lw_is_model_exchange(self, function)) return false;
+    if (!(initializing && self->s.mode == LW_INITIALIZING) && !lw_is_initialized(self, function)) return false;
+    if (found == expected) return true;
+    return lw_fail(self, "%s: found room for %zu values, expected %zu.", function, found, expected);
+}
+
+fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance) {
+    LW_SELF;
+    const char *function = "fmi3EnterContinuousTimeMode";
+    return LW_OK(lw_is_model_exchange(self, function) && lw_leave_event_mode(self, function, LW_CONTINUOUS));
+}
+
+fmi3Status fmi3CompletedIntegratorStep(fmi3Instance instance, fmi3Boolean noSetFMUStatePriorToCurrentPoint,
+        fmi3Boolean *enterEventMode, fmi3Boolean *terminateSimulation) {
+    LW_SELF;
+    (void)noSetFMUStatePriorToCurrentPoint; /* nothing is buffered */
+    if (enterEventMode) *enterEventMode = fmi3False;
+    if (terminateSimulation) *terminateSimulation = fmi3False;
+    return LW_OK(lw_is_model_exchange(self, "fmi3CompletedIntegratorStep")
+                 && lw_in_mode(self, "fmi3CompletedIntegratorStep", LW_CONTINUOUS));
+}
+
+fmi3Status fmi3SetTime(fmi3Instance instance, fmi3Float64 time) {
+    LW_SELF;
+    return LW_OK(lw_check_vector(self, "fmi3SetTime", false, 0, 0) && lw_set_time(self, "fmi3SetTime", time));
+}
+
+fmi3Status fmi3SetContinuousStates(fmi3Instance instance, const fmi3Float64 continuousStates[], size_t nContinuousStates) {
+    LW_SELF;
+    return LW_OK(lw_check_vector(self, "fmi3SetContinuousStates", false, nContinuousStates, LW_N_X)
+                 && lw_set_states(self, "fmi3SetContinuousStates", continuousStates));
+}
+
+fmi3Status fmi3GetContinuousStates(fmi3Instance instance, fmi3Float64 continuousStates[], size_t nContinuousStates) {
+    LW_SELF;
+    if (!lw_check_vector(self, "fmi3GetContinuousStates", true, nContinuousStates, LW_N_X)) return fmi3Error;
+    memcpy(continuousStates, self->s.values + LW_X, LW_N_X * sizeof(double));
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 derivatives[], size_t nContinuousStates) {
+    LW_SELF;
+    if (!lw_check_vector(self, "fmi3GetContinuousStateDerivatives", true, nContinuousStates, LW_N_X)) return fmi3Error;
+    if (!lw_update_derivatives(self)) return fmi3Error;
+    memcpy(derivatives, self->s.values + LW_DX, LW_N_X * sizeof(double));
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 eventIndicators[], size_t nEventIndicators) {
+    LW_SELF;
+    if (!lw_check_vector(self, "fmi3GetEventIndicators", true, nEventIndicators, LW_N_Z)) return fmi3Error;
+    if (!lw_update_indicators(self)) return fmi3Error;
+    memcpy(eventIndicators, self->s.values + LW_Z, LW_N_Z * sizeof(double));
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Float64 nominals[], size_t nContinuousStates) {
+    LW_SELF;
+    if (!lw_check_vector(self, "fmi3GetNominalsOfContinuousStates", true, nContinuousStates, LW_N_X)) return fmi3Error;
+    memcpy(nominals, lw_nominals, LW_N_X * sizeof(double));
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *nContinuousStates) {
+    LW_SELF;
+    if (!lw_is_model_exchange(self, "fmi3GetNumberOfContinuousStates")) return fmi3Error;
+    *nContinuousStates = LW_N_X;
+    return fmi3OK;
+}
+
+fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *nEventIndicators) {
+    LW_SELF;
+    if (!lw_is_model_exchange(self, "fmi3GetNumberOfEventIndicators")) return fmi3Error;
+    *nEventIndicators = LW_N_Z;
+    return fmi3OK;
+}
