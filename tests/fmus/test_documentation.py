@@ -149,6 +149,7 @@ def everything(a, b):
         a ** (b**a),
     ]
     one += [
+        (-a) ** ca.floor(b),
         2 * a,
         1 / a,
         1 / (a * b),
