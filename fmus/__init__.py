@@ -1,6 +1,15 @@
 """FMUs: plants written as Python equations and exported, and FMUs of anyone's as blocks."""
 
-from . import gantry
+from . import (
+    bouncing_ball,
+    dc_motor,
+    gantry,
+    gantry_contact,
+    gantry_elastic,
+    gantry_stiction,
+    mass_spring_damper,
+    scara,
+)
 from ._build import build_fmu, clear_cache
 from ._description_reading import FmuDescription, FmuVariable, read_description
 from ._export import build, model_spec
@@ -13,10 +22,17 @@ __all__ = [
     "FmuVariable",
     "ModelSpec",
     "Variable",
+    "bouncing_ball",
     "build",
     "build_fmu",
     "clear_cache",
+    "dc_motor",
     "gantry",
+    "gantry_contact",
+    "gantry_elastic",
+    "gantry_stiction",
+    "mass_spring_damper",
     "model_spec",
     "read_description",
+    "scara",
 ]
