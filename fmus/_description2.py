@@ -14,6 +14,7 @@ from ._description import (
     LOG_CATEGORIES,
     Dependency,
     _element,
+    _reinitialized,
     _unit,
     dependencies,
     package_version,
@@ -21,7 +22,7 @@ from ._description import (
 from ._spec import ModelSpec
 
 
-def _variable(e: Entry) -> str:
+def _variable(e: Entry, reinitialized: set[str]) -> str:
     v = e.variable
     about = {
         "name": e.name,
@@ -35,8 +36,10 @@ def _variable(e: Entry) -> str:
         "unit": v.unit,
         "min": None if v.minimum is None else float(v.minimum),
         "max": None if v.maximum is None else float(v.maximum),
+        "nominal": None if v.nominal is None else float(v.nominal),
         "start": v.flat_start[0] if v.flat_start else None,
         "derivative": None if e.of is None else _index(e.of),
+        "reinit": True if e.kind == "state" and e.name in reinitialized else None,
     }
     return _element("ScalarVariable", about, [_element("Real", real)])
 
@@ -72,7 +75,6 @@ def _structure(spec: ModelSpec, entries: tuple[Entry, ...]) -> list[str]:
     """
     found = dependencies(spec)
     knowns = {e.reference for e in entries if e.kind in ("time", "input", "state")}
-    knowns -= {e.reference for e in entries if e.kind == "state" and e.variable.variability == "discrete"}
 
     def running(d: Dependency) -> str | None:
         return d.kind if d.known in knowns else None
@@ -107,9 +109,9 @@ def model_description2(spec: ModelSpec, token: str, *, derivatives: bool) -> str
         "description": spec.description or None,
         "generationTool": f"Loopwright {package_version()}",
         "variableNamingConvention": "structured",
-        "numberOfEventIndicators": 0,
+        "numberOfEventIndicators": len(spec.events),
     }
-    both = {
+    both: dict[str, object] = {
         "modelIdentifier": spec.name,
         "canNotUseMemoryManagementFunctions": True,
         "canGetAndSetFMUstate": True,
@@ -125,15 +127,22 @@ def model_description2(spec: ModelSpec, token: str, *, derivatives: bool) -> str
     sources = _element("SourceFiles", {}, [_element("File", {"name": "model.c"})])
     units = sorted({e.variable.unit for e in entries if e.variable.unit is not None})
     categories = LOG_CATEGORIES | {"logAll": "All of them"}
-    experiment = {"startTime": 0.0, "stopTime": float(spec.stop_time), "stepSize": float(spec.step_size)}
+    experiment = {
+        "startTime": 0.0,
+        "stopTime": float(spec.stop_time),
+        "tolerance": float(spec.tolerance),
+        "stepSize": float(spec.step_size),
+    }
+    reinitialized = _reinitialized(spec)
     children = [
+        _element("ModelExchange", both | {"completedIntegratorStepNotNeeded": True}, [sources]),
         _element("CoSimulation", both | stepping, [sources]),
         _element("UnitDefinitions", {}, map(_unit, units)),
         _element(
             "LogCategories", {}, [_element("Category", {"name": n, "description": d}) for n, d in categories.items()]
         ),
         _element("DefaultExperiment", experiment),
-        _element("ModelVariables", {}, map(_variable, entries)),
+        _element("ModelVariables", {}, [_variable(e, reinitialized) for e in entries]),
         _element("ModelStructure", {}, _structure(spec, entries)),
     ]
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"

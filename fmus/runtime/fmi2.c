@@ -1,4 +1,4 @@
-/* FMI 2.0 for Co-Simulation: the functions of fmi2Functions.h that exported FMUs support. The others: fmi2_refused.c.
+/* FMI 2.0 for Co-Simulation and Model Exchange: the functions of fmi2Functions.h that exported FMUs support. The others: fmi2_refused.c.
  *
  * All variables are scalars of type Real, so that n value references take n values. */
 #include "fmi2Functions.h"
@@ -56,6 +56,7 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
     const char *name = lw_is_blank(instanceName) ? LW_MODEL_NAME : instanceName;
     lw_instance *self = lw_create(name, strlen(name));
     if (!self) return NULL;
+    self->s.model_exchange = fmuType == fmi2ModelExchange;
     self->categories = loggingOn ? LW_LOG_WARNING | LW_LOG_ERROR : 0;
     if (functions && functions->logger) {
         self->environment = functions->componentEnvironment;
@@ -67,8 +68,8 @@ fmi2Component fmi2Instantiate(fmi2String instanceName, fmi2Type fmuType, fmi2Str
     else if (!fmuGUID || strcmp(fmuGUID, LW_TOKEN))
         ok = lw_fail(self, "the GUID is %s, expected " LW_TOKEN ". The modelDescription.xml that was read doesn't belong to "
                      "this binary: unzip the FMU again.", fmuGUID ? fmuGUID : "missing");
-    else if (fmuType != fmi2CoSimulation)
-        ok = lw_fail(self, "this FMU has no Model Exchange. Instantiate it as fmi2CoSimulation.");
+    else if (fmuType != fmi2CoSimulation && fmuType != fmi2ModelExchange)
+        ok = lw_fail(self, "the type is %d, expected fmi2ModelExchange (0) or fmi2CoSimulation (1).", (int)fmuType);
     if (ok) return self;
     lw_destroy(self);
     return NULL;
@@ -85,36 +86,27 @@ fmi2Status fmi2Reset(fmi2Component c) {
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean toleranceDefined, fmi2Real tolerance, fmi2Real startTime,
         fmi2Boolean stopTimeDefined, fmi2Real stopTime) {
     LW_SELF;
-    (void)toleranceDefined, (void)tolerance; /* a fixed internal step has no error control */
-    if (!lw_in_mode(self, "fmi2SetupExperiment", LW_INSTANTIATED)) return fmi2Error;
-    if (!isfinite(startTime) || (stopTimeDefined && !(stopTime >= startTime)))
-        return LW_OK(lw_fail(self, "fmi2SetupExperiment: startTime is %g s, stopTime is %g s, expected finite times in this "
-                             "order.", startTime, stopTime));
-    self->s.values[0] = startTime;
-    self->s.stop_time_defined = stopTimeDefined != fmi2False;
-    self->s.stop_time = stopTimeDefined ? stopTime : 0.0;
+    /* checked here, for the message to name this function */
+    if (!lw_initialize(self, "fmi2SetupExperiment", startTime, stopTimeDefined != fmi2False, stopTime)) return fmi2Error;
+    self->s.mode = LW_INSTANTIATED;
+    if (toleranceDefined) lw_suggest_tolerance(self, tolerance);
     return fmi2OK;
 }
 
 fmi2Status fmi2EnterInitializationMode(fmi2Component c) {
     LW_SELF;
-    if (!lw_in_mode(self, "fmi2EnterInitializationMode", LW_INSTANTIATED)) return fmi2Error;
-    self->s.mode = LW_INITIALIZING;
-    self->s.have_outputs = self->s.have_derivatives = 0;
-    return fmi2OK;
+    return LW_OK(lw_initialize(self, "fmi2EnterInitializationMode", self->s.values[0], self->s.stop_time_defined,
+                               self->s.stop_time));
 }
 
 fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
     LW_SELF;
-    if (!lw_in_mode(self, "fmi2ExitInitializationMode", LW_INITIALIZING)) return fmi2Error;
-    if (!lw_update_outputs(self)) return fmi2Error;
-    self->s.mode = LW_STEPPING;
-    return fmi2OK;
+    return LW_OK(lw_start(self, "fmi2ExitInitializationMode", self->s.model_exchange ? LW_EVENT : LW_STEPPING));
 }
 
 fmi2Status fmi2Terminate(fmi2Component c) {
     LW_SELF;
-    if (!lw_in_mode(self, "fmi2Terminate", LW_STEPPING)) return fmi2Error;
+    if (!lw_is_initialized(self, "fmi2Terminate")) return fmi2Error;
     self->s.mode = LW_TERMINATED;
     return fmi2OK;
 }
@@ -153,6 +145,85 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint, fmi2R
     (void)noSetFMUStatePriorToCurrentPoint; /* nothing is buffered */
     return LW_OK(lw_check_step(self, currentCommunicationPoint, communicationStepSize)
                  && lw_step(self, currentCommunicationPoint, communicationStepSize));
+}
+
+/* ---- Model Exchange (FMI 2.0, 3.2.1 and 3.2.2) ---- */
+
+/* Is the call allowed, and are there as many values as there are? */
+static bool lw_check_vector(lw_instance *self, const char *function, bool initializing, size_t found, size_t expected) {
+    if (!self->s.model_exchange)
+        return lw_fail(self, "%s: this is a Co-Simulation instance. Instantiate it as fmi2ModelExchange.", function);
+    if (!(initializing && self->s.mode == LW_INITIALIZING) && !lw_is_initialized(self, function)) return false;
+    if (found == expected) return true;
+    return lw_fail(self, "%s: found room for %zu values, expected %zu.", function, found, expected);
+}
+
+static bool lw_copy(double *to, const double *from, size_t n) {
+    if (n) memcpy(to, from, n * sizeof(double));
+    return true;
+}
+
+fmi2Status fmi2EnterEventMode(fmi2Component c) {
+    LW_SELF;
+    return LW_OK(lw_check_vector(self, "fmi2EnterEventMode", false, 0, 0) && lw_enter_event_mode(self, "fmi2EnterEventMode"));
+}
+
+fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *eventInfo) {
+    LW_SELF;
+    bool again = false, moved = false;
+    bool ok = lw_check_vector(self, "fmi2NewDiscreteStates", false, 0, 0)
+              && lw_update_discrete_states(self, "fmi2NewDiscreteStates", &again, &moved);
+    *eventInfo = (fmi2EventInfo){.newDiscreteStatesNeeded = again, .valuesOfContinuousStatesChanged = moved};
+    return LW_OK(ok);
+}
+
+fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) {
+    LW_SELF;
+    return LW_OK(lw_check_vector(self, "fmi2EnterContinuousTimeMode", false, 0, 0)
+                 && lw_leave_event_mode(self, "fmi2EnterContinuousTimeMode", LW_CONTINUOUS));
+}
+
+fmi2Status fmi2CompletedIntegratorStep(fmi2Component c, fmi2Boolean noSetFMUStatePriorToCurrentPoint,
+        fmi2Boolean *enterEventMode, fmi2Boolean *terminateSimulation) {
+    LW_SELF;
+    (void)noSetFMUStatePriorToCurrentPoint; /* nothing is buffered */
+    *enterEventMode = *terminateSimulation = fmi2False;
+    return LW_OK(lw_check_vector(self, "fmi2CompletedIntegratorStep", false, 0, 0)
+                 && lw_in_mode(self, "fmi2CompletedIntegratorStep", LW_CONTINUOUS));
+}
+
+fmi2Status fmi2SetTime(fmi2Component c, fmi2Real time) {
+    LW_SELF;
+    return LW_OK(lw_check_vector(self, "fmi2SetTime", false, 0, 0) && lw_set_time(self, "fmi2SetTime", time));
+}
+
+fmi2Status fmi2SetContinuousStates(fmi2Component c, const fmi2Real x[], size_t nx) {
+    LW_SELF;
+    return LW_OK(lw_check_vector(self, "fmi2SetContinuousStates", false, nx, LW_N_X)
+                 && lw_set_states(self, "fmi2SetContinuousStates", x));
+}
+
+fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real x[], size_t nx) {
+    LW_SELF;
+    return LW_OK(lw_check_vector(self, "fmi2GetContinuousStates", true, nx, LW_N_X) && lw_copy(x, self->s.values + LW_X, nx));
+}
+
+fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real derivatives[], size_t nx) {
+    LW_SELF;
+    return LW_OK(lw_check_vector(self, "fmi2GetDerivatives", true, nx, LW_N_X) && lw_update_derivatives(self)
+                 && lw_copy(derivatives, self->s.values + LW_DX, nx));
+}
+
+fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real eventIndicators[], size_t ni) {
+    LW_SELF;
+    return LW_OK(lw_check_vector(self, "fmi2GetEventIndicators", true, ni, LW_N_Z) && lw_update_indicators(self)
+                 && lw_copy(eventIndicators, self->s.values + LW_Z, ni));
+}
+
+fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x_nominal[], size_t nx) {
+    LW_SELF;
+    return LW_OK(lw_check_vector(self, "fmi2GetNominalsOfContinuousStates", true, nx, LW_N_X)
+                 && lw_copy(x_nominal, lw_nominals, nx));
 }
 
 /* ---- states (FMI 2.0, 2.1.8) ---- */

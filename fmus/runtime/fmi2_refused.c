@@ -69,21 +69,6 @@ fmi2Status fmi2GetStringStatus(fmi2Component c, const fmi2StatusKind s, fmi2Stri
     return lw_discard(c, "fmi2GetStringStatus", LW_SYNCHRONOUS);
 }
 
-/* ---- Model Exchange ---- */
-
-#define LW_NO_ME "this FMU has no Model Exchange (see modelDescription.xml)"
-fmi2Status fmi2EnterEventMode(fmi2Component c) { return lw_refuse(c, "fmi2EnterEventMode", LW_NO_ME); }
-fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) { return lw_refuse(c, "fmi2EnterContinuousTimeMode", LW_NO_ME); }
-LW_REFUSE(fmi2NewDiscreteStates, LW_NO_ME, fmi2EventInfo *eventInfo)
-LW_REFUSE(fmi2CompletedIntegratorStep, LW_NO_ME, fmi2Boolean noSetFMUStatePriorToCurrentPoint, fmi2Boolean *enterEventMode,
-          fmi2Boolean *terminateSimulation)
-LW_REFUSE(fmi2SetTime, LW_NO_ME, fmi2Real time)
-LW_REFUSE(fmi2SetContinuousStates, LW_NO_ME, const fmi2Real x[], size_t nx)
-LW_REFUSE(fmi2GetDerivatives, LW_NO_ME, fmi2Real derivatives[], size_t nx)
-LW_REFUSE(fmi2GetEventIndicators, LW_NO_ME, fmi2Real eventIndicators[], size_t ni)
-LW_REFUSE(fmi2GetContinuousStates, LW_NO_ME, fmi2Real x[], size_t nx)
-LW_REFUSE(fmi2GetNominalsOfContinuousStates, LW_NO_ME, fmi2Real x_nominal[], size_t nx)
-
 #if !LW_HAS_DERIVATIVES
 LW_REFUSE(fmi2GetDirectionalDerivative, "providesDirectionalDerivative is false", const fmi2ValueReference vUnknown_ref[],
           size_t nUnknown, const fmi2ValueReference vKnown_ref[], size_t nKnown, const fmi2Real dvKnown[], fmi2Real dvUnknown[])

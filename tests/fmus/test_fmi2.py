@@ -150,13 +150,15 @@ def test_arrays_become_elements(options):
 
 
 def test_capabilities_are_true(msd2):
-    cs = xml(msd2).find("CoSimulation")
-    assert cs.attrib == {
+    both = {
         "modelIdentifier": "mass_spring_damper",
         "canNotUseMemoryManagementFunctions": "true",
         "canGetAndSetFMUstate": "true",
         "canSerializeFMUstate": "true",
         "providesDirectionalDerivative": "true",
+    }
+    assert xml(msd2).find("ModelExchange").attrib == both | {"completedIntegratorStepNotNeeded": "true"}
+    assert xml(msd2).find("CoSimulation").attrib == both | {
         "canHandleVariableCommunicationStepSize": "true",
         "canInterpolateInputs": "false",
         "maxOutputDerivativeOrder": "0",
@@ -383,7 +385,7 @@ def test_what_may_be_set_when(msd2, instance2):
     item = instance2(msd2)
     fails2(item, lambda: item["acceleration"], "acceleration is calculated", "fmi2EnterInitializationMode first")
     fails2(item, lambda: item.initialize(time=1.0), "fmi2DoStep advances it")
-    for name, why in (("mass", "fixed parameter"), ("position", "is a state"), ("internal_step", "fixed parameter")):
+    for name, why in (("mass", "fixed parameter"), ("position", "is a state"), ("integrator", "fixed parameter")):
         item.initialize()
         fails2(item, lambda name=name: item.step(0.0, 0.1, **{name: 1.0}), name, why, "fmi2ExitInitializationMode")
 
