@@ -14,6 +14,7 @@ from ._build import build_fmu, clear_cache
 from ._description_reading import FmuDescription, FmuVariable, read_description
 from ._export import build, model_spec
 from ._fmu import Fmu
+from ._pythonfmu import build_python
 from ._spec import ModelSpec, Variable
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "bouncing_ball",
     "build",
     "build_fmu",
+    "build_python",
     "clear_cache",
     "dc_motor",
     "gantry",
