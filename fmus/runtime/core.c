@@ -182,6 +182,8 @@ static const char *lw_why_not_set(lw_instance *self, const lw_variable *variable
     if (mode == LW_TERMINATED) return "can't be set in state Terminated; reset the FMU, or set an FMU state first";
     if (mode == LW_INSTANTIATED || mode == LW_INITIALIZING) return NULL;
     if (kind == LW_FIXED) return "is a fixed parameter; set it before " LW_API "ExitInitializationMode";
+    if (kind == LW_STATE && (mode == LW_EVENT || mode == LW_CONTINUOUS) && self->s.model_exchange)
+        return NULL; /* some importers of Model Exchange set states as variables; it is the same as SetContinuousStates */
     if (kind == LW_STATE || kind == LW_DISCRETE) return "is a state; set its start value before " LW_API "ExitInitializationMode";
     if (mode == LW_CONTINUOUS && kind == LW_TUNABLE) return "is a tunable parameter; set it in Event Mode";
     if (mode == LW_CONTINUOUS && variable->is_discrete) return "is a discrete input; set it in Event Mode";
