@@ -19,7 +19,7 @@ from loopwright.blocks import (
     TransverseTransform,
 )
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.fmus import Fmu, gantry, gantry_elastic, gantry_stiction, scara
+from loopwright.fmus import Fmu, gantry, gantry_contact, gantry_elastic, gantry_stiction, scara
 
 PATH = experiments.ELLIPSE
 
@@ -45,6 +45,10 @@ COST = {
     (gantry_stiction, "B"): (483, 83.9),
     (gantry_stiction, "C"): (324, 83.2),
     (gantry_stiction, "D"): (525, 107),
+    (gantry_contact, "A"): (3.25, 1.77),
+    (gantry_contact, "B"): (3.33, 1.36),
+    (gantry_contact, "C"): (3.19, 2.11),
+    (gantry_contact, "D"): (1.48, 1.39),
 }
 
 
@@ -54,11 +58,36 @@ def test_what_another_plant_costs_in_tracking(runs, plant, letter):
     run = experiments.EXPERIMENTS[letter](plant=plant.build()).simulate(progress=False)
     assert nominal == pytest.approx(GANTRY[letter], rel=0.05)
     assert rms(run) == pytest.approx(COST[plant, letter], rel=0.05)
-    assert np.all(rms(run) > 1.2 * nominal)
-    if plant is gantry_elastic:
-        assert np.abs(errors(run)).max() < 100.0  # no more than a gantry with an encoder of 0.1 mm
-    else:
-        assert np.abs(errors(run)).max() < 2500.0  # stick and slip
+    if plant is gantry_elastic:  # across the path, where the loop is faster, it is twice the gantry's
+        assert 1.5 < rms(run)[1] / nominal[1] < 2.5
+        assert np.abs(errors(run)).max() < 60.0
+    elif plant is gantry_stiction:  # stick and slip: a hundred times
+        assert np.all(rms(run) > 40.0 * nominal)
+        assert 500.0 < np.abs(errors(run)).max() < 2000.0
+    else:  # the wall's force is measured, and cancelled but for what it changes within a sample
+        assert np.all(rms(run) < 1.4 * nominal)
+        assert np.abs(errors(run)).max() < 30.0
+
+
+@pytest.mark.parametrize(
+    ("letter", "longest", "push"),
+    [
+        ("A", (0.32, 0.34), (200.0, 201.0)),
+        ("B", (4.5, 6.0), (5.0, 20.0)),
+        ("C", (2.0, 3.5), (20.0, 60.0)),
+        ("D", (0.2, 0.5), (5.0, 10.0)),
+    ],
+)
+def test_every_experiment_touches_the_wall(letter, longest, push):
+    # without compliance (A) the robot goes its way, 10 mm into 20 kN/m; with it, it yields, and the wall stops it
+    run = experiments.EXPERIMENTS[letter](plant=gantry_contact.build()).simulate(progress=False)
+    force = np.linalg.norm(run["plant.contact_force"], axis=1)
+    assert longest[0] < 1e-3 * run["plant.contact"].sum() < longest[1]
+    assert push[0] < force.max() < push[1]
+    if letter in "AB":  # in free space nothing else is felt
+        assert np.array_equal(run["force"], run["plant.contact_force"])
+    if letter == "A":
+        assert run["plant.penetration"].max() == pytest.approx(0.01, rel=2e-3)
 
 
 class Elastic:
