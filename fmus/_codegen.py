@@ -27,8 +27,8 @@ _ORDER = {3: "FMI 3.0, 2.3, 3.2 and 4.2", 2: "FMI 2.0, 2.1.6 and 4.2.4"}
 # Longest function that is expanded: beyond, calls of shared functions keep the code small (compile time grows faster).
 _SCALAR_LIMIT = 20_000
 _STEP_DESCRIPTION = (
-    "Longest step of the explicit Runge-Kutta method of order 4 (integrator = 1); a communication step h, or what an event "
-    "leaves of it, takes ceil(h / internal_step) equal substeps, at least one"
+    "Longest step of the explicit Runge-Kutta method of order 4 (integrator = 1); a communication step h, or what an "
+    "event leaves of it, takes ceil(h / internal_step) equal substeps, at least one"
 )
 _INTEGRATOR_DESCRIPTION = (
     "Integrator of Co-Simulation. 1: explicit Runge-Kutta, order 4, fixed step; 2: explicit Runge-Kutta, order 5(4), "
@@ -147,7 +147,7 @@ def scalar(f: ca.Function) -> ca.Function:
 
 
 def symbolic(spec: ModelSpec) -> tuple[Any, Any]:
-    """All knowns (time, parameters, inputs, states) as one column; derivatives, outputs and indicators of them, inlined.
+    """Give all knowns (time, parameters, inputs, states) as one column; and derivatives, outputs, indicators of them.
 
     SX where all functions have a scalar expansion, else MX. The unknowns are one column too.
     """
@@ -207,7 +207,7 @@ def _equations(spec: ModelSpec) -> _Equations:
 
 
 def _linear(spec: ModelSpec) -> tuple[list[ca.Function], list[tuple[int, int]]]:
-    """The Jacobian of the derivatives by continuous states and time; the indicators and their rates along a solution."""
+    """Derive the derivatives by continuous states and time, and the indicators along a solution."""
     f = scalar(spec.derivative)
     kind = ca.SX if f.is_a("SXFunction") else ca.MX
     t, x, u, p = (kind.sym(name, f.numel_in(i)) for i, name in enumerate("txup"))

@@ -93,7 +93,7 @@ class Variable:
             )
         if self.variability == "discrete" and self.causality != "input" and not self.state:
             raise DefinitionError(
-                f"{self.name} is discrete, but neither an input nor a state. Make it a state (state=True), or continuous."
+                f"{self.name} is discrete, but neither input nor state. Make it a state (state=True), or continuous."
             )
         if self.nominal is not None and not (math.isfinite(self.nominal) and self.nominal > 0):
             raise ParameterError(f"{self.name} has nominal {self.nominal!r}, expected a positive number.")
@@ -186,7 +186,7 @@ class Event:
 
 @dataclass(frozen=True, eq=False)
 class ModelSpec:
-    """A model to export: x' = derivative(t, x, u, p), y = output(t, x, u, p), and x = jump(t, x, u, p, fired) at events.
+    """A model to export: x' = derivative(t, x, u, p), y = output(t, x, u, p); at events x = jump(t, x, u, p, fired).
 
     All vectors are flat columns: the concatenation, in the order of the tuples, of each variable flattened row by row.
     x is all states, the continuous ones first; x' is the rates of the continuous ones alone.

@@ -11,8 +11,9 @@ static bool lw_inputs_jumped(const lw_instance *self) {
 static bool lw_step_too_small(lw_instance *self, double t, double h) {
     int worst = 0;
     double largest = -1.0;
+    lw_rate(self, t, self->x, self->s.values + LW_U, self->k1);
     for (int i = 0; i < LW_N_X; i++) {
-        double change = fabs(self->next[i] - self->x[i]) / lw_scale(self, i, self->x[i], self->x[i]);
+        double change = fabs(self->k1[i]) / lw_scale(self, i, self->x[i], self->x[i]);
         if (!isfinite(change)) change = INFINITY;
         if (change > largest) largest = change, worst = i;
     }
@@ -52,6 +53,7 @@ static bool lw_adaptive_step(lw_instance *self, lw_run *run, double t, double *t
     for (;;) {
         bool last = h >= left * (1.0 - 1e-10);
         double used = last ? left : h, error;
+        if (!last && h < shortest) return lw_step_too_small(self, t, h);
 #if LW_HAS_DERIVATIVES
         error = implicit ? lw_rodas_step(self, t, used, u) : lw_dopri5_step(self, t, used, u);
 #else
@@ -67,7 +69,6 @@ static bool lw_adaptive_step(lw_instance *self, lw_run *run, double t, double *t
         }
         h = used * factor;
         run->rejected = true;
-        if (h < shortest) return lw_step_too_small(self, t, h);
     }
 }
 

@@ -6,7 +6,7 @@ import fmpy.fmi3
 import numpy as np
 import pytest
 
-from loopwright.fmus._spec import ModelSpec, Variable
+from loopwright.fmus._spec import Event, ModelSpec, Variable
 
 M, D, K = 2.0, 0.5, 10.0
 
@@ -68,23 +68,110 @@ def explosive():
     return ModelSpec("explosive", "", (), (Variable("y", "output"),), (), states, f, g, internal_step=1e-3)
 
 
+def _model(name, states, parameters, inputs, f, g=None, outputs=(), *, z=None, jump=None, **more):
+    """A model from functions of (t, x, u, p) and (t, x, u, p, fired) on SX columns."""
+    sizes = [sum(v.size for v in group) for group in (states, inputs, parameters)]
+    t, *rest = ca.SX.sym("t"), *(ca.SX.sym(c, n) for c, n in zip("xup", sizes, strict=True))
+    args = (t, *rest)
+    made = {"derivative": ca.Function("f", args, [ca.vertcat(*f(*args))])}
+    made["output"] = ca.Function("g", args, [ca.vertcat(*(g(*args) if g else ()))])
+    if z is not None:
+        fired = ca.SX.sym("fired", len(more["events"]))
+        made["indicators"] = ca.Function("z", args, [ca.vertcat(*z(*args))])
+        made["jump"] = ca.Function("j", (*args, fired), [ca.vertcat(*jump(*args, fired))])
+    return ModelSpec(name, "", inputs, outputs, parameters, states, **(made | more))
+
+
+def bouncing_ball(**changes):
+    """A ball under gravity g that leaves the floor with the fraction e of its speed."""
+    given = {
+        "z": lambda t, x, u, p: [x[0]],
+        "jump": lambda t, x, u, p, fired: [x[0], ca.if_else(fired[0], -p[1] * x[1], x[1])],
+        "events": (Event("bounce", "falling", "Height above the floor"),),
+        "f": lambda t, x, u, p: [x[1], -p[0]],
+    }
+    return _model(
+        "bouncing_ball",
+        (
+            Variable("height", "output", unit="m", start=1.0, state=True),
+            Variable("velocity", "output", unit="m/s", start=0.0, state=True),
+        ),
+        (
+            Variable("g", "parameter", "tunable", unit="m/s2", start=9.81),
+            Variable("e", "parameter", "tunable", unit="1", start=0.7),
+        ),
+        (),
+        **(given | changes),
+    )
+
+
+def thermostat(**changes):
+    """T' = -a (T - ambient) + heating * on, switched off above 21 and on below 19 degrees: a hysteresis."""
+
+    def jump(t, x, u, p, fired):
+        return [x[0], ca.if_else(fired[0], 0.0, ca.if_else(fired[1], 1.0, x[1]))]
+
+    given = {"events": (Event("too_warm", "rising"), Event("too_cold", "falling", nominal=0.5))}
+    return _model(
+        "thermostat",
+        (
+            Variable("temperature", "output", start=20.0, state=True, nominal=20.0),
+            Variable("on", "output", "discrete", start=1.0, state=True),
+        ),
+        (Variable("a", "parameter", "fixed", start=0.1), Variable("heating", "parameter", "tunable", start=3.0)),
+        (Variable("ambient", "input", start=5.0), Variable("set_point", "input", "discrete", start=20.0)),
+        lambda t, x, u, p: [-p[0] * (x[0] - u[0]) + p[1] * x[1]],
+        lambda t, x, u, p: [p[1] * x[1] + u[0]],
+        (Variable("power", "output"),),
+        z=lambda t, x, u, p: [x[0] - u[1] - 1.0, x[0] - u[1] + 1.0],
+        jump=jump,
+        **(given | changes),
+    )
+
+
+def van_der_pol(**changes):
+    """x'' = mu (1 - x^2) x' - x: stiff for a large mu."""
+    return _model(
+        "van_der_pol",
+        (Variable("x", "output", start=2.0, state=True), Variable("v", "output", start=0.0, state=True)),
+        (Variable("mu", "parameter", "tunable", start=1000.0),),
+        (),
+        lambda t, x, u, p: [x[1], p[0] * (1 - x[0] ** 2) * x[1] - x[0]],
+        **({"integrator": "rodas"} | changes),
+    )
+
+
+def driven(**changes):
+    """Nonlinear, with time and an input in it: x' = -x y + sin(3 t) + u, y' = x - y^3 - y cos(t) / 2."""
+    return _model(
+        "driven",
+        (Variable("x", "output", start=1.0, state=True), Variable("y", "output", start=0.5, state=True)),
+        (),
+        (Variable("u", "input"),),
+        lambda t, x, u, p: [-x[0] * x[1] + ca.sin(3 * t) + u, x[0] - x[1] ** 3 - 0.5 * x[1] * ca.cos(t)],
+        **changes,
+    )
+
+
 class Instance:
     """An FMU under FMPy's low-level interface, by names, with what it logs."""
 
-    def __init__(self, path, folder, name="plant", token=None, start_time=0.0, stop_time=None):
+    def __init__(self, path, folder, name="plant", token=None, start_time=0.0, stop_time=None, **options):
         description = fmpy.read_model_description(str(path))
         self.references = {v.name: v.valueReference for v in description.modelVariables}
         self.sizes = {v.name: int(np.prod([d.start for d in v.dimensions] or [1])) for v in description.modelVariables}
         self.log = []
         self.folder, self.start_time, self.stop_time = folder, start_time, stop_time
         fmpy.extract(str(path), str(folder))
-        self.fmu = fmpy.fmi3.FMU3Slave(
+        exchange = options.pop("model_exchange", False)
+        self.n_states, self.n_events = description.numberOfContinuousStates, description.numberOfEventIndicators
+        self.fmu = (fmpy.fmi3.FMU3Model if exchange else fmpy.fmi3.FMU3Slave)(
             guid=token or description.guid,
             unzipDirectory=str(folder),
             modelIdentifier=description.modelName,
             instanceName=name,
         )
-        self.fmu.instantiate(loggingOn=True, logMessage=self._logged)
+        self.fmu.instantiate(loggingOn=True, logMessage=self._logged, **options)
 
     def _logged(self, environment, status, category, message):
         self.log.append((status, category.decode(), message.decode()))
