@@ -1,6 +1,7 @@
 """The command line, ``loopwright``.
 
-Exit status: 0 done, 1 a run failed (its files are kept), 2 wrong usage, 130 interrupted.
+Exit status: 0 done, 1 a run or a build failed (a run's files are kept) or an FMU has problems, 2 wrong usage, 130
+interrupted.
 """
 
 from __future__ import annotations
@@ -14,10 +15,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from inspect import signature
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from ..blocks._errors import FmuError, FmuFileError, LoopwrightError, OptionError, near
 from ..fmus import gantry
+from ._cli_fmu import COMMANDS, add_commands
+from ._cli_text import fit as _fit
+from ._cli_text import say as _say
 from ._keynumbers import DEFINITIONS, key_numbers
 from ._run import Run
 from .experiments import DEFAULTS, EXPERIMENTS, Experiment
@@ -40,10 +44,6 @@ SIGNALS = (
 
 _INTERRUPTED = "interrupted"
 _SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0), "m/s2": ("m/s²", 1.0)}
-_PLAIN = str.maketrans(
-    {"η": "eta", "ξ": "xi", "θ": "theta", "σ": "sigma", "κ": "kappa", "ζ": "zeta", "∥": "_par", "⊥": "_perp", "²": "2"}
-    | {"…": "...", "·": "*", "−": "-", "→": "->", "∞": "inf", "√": "sqrt", "—": "-", "–": "-", "’": "'", "′": "'"}
-)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.print_help(sys.stderr)
         return 2
     try:
-        return _run(arguments)
+        return COMMANDS.get(arguments.command, _run)(arguments)
     except OptionError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
         return 2
@@ -100,6 +100,7 @@ def _parser() -> argparse.ArgumentParser:
         dest="options",
         help="an option of the experiments; repeat it for several",
     )
+    add_commands(commands)
     return parser
 
 
@@ -298,18 +299,3 @@ def _number(value: float | None, factor: float) -> str:
     if value is None:
         return "-"
     return f"{value * factor:.4g}" if math.isfinite(value) else "never"
-
-
-def _say(text: str, stream: IO[str] | None = None) -> None:
-    stream = stream or sys.stdout
-    print(_fit(text, stream), file=stream, flush=True)
-
-
-def _fit(text: str, stream: IO[str]) -> str:
-    """Return the text as the stream can print it."""
-    encoding = getattr(stream, "encoding", None) or "utf-8"
-    try:
-        text.encode(encoding)
-    except UnicodeEncodeError:
-        return text.translate(_PLAIN).encode(encoding, "replace").decode(encoding)
-    return text

@@ -188,12 +188,13 @@ def _notes(fmi: str, entries: Iterable[str], interfaces: Mapping[str, Mapping[st
             "FMI 1.0 can be read here and nothing else: no block is made of it, and it is not run to validate it. "
             "Export it with FMI 3.0."
         )
-    if tool.startswith("PythonFMU") or "resources/slavemodule.txt" in set(entries):
+    python = tool.startswith("PythonFMU") or "resources/slavemodule.txt" in set(entries)
+    if python:
         notes.append(
             "It needs Python: its equations are Python code that runs in an interpreter (PythonFMU), with the packages "
             "that they import. On Linux it loads only in a process that has libpython loaded, such as Python's own."
         )
-    if any(attributes.get("needsExecutionTool") in (True, 1) for attributes in interfaces.values()):
+    elif any(attributes.get("needsExecutionTool") in (True, 1) for attributes in interfaces.values()):
         notes.append("It needs another program where it runs (needsExecutionTool): a coupling, not a model.")
     if any(attributes.get("canBeInstantiatedOnlyOncePerProcess") in (True, 1) for attributes in interfaces.values()):
         notes.append("It can be instantiated once in a process only (canBeInstantiatedOnlyOncePerProcess).")

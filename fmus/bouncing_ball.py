@@ -64,8 +64,9 @@ def build(
     model: BouncingBall = nominal,
     out: Path | str | None = None,
     *,
+    name: str = "bouncing_ball",
     internal_step: float = 1e-2,
     **options: Any,
 ) -> Path:
     """Export it as an FMU, ``bouncing_ball.fmu``, and return the file; ``options`` as `loopwright.fmus.build`."""
-    return _build(model, out, name="bouncing_ball", internal_step=internal_step, stop_time=3.0, **options)
+    return _build(model, out, name=name, internal_step=internal_step, stop_time=3.0, **options)

@@ -59,8 +59,9 @@ def build(
     model: DcMotor = nominal,
     out: Path | str | None = None,
     *,
+    name: str = "dc_motor",
     internal_step: float = 1e-4,
     **options: Any,
 ) -> Path:
     """Export it as an FMU, ``dc_motor.fmu``, and return the file; ``options`` as `loopwright.fmus.build`."""
-    return _build(model, out, name="dc_motor", internal_step=internal_step, stop_time=0.2, **options)
+    return _build(model, out, name=name, internal_step=internal_step, stop_time=0.2, **options)

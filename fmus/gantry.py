@@ -100,8 +100,10 @@ def build(
     model: Gantry = nominal,
     out: Path | str | None = None,
     *,
+    name: str = "gantry",
     internal_step: float = INTERNAL_STEP,
     notify: Callable[[str], None] | None = None,
+    **options: Any,
 ) -> Path:
     """Export the gantry as an FMU, ``gantry.fmu``, and return the file; it is built once and then cached.
 
@@ -114,9 +116,13 @@ def build(
         Parameters and start values.
     out : path, optional
         Where to put the file; in the cache without it.
+    name : str, optional
+        The model's name.
     internal_step : float, optional
         Longest step of the FMU's own integrator in s.
     notify : callable, optional
         Called with a line of text when a compilation starts.
+    **options
+        As `loopwright.fmus.build` takes them.
     """
-    return _build(model, out, name="gantry", internal_step=internal_step, stop_time=11.0, notify=notify)
+    return _build(model, out, name=name, internal_step=internal_step, stop_time=11.0, notify=notify, **options)

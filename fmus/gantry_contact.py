@@ -99,8 +99,9 @@ def build(
     model: GantryContact = nominal,
     out: Path | str | None = None,
     *,
+    name: str = "gantry_contact",
     internal_step: float = INTERNAL_STEP,
     **options: Any,
 ) -> Path:
     """Export it as an FMU, ``gantry_contact.fmu``, and return the file; ``options`` as `loopwright.fmus.build`."""
-    return _build(model, out, name="gantry_contact", internal_step=internal_step, stop_time=11.0, **options)
+    return _build(model, out, name=name, internal_step=internal_step, stop_time=11.0, **options)

@@ -101,8 +101,9 @@ def build(
     model: GantryElastic = nominal,
     out: Path | str | None = None,
     *,
+    name: str = "gantry_elastic",
     internal_step: float = INTERNAL_STEP,
     **options: Any,
 ) -> Path:
     """Export it as an FMU, ``gantry_elastic.fmu``, and return the file; ``options`` as `loopwright.fmus.build`."""
-    return _build(model, out, name="gantry_elastic", internal_step=internal_step, stop_time=11.0, **options)
+    return _build(model, out, name=name, internal_step=internal_step, stop_time=11.0, **options)

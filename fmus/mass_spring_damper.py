@@ -44,8 +44,9 @@ def build(
     model: MassSpringDamper = nominal,
     out: Path | str | None = None,
     *,
+    name: str = "mass_spring_damper",
     internal_step: float = 1e-3,
     **options: Any,
 ) -> Path:
     """Export it as an FMU, ``mass_spring_damper.fmu``, and return the file; ``options`` as `loopwright.fmus.build`."""
-    return _build(model, out, name="mass_spring_damper", internal_step=internal_step, stop_time=10.0, **options)
+    return _build(model, out, name=name, internal_step=internal_step, stop_time=10.0, **options)

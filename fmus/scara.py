@@ -197,8 +197,9 @@ def build(
     model: Scara = nominal,
     out: Path | str | None = None,
     *,
+    name: str = "scara",
     internal_step: float = INTERNAL_STEP,
     **options: Any,
 ) -> Path:
     """Export it as an FMU, ``scara.fmu``, and return the file; ``options`` as `loopwright.fmus.build`."""
-    return _build(model, out, name="scara", internal_step=internal_step, stop_time=11.0, **options)
+    return _build(model, out, name=name, internal_step=internal_step, stop_time=11.0, **options)

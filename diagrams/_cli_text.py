@@ -1,0 +1,27 @@
+"""What the command line prints, as the terminal can show it."""
+
+from __future__ import annotations
+
+import sys
+from typing import IO
+
+_PLAIN = str.maketrans(
+    {"η": "eta", "ξ": "xi", "θ": "theta", "σ": "sigma", "κ": "kappa", "ζ": "zeta", "∥": "_par", "⊥": "_perp", "²": "2"}
+    | {"…": "...", "·": "*", "−": "-", "→": "->", "∞": "inf", "√": "sqrt", "—": "-", "–": "-", "’": "'", "′": "'"}
+)
+
+
+def say(text: str, stream: IO[str] | None = None) -> None:
+    """Print a line, at once; on standard output without a stream."""
+    stream = stream or sys.stdout
+    print(fit(text, stream), file=stream, flush=True)
+
+
+def fit(text: str, stream: IO[str]) -> str:
+    """Return the text as the stream can print it."""
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    try:
+        text.encode(encoding)
+    except UnicodeEncodeError:
+        return text.translate(_PLAIN).encode(encoding, "replace").decode(encoding)
+    return text
