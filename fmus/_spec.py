@@ -267,7 +267,9 @@ class ModelSpec:
             "one derivative for each element of the continuous states",
         )
         self._check_function("output", sum(v.size for v in self.outputs), "each element of the outputs")
-        self._check_events()
+        if self.events:
+            self._check_function("indicators", len(self.events), "one for each event")
+            self._check_function("jump", sum(v.size for v in self.states), "all states", fired=len(self.events))
 
     @property
     def continuous(self) -> tuple[Variable, ...]:
@@ -306,23 +308,11 @@ class ModelSpec:
                 f"({', '.join(v.name for v in self.discrete)}) after all others. Reorder them.",
                 block=self.name,
             )
-
-    def _check_events(self) -> None:
-        if not self.events:
-            if self.indicators is not None or self.jump is not None or self.discrete:
-                found = (
-                    "indicators"
-                    if self.indicators is not None
-                    else "jump"
-                    if self.jump is not None
-                    else "discrete states"
-                )
-                raise DefinitionError(
-                    f"found {found}, but no events. Give events=, or leave them out.", block=self.name
-                )
-            return
-        self._check_function("indicators", len(self.events), "one for each event")
-        self._check_function("jump", sum(v.size for v in self.states), "all states", fired=len(self.events))
+        given = {"indicators": self.indicators, "jump": self.jump, "discrete states": self.discrete or None}
+        if not self.events and (found := [name for name, value in given.items() if value is not None]):
+            raise DefinitionError(
+                f"found {' and '.join(found)}, but no events. Give events=, or leave them out.", block=self.name
+            )
 
     def _check_names(self) -> None:
         names = [*(v.name for v in self), *(e.indicator for e in self.events)]

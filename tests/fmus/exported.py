@@ -5,6 +5,7 @@ import fmpy
 import fmpy.fmi3
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from loopwright.fmus._spec import Event, ModelSpec, Variable
 
@@ -151,6 +152,12 @@ def driven(**changes):
         lambda t, x, u, p: [-x[0] * x[1] + ca.sin(3 * t) + u, x[0] - x[1] ** 3 - 0.5 * x[1] * ca.cos(t)],
         **changes,
     )
+
+
+def exact(t, x0, force=0.0):
+    """State of the mass-spring-damper under a constant force: matrix exponential."""
+    A = np.array([[0, 1, 0], [-K / M, -D / M, force / M], [0, 0, 0]])
+    return (expm(A * t) @ np.array([*x0, 1.0]))[:2]
 
 
 class Instance:

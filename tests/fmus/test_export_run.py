@@ -8,17 +8,9 @@ import fmpy.fmi3
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.linalg import expm
 
-from exported import D, Instance, K, M, explosive, fails, mass_spring_damper, pendulums, run
+from exported import D, Instance, K, M, exact, explosive, fails, mass_spring_damper, pendulums, run
 from loopwright.fmus._build import build_fmu
-
-
-def exact(t, x0, force=0.0):
-    """State of the mass-spring-damper under a constant force: matrix exponential."""
-    A = np.array([[0, 1, 0], [-K / M, -D / M, force / M], [0, 0, 0]])
-    return (expm(A * t) @ np.array([*x0, 1.0]))[:2]
-
 
 # ---- the numbers ----
 

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from exported import D, K, M, driven, explosive, fails, mass_spring_damper, van_der_pol
+from exported import D, K, M, driven, exact, explosive, fails, mass_spring_damper, van_der_pol
 from loopwright.blocks._errors import DefinitionError, ParameterError
 from loopwright.fmus._build import build_fmu
-from test_export_run import exact
 
 RK4, DOPRI5, RODAS = 1, 2, 3
 
