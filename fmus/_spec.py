@@ -264,7 +264,7 @@ class ModelSpec:
         self._check_function(
             "derivative",
             sum(v.size for v in self.continuous),
-            "one derivative for each element of the continuous states",
+            "one derivative for each continuous state",
         )
         self._check_function("output", sum(v.size for v in self.outputs), "each element of the outputs")
         if self.events:
