@@ -57,19 +57,43 @@ def _names(variables: Iterable[Variable]) -> list[str]:
     return [v.name for v in variables]
 
 
-def _equations(spec: ModelSpec) -> list[str]:
+def _equations(spec: ModelSpec) -> list[tuple[str, str]]:
+    """Give the printed equations, each group with its title; none if one group can't be printed."""
     flat = scalarized(spec)
-    continuous = [v.name for v in flat.states if v.variability != "discrete"]
     knowns = [["time"], _names(flat.states), _names(flat.inputs), _names(flat.parameters)]
+    events = [e.name for e in spec.events]
+    groups = [
+        ("Rates of the states", spec.derivative, knowns, [f"der({v.name})" for v in flat.continuous]),
+        ("Outputs", spec.output, knowns, _names(flat.outputs)),
+    ]
+    if spec.indicators is not None and spec.jump is not None:
+        fires = (
+            "Event indicators: an event fires where its indicator comes to be above 0 (rising), or no longer (falling)"
+        )
+        after = "States after an event; the name of an event is 1 where it fires, else 0"
+        groups.append((fires, spec.indicators, knowns, [e.indicator for e in spec.events]))
+        groups.append((after, spec.jump, [*knowns, events], [f"next({v.name})" for v in flat.states]))
     found = []
-    for f, unknowns in ((spec.derivative, [f"der({n})" for n in continuous]), (spec.output, _names(flat.outputs))):
+    for title, f, names, unknowns in groups:
         if not unknowns:
             continue
-        lines = equations(f, knowns, unknowns)
+        lines = equations(f, names, unknowns)
         if not lines:
             return []
-        found.append("\n".join(lines))
+        kept = {f"next({v.name}) = {v.name}" for v in flat.states}  # a jump leaves them alone
+        found.append((title, "\n".join(line for line in lines if line not in kept)))
     return found
+
+
+def _events(spec: ModelSpec) -> list[str]:
+    if not spec.events:
+        return []
+    head = "".join(f'<th scope="col">{name}</th>' for name in ("Name", "Direction", "Nominal", "Description"))
+    rows = []
+    for e in spec.events:
+        cells = "".join(f"<td>{escape(cell)}</td>" for cell in (e.direction, number(e.nominal), e.description))
+        rows.append(f'<tr><th scope="row"><code>{escape(e.name)}</code></th>{cells}</tr>')
+    return ["<table>", f"<thead><tr>{head}</tr></thead>", "<tbody>", *rows, "</tbody>", "</table>"]
 
 
 def _start(variable: Variable) -> str:
@@ -122,8 +146,8 @@ def index_html(spec: ModelSpec, text: str = "", *, fmi: int = 3) -> str:
     note = "Arrays are listed row by row." if fmi == 3 else "Elements of arrays count from 1."
     traced = _equations(spec)
     if traced:
-        printed = [f"<pre>{escape(block)}</pre>" for block in traced]
-        printed.append("<p>As they are compiled; <code>where(c, a, 0)</code> is a where c holds, else 0.</p>")
+        printed = [f"<p>{escape(title)}:</p>\n<pre>{escape(lines)}</pre>" for title, lines in traced]
+        printed.append("<p>As they are compiled; <code>where(c, a, b)</code> is a where c holds, else b.</p>")
     else:
         printed = ["<p>Too long to print, or with tables; <code>sources/model.c</code> has them.</p>"]
     lines = [
@@ -141,6 +165,7 @@ def index_html(spec: ModelSpec, text: str = "", *, fmi: int = 3) -> str:
         f"<p>An FMU of FMI {fmi}.0. It needs no other software to run.</p>",
         *_section("Description", [f'<pre class="text">{escape(text.strip())}</pre>'] if text.strip() else []),
         *_section("Equations", printed),
+        *_section("Events", _events(spec)),
         *_section(
             "Variables",
             [

@@ -60,6 +60,15 @@ def _term(op: int, operands: Sequence[Term]) -> Term | None:
     return first if op == ca.OP_ASSIGN else None
 
 
+def _choice(op: int, operands: Sequence[Term], choices: dict[str, tuple[str, str]]) -> Term | None:
+    """Write a choice as one: CasADi has it as where(c, a, 0) + where(not(c), b, 0)."""
+    if op == ca.OP_ADD and all(text in choices for text, _ in operands):
+        (yes, a), (no, b) = (choices[text] for text, _ in operands)
+        if no == f"not({yes})":
+            return f"where({yes}, {a}, {b})", _ATOM
+    return None
+
+
 def equations(f: ca.Function, knowns: Sequence[Sequence[str]], unknowns: Sequence[str], limit: int = 400) -> list[str]:
     """Write a function of scalar operations as equations.
 
@@ -89,6 +98,7 @@ def equations(f: ca.Function, knowns: Sequence[Sequence[str]], unknowns: Sequenc
     uses = _uses(f)
     work: dict[int, Term] = {}
     shared: list[str] = []
+    choices: dict[str, tuple[str, str]] = {}
     results = dict.fromkeys(range(len(unknowns)), "0")  # a structural zero is no instruction
     for k in range(f.n_instructions()):
         op, out, operands = f.instruction_id(k), f.instruction_output(k), f.instruction_input(k)
@@ -102,9 +112,12 @@ def equations(f: ca.Function, knowns: Sequence[Sequence[str]], unknowns: Sequenc
         if op == ca.OP_INPUT:
             work[out[0]] = (knowns[operands[0]][operands[1]], _ATOM)
             continue
-        term = _term(op, [work[i] for i in operands])
+        terms = [work[i] for i in operands]
+        term = _choice(op, terms, choices) or _term(op, terms)
         if term is None:
             return []
+        if op == ca.OP_IF_ELSE_ZERO:
+            choices[term[0]] = (terms[0][0], terms[1][0])
         if uses[k] > 1 and len(term[0]) > 12:
             name = next(n for i in range(1, len(taken) + 2) if (n := f"w{i}") not in taken)
             taken.add(name)

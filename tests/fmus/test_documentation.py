@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from exported import mass_spring_damper, pendulums
+from exported import bouncing_ball, mass_spring_damper, pendulums, thermostat
 from loopwright.fmus import gantry
 from loopwright.fmus._build import build_fmu
 from loopwright.fmus._documentation import block_text, index_html
@@ -56,7 +56,7 @@ class Reader(HTMLParser):
 
 
 @pytest.mark.parametrize("options", [{"fmi": 3}, {"fmi": 2}])
-@pytest.mark.parametrize("make", [mass_spring_damper, pendulums])
+@pytest.mark.parametrize("make", [mass_spring_damper, pendulums, thermostat])
 def test_valid_html_in_one_file(make, options):
     html5lib = pytest.importorskip("html5lib")
     text = page(build_fmu(make(), documentation="m < 1 & k > 2\n\n<script>alert(1)</script>", **options))
@@ -92,6 +92,19 @@ def test_equations_are_those_of_the_model():
     acceleration = "(force - damping*velocity - stiffness*position)/mass"
     assert states == f"der(position) = velocity\nder(velocity) = {acceleration}"
     assert outputs == f"acceleration = {acceleration}"
+
+
+def test_events_and_what_they_do():
+    read = Reader(index_html(bouncing_ball()))
+    assert read.blocks[-2:] == [
+        "bounce.indicator = height",
+        "next(velocity) = where(bounce, -e*velocity, velocity)",
+    ]
+    assert ["bounce", "falling", "1", "Height above the floor"] in read.rows
+    read = Reader(index_html(thermostat()))
+    assert [row[0] for row in read.rows if row[1] in ("rising", "falling")] == ["too_warm", "too_cold"]
+    assert "next(temperature)" not in read.blocks[-1]  # the jump leaves it alone
+    assert read.blocks[-1].startswith("next(on) = where(")
 
 
 def test_a_model_that_is_too_long_says_where_its_equations_are():
