@@ -51,6 +51,12 @@ def test_all_bounces_fall_within_one_long_step():
     assert got["height"].tolist() == [1.0, 0.0]
 
 
+@pytest.mark.parametrize(("resting_speed", "bounces"), [(0.0102, 18), (0.0104, 17)])
+def test_the_ball_rests_where_an_impact_would_leave_too_slowly(resting_speed, bounces):
+    # the 17th impact leaves with 0.7^17 sqrt(2 g) = 10.3 mm/s
+    assert ball(bouncing_ball.build(), 3.0, 1, resting_speed=resting_speed)["bounces"][-1] == bounces
+
+
 def test_an_elastic_ball_keeps_its_energy():
     got = ball(bouncing_ball.build(), 1e-2, 1000, restitution=1.0)
     energy = G * got["height"] + got["velocity"] ** 2 / 2
