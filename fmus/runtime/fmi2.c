@@ -158,6 +158,14 @@ static bool lw_check_vector(lw_instance *self, const char *function, bool initia
     return lw_fail(self, "%s: found room for %zu values, expected %zu.", function, found, expected);
 }
 
+/* Outside of the model's domain, the importer may try a shorter step (FMI 2.0, 2.1.3): the instance is not terminated. */
+static fmi2Status lw_evaluated(lw_instance *self, int32_t mode, bool ok) {
+    if (ok) return fmi2OK;
+    if (mode != LW_CONTINUOUS) return fmi2Error;
+    self->s.mode = mode;
+    return fmi2Discard;
+}
+
 static bool lw_copy(double *to, const double *from, size_t n) {
     if (n) memcpy(to, from, n * sizeof(double));
     return true;
@@ -210,14 +218,16 @@ fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real x[], size_t nx) {
 
 fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real derivatives[], size_t nx) {
     LW_SELF;
-    return LW_OK(lw_check_vector(self, "fmi2GetDerivatives", true, nx, LW_N_X) && lw_update_derivatives(self)
-                 && lw_copy(derivatives, self->s.values + LW_DX, nx));
+    int32_t mode = self->s.mode;
+    if (!lw_check_vector(self, "fmi2GetDerivatives", true, nx, LW_N_X)) return fmi2Error;
+    return lw_evaluated(self, mode, lw_update_derivatives(self) && lw_copy(derivatives, self->s.values + LW_DX, nx));
 }
 
 fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real eventIndicators[], size_t ni) {
     LW_SELF;
-    return LW_OK(lw_check_vector(self, "fmi2GetEventIndicators", true, ni, LW_N_Z) && lw_update_indicators(self)
-                 && lw_copy(eventIndicators, self->s.values + LW_Z, ni));
+    int32_t mode = self->s.mode;
+    if (!lw_check_vector(self, "fmi2GetEventIndicators", true, ni, LW_N_Z)) return fmi2Error;
+    return lw_evaluated(self, mode, lw_update_indicators(self) && lw_copy(eventIndicators, self->s.values + LW_Z, ni));
 }
 
 fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x_nominal[], size_t nx) {

@@ -391,6 +391,19 @@ def test_the_importers_tolerance_counts_unless_the_parameter_is_set(files, insta
 # ---- errors ----
 
 
+def test_outside_of_its_domain_the_importer_may_try_again(instance2):
+    """sqrt(x) at x < 0: fmi2Discard asks for a shorter step (FMI 2.0, 2.1.3)."""
+    t, x, u, p = ca.SX.sym("t"), ca.SX.sym("x"), ca.SX.sym("u", 0), ca.SX.sym("p", 0)
+    f, g = ca.Function("f", [t, x, u, p], [-ca.sqrt(x)]), ca.Function("g", [t, x, u, p], [x])
+    spec = ModelSpec("tank", "", (), (Variable("y", "output"),), (), (Variable("x", start=4.0, state=True),), f, g)
+    item = Model(instance2(build_fmu(spec, fmi=2), kind=fmpy.fmi2.FMU2Model), 1).start()
+    with pytest.raises(fmpy.fmi1.FMICallException) as caught:
+        item.f(0.1, [-1.0])
+    assert caught.value.status == fmpy.fmi2.fmi2Discard
+    assert "der(x) (element 0) became" in item.item.log[-1][2]
+    assert item.f(0.1, [9.0]) == [-3.0]
+
+
 def test_calls_out_of_order(files, model, instance2):
     item = model("ball", 2, 2)
     fails2(item.item, lambda: item.rates, "fmi2GetDerivatives was called in state Instantiated")
