@@ -209,7 +209,7 @@ def _equations(spec: ModelSpec) -> _Equations:
 def _linear(spec: ModelSpec) -> tuple[list[ca.Function], list[tuple[int, int]]]:
     """Derive the derivatives by continuous states and time, and the indicators along a solution."""
     f = scalar(spec.derivative)
-    kind = ca.SX if f.is_a("SXFunction") else ca.MX
+    kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
     t, x, u, p = (kind.sym(name, f.numel_in(i)) for i, name in enumerate("txup"))
     dx = _call(f, (t, x, u, p))
     n = dx.numel()
