@@ -275,8 +275,12 @@ def _print_variables(variables: Iterable[Mapping[str, Any]], *, everything: bool
     from rich.table import Table
     from rich.text import Text
 
-    variables = list(variables)
-    chosen = [v for v in variables if everything or v["causality"] in _SHOWN or v["state"]]
+    chosen, hidden = [], Counter[str]()
+    for v in variables:
+        if everything or v["causality"] in _SHOWN or v["state"]:
+            chosen.append(v)
+        else:
+            hidden[v["causality"]] += 1
     if chosen:
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False, highlight=False)
         for column in ("name", "type", "shape", "causality", "variability", "unit", "start", "description"):
@@ -288,7 +292,6 @@ def _print_variables(variables: Iterable[Mapping[str, Any]], *, everything: bool
                      _start(v["start"]), v["description"])  # fmt: skip
             table.add_row(*(Text(fit(cell, sys.stdout)) for cell in cells))
         Console(file=sys.stdout, width=None if sys.stdout.isatty() else _WIDTH, highlight=False).print(table)
-    hidden = Counter(v["causality"] for v in variables if v not in chosen)
     if hidden:
         say(f"not shown: {', '.join(f'{n} {name}' for name, n in hidden.items())}; --all shows them.")
 

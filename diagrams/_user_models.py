@@ -82,9 +82,11 @@ def _loaded(path: Path) -> Iterator[ModuleType]:
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # sys.exit() too: a script without a guard
+            step = f"Correct it; python {path.name} shows the whole traceback."
+            if isinstance(error, SystemExit):
+                step = 'Put what it does as a script behind if __name__ == "__main__".'
             raise DefinitionError(
-                f"importing it fails{_line(error, path)}: {type(error).__name__}: {_text(error)}. Correct it; "
-                f"python {path.name} shows the whole traceback.",
+                f"importing it fails{_line(error, path)}: {type(error).__name__}: {_text(error)}. {step}",
                 block=str(path),
             ) from error
         yield module
