@@ -50,10 +50,10 @@ static bool lw_integrate(lw_instance *self, double t0, double h, long n, bool wa
         failed |= lw_rk4(self, t0 + h * ((double)i / (double)n), h / (double)n, u, x);
         double t = t0 + h * ((double)(i + 1) / (double)n);
         if (watch && failed) return lw_fail(self, "the equations can't be evaluated at t = %.9g s.", t);
-        if (watch && !lw_check_finite(self, x, LW_X, LW_N_X, t)) return false;
+        if (LW_N_X && watch && !lw_check_finite(self, x, LW_X, LW_N_X, t)) return false;
     }
     memcpy(self->next, x, LW_N_S * sizeof(double));
-    return !failed && lw_is_finite(x, LW_N_X);
+    return !failed && (!LW_N_X || lw_is_finite(x, LW_N_X));
 }
 
 static bool lw_fixed_steps(lw_instance *self, double t, double h) {

@@ -35,7 +35,7 @@ typedef struct {
 } lw_run;
 
 /* An accepted step of an adaptive integrator from self->x at t, into self->next; `to` is where it ends. */
-static bool lw_adaptive_step(lw_instance *self, lw_run *run, double t, double *to) {
+static inline bool lw_adaptive_step(lw_instance *self, lw_run *run, double t, double *to) {
     const double *u = self->s.values + LW_U;
     const bool implicit = run->integrator == LW_RODAS;
     const double exponent = implicit ? -1.0 / 4.0 : -1.0 / 5.0, left = run->end - t;
