@@ -14,7 +14,7 @@ from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from exported import D, Instance, K, M, mass_spring_damper, pendulums
+from exported import D, Instance, K, M, bouncing_ball, mass_spring_damper, pendulums, thermostat
 from exported2 import Instance2, fails2
 from loopwright.fmus._build import build_fmu
 from loopwright.fmus._spec import Event, ModelSpec, Variable
@@ -208,6 +208,13 @@ def test_knowns_of_outputs_are_continuous_states_inputs_and_time_alone(files):
     }
 
 
+def test_discrete_states_are_no_knowns():
+    """The power is heating * on + ambient: `on` changes at events alone, `heating` is a parameter."""
+    description = fmpy.read_model_description(str(build_fmu(thermostat(), fmi=2)))
+    found = {u.variable.name: [v.name for v in u.dependencies] for u in description.outputs}
+    assert found == {"temperature": ["temperature"], "on": [], "power": ["ambient"]}
+
+
 # ---- Model Exchange, the equations ----
 
 
@@ -327,6 +334,16 @@ def test_event_iteration(model):
     item.move(fall + 1e-3, [1e-3, 4.0])
     assert item.event() == [(False, False)]  # rising through the floor is not declared
     assert item.item["bounces"] == 1.0
+
+
+def test_an_event_says_whether_it_has_moved_a_continuous_state(instance2):
+    item = Model(instance2(build_fmu(bouncing_ball(), fmi=2), kind=fmpy.fmi2.FMU2Model), 2, 1).start()
+    item.move(0.5, [-1e-3, -4.0])
+    assert item.event() == [(False, True)]
+    item = Model(instance2(build_fmu(thermostat(), fmi=2), kind=fmpy.fmi2.FMU2Model), 1, 2).start()
+    item.move(1.0, [21.5])
+    assert item.event() == [(False, False)]
+    assert item.item["on"] == 0.0  # it has switched the heating off
 
 
 def test_a_saved_state_resumes_bit_identically_with_its_domains(files, model):
