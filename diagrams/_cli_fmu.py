@@ -14,10 +14,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from .. import fmus
 from ..blocks._block import Block
 from ..blocks._errors import FmuFileError, LoopwrightError, OptionError, TraceError, near
+from ..fmus import gantry
 from ..fmus._compiler import TARGETS, native_platform
+from ..fmus._export import build as build_model
+from ..fmus._pythonfmu import build_python
 from ..fmus._summary import INTERFACES, summarize
 from ..fmus._validation import validate
 from ._cli_text import fit, say
@@ -111,7 +113,8 @@ def _progress(line: str) -> None:
 
 def plants() -> list[str]:
     """Return the names of the library's plants: the public modules of `loopwright.fmus`."""
-    return sorted(module.name for module in pkgutil.iter_modules(fmus.__path__) if not module.name.startswith("_"))
+    room = Path(gantry.__file__).parent
+    return sorted(module.name for module in pkgutil.iter_modules([str(room)]) if not module.name.startswith("_"))
 
 
 def run_build(arguments: argparse.Namespace) -> int:
@@ -182,11 +185,11 @@ def _model(arguments: argparse.Namespace) -> Iterator[Make]:
     """Give what builds the model that is asked for."""
     text = arguments.model
     if text in plants():
-        module = importlib.import_module(f"{fmus.__name__}.{text}")
+        module = importlib.import_module(f"{gantry.__package__}.{text}")
         yield _maker(module.nominal, arguments.python, module.build, text)
     elif text.endswith(".py") or ".py:" in text:
         with user_model(text) as model:
-            yield _maker(model.block, arguments.python, fmus.build, type(model.block).__name__.lower(), model.beside)
+            yield _maker(model.block, arguments.python, build_model, type(model.block).__name__.lower(), model.beside)
     else:
         hint = near(text, plants())
         known = "" if hint.startswith("Known") else f" The plants: {', '.join(plants())}."
@@ -198,7 +201,7 @@ def _maker(block: Block, python: bool, build: Callable[..., Path], name: str, be
         chosen = {"name": name, **options}
         target = file or folder / f"{chosen['name']}.fmu"
         if python:
-            return fmus.build_python(block, target, files=beside, notify=_progress, **chosen)
+            return build_python(block, target, files=beside, notify=_progress, **chosen)
         _progress(f"tracing {chosen['name']}")
         return build(block, target, notify=_progress, **chosen)
 

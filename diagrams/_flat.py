@@ -18,10 +18,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ..blocks._comparison import GUARDS, NEXT
 from ..blocks._errors import SampleTimeError
 from ..blocks._ports import Shape
 from ..blocks._symbols import size
-from ..blocks._tracing import GUARDS, NEXT
 from ._check import Checked
 from ._order import Step, evaluation_order
 from ._structure import Structure, Wire, join

@@ -25,9 +25,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..blocks._comparison import GUARDS, NEXT
 from ..blocks._errors import LoopwrightError, NonFiniteError, OptionError, SimulationError
 from ..blocks._symbols import bundle
-from ..blocks._tracing import GUARDS, NEXT
 from ._flat import FlatDiagram
 from ._run import Run
 from ._structure import join

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from lxml import etree
 
+from loopwright.diagrams import _cli_fmu
 from loopwright.diagrams._cli import main
 from loopwright.fmus import _summary, _validation
 from loopwright.fmus._build import _zip
@@ -232,15 +233,13 @@ def test_a_file_to_write(here):
 
 def test_platforms(here, capsys, monkeypatch):
     """Names reach the builder; compiling for others is tested with the compiler."""
-    from loopwright import fmus
-
     asked = []
 
     def build(block, out, **options):
         asked.append(options["platform"])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(fmus, "build", build)
+    monkeypatch.setattr(_cli_fmu, "build_model", build)
     for given in (["x86_64-windows", "x86_64-linux"], ["aarch64-darwin", "all"]):
         assert main(["build", "mine.py:Lag", "--platform", *given]) == 130
     assert asked == [["x86_64-windows", "x86_64-linux"], "all"]
