@@ -237,6 +237,7 @@ def test_a_jump_to_no_number_is_an_error(instance):
     with pytest.raises(fmpy.fmi1.FMICallException):
         item.step(0.0, 1.0, u=2.0)
     assert "n (element 0) became" in item.log[-1][2]
+    assert item["reached.indicator"] == pytest.approx(-1.0 - 1e-10, rel=0, abs=1e-12)  # its domain too is as before
 
 
 def touch(height):

@@ -136,6 +136,19 @@ def test_the_step_size_is_part_of_the_state(instance):
 
 
 @pytest.mark.parametrize("integrator", [DOPRI5, RODAS])
+def test_an_input_that_jumps_restarts_the_integrator(instance, integrator):
+    """Bit by bit what a fresh instance does, which has no step size yet."""
+    path = build_fmu(driven())
+    item, fresh = instance(path).initialize(integrator=integrator), instance(path, start_time=5.0)
+    item.step(0.0, 5.0)
+    fresh.initialize(integrator=integrator, x=item["x"], y=item["y"])
+    item.step(5.0, 0.3, u=2.0)
+    fresh.step(5.0, 0.3, u=2.0)
+    assert (item["x"], item["y"]) == (fresh["x"], fresh["y"])
+    item.step(5.3, 0.3)  # and now it goes on
+
+
+@pytest.mark.parametrize("integrator", [DOPRI5, RODAS])
 def test_an_input_that_jumps(instance, integrator):
     """Long after the step has grown: what is lost to a jump stays within the tolerance."""
     item = instance(build_fmu(mass_spring_damper(tolerance=1e-9))).initialize(integrator=integrator)
