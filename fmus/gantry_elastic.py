@@ -59,8 +59,9 @@ class GantryElastic(Gantry):
         unit="m",
         description="motor's position ahead of the slide's; starts where it carries the weight",
         start=lambda model: model.weight / model.screw_stiffness,
+        nominal=1e-4,
     )
-    deflection_rate = State(unit="m/s", description="rate of the deflection", start=(0.0, 0.0))
+    deflection_rate = State(unit="m/s", description="rate of the deflection", start=(0.0, 0.0), nominal=1e-2)
     motor_position = Output(shape=(2,), unit="m", description="position of the motor, as seen from the slide")
 
     @property
