@@ -2,7 +2,8 @@
 
 import pytest
 
-from exported import Instance, mass_spring_damper
+from exported import Instance, mass_spring_damper, pendulums
+from exported2 import Instance2
 from loopwright.fmus._build import build_fmu
 
 
@@ -26,6 +27,29 @@ def instance(tmp_path):
 
     def make(path, **options):
         made.append(Instance(path, tmp_path / str(len(made)), **options))
+        return made[-1]
+
+    yield make
+    for item in made:
+        item.fmu.freeInstance()
+
+
+@pytest.fixture(scope="module")
+def msd2(cache):
+    return build_fmu(mass_spring_damper(), fmi=2)
+
+
+@pytest.fixture(scope="module")
+def pendulums2(cache):
+    return build_fmu(pendulums(), fmi=2)
+
+
+@pytest.fixture
+def instance2(tmp_path):
+    made = []
+
+    def make(path, **options):
+        made.append(Instance2(path, tmp_path / f"v2-{len(made)}", **options))
         return made[-1]
 
     yield make
