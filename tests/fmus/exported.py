@@ -160,6 +160,71 @@ def exact(t, x0, force=0.0):
     return (expm(A * t) @ np.array([*x0, 1.0]))[:2]
 
 
+def relay(**changes):
+    """x' = 1 or -1, switched when x leaves [-width, width]; with width = 0 it chatters."""
+    return _model(
+        "relay",
+        (
+            Variable("x", "output", start=0.5, state=True),
+            Variable("sign", "output", "discrete", start=-1.0, state=True),
+        ),
+        (Variable("width", "parameter", "tunable", start=0.1),),
+        (),
+        lambda t, x, u, p: [x[1]],
+        z=lambda t, x, u, p: [x[0] - p[0], x[0] + p[0]],
+        jump=lambda t, x, u, p, fired: [x[0], ca.if_else(fired[0], -1.0, ca.if_else(fired[1], 1.0, x[1]))],
+        **({"events": (Event("above", "rising"), Event("below", "falling"))} | changes),
+    )
+
+
+def counter(jump, z=None, **changes):
+    """x' = 0, n counts: an event at x + u = 1."""
+    return _model(
+        "counter",
+        (Variable("x", "output", start=0.0, state=True), Variable("n", "output", "discrete", start=0.0, state=True)),
+        (),
+        (Variable("u", "input"), Variable("v", "input", "discrete")),
+        lambda t, x, u, p: [0.0],
+        lambda t, x, u, p: [x[0] + u[0]],
+        (Variable("y", "output"),),
+        z=z or (lambda t, x, u, p: [x[0] + u[0] - 1.0]),
+        jump=jump,
+        **({"events": (Event("reached"),)} | changes),
+    )
+
+
+G, E = 9.81, 0.7
+
+
+def bounces(n, e=E):
+    """Times of the first bounces from 1 m, and the speeds after them."""
+    t, v, found = np.sqrt(2.0 / G), np.sqrt(2.0 * G), []
+    for _ in range(n):
+        v *= e
+        found.append((t, v))
+        t += 2.0 * v / G
+    return found
+
+
+def ball(t, e=E):
+    """Height and velocity of the ball."""
+    past = [(tk, v) for tk, v in bounces(30, e) if tk <= t]
+    if not past:
+        return 1.0 - G * t**2 / 2.0, -G * t
+    tk, v = past[-1]
+    return v * (t - tk) - G * (t - tk) ** 2 / 2.0, v - G * (t - tk)
+
+
+def heating(t):
+    """Temperature and switch of the thermostat at t, from 20 degrees."""
+    warm, cold = np.log(15 / 14) / 0.1, np.log(16 / 14) / 0.1  # 20 to 21 on, 21 to 19 off
+    again = np.log(16 / 14) / 0.1  # 19 to 21 on: 35 - 19 to 35 - 21
+    if t < warm:
+        return 35.0 - 15.0 * np.exp(-0.1 * t), 1.0
+    s = (t - warm) % (cold + again)
+    return (5.0 + 16.0 * np.exp(-0.1 * s), 0.0) if s < cold else (35.0 - 16.0 * np.exp(-0.1 * (s - cold)), 1.0)
+
+
 class Instance:
     """An FMU under FMPy's low-level interface, by names, with what it logs."""
 

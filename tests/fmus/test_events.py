@@ -1,4 +1,4 @@
-"""Events of exported FMUs in Co-Simulation: inside doStep, and with Event Mode."""
+"""Events of exported FMUs inside doStep; models whose events are none."""
 
 from dataclasses import replace
 
@@ -8,42 +8,12 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
-from exported import _model, bouncing_ball, fails, mass_spring_damper, thermostat
+from exported import E, G, ball, bouncing_ball, counter, heating, mass_spring_damper, relay, thermostat
 from loopwright.blocks._errors import DefinitionError, ParameterError
 from loopwright.fmus._build import build_fmu
 from loopwright.fmus._spec import Event, Variable
 
-G, E = 9.81, 0.7
 INTEGRATORS = (1, 2, 3)
-
-
-def bounces(n, e=E):
-    """Times of the first bounces from 1 m, and the speeds after them."""
-    t, v, found = np.sqrt(2.0 / G), np.sqrt(2.0 * G), []
-    for _ in range(n):
-        v *= e
-        found.append((t, v))
-        t += 2.0 * v / G
-    return found
-
-
-def ball(t, e=E):
-    """Height and velocity of the ball."""
-    past = [(tk, v) for tk, v in bounces(30, e) if tk <= t]
-    if not past:
-        return 1.0 - G * t**2 / 2.0, -G * t
-    tk, v = past[-1]
-    return v * (t - tk) - G * (t - tk) ** 2 / 2.0, v - G * (t - tk)
-
-
-def heating(t):
-    """Temperature and switch of the thermostat at t, from 20 degrees."""
-    warm, cold = np.log(15 / 14) / 0.1, np.log(16 / 14) / 0.1  # 20 to 21 on, 21 to 19 off
-    again = np.log(16 / 14) / 0.1  # 19 to 21 on: 35 - 19 to 35 - 21
-    if t < warm:
-        return 35.0 - 15.0 * np.exp(-0.1 * t), 1.0
-    s = (t - warm) % (cold + again)
-    return (5.0 + 16.0 * np.exp(-0.1 * s), 0.0) if s < cold else (35.0 - 16.0 * np.exp(-0.1 * (s - cold)), 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -132,23 +102,6 @@ def test_no_ball_falls_through_the_floor(ball_fmu, instance, integrator, e):
     assert "the event bounce fires faster and faster" in item.log[-1][2]
 
 
-def relay(**changes):
-    """x' = 1 or -1, switched when x leaves [-width, width]; with width = 0 it chatters."""
-    return _model(
-        "relay",
-        (
-            Variable("x", "output", start=0.5, state=True),
-            Variable("sign", "output", "discrete", start=-1.0, state=True),
-        ),
-        (Variable("width", "parameter", "tunable", start=0.1),),
-        (),
-        lambda t, x, u, p: [x[1]],
-        z=lambda t, x, u, p: [x[0] - p[0], x[0] + p[0]],
-        jump=lambda t, x, u, p, fired: [x[0], ca.if_else(fired[0], -1.0, ca.if_else(fired[1], 1.0, x[1]))],
-        **({"events": (Event("above", "rising"), Event("below", "falling"))} | changes),
-    )
-
-
 def test_chattering_is_an_error(instance):
     item = instance(build_fmu(relay())).initialize(width=0.0)
     with pytest.raises(fmpy.fmi1.FMICallException):
@@ -170,22 +123,6 @@ def test_too_many_events_are_an_error(instance):
     for k in range(5):  # in shorter steps it goes on
         item.step(0.1 * k, 0.1)
     assert abs(item["x"]) <= 1.25e-5
-
-
-def counter(jump, z=None, **changes):
-    """x' = 0, n counts: an event at x + u = 1."""
-    return _model(
-        "counter",
-        (Variable("x", "output", start=0.0, state=True), Variable("n", "output", "discrete", start=0.0, state=True)),
-        (),
-        (Variable("u", "input"), Variable("v", "input", "discrete")),
-        lambda t, x, u, p: [0.0],
-        lambda t, x, u, p: [x[0] + u[0]],
-        (Variable("y", "output"),),
-        z=z or (lambda t, x, u, p: [x[0] + u[0] - 1.0]),
-        jump=jump,
-        **({"events": (Event("reached"),)} | changes),
-    )
 
 
 def test_an_input_that_jumps_fires_at_the_communication_point(instance):
@@ -282,103 +219,6 @@ def test_a_tunable_parameter_acts_between_steps(ball_fmu, instance):
     item.step(0.0, 0.2)
     item.step(0.2, 0.6, e=0.5)
     assert [item["height"], item["velocity"]] == pytest.approx(list(ball(0.8, 0.5)), abs=1e-12)
-
-
-# ---- with Event Mode ----
-
-
-def enter(item, **start):
-    """Initialize, and leave the Event Mode that follows."""
-    for name, value in start.items():
-        item[name] = value
-    item.fmu.enterInitializationMode()
-    item.fmu.exitInitializationMode()
-    assert item.fmu.updateDiscreteStates() == (False, False, False, False, False, 0.0)
-    item.fmu.enterStepMode()
-
-
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_do_step_returns_early_at_each_bounce(ball_fmu, instance, integrator):
-    item = instance(ball_fmu, eventModeUsed=True, earlyReturnAllowed=True)
-    enter(item, integrator=integrator)
-    t = 0.0
-    for when, speed in bounces(5):
-        needed, terminate, early, last = item.step(t, 10.0)
-        assert (needed, terminate, early) == (True, False, True)
-        assert last == item["time"] == pytest.approx(when, abs=1e-12)
-        assert item["velocity"] == pytest.approx(-speed / E, abs=1e-11)  # the jump is still to come
-        assert -1e-14 < item["height"] <= 0.0
-        item.fmu.enterEventMode()
-        assert item.fmu.updateDiscreteStates() == (False, False, False, True, False, 0.0)
-        assert item["velocity"] == pytest.approx(speed, abs=1e-11)
-        assert item.fmu.updateDiscreteStates()[0] is False  # once is enough
-        assert item["velocity"] == pytest.approx(speed, abs=1e-11)
-        item.fmu.enterStepMode()
-        t = last
-    assert item.step(t, 0.01) == (False, False, False, t + 0.01)
-
-
-def test_without_early_return_events_are_handled_inside(ball_fmu, instance):
-    item = instance(ball_fmu, eventModeUsed=True)
-    enter(item)
-    assert item.step(0.0, 2.0) == (False, False, False, 2.0)
-    assert [item["height"], item["velocity"]] == pytest.approx(list(ball(2.0)), abs=1e-11)
-
-
-def test_an_unhandled_event_is_not_passed_over(ball_fmu, instance):
-    item = instance(ball_fmu, eventModeUsed=True, earlyReturnAllowed=True)
-    enter(item)
-    last = item.step(0.0, 1.0)[3]
-    assert item.step(last, 1.0) == (True, False, True, last)
-
-
-def test_outputs_follow_the_inputs_in_event_mode(instance):
-    spec = counter(lambda t, x, u, p, fired: [x[0], x[1] + fired[0]])
-    item = instance(build_fmu(spec), eventModeUsed=True, earlyReturnAllowed=True)
-    enter(item)
-    item["u"] = 0.5
-    assert item["y"] == 0.0  # Step Mode: that of the last step
-    item.fmu.enterEventMode()
-    assert item["y"] == 0.5
-    item["u"], item["v"] = 3.0, 1.0
-    assert item["y"] == 3.0
-    assert item.fmu.updateDiscreteStates() == (False, False, False, False, False, 0.0)  # n is no continuous state
-    assert item["n"] == 1.0
-    item["u"] = 0.0
-    item.fmu.updateDiscreteStates()
-    assert item["n"] == 2.0
-    item.fmu.enterStepMode()
-    assert item.step(0.0, 1.0) == (False, False, False, 1.0)
-    assert item.step(1.0, 1.0, u=2.0) == (True, False, True, 1.0)  # the input's jump is an event at once
-
-
-def test_event_mode_in_fmpy(ball_fmu):
-    result = fmpy.simulate_fmu(
-        str(ball_fmu), fmi_type="CoSimulation", stop_time=2.2, output_interval=0.02, use_event_mode=True,
-        early_return_allowed=True, start_values={"integrator": 2},
-    )  # fmt: skip
-    errors = [abs(height - ball(t)[0]) for t, height in zip(result["time"], result["height"], strict=True)]
-    assert max(errors) < 1e-11
-    assert len(errors) > 110
-
-
-def test_calls_out_of_order(ball_fmu, msd, instance):
-    item = instance(ball_fmu)
-    item.initialize()
-    fails(item, item.fmu.enterEventMode, "no Event Mode. Instantiate it with eventModeUsed = fmi3True")
-    item = instance(msd)
-    item.initialize()
-    fails(item, item.fmu.updateDiscreteStates, "hasEventMode = false")
-    with pytest.raises(Exception, match="Failed to instantiate"):
-        instance(msd, eventModeUsed=True)
-    item = instance(ball_fmu, eventModeUsed=True)
-    item.fmu.enterInitializationMode()
-    item.fmu.exitInitializationMode()
-    fails(item, lambda: item.step(0.0, 1.0), "fmi3DoStep was called in state Event Mode, expected Step Mode")
-    enter(item)
-    fails(item, item.fmu.updateDiscreteStates, "called in state Step Mode, expected Event Mode")
-    enter(item)
-    fails(item, item.fmu.enterStepMode, "called in state Step Mode, expected Event Mode")
 
 
 # ---- models that are no such ----

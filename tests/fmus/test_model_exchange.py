@@ -9,16 +9,20 @@ import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
-from test_events import E, G, ball, bounces, heating
 
 from exported import (
     D,
+    E,
+    G,
     K,
     M,
+    ball,
+    bounces,
     bouncing_ball,
     driven,
     exact,
     fails,
+    heating,
     mass_spring_damper,
     pendulums,
     thermostat,
