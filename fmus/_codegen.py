@@ -22,7 +22,7 @@ from ._spec import DIRECTIONS, INTEGRATORS, ModelSpec, Variable
 Kind = Literal["time", "fixed", "tunable", "input", "state", "discrete", "derivative", "output", "indicator"]
 _COMMON = ("model.h", "core.c", "integrators.c", "events.c", "stepping.c")
 RUNTIME = {3: (*_COMMON, "fmi3.c", "fmi3_events.c", "fmi3_refused.c"), 2: (*_COMMON, "fmi2.c", "fmi2_refused.c")}
-_ORDER = {3: "FMI 3.0, 2.3, 3.2 and 4.2", 2: "FMI 2.0, 2.1.6 and 4.2.4"}
+_ORDER = {3: "FMI 3.0, 2.3, 3.2 and 4.2", 2: "FMI 2.0, 3.2.3 and 4.2.4"}
 
 # Longest function that is expanded: beyond, calls of shared functions keep the code small (compile time grows faster).
 _SCALAR_LIMIT = 20_000
