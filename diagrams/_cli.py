@@ -10,6 +10,7 @@ import argparse
 import ast
 import json
 import math
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
@@ -67,6 +68,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OptionError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
         return 2
+    except BrokenPipeError:  # the reader of a pipe, such as head, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it ends
+        return 1
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -180,7 +180,7 @@ def _values(block: Block, name: str, kind: str) -> dict[str, dict[str, Any]]:
         if given.shape is None:
             raise DefinitionError("its shape is not declared; declare it with Input(shape=…).", block=name, port=key)
         shapes[key] = given.shape
-        put(key, "input", np.zeros(given.shape) if given.default is None else given.default, given)
+        put(key, "input", np.broadcast_to(0.0 if given.default is None else given.default, given.shape), given)
     for key, value in traced_parameters(block):
         put(key, "parameter", value, _declared(block, key))
     for key, state in block.states.items():
@@ -348,9 +348,9 @@ def _completed(file: Path, about: dict[str, Any], values: dict[str, dict[str, An
         if unit is not None:
             real.set("unit", unit)
             units.add(unit)
-        for key, bound in (("min", getattr(port, "minimum", None)), ("max", getattr(port, "maximum", None))):
-            if bound is not None:
-                real.set(key, repr(float(bound)))
+        for key, attribute in (("min", "minimum"), ("max", "maximum"), ("nominal", "nominal")):
+            if (value := getattr(port, attribute, None)) is not None:
+                real.set(key, repr(float(value)))
     structure, place = root.find("ModelStructure"), list(root).index(root.find("CoSimulation"))  # type: ignore[arg-type]
     assert structure is not None
     unknown = [str(i + 1) for i, v in enumerate(about["variables"]) if v["initial"] == "calculated"]

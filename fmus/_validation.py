@@ -26,7 +26,7 @@ from ._trial import STAGES
 
 #: Seconds that an FMU may take for its first step before it counts as hung.
 PATIENCE = 120.0
-_AGAIN = "Export it again with a newer version of {tool}, or report it to its makers."
+_AGAIN = "Export it again with a newer version of its tool ({tool}), or report it to its makers."
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def validate(file: Path, *, run: bool = True) -> Report:
         entries, root = read_archive(file)
     except FmuFileError as error:
         return Report((Problem(str(error), "Export it again; the file may be cut off, or no FMU at all."),), (), ())
-    tool = root.get("generationTool") or "the tool that wrote it"
+    tool = root.get("generationTool") or "not named"
     again = _AGAIN.format(tool=tool)
     fmi = root.get("fmiVersion") or "(none)"
     if not (fmi in ("1.0", "2.0") or fmi.startswith("3.")):
@@ -199,7 +199,7 @@ def _identifiers(root: Any) -> dict[str, str]:
 
 def _binaries(file: Path, root: Any, entries: list[str], tool: str) -> Iterator[tuple[str, str]]:
     """Give what is wrong with the libraries: missing, or for another machine than their folder says."""
-    build = f"Export it again with {tool}; if it has sources, fmpy compile builds it for this machine."
+    build = f"Export it again with its tool ({tool}); if it has sources, fmpy compile builds it for this machine."
     folders = binaries_of(entries)
     if not folders and not any(name.startswith("sources/") for name in entries):
         yield "it holds neither a binary nor sources, so that nothing can run it.", build

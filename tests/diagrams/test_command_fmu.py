@@ -715,6 +715,15 @@ def test_terminal_without_greek(lag):
     assert b"First-order lags: T ? = u - y [both]." in result.stdout
 
 
+def test_a_reader_that_has_had_enough(lag):
+    command = [sys.executable, "-m", "loopwright.diagrams", "inspect", str(lag / "lag.fmu")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert process.wait() == 1
+
+
 @pytest.mark.parametrize("command", ["build", "inspect", "validate"])
 def test_help(command, capsys):
     assert main([command, "--help"]) == 0

@@ -90,6 +90,16 @@ class FailsAtOnce(Block):
         return values["nothing"]
 
 
+class Odd(Block):
+    """No number at the start, and an input with a default."""
+
+    u = Input(shape=(2,), default=1.5, minimum=-2.0, maximum=3.0, nominal=10.0)
+    y = Output()
+
+    def output(self, t, x, u):
+        return float("nan") if t <= 0.1 else u.u[1]
+
+
 def local():
     class Local(Decay):
         """Out of a function."""
@@ -317,6 +327,25 @@ def test_errors_while_it_runs_are_quoted(models, beside, tmp_path):
     assert "y is nan; expected finite numbers" in run(stop_time=1.0, output_interval=0.125)
     assert "past one half" in run(stop_time=1.0, output_interval=1.0)
     assert "found -1; expected a value above 0" in run(start_values={"k": -1.0}, stop_time=0.1, output_interval=0.1)
+
+
+def test_what_goes_wrong_in_the_first_step_is_told(models, beside, tmp_path):
+    file = build_python(models.Odd(), tmp_path, files=beside, step_size=0.1)
+    assert [problem.found for problem in validate(file).problems] == [
+        "co-simulation: after one step from its start values, y is no finite number."
+    ]
+    assert validate(build_python(models.Odd(), tmp_path, files=beside, step_size=0.2)).problems == ()
+    problems = validate(build_python(models.Fails(), tmp_path, files=beside, step_size=0.5, stop_time=2.0)).problems
+    assert len(problems) == 1
+    assert problems[0].found.startswith("co-simulation: its first step failed: FMICallException: fmi2DoStep failed")
+    assert "y is nan; expected finite numbers" in problems[0].found
+
+
+def test_limits_and_defaults_of_ports(models, beside, tmp_path):
+    file = build_python(models.Odd(), tmp_path, files=beside)
+    variables = {v.name: v for v in fmpy.read_model_description(str(file)).modelVariables}
+    found = [(v.start, v.min, v.max, v.nominal) for name, v in variables.items() if name.startswith("u[")]
+    assert found == 2 * [("1.5", "-2.0", "3.0", "10.0")]
 
 
 # --- what is refused ------------------------------------------------------------------------------------------------
