@@ -5,19 +5,23 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
 
 from ..blocks._block import Block
+from ..blocks._comparison import GUARDS, NEXT
 from ..blocks._errors import DefinitionError
-from ..blocks._ports import Port
-from ..blocks._tracing import NEXT, trace, traced_parameters
+from ..blocks._ports import Port, Shape
+from ..blocks._symbols import size
+from ..blocks._tracing import Traced, trace, traced_parameters
 from ..blocks._values import ParameterSpec
 from ._build import build_fmu
 from ._documentation import block_text
-from ._spec import ModelSpec, Variable
+from ._spec import Event, Integrator, ModelSpec, Variable
+
+_TINY = float(np.finfo(float).tiny)  # the least positive number that is not denormal
 
 
 def model_spec(
@@ -27,6 +31,8 @@ def model_spec(
     internal_step: float = 1e-3,
     stop_time: float = 1.0,
     step_size: float = 1e-3,
+    integrator: Integrator = "rk4",
+    tolerance: float = 1e-8,
 ) -> ModelSpec:
     """Return what an FMU of a continuous block consists of: its variables, and its equations as CasADi functions.
 
@@ -41,51 +47,93 @@ def model_spec(
         If its equations can't be traced.
     """
     name = name or type(block).__name__.lower()
-    if not hasattr(block, "derivative"):
-        raise DefinitionError(
-            "it has no derivative(t, x, u), so it is no continuous model; an FMU is made from one.", block=name
-        )
-    shapes = {}
-    for port, spec in block.inputs.items():
-        if spec.shape is None:
-            raise DefinitionError("its shape is not declared; declare it with Input(shape=…).", block=name, port=port)
-        shapes[port] = spec.shape
-    traced = trace(block, shapes, sampled=False, zeros=False)
-    entries = list(traced_parameters(block))
-    f = traced.function
-    t, x, u = (
-        ca.MX.sym("t"),
-        ca.MX.sym("x", f.numel_in(1)),
-        ca.MX.sym("u", sum(f.numel_in(2 + i) for i in range(len(shapes)))),
-    )
-    p = ca.MX.sym("p", sum(np.size(v) for _, v in entries))
-    offsets = np.cumsum([0, *(f.numel_in(2 + i) for i in range(len(shapes)))])
-    parts = [u[int(a) : int(b)] for a, b in itertools.pairwise(offsets)]
-    made = f.call([t, x, *parts, ca.vertcat(p, 0.0)])  # the sample time does not enter a continuous model
-    results = dict(zip((*traced.outputs, NEXT), made[: len(traced.outputs) + 1], strict=True))
+    _check_exportable(block, name)
+    shapes = {port: spec.shape or () for port, spec in block.inputs.items()}
+    equations = _Equations(block, trace(block, shapes, sampled=False, zeros=False))
+    traced = equations.traced
     computed = [n for n in block.outputs if n not in block.states]
-    y = ca.vertcat(*(results[n] for n in computed))
     return ModelSpec(
         name=name,
         description=(type(block).__doc__ or name).strip().splitlines()[0],
-        inputs=tuple(_variable(port, "input", shape=shapes[n], start=0.0) for n, port in block.inputs.items()),
-        outputs=tuple(_variable(block.outputs[n], "output", shape=traced.outputs[n]) for n in computed),
-        parameters=tuple(_parameter(block, n, v) for n, v in entries),
-        states=tuple(
-            _variable(
-                port,
-                "output" if port.output else "local",
-                shape=traced.states[n],
-                state=True,
-                start=port.start_value(block, shapes),
-            )
-            for n, port in block.states.items()
+        inputs=tuple(
+            _variable(port, "input", shape=shapes[n], start=0.0 if port.default is None else port.default)
+            for n, port in block.inputs.items()
         ),
-        derivative=ca.Function("derivative", [t, x, u, p], [results[NEXT]]),
-        output=ca.Function("output", [t, x, u, p], [y]),
+        outputs=tuple(_variable(block.outputs[n], "output", shape=traced.outputs[n]) for n in computed),
+        parameters=tuple(_parameter(block, n, v) for n, v in traced_parameters(block)),
+        states=tuple(_state(block, n, traced.states[n], shapes) for n in equations.order),
+        derivative=equations.derivative(),
+        output=equations.output(computed),
+        events=tuple(
+            Event(n, cast(Any, port.direction), port.description, port.nominal or 1.0)
+            for n, port in block.events.items()
+        ),
+        indicators=equations.indicators(),
+        jump=equations.jump(),
         internal_step=internal_step,
         stop_time=stop_time,
         step_size=step_size,
+        integrator=integrator,
+        tolerance=tolerance,
+    )
+
+
+class _Equations:
+    """A block's traced equations as functions of (t, x, u, p), with the discrete states behind the continuous ones."""
+
+    def __init__(self, block: Block, traced: Traced):
+        self.block, self.traced = block, traced
+        states = block.states
+        self.order = sorted(states, key=lambda n: states[n].discrete)
+        sizes = {n: size(shape) for n, shape in traced.states.items()}
+        first = dict(zip(sizes, itertools.accumulate(sizes.values(), initial=0), strict=False))
+        self._rows = [first[n] + i for n in self.order for i in range(sizes[n])]
+        self._n_continuous = sum(sizes[n] for n in self.order if not states[n].discrete)
+        f = traced.function
+        n_u = [f.numel_in(2 + i) for i in range(len(traced.inputs))]
+        self.t, self.x, self.u = ca.MX.sym("t"), ca.MX.sym("x", len(self._rows)), ca.MX.sym("u", sum(n_u))
+        self.p = ca.MX.sym("p", sum(np.size(v) for _, v in traced_parameters(block)))
+        columns = ca.vertsplit(self.u, [0, *itertools.accumulate(n_u)]) if n_u else []
+        x = self.x[[self._rows.index(i) for i in range(len(self._rows))]] if self._rows else self.x
+        # the sample time does not enter a continuous model
+        self._arguments = [self.t, x, *columns, ca.vertcat(self.p, 0.0)]
+        names = (*traced.outputs, NEXT, GUARDS)
+        self._made = dict(zip(names, f.call(self._arguments), strict=True))
+
+    def _function(self, name: str, result: Any, *more: Any) -> Any:
+        return ca.Function(name, [self.t, self.x, self.u, self.p, *more], [result])
+
+    def derivative(self) -> Any:
+        """Return the rates of the continuous states."""
+        return self._function("derivative", self._made[NEXT][self._rows[: self._n_continuous]])
+
+    def output(self, computed: list[str]) -> Any:
+        """Return the computed outputs, in one column."""
+        return self._function("output", ca.vertcat(*(self._made[n] for n in computed)))
+
+    def indicators(self) -> Any:
+        """Return the event indicators; None without events."""
+        f = self.traced.indicators
+        return None if f is None else self._function("indicators", f.call(self._arguments)[0])
+
+    def jump(self) -> Any:
+        """Return the states after an event; None without events."""
+        if self.traced.jump is None:
+            return None
+        fired = ca.MX.sym("fired", len(self.block.events))
+        after = self.traced.jump.call([*self._arguments, fired])[0]
+        return self._function("jump", after[self._rows], fired)
+
+
+def _state(block: Block, name: str, shape: Shape, shapes: dict[str, Shape]) -> Variable:
+    port = block.states[name]
+    return _variable(
+        port,
+        "output" if port.output else "local",
+        variability="discrete" if port.discrete else "continuous",
+        shape=shape,
+        state=True,
+        start=port.start_value(block, shapes),
     )
 
 
@@ -97,6 +145,8 @@ def build(
     internal_step: float = 1e-3,
     stop_time: float = 1.0,
     step_size: float = 1e-3,
+    integrator: Integrator = "rk4",
+    tolerance: float = 1e-8,
     fmi: int = 3,
     arrays: bool = True,
     platform: str | Iterable[str] | None = None,
@@ -117,7 +167,12 @@ def build(
         The model's name; the class name in lower case without one.
     internal_step : float
         Start value, in s, of the FMU's parameter ``internal_step``: the longest step of its Runge-Kutta integrator
-        (order 4).
+        (order 4), and the longest of the others.
+    integrator : {"rk4", "dopri5", "rodas"}
+        Start value of the FMU's parameter ``integrator``, for co-simulation: explicit with a fixed step, explicit with
+        an adaptive one, or implicit for stiff models.
+    tolerance : float
+        Start value of the FMU's parameter ``tolerance``: relative error of a step of the adaptive integrators.
     stop_time, step_size : float
         Default experiment, s.
     fmi : {3, 2}
@@ -139,14 +194,50 @@ def build(
     CompilerError
         No compiler, or one that failed.
     """
-    spec = model_spec(block, name=name, internal_step=internal_step, stop_time=stop_time, step_size=step_size)
+    spec = model_spec(
+        block,
+        name=name,
+        internal_step=internal_step,
+        stop_time=stop_time,
+        step_size=step_size,
+        integrator=integrator,
+        tolerance=tolerance,
+    )
     text = block_text(block) if documentation is None else documentation
     return build_fmu(spec, out, fmi=fmi, arrays=arrays, platform=platform, documentation=text, notify=notify)
 
 
+def _check_exportable(block: Block, name: str) -> None:
+    """Refuse what an FMU would leave out without a word."""
+    if isinstance(block, type) or not isinstance(block, Block):
+        raise DefinitionError(f"found {block!r}; expected a block, such as Gantry().", block=name)
+    if not (hasattr(block, "derivative") or block.events):
+        raise DefinitionError(
+            "it has no derivative(t, x, u), so it is no continuous model; an FMU is made from one.", block=name
+        )
+    for what, why in (
+        ("guards", "an FMU has no guards"),
+        ("initial", "an FMU's states have start values, and none that are computed from its inputs"),
+    ):
+        if hasattr(block, what):
+            raise DefinitionError(f"it has {what}(…), but {why}. Export a block without.", block=name)
+    for port, spec in block.inputs.items():
+        if spec.shape is None:
+            raise DefinitionError("its shape is not declared; declare it with Input(shape=…).", block=name, port=port)
+    for port, declared in {**block.inputs, **block.outputs, **block.states}.items():
+        if isinstance(declared.unit, tuple):
+            raise DefinitionError(
+                f"its entries have units of their own, {', '.join(declared.unit)}; a variable of an FMU has one. Split "
+                "the port.",
+                block=name,
+                port=port,
+            )
+
+
 def _variable(port: Port, causality: Any, **more: Any) -> Variable:
     unit = port.unit if isinstance(port.unit, str) else None
-    return Variable(name=port.name, causality=causality, unit=unit or "1", description=port.description, **more)
+    limits: dict[str, Any] = {"nominal": port.nominal, "minimum": port.minimum, "maximum": port.maximum}
+    return Variable(name=port.name, causality=causality, unit=unit, description=port.description, **limits, **more)
 
 
 def _parameter(block: Block, name: str, value: Any) -> Variable:
@@ -155,15 +246,15 @@ def _parameter(block: Block, name: str, value: Any) -> Variable:
     for part in outer:
         owner = owner.__dict__[part]
     spec: ParameterSpec = type(owner).parameter_specs[last]
-    tiny = np.finfo(float).tiny
+    above = spec.above if spec.above is None else float(np.nextafter(spec.above, np.inf)) if spec.above else _TINY
     return Variable(
         name=name,
         causality="parameter",
-        variability="tunable",
+        variability="tunable" if spec.tunable else "fixed",
         shape=np.shape(value),
-        unit=spec.unit or "1",
+        unit=spec.unit,
         description=spec.description,
         start=value,
-        minimum=spec.above + tiny if spec.above is not None else spec.minimum,
+        minimum=spec.minimum if above is None else above,
         maximum=spec.maximum,
     )
