@@ -37,7 +37,7 @@ from ._errors import (
 from ._mechanics import PlanarModel
 from ._path_following import FeedbackLinearization, ForceProjection, PathProjection, PathTracking, TransverseTransform
 from ._paths import Circle, CubicSpline, Ellipse, Frame, Line, Path
-from ._ports import Input, Output, State
+from ._ports import Event, Input, Output, State
 from ._signals import Call, Signal
 from ._sources import Constant, Pulse, Reference, Sine, SmoothStep, Step
 from ._units import Unit, parse_unit
@@ -59,6 +59,7 @@ __all__ = [
     "Ellipse",
     "Encoder",
     "ErrorDynamics",
+    "Event",
     "FeedbackLinearization",
     "FmuError",
     "FmuFileError",

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from ._errors import DefinitionError, GuardError
-from ._ports import Input, Output, Port, State
+from ._ports import Event, Input, Output, Port, State
 from ._signals import Call, Signal, Wireable, as_signal, bind, check_name, primary_outputs
 from ._values import Value
 
@@ -36,6 +36,7 @@ class Block(Value, Wireable):
 
     A block has continuous states if it has a ``derivative``, sampled ones if it has an ``update`` alone. A continuous
     block in a sampled subsystem is discretized by the subsystem's method, unless it has an ``update`` of its own.
+    A continuous block may declare events and discrete states, which its ``jump`` changes.
 
     Equations (all optional; ``T`` may be declared as a last argument of ``output``, ``update`` and ``guards`` and is
     then the sample time in s)
@@ -43,7 +44,11 @@ class Block(Value, Wireable):
     output(t, x, u)
         The outputs that are not states.
     derivative(t, x, u)
-        Time derivative of the states.
+        Time derivative of the states that are not discrete.
+    indicators(t, x, u)
+        One expression for each `Event`: it fires where the expression crosses zero.
+    jump(t, x, u, fired)
+        All states after an event; ``fired`` is a named tuple of 1 for the events that fire at this instant, 0 else.
     update(t, x, u)
         The states at the next tick.
     guards(t, x, u)
@@ -70,6 +75,7 @@ class Block(Value, Wireable):
     inputs: ClassVar[Mapping[str, Input]] = {}
     outputs: ClassVar[Mapping[str, Output | State]] = {}
     states: ClassVar[Mapping[str, State]] = {}
+    events: ClassVar[Mapping[str, Event]] = {}
     name: str | None = None
     _hint: ClassVar[str | None] = None
 
@@ -84,7 +90,7 @@ class Block(Value, Wireable):
                     ports.pop(name, None)
         for clash in ports.keys() & cls.parameter_specs.keys():
             raise DefinitionError("a port and a parameter share this name; rename one.", block=cls.__name__, port=clash)
-        for attribute, kind in (("inputs", Input), ("states", State)):
+        for attribute, kind in (("inputs", Input), ("states", State), ("events", Event)):
             if not isinstance(cls.__dict__.get(attribute), property):
                 setattr(cls, attribute, {k: p for k, p in ports.items() if isinstance(p, kind)})
         if not isinstance(cls.__dict__.get("outputs"), property):

@@ -29,13 +29,39 @@ class Port:
         Unit as FMI spells it; a tuple gives one per entry. None: not declared, and not checked.
     description : str
         One line for people.
+    nominal : float, optional
+        Typical size, positive, in its unit: what tolerances of a solver are relative to.
+    minimum, maximum : float, optional
+        Range in its unit; an FMU refuses values outside.
     """
 
-    def __init__(self, shape: Shape | None = (), unit: Unit = None, description: str = "", name: str = ""):
+    def __init__(
+        self,
+        shape: Shape | None = (),
+        unit: Unit = None,
+        description: str = "",
+        name: str = "",
+        *,
+        nominal: float | None = None,
+        minimum: float | None = None,
+        maximum: float | None = None,
+    ):
         self.shape, self.unit, self.description, self.name = shape, unit, description, name
+        self.nominal, self.minimum, self.maximum = nominal, minimum, maximum
+        if nominal is not None and not nominal > 0:
+            raise DefinitionError(f"found nominal {nominal!r}; expected a positive number.")
 
     def __set_name__(self, owner: type, name: str) -> None:
-        if name.startswith("_") or name in {"name", "inputs", "outputs", "states", "replace", "parameters", "T"}:
+        if name.startswith("_") or name in {
+            "name",
+            "inputs",
+            "outputs",
+            "states",
+            "events",
+            "replace",
+            "parameters",
+            "T",
+        }:
             raise DefinitionError(f"a port can't be called {name!r}; choose another name.", block=owner.__name__)
         self.name = name
 
@@ -45,12 +71,19 @@ class Port:
 
 
 class Input(Port):
-    """An input. With ``default`` it may stay unwired."""
+    """An input. With ``default`` it may stay unwired. It takes ``nominal``, ``minimum`` and ``maximum`` of `Port`."""
 
     def __init__(
-        self, shape: Shape | None = (), unit: Unit = None, description: str = "", *, default: Any = None, name: str = ""
+        self,
+        shape: Shape | None = (),
+        unit: Unit = None,
+        description: str = "",
+        *,
+        default: Any = None,
+        name: str = "",
+        **limits: float | None,
     ):
-        super().__init__(shape, unit, description, name)
+        super().__init__(shape, unit, description, name, **limits)
         self.default = None if default is None else np.asarray(default, dtype=float)
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
@@ -82,8 +115,9 @@ class Output(Port):
         like: str | None = None,
         secondary: bool = False,
         name: str = "",
+        **limits: float | None,
     ):
-        super().__init__(None if like and shape == () else shape, unit, description, name)
+        super().__init__(None if like and shape == () else shape, unit, description, name, **limits)
         self.like, self.secondary = like, secondary
 
     @overload
@@ -110,6 +144,8 @@ class State(Port):
         Name of the input whose shape the state takes.
     output : bool, optional
         True when the state is an output as well, under the same name.
+    discrete : bool, optional
+        True for a state that is constant between events: only ``jump`` changes it.
     """
 
     def __init__(
@@ -120,10 +156,12 @@ class State(Port):
         start: float | Any | str | Callable[[Any], Any] = 0.0,
         like: str | None = None,
         output: bool = False,
+        discrete: bool = False,
         name: str = "",
+        **limits: float | None,
     ):
-        super().__init__(None, unit, description, name)
-        self.start, self.like, self.output = start, like, output
+        super().__init__(None, unit, description, name, **limits)
+        self.start, self.like, self.output, self.discrete = start, like, output, discrete
 
     def start_value(self, block: Block, shapes: Mapping[str, Shape]) -> np.ndarray:
         """Return the start value on ``block``, with inputs of the given shapes, as a float64 array."""
@@ -143,3 +181,31 @@ class State(Port):
 
             return Signal(instance, self.name)
         raise AttributeError(f"{self.name!r} is a state of {instance!r}: it lives in the run, not on the block.")
+
+
+class Event(Port):
+    """An event of a continuous block: one of its ``indicators`` crosses zero in a direction.
+
+    An indicator is in one of two domains, z > 0 or z ≤ 0. A change of domain in the declared direction fires the event,
+    and the block's ``jump`` gives the states after it. At the start domains are taken as they are, and nothing fires.
+
+    Parameters
+    ----------
+    direction : {"both", "rising", "falling"}
+        Rising is from z ≤ 0 to z > 0.
+    description : str
+        One line for people.
+    nominal : float
+        Typical size of the indicator, positive: what "close to zero" is measured by.
+    """
+
+    def __init__(self, direction: str = "both", description: str = "", *, nominal: float = 1.0, name: str = ""):
+        super().__init__((), None, description, name, nominal=float(nominal))
+        if direction not in ("both", "rising", "falling"):
+            raise DefinitionError(f"found direction {direction!r}; expected 'both', 'rising' or 'falling'.")
+        self.direction = direction
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        if instance is None:
+            return self
+        raise AttributeError(f"{self.name!r} is an event of {instance!r}: it happens in a run, and can't be read.")

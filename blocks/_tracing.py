@@ -7,6 +7,8 @@ What is traced becomes one CasADi function per block,
 with flat columns (vectors and matrices in C order). ``next`` is the state at the next tick in a sampled frame, the time
 derivative in a continuous one. ``p`` holds the parameters, then the sample time, then what was computed from them.
 Parameters are symbols, except exact zeros, which are structure. Traces are shared among blocks of equal structure.
+
+Events add two functions in a continuous frame, indicators(t, x, u₁ … uₘ, p) → z and jump(t, x, u₁ … uₘ, p, fired) → x⁺.
 """
 
 from __future__ import annotations
@@ -20,13 +22,12 @@ import casadi as ca
 import numpy as np
 
 from ._block import Block
+from ._comparison import GUARDS, NEXT, compare
 from ._discretization import hold
 from ._errors import LoopwrightError, SampleTimeError, TraceError
 from ._ports import Shape
 from ._symbols import bundle, expanded, flat_column, size, split, with_values, wrap
 from ._values import Value, identity
-
-NEXT, GUARDS = "next", "guards"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +47,10 @@ class Traced:
     system_matrix: Any
     """CasADi function p → A where ``advance`` is "affine", else None."""
     method: str
+    indicators: Any = None
+    """CasADi function of (t, x, one column per input, p), one entry for each event; None without events."""
+    jump: Any = None
+    """CasADi function of the same and a column of ones and zeros, to all states; None without events."""
 
     def pack(self, block: Block, T: float) -> np.ndarray:
         """Return the numbers of ``p`` for ``block`` (of this structure) at the sample time T."""
@@ -163,7 +168,8 @@ class _Tracer:
             name: frozenset(a for j, a in enumerate(arguments) if function.jac_sparsity(i, j).nnz())
             for i, name in enumerate(names)
         }
-        self._compare(function, names)
+        self.check(function, names)
+        indicators, jump = self._events()
         return Traced(
             function=function,
             inputs=self.shapes,
@@ -174,6 +180,8 @@ class _Tracer:
             advance=advance,
             system_matrix=matrix,
             method=self.method,
+            indicators=indicators,
+            jump=jump,
         )
 
     # --- the equations, called with symbols -------------------------------------------------------------------------
@@ -193,13 +201,13 @@ class _Tracer:
         shadow: Block = with_values(self.block, values)
         return shadow
 
-    def _call(self, what: str, x: Any = None) -> Any:
-        """Call an equation; ``x`` replaces the states' own symbols."""
+    def _call(self, what: str, x: Any = None, *more: Any) -> Any:
+        """Call an equation; ``x`` replaces the states' own symbols, and ``more`` follows the inputs."""
         states = bundle("x", self._columns(self.states, self.x if x is None else x))
         inputs = bundle("u", {n: wrap(c, s) for (n, s), c in zip(self.shapes.items(), self.u, strict=True)})
         keywords = {"T": wrap(self.T, ())} if self._wants_sample_time(what) else {}
         try:
-            return getattr(self._shadow(), what)(wrap(self.t, ()), states, inputs, **keywords)
+            return getattr(self._shadow(), what)(wrap(self.t, ()), states, inputs, *more, **keywords)
         except LoopwrightError:
             raise
         except Exception as error:
@@ -246,6 +254,35 @@ class _Tracer:
         self.guard_names = tuple(made)
         return ca.vertcat(*(flat_column(v) for v in made.values())) if made else ca.MX(0, 1)
 
+    def _events(self) -> tuple[Any, Any]:
+        """Return the functions of the event indicators and of the jump."""
+        events = self.block.events
+        lone = [n for n, port in self.block.states.items() if port.discrete]
+        if not events:
+            if lone:
+                raise TraceError(
+                    f"its states {', '.join(lone)} are discrete but no event changes them; declare an Event, or leave "
+                    "discrete=True out."
+                )
+            return None, None
+        for what in ("indicators", "jump"):
+            if not hasattr(self.block, what):
+                raise TraceError(f"it declares the events {', '.join(events)} but has no {what}; write it.")
+        if self.sampled:
+            raise SampleTimeError(
+                f"it has events ({', '.join(events)}), and it stands in a sampled frame; put it outside of it."
+            )
+        fired = ca.MX.sym("fired", len(events))
+        z = ca.vertcat(*split(self._call("indicators"), dict.fromkeys(events, ()), "indicators")[0].values())
+        after = self._call("jump", None, bundle("fired", self._columns(dict.fromkeys(events, ()), fired)))
+        x_next = ca.vertcat(*split(after, self.states, "jump")[0].values()) if self.states else ca.MX(0, 1)
+        arguments = [self.t, self.x, *self.u, self.p]
+        indicators = expanded(ca.Function("indicators", arguments, [z]))
+        jump = expanded(ca.Function("jump", [*arguments, fired], [x_next]))
+        self.check(indicators, ["indicators"])
+        self.check(jump, ["jump"])
+        return indicators, jump
+
     def _advance(self) -> tuple[str, Any, Any, Any]:
         """Return how the states advance, A(p) where needed, the new states (or rates), and symbols for Ad and Φ."""
         none, x = ca.MX(0, 1), self.x
@@ -263,12 +300,13 @@ class _Tracer:
                     "a sampled block stands in a continuous frame; put it into a @subsystem(sample_time=…)."
                 )
             return "update", None, states_from("update"), unused
-        if not derivative:
+        discrete = {name for name, port in self.block.states.items() if port.discrete}
+        if not derivative and len(discrete) < len(self.states):
             raise TraceError(
                 f"it has states ({', '.join(self.states)}) but neither derivative(t, x, u) nor update(t, x, u); "
                 "write one."
             )
-        dx = states_from("derivative")
+        dx = self._rates(discrete)
         if not self.sampled:
             return "derivative", None, dx, unused
         n, arguments = x.numel(), [self.t, x, *self.u, self.p]
@@ -288,65 +326,17 @@ class _Tracer:
             return "semi_implicit", None, new, unused
         return "forward", None, x + self.T * dx, unused
 
-    # --- NumPy's own result beside it -------------------------------------------------------------------------------
+    def _rates(self, discrete: set[str]) -> Any:
+        """Return the time derivatives of all states, zero for the discrete ones."""
+        continuous = {n: s for n, s in self.states.items() if n not in discrete}
+        made = split(self._call("derivative"), continuous, "derivative")[0] if continuous else {}
+        dx = ca.vertcat(*(made[n] if n in made else ca.MX.zeros(size(s)) for n, s in self.states.items()))
+        self.check(expanded(ca.Function("derivative", [self.t, self.x, *self.u, self.p], [dx])), ["derivative"])
+        return dx
 
-    def _compare(self, function: Any, names: list[str]) -> None:
-        """Evaluate the equations with NumPy at random points: finds what traces silently wrong."""
-        rng = np.random.default_rng(20140)
-        T = 1.0 if self.sampled else float("nan")
-        p = np.concatenate([*(np.ravel(v) for _, v in self.entries), [T], *map(np.ravel, self.constants.values())])
-        p = np.concatenate([p, np.zeros(function.numel_in(function.n_in() - 1) - p.size)])
-        for _ in range(2):
-            t = float(rng.uniform(0.0, 2.0))
-            x = {k: v + 0.1 * rng.standard_normal(v.shape) for k, v in self.starts.items()}
-            u = {k: rng.standard_normal(s) for k, s in self.shapes.items()}
-            flat_x = np.concatenate([*map(np.ravel, x.values()), np.zeros(0)])
-            columns = function.call([t, flat_x, *map(np.ravel, u.values()), p])
-            traced = {name: np.ravel(np.array(c)) for name, c in zip(names, columns, strict=True)}
-            for name, value in evaluate(self.block, t, x, u, T, self.constants).items():
-                difference = _difference(traced[name], np.ravel(np.asarray(value, dtype=float)), name)
-                if difference:
-                    raise TraceError(
-                        f"{difference} (t = {t:.3g}, x = {x}, u = {u}). An operation in it traces wrongly; avoid "
-                        "math.…, float(…), masks and assignments into arrays, and build vectors with np.stack."
-                    )
-
-
-def _difference(traced: np.ndarray, numpy: np.ndarray, name: str) -> str:
-    """Return in words how two evaluations differ, or nothing."""
-    if traced.size != numpy.size:
-        return f"its traced equation gives {traced.size} numbers for {name!r} where NumPy gives {numpy.size}"
-    with np.errstate(all="ignore"):
-        close = np.abs(traced - numpy) <= 1e-9 * (1.0 + np.abs(numpy))
-    wrong = ~(close | (np.isnan(traced) & np.isnan(numpy)) | (traced == numpy))
-    if wrong.any():
-        return f"its traced equation gives {traced[wrong][:3]} for {name!r} where NumPy gives {numpy[wrong][:3]}"
-    return ""
-
-
-def evaluate(
-    block: Block, t: float, x: Mapping[str, Any], u: Mapping[str, Any], T: float, constants: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Evaluate a block's equations with NumPy: outputs by name, the updated states flat, the guards flat."""
-    shadow = with_values(block, dict(constants))
-    bx, bu = (bundle(k, {n: float(v) if np.ndim(v) == 0 else v for n, v in d.items()}) for k, d in (("x", x), ("u", u)))
-
-    def call(what: str) -> Any:
-        wants = "T" in inspect.signature(getattr(type(block), what)).parameters and np.isfinite(T)
-        with np.errstate(all="ignore"):
-            return getattr(shadow, what)(t, bx, bu, **({"T": T} if wants else {}))
-
-    result: dict[str, Any] = {name: x[name] for name in block.outputs if name in block.states}
-    own = [name for name in block.outputs if name not in block.states]
-    if own:
-        made = call("output")
-        result.update(zip(own, (made,) if len(own) == 1 else made, strict=True))
-    if block.states and hasattr(block, "update") and (np.isfinite(T) or not hasattr(block, "derivative")):
-        made = call("update")
-        result[NEXT] = np.concatenate([np.ravel(m) for m in ((made,) if len(block.states) == 1 else made)])
-    if hasattr(block, "guards"):
-        result[GUARDS] = np.array([float(v) for v in call("guards").values()])
-    return result
+    def check(self, function: Any, names: list[str]) -> None:
+        """Compare results of a traced function with NumPy's own."""
+        compare(self.block, function, names, self.shapes, self.starts, self.entries, self.constants, self.sampled)
 
 
 def _where(error: Exception, block: Block, what: str) -> str:

@@ -35,6 +35,7 @@ class ParameterSpec:
     shape: tuple[int, ...] | None = None
     structural: bool = False
     kw_only: bool = True
+    tunable: bool = True
     annotation: str = "Any"
 
     @property
@@ -54,6 +55,7 @@ def parameter(
     shape: tuple[int, ...] | None = None,
     structural: bool = False,
     kw_only: bool = True,
+    tunable: bool = True,
 ) -> Any:
     """Declare a parameter of a value: ``mass: float = parameter(unit="kg", above=0.0)``.
 
@@ -74,8 +76,10 @@ def parameter(
         Values that are no floats are structural by nature.
     kw_only : bool, optional
         False for the one defining object that may come first by position.
+    tunable : bool, optional
+        False when an FMU made from it must not change the value during a run (FMI's variability "fixed").
     """
-    return ParameterSpec(default, unit, description, above, minimum, maximum, shape, structural, kw_only)
+    return ParameterSpec(default, unit, description, above, minimum, maximum, shape, structural, kw_only, tunable)
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(parameter,))
