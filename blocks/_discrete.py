@@ -69,8 +69,8 @@ class Encoder(Block):
 class ForceSensor(Block):
     """Force sensor between the robot and its tool: the tool's inertia acts on it (E25).
 
-    F = force + contact force − m_tool · acceleration; the gravity part is tared. At the first tick the acceleration
-    counts as zero, since no force has acted yet.
+    F = force + contact force − m_tool · acceleration; the gravity part is tared. At t = 0 the acceleration counts as
+    zero, since no force has acted yet.
     """
 
     tool_mass: float = parameter(default=0.0, unit="kg", minimum=0.0, description="mass on the far side of the sensor")
@@ -78,12 +78,7 @@ class ForceSensor(Block):
     acceleration = Input(shape=(2,), unit="m/s2", description="acceleration at the end of the last step")
     contact_force = Input(shape=(2,), unit="N", default=(0.0, 0.0), description="force of a contact inside the plant")
     measured = Output(shape=(2,), unit="N")
-    running = State(description="0 before the first tick, then 1")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the measured force."""
-        return u.force + u.contact_force - self.tool_mass * np.where(x.running > 0.5, u.acceleration, 0.0)
-
-    def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Remember that a step has been made."""
-        return 1.0 + 0.0 * t
+        return u.force + u.contact_force - self.tool_mass * np.where(t > 0.0, u.acceleration, 0.0)

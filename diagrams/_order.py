@@ -11,8 +11,9 @@ import heapq
 from collections import defaultdict
 from collections.abc import Mapping
 
+from ..blocks._comparison import GUARDS, NEXT
 from ..blocks._errors import AlgebraicLoopError
-from ..blocks._tracing import GUARDS, NEXT, Traced
+from ..blocks._tracing import Traced
 from ._structure import Structure
 
 Port = tuple[str, str]

@@ -11,9 +11,10 @@ import casadi as ca
 import numpy as np
 
 from ..blocks._block import Block
+from ..blocks._comparison import NEXT
 from ..blocks._errors import DefinitionError
 from ..blocks._ports import Port
-from ..blocks._tracing import NEXT, trace, traced_parameters
+from ..blocks._tracing import trace, traced_parameters
 from ..blocks._values import ParameterSpec
 from ._build import build_fmu
 from ._spec import ModelSpec, Variable
