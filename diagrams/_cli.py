@@ -260,7 +260,8 @@ def _write(
         json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )
     if run is not None:
-        from ._figures import plot_experiment, plot_path, save
+        from ._figures import plot_experiment, plot_path
+        from ._plots import save
 
         run.to_csv(folder / f"{letter}.csv", *SIGNALS)
         names.insert(0, f"{letter}.csv")
