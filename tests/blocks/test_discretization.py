@@ -197,6 +197,17 @@ def test_the_exact_hold_of_an_oscillator_turns_and_decays():
     np.testing.assert_allclose(forcing[:, 1], [(1 - want[0, 0]) / (d**2 + w**2), want[0, 1]], rtol=0, atol=1e-14)
 
 
+@EULER
+def test_the_holds_of_eulers_methods_are_their_recurrences(method):
+    rng, h = np.random.default_rng(8), 0.07
+    A, x, g = rng.standard_normal((4, 4)), rng.standard_normal(4), rng.standard_normal(4)
+    new = x.copy()
+    for i in (3, 2, 1, 0):
+        new[i] = x[i] + h * (A[i] @ (new if method == "semi_implicit" else x) + g[i])
+    transition, forcing = hold(A, h, method)
+    np.testing.assert_allclose(transition @ x + forcing @ g, new, rtol=1e-13, atol=1e-14)
+
+
 def test_a_method_that_is_none_is_refused():
     with pytest.raises(SampleTimeError, match=r"found the method 'euler'; expected one of exact, forward, semi_impl"):
         hold(np.eye(1), 0.1, "euler")
