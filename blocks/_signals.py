@@ -6,13 +6,23 @@ one. Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` an
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator
+from contextlib import suppress
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ._errors import DoubleDriveError, ShapeError, UnknownNameError, UnwiredInputError, WiringError, near
+from ._errors import (
+    DoubleDriveError,
+    LoopwrightError,
+    ShapeError,
+    UnknownNameError,
+    UnwiredInputError,
+    WiringError,
+    near,
+)
 
 if TYPE_CHECKING:
     from ._block import Block
@@ -58,6 +68,15 @@ class Wireable:
     def __getitem__(self, index: int | slice) -> Signal:
         return self._signal()[index]
 
+    def __iter__(self) -> Iterator[Signal]:  # without it Python would index from 0 on and never stop
+        return iter(self._signal())
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *(name for name in _outputs(self) if name.isidentifier())]
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return _outputs(self)
+
 
 class Signal(Wireable):
     """One output port of a block, or a part of it.
@@ -89,12 +108,11 @@ class Signal(Wireable):
     def __getitem__(self, index: int | slice) -> Signal:
         if self.index is not None:
             raise WiringError("a part of a part of a signal; index the port once.", port=self.port)
-        if not isinstance(index, int | slice):
-            raise WiringError(f"a signal is indexed by an integer or a slice, found {index!r}.", port=self.port)
-        return Signal(self.source, self.port, index, None, self.call)
+        return Signal(self.source, self.port, _index(index, self.port), None, self.call)
 
     def __iter__(self) -> Iterator[Signal]:
-        raise WiringError("this is one signal and can't be unpacked; index it, as in y[0].", port=self.port)
+        who = getattr(self.source, "label", None)
+        raise WiringError("this is one signal and can't be unpacked; index it, as in y[0].", block=who, port=self.port)
 
     def named(self, name: str) -> Signal:
         """Name the wire: a log channel, and a point at which the loop can be opened.
@@ -106,6 +124,32 @@ class Signal(Wireable):
     def __repr__(self) -> str:
         part = "" if self.index is None else f"[{self.index}]"
         return f"<signal {getattr(self.source, 'label', self.source)}.{self.port}{part}>"
+
+
+def _index(index: Any, port: str) -> int | slice:
+    """Return an index of plain integers, so that NumPy's integers wire (and compare) as Python's do."""
+
+    def integer(value: Any) -> int:
+        if isinstance(value, bool | np.bool_):
+            raise TypeError
+        return operator.index(value)
+
+    try:
+        if not isinstance(index, slice):
+            return integer(index)
+        return slice(*(None if i is None else integer(i) for i in (index.start, index.stop, index.step)))
+    except TypeError:
+        raise WiringError(
+            f"found the index {index!r}; expected an integer or a slice of integers, as in y[0] or y[:2].", port=port
+        ) from None
+
+
+def _outputs(source: Wireable) -> list[str]:
+    """Return the names that complete in a notebook; nothing where they can't be had, for completion never fails."""
+    with suppress(LoopwrightError):
+        if not isinstance(source, Signal):
+            return list(getattr(source.block if isinstance(source, Call) else source, "outputs", ()))
+    return []
 
 
 class Call(Wireable):
