@@ -19,6 +19,8 @@ from ..blocks._values import ParameterSpec
 from ._build import build_fmu
 from ._spec import ModelSpec, Variable
 
+_TINY = float(np.finfo(float).tiny)  # the least positive number that is not denormal
+
 
 def model_spec(
     block: Block,
@@ -41,15 +43,8 @@ def model_spec(
         If its equations can't be traced.
     """
     name = name or type(block).__name__.lower()
-    if not hasattr(block, "derivative"):
-        raise DefinitionError(
-            "it has no derivative(t, x, u), so it is no continuous model; an FMU is made from one.", block=name
-        )
-    shapes = {}
-    for port, spec in block.inputs.items():
-        if spec.shape is None:
-            raise DefinitionError("its shape is not declared; declare it with Input(shape=…).", block=name, port=port)
-        shapes[port] = spec.shape
+    _check_exportable(block, name)
+    shapes = {port: spec.shape or () for port, spec in block.inputs.items()}
     traced = trace(block, shapes, sampled=False, zeros=False)
     entries = list(traced_parameters(block))
     f = traced.function
@@ -68,7 +63,10 @@ def model_spec(
     return ModelSpec(
         name=name,
         description=(type(block).__doc__ or name).strip().splitlines()[0],
-        inputs=tuple(_variable(port, "input", shape=shapes[n], start=0.0) for n, port in block.inputs.items()),
+        inputs=tuple(
+            _variable(port, "input", shape=shapes[n], start=0.0 if port.default is None else port.default)
+            for n, port in block.inputs.items()
+        ),
         outputs=tuple(_variable(block.outputs[n], "output", shape=traced.outputs[n]) for n in computed),
         parameters=tuple(_parameter(block, n, v) for n, v in entries),
         states=tuple(
@@ -133,9 +131,38 @@ def build(
     return build_fmu(spec, out, platform=platform, notify=notify)
 
 
+def _check_exportable(block: Block, name: str) -> None:
+    """Refuse what an FMU would leave out without a word."""
+    if isinstance(block, type) or not isinstance(block, Block):
+        raise DefinitionError(f"found {block!r}; expected a block, such as Gantry().", block=name)
+    if not hasattr(block, "derivative"):
+        raise DefinitionError(
+            "it has no derivative(t, x, u), so it is no continuous model; an FMU is made from one.", block=name
+        )
+    for what, why in (
+        ("guards", "an FMU has no guards"),
+        ("initial", "an FMU's states have start values, and none that are computed from its inputs"),
+        ("jump", "events are not exported yet"),
+    ):
+        if hasattr(block, what):
+            raise DefinitionError(f"it has {what}(…), but {why}. Export a block without.", block=name)
+    for port, spec in block.inputs.items():
+        if spec.shape is None:
+            raise DefinitionError("its shape is not declared; declare it with Input(shape=…).", block=name, port=port)
+    for port, declared in {**block.inputs, **block.outputs, **block.states}.items():
+        if isinstance(declared.unit, tuple):
+            raise DefinitionError(
+                f"its entries have units of their own, {', '.join(declared.unit)}; a variable of an FMU has one. Split "
+                "the port.",
+                block=name,
+                port=port,
+            )
+
+
 def _variable(port: Port, causality: Any, **more: Any) -> Variable:
     unit = port.unit if isinstance(port.unit, str) else None
-    return Variable(name=port.name, causality=causality, unit=unit or "1", description=port.description, **more)
+    limits = {"minimum": port.minimum, "maximum": port.maximum}
+    return Variable(name=port.name, causality=causality, unit=unit, description=port.description, **limits, **more)
 
 
 def _parameter(block: Block, name: str, value: Any) -> Variable:
@@ -144,15 +171,15 @@ def _parameter(block: Block, name: str, value: Any) -> Variable:
     for part in outer:
         owner = owner.__dict__[part]
     spec: ParameterSpec = type(owner).parameter_specs[last]
-    tiny = np.finfo(float).tiny
+    above = spec.above if spec.above is None else float(np.nextafter(spec.above, np.inf)) if spec.above else _TINY
     return Variable(
         name=name,
         causality="parameter",
-        variability="tunable",
+        variability="tunable" if spec.tunable else "fixed",
         shape=np.shape(value),
-        unit=spec.unit or "1",
+        unit=spec.unit,
         description=spec.description,
         start=value,
-        minimum=spec.above + tiny if spec.above is not None else spec.minimum,
+        minimum=spec.minimum if above is None else above,
         maximum=spec.maximum,
     )
