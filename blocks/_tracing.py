@@ -341,11 +341,13 @@ class _Tracer:
 
 def _where(error: Exception, block: Block, what: str) -> str:
     """Say which line of the user's equations an operation failed on."""
-    file = inspect.getsourcefile(type(block)) if type(block).__module__ != "__main__" else None
+    # by the code's own file, which a notebook's cell and a script have too; helpers beside the equation count as well
+    equation = inspect.unwrap(getattr(type(block), what))
+    file = getattr(getattr(equation, "__code__", None), "co_filename", None)
     line, step = "", error.__traceback__
     while step is not None:
-        if file is None or step.tb_frame.f_code.co_filename == file or step.tb_frame.f_code.co_name == what:
-            line = f" in line {step.tb_lineno} of {step.tb_frame.f_code.co_filename}"
+        if step.tb_frame.f_code.co_filename == file:
+            line = f" in line {step.tb_lineno} of {file}"
         step = step.tb_next
     return (
         f"its {what} can't be traced{line}: {type(error).__name__}: {error}. Use NumPy functions of (t, x, "
