@@ -161,7 +161,7 @@ def _check_exportable(block: Block, name: str) -> None:
 
 def _variable(port: Port, causality: Any, **more: Any) -> Variable:
     unit = port.unit if isinstance(port.unit, str) else None
-    limits = {"minimum": port.minimum, "maximum": port.maximum}
+    limits: dict[str, Any] = {"minimum": port.minimum, "maximum": port.maximum}
     return Variable(name=port.name, causality=causality, unit=unit, description=port.description, **limits, **more)
 
 

@@ -112,16 +112,11 @@ ENCODER = {"encoder": 1e-6}
 NARROW = {"friction_width": 0.001}
 
 
-def reads_the_same(letter, options):
-    """Whether oracle and block mean the same: with a moving reference (D) the oracle takes its rate of t_k for t_k+1."""
-    return letter != "D" or "velocity_limit" not in options
-
-
 QUICK = [pytest.param(letter, options, id=f"{letter}, {name}") for name, (options, letter) in OPTIONS.items()]
 REST = [
     pytest.param(letter, options, id=f"{letter}, {name}", marks=pytest.mark.slow)
     for (name, (options, quick)), letter in product(OPTIONS.items(), "ABCD")
-    if letter != quick and not (letter == "A" and LIMITS & options.keys()) and reads_the_same(letter, options)
+    if letter != quick and not (letter == "A" and LIMITS & options.keys())
 ]
 
 
