@@ -100,18 +100,15 @@ def test_a_loop_has_one_shape_whatever_its_blocks_are_called(names, start, signa
 
 @pytest.mark.parametrize("names", list(itertools.permutations("abz")), ids="".join)
 def test_a_loop_whose_shapes_disagree_is_refused_whatever_its_blocks_are_called(names):
-    widening, scaling, delayed = names
+    total, widening, delayed = names
 
     @subsystem(sample_time=0.1)
-    def box():
-        delay = UnitDelay(initial_value=(1.0, 2.0), name=delayed)
-        wide = Gain(gain=np.ones((3, 2)), name=widening)(
-            delay.y
-        )  # three numbers, which are to be the pair's next value
-        delay(Gain(gain=0.5, name=scaling)(wide))
-        return wide
+    def box(u):
+        delay = UnitDelay(initial_value=0.0, name=delayed)
+        s = Sum(name=total)(delay.y, u)
+        delay(Gain(gain=np.ones((3, 2)), name=widening)(s))  # three numbers, to be added to a pair in the next tick
+        return s
 
-    with pytest.raises(
-        ShapeError, match=rf"^box\.{delayed}\.u: box\.{scaling}\.y has shape \(3,\), where the loop .* \(2,\)"
-    ):
-        Diagram("d", box())
+    where = rf"^box\.{total}\.u1: box\.{delayed}\.y has shape \(3,\), where the loop that it closes asks for \(2,\)"
+    with pytest.raises(ShapeError, match=where):
+        Diagram("d", box(Constant(value=(1.0, 2.0), name="n")))
