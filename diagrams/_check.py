@@ -93,6 +93,7 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[Port, Shape
         if port.shape is not None
     }
     assumed: dict[Port, Shape] = {}
+    shared: dict[Any, Traced] = {}  # traces of users' classes: what they close over may change between two builds
     consumers: dict[Port, list[Port]] = {}
     unknown: dict[str, set[str]] = {path: set() for path in table.blocks}
     for (path, port), wire in table.wires.items():
@@ -115,7 +116,7 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[Port, Shape
         block = table.blocks[path]
         if block.opaque:
             continue
-        traced[path] = _trace(block, _input_shapes(table, shapes, path, assumed), table, path)
+        traced[path] = _trace(block, _input_shapes(table, shapes, path, assumed), table, path, shared)
         for name, shape in traced[path].outputs.items():
             if (path, name) not in shapes:
                 shapes[path, name] = shape
@@ -152,10 +153,11 @@ def _check_shapes(
         part_shape(shapes[wire.block, wire.port], wire, wire.block, f"{wire.port} (named {name!r})")
 
 
-def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str) -> Traced:
+def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, shared: dict[Any, Traced]) -> Traced:
     frame = table.frame_of[path]
+    sampled, method = table.rate(frame) is not None, table.frames[frame].method
     try:
-        return trace(block, shapes, sampled=table.rate(frame) is not None, method=table.frames[frame].method)
+        return trace(block, shapes, sampled=sampled, method=method, cache=shared)
     except WiringError as error:
         error.block = path
         raise

@@ -6,6 +6,7 @@ from scipy.integrate import quad
 
 from loopwright.blocks import (
     Block,
+    Constant,
     DefinitionError,
     Ellipse,
     Event,
@@ -23,6 +24,7 @@ from loopwright.blocks import (
 from loopwright.blocks._equations import initial_state
 from loopwright.blocks._symbols import bundle
 from loopwright.blocks._tracing import trace
+from loopwright.diagrams import Diagram
 
 
 def shapes_of(block):
@@ -90,6 +92,29 @@ def test_within_one_build_equal_blocks_share_a_trace():
     first, second = (trace(Body(), {"F": ()}, sampled=False, cache=cache) for _ in range(2))
     assert first is second
     assert trace(Body(), {"F": ()}, sampled=False, cache={}) is not first
+
+
+def test_equal_blocks_of_a_users_class_are_traced_once_in_one_build_and_again_in_the_next():
+    ran = []
+
+    class Slow(Block):
+        u = Input()
+        y = Output()
+
+        def output(self, t, x, u):
+            ran.append(1)
+            return 2.0 * u.u
+
+    def chain(n):
+        signal = Constant(value=1.0)
+        for _ in range(n):
+            signal = Slow()(signal)
+        return Diagram("chain", signal)
+
+    chain(2)
+    once = len(ran)
+    chain(20)
+    assert len(ran) == 2 * once  # linear: the number of blocks doesn't count, each build does
 
 
 BEND = 0.1
