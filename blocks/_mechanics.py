@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from ._block import Block
+from ._errors import DefinitionError
 from ._values import Array
 
 
@@ -26,11 +27,16 @@ class PlanarModel(Block):
 
     def f_v(self, x_c: Array, x_v: Array) -> Array:
         """Return the drift f_v of (2), shape (2,), in the coordinates' unit per s²."""
-        raise NotImplementedError
+        raise self._undefined("f_v(x_c, x_v)")
 
     def G_v(self, x_c: Array) -> Array:  # noqa: N802 - the paper's symbol
         """Return the input matrix G_v of (2), shape (2, 2)."""
-        raise NotImplementedError
+        raise self._undefined("G_v(x_c)")
+
+    def _undefined(self, what: str) -> DefinitionError:
+        return DefinitionError(
+            f"found no {what}; expected a PlanarModel to define it, equation (2). Write it.", block=type(self).__name__
+        )
 
     def h(self, x_c: Array) -> Array:
         """Return the output y = h(x_c), (3), in m."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from ._errors import ParameterError
 from ._paths_base import UNLIMITED, Path, check_order
+from ._paths_tables import positions
 from ._values import Array, parameter
 
 __all__ = ["Circle", "Ellipse", "Line"]
@@ -107,7 +108,7 @@ class Ellipse(Path):
         enough. On the medial axis, of two points equally near, that with positive sin θ (or cos θ) is taken.
         """
         a, b = self.semi_axes
-        y = np.asarray(y, dtype=float)
+        y = positions(self, y)
         u, v = y[0] - self.center[0], y[1] - self.center[1]
         if self.clockwise:
             v = -v
@@ -169,7 +170,7 @@ class Circle(Path):
 
     def project(self, y: Array) -> Array:
         """Return the parameter of the nearest point, equation (4) (0 for the centre); NumPy only."""
-        y = np.asarray(y, dtype=float)
+        y = positions(self, y)
         v = y[1] - self.center[1]
         theta = self._lapped(np.arctan2(-v if self.clockwise else v, y[0] - self.center[0]))
         return theta if theta.ndim else float(theta)
@@ -223,6 +224,6 @@ class Line(Path):
 
     def project(self, y: Array) -> Array:
         """Return the parameter of the nearest point between the ends, equation (4); NumPy only."""
-        y, d = np.asarray(y, dtype=float), self.end - self.start
+        y, d = positions(self, y), self.end - self.start
         theta = np.clip(((y[0] - self.start[0]) * d[0] + (y[1] - self.start[1]) * d[1]) / (d @ d), 0.0, 1.0)
         return theta if theta.ndim else float(theta)
