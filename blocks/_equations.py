@@ -217,7 +217,7 @@ def start_values(block: Block, shapes: Mapping[str, Shape]) -> dict[str, np.ndar
     return values
 
 
-def initial_state(block: Block, states: Mapping[str, Shape], u: Any) -> np.ndarray:
+def initial_state(block: Any, states: Mapping[str, Shape], u: Any) -> np.ndarray:
     """Return the state that ``initial`` computes from the inputs ``u``, flat.
 
     Raises
@@ -227,7 +227,7 @@ def initial_state(block: Block, states: Mapping[str, Shape], u: Any) -> np.ndarr
     """
     names = list(states)
     columns = [np.zeros(0)]
-    for name, part in zip(names, parts_of(block.initial(u), names, "initial"), strict=True):  # type: ignore[attr-defined]
+    for name, part in zip(names, parts_of(block.initial(u), names, "initial"), strict=True):
         shape = _shape(part)
         if shape is None:
             raise TraceError(f"its initial returned {_named(part)} for {name}; expected numbers.", port=name)

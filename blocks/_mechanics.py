@@ -18,6 +18,11 @@ class PlanarModel(Block):
     and (3): y = h(x_c). A subclass gives `f_v` and `G_v`, and `h` with its first two derivatives where h is not the
     identity. It is a block too where it declares ports and states: the plant and the model that a controller inverts
     are then one definition.
+
+    Raises
+    ------
+    DefinitionError
+        When f_v or G_v is needed and not written.
     """
 
     coordinate_unit: ClassVar[str] = "m"

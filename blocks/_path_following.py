@@ -163,6 +163,11 @@ class PathProjection(PathTracking):
     """Projection of a position onto the path: θ̂ = arg min ‖y − σ̂(θ̂)‖, (4), tracked through (6).
 
     The secondary output ``q`` is 1 − κ ξ₁, which scales tangential motion off the path.
+
+    Raises
+    ------
+    ParameterError, PathDomainError
+        As `PathTracking`.
     """
 
     theta = Output(description="path parameter θ̂ of the foot point, counted over laps (E17)")
@@ -180,8 +185,13 @@ class TransverseTransform(Block):
 
     η₁ = g(θ̂), (5), lifted over laps (E17); ξ₁ = nᵀ(y − σ); η₂ = tᵀẏ / q; ξ₂ = nᵀẏ.
 
-    Without a model the inputs are the output y = h(x_c) and its rate; with one they are x_c and x_v, and y = h(x_c),
-    ẏ = dh x_v, (3).
+    Inputs are ``theta``, the path parameter θ̂ of the foot point, then ``position`` and ``velocity``: without a model
+    the output y = h(x_c) and its rate; with one x_c and x_v, and y = h(x_c), ẏ = dh x_v, (3).
+
+    Raises
+    ------
+    ParameterError
+        A path or a model that is none, when the block is made.
     """
 
     path: Path = parameter(kw_only=False, description="the path")
@@ -212,7 +222,13 @@ class TransverseTransform(Block):
 
 
 class ForceProjection(Block):
-    """Force in the path frame, (13): F∥ = tᵀF, F⊥ = nᵀF."""
+    """Force in the path frame, (13): F∥ = tᵀF, F⊥ = nᵀF, with F the force on the robot (E6).
+
+    Raises
+    ------
+    ParameterError
+        A path that is none, when the block is made.
+    """
 
     path: Path = parameter(kw_only=False, description="the path")
     theta = Input(description="path parameter of the foot point")
@@ -240,6 +256,17 @@ class FeedbackLinearization(Block):
 
     For any fully actuated planar model with ẋ_v = f_v + G_v (u + dhᵀ F), y = h(x_c); the gantry is the case h =
     identity. The measured force F on the robot is cancelled with the sign of E6.
+
+    Inputs are ``theta``, θ̂ of the foot point; ``position`` x_c and ``velocity`` x_v in the model's coordinates;
+    ``force`` F on the robot; ``v_par`` and ``v_perp``, the wanted η̈₁ and ξ̈₁. The output ``motor_force`` is u in the
+    model's unit.
+
+    Raises
+    ------
+    ParameterError
+        A path or a model that is none, or a model without f_v or G_v, when the block is made.
+    GuardError
+        In a run, where |det(dh G_v)| falls to ``minimum_determinant``.
     """
 
     path: Path = parameter(kw_only=False, description="the path")

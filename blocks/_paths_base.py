@@ -66,7 +66,7 @@ class Path(Value):
                 y = np.cos(theta + turn) + self.bend * 2.0**order * np.cos(2.0 * theta + turn)
                 return self.radius * np.stack([y, np.sin(theta + turn)])
 
-    The path must not meet itself (its reach is next to nothing there).
+    The path must not meet itself (its reach is next to nothing there), and its σ′ must not vanish (E19).
 
     All methods take a parameter θ as a number, as an array of N numbers (vectors then have the shape (2, N)) or, unless
     they say that they are NumPy only, as a traced scalar.
@@ -243,6 +243,11 @@ class Path(Value):
         -------
         float or array
             θ within one period, or within the domain.
+
+        Raises
+        ------
+        ParameterError
+            A position of another shape.
         """
         y = tables.positions(self, y)
         theta = np.array([tables.nearest(self, column) for column in y.reshape(2, -1).T])

@@ -25,7 +25,13 @@ def _turned(theta: Array, order: int) -> tuple[Array, Array]:
 class Ellipse(Path):
     """Ellipse σ(θ) = c + (a cos θ, ± b sin θ), counter-clockwise (+) or clockwise (−), period 2π; equation (16).
 
-    Its normal points inwards when it runs counter-clockwise (ξ > 0 is inside), else outwards.
+    a and b are the semi-axes (E12). Its normal points inwards when it runs counter-clockwise (ξ > 0 is inside), else
+    outwards; inwards its reach is that of docs/paper.md, b²/a at the ends of the major axis.
+
+    Raises
+    ------
+    ParameterError
+        Semi-axes that are not positive.
     """
 
     semi_axes: Array = parameter(unit="m", above=0.0, shape=(2,), description="semi-axes a along y and b along z")
@@ -131,7 +137,13 @@ class Ellipse(Path):
 
 
 class Circle(Path):
-    """Circle σ(θ) = c + r (cos θ, ± sin θ), counter-clockwise (+) or clockwise (−), period 2π."""
+    """Circle σ(θ) = c + r (cos θ, ± sin θ), counter-clockwise (+) or clockwise (−), period 2π: (16) with a = b.
+
+    Raises
+    ------
+    ParameterError
+        A radius that is not positive.
+    """
 
     radius: float = parameter(unit="m", above=0.0, description="radius r")
     center: Array = parameter(default=np.zeros(2), unit="m", shape=(2,), description="the centre (y, z)")
@@ -177,7 +189,15 @@ class Circle(Path):
 
 
 class Line(Path):
-    """Straight line σ(θ) = p₀ + θ (p₁ − p₀), θ from 0 to 1; it goes straight on beyond its ends."""
+    """Straight line σ(θ) = p₀ + θ (p₁ − p₀), θ from 0 to 1; it goes straight on beyond its ends.
+
+    Its κ is zero and its reach unlimited: path following is then that of two Cartesian axes, turned.
+
+    Raises
+    ------
+    ParameterError
+        A start and an end in the same place.
+    """
 
     start: Array = parameter(unit="m", shape=(2,), description="where it starts (y, z)")
     end: Array = parameter(unit="m", shape=(2,), description="where it ends (y, z)")
