@@ -11,8 +11,11 @@ import numpy as np
 from ._documentation import port_section, with_section
 from ._errors import DefinitionError, GuardError, WiringError, near
 from ._ports import Event, Input, Output, Port, State
-from ._signals import Call, Signal, Wireable, as_signal, bind, check_name, primary_outputs
+from ._signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, bind, check_name, primary_outputs
 from ._values import Value
+
+_ABSENT = frozenset({"output", "derivative", "update", "indicators", "jump", "guards", "initial", "constants"})
+_ABSENT |= {"inputs", "outputs", "states", "events"}
 
 
 class Block(Value, Wireable):
@@ -130,6 +133,18 @@ class Block(Value, Wireable):
     def __call__(self, *args: Any, **kwargs: Any) -> Call:
         """Wire the block: signals by position in the order of the inputs, or by keyword."""
         return Call(self, bind(self, args, kwargs))
+
+    def named(self, *names: str) -> Call:
+        """Name the wires of the outputs of a block without inputs; see `Call.named`."""
+        return self().named(*names)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name in _ABSENT or name in self.parameter_specs:
+            raise AttributeError(name)  # what is not written is asked for often; the rest would come back here
+        if isinstance(port := getattr(type(self), name, None), Port):
+            return port.__get__(self)  # type: ignore[attr-defined]  # its own error: it is no signal
+        known = {*self.outputs, *self.parameter_specs}
+        raise UnknownAttributeError(f"it has no output or parameter {name!r}. {near(name, known)}", block=self.label)
 
     def _signal(self) -> Signal:
         if any(port.default is None for port in self.inputs.values()) or len(primary_outputs(self)) != 1:

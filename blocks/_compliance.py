@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -109,6 +109,18 @@ class AdmittanceFilter(Block):
     error_rate = State(unit="m/s", description="ė")
     limited = State(description="1 after a tick in which a limit acted: then the states hold r^p and ṙ^p, not e and ė")
 
+    @property
+    def has_limits(self) -> bool:
+        """Whether the path reference is bounded."""
+        return self.velocity_limit is not None or self.acceleration_limit is not None
+
+    @property
+    def states(self) -> Mapping[str, State]:  # type: ignore[override]
+        """E and ė, and where there are limits whether one acted."""
+        cls = type(self)
+        free = {"error": cls.error, "error_rate": cls.error_rate}
+        return {**free, "limited": cls.limited} if self.has_limits else free
+
     def check(self) -> None:
         """Refuse a damping that is given twice or not at all."""
         if (self.damping is None) == (self.damping_ratio is None):
@@ -145,7 +157,7 @@ class AdmittanceFilter(Block):
 
     def deviation(self, x: Any, u: Any) -> tuple[Array, Array]:
         """Return e and ė at this tick."""
-        if self.velocity_limit is None and self.acceleration_limit is None:
+        if not self.has_limits:
             return x.error, x.error_rate
         after_cut = x.limited > 0.5
         e = np.where(after_cut, x.error - u.reference[0], x.error)
@@ -156,14 +168,14 @@ class AdmittanceFilter(Block):
             e_rate = np.where(v == admissible, e_rate, admissible - u.reference[1])
         return e, e_rate
 
-    def step(self, x: Any, u: Any, T: Array) -> tuple[Array, Array, Array, Array]:
+    def step(self, x: Any, u: Any, T: Array) -> tuple[tuple[Array, ...], Array]:
         """Return the states at the next tick, and ë that is held over this one."""
         e, e_rate = self.deviation(x, u)
         drive = self.driving_acceleration(u)
         a = self.acceleration(e, e_rate, drive)
         free = self.transition @ np.stack([e, e_rate]) + self.forcing @ np.stack([0.0 * drive, drive])
-        if self.velocity_limit is None and self.acceleration_limit is None:
-            return free[0], free[1], 0.0 * drive, a
+        if not self.has_limits:
+            return (free[0], free[1]), a
         r_d, v_d, a_d = u.reference[0], u.reference[1], u.reference[2]
         p, v, wanted = r_d + e, v_d + e_rate, a_d + a
         cut, acts = wanted, wanted != wanted
@@ -173,20 +185,20 @@ class AdmittanceFilter(Block):
         if self.acceleration_limit is not None:
             acts = np.logical_or(acts, np.abs(wanted) > self.acceleration_limit)
             cut = _clip(cut, -self.acceleration_limit, self.acceleration_limit)
-        return (
+        new = (
             np.where(acts, p + v * T + 0.5 * cut * T**2, free[0]),
             np.where(acts, v + cut * T, free[1]),
             np.where(acts, 1.0, 0.0),
-            np.where(acts, cut - a_d, a),
         )
+        return new, np.where(acts, cut - a_d, a)
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> Array:
         """Return r^p with its derivatives."""
         e, e_rate = self.deviation(x, u)
-        a = self.derivative(t, x, u)[1] if T is None else self.step(x, u, T)[3]
+        a = self.derivative(t, x, u)[1] if T is None else self.step(x, u, T)[1]
         return u.reference + np.stack([e, e_rate, a])
 
-    def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, Array, Array]:
+    def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, ...]:
         """Return ė and ë; at a velocity limit the acceleration points inwards."""
         a = self.acceleration(x.error, x.error_rate, self.driving_acceleration(u))
         v_d, a_d = u.reference[1], u.reference[2]
@@ -197,12 +209,11 @@ class AdmittanceFilter(Block):
             v = v_d + x.error_rate
             outwards = np.logical_and(np.abs(v) >= self.velocity_limit, v * wanted > 0.0)
             wanted = np.where(outwards, 0.0, wanted)
-        limited = self.acceleration_limit is not None or self.velocity_limit is not None
-        return x.error_rate, wanted - a_d if limited else a, 0.0 * t
+        return (x.error_rate, wanted - a_d, 0.0 * t) if self.has_limits else (x.error_rate, a)
 
-    def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array, Array]:
+    def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, ...]:
         """Return the states at the next tick."""
-        return self.step(x, u, T)[:3]
+        return self.step(x, u, T)[0]
 
 
 def _clip(value: Array, low: Array, high: Array) -> Array:

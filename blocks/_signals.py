@@ -52,13 +52,20 @@ class Wireable:
         return _sum(other, self, "+-")
 
     def __neg__(self) -> Signal:
-        return -1.0 * self
+        from ._algebra import Sum  # it keeps the unit, which a gain would not
+
+        return hinted(Sum(signs="-"), f"minus_{_operand(self, 'constant')}")(self)._signal()
 
     def __mul__(self, other: Any) -> Signal:
         return _product(self, other)
 
     def __rmul__(self, other: Any) -> Signal:
         return _product(self, other)
+
+    def __rmatmul__(self, matrix: Any) -> Signal:
+        from ._algebra import Gain
+
+        return hinted(Gain(gain=matrix), f"gain_of_{_operand(self, 'constant')}")(self)._signal()
 
     def __truediv__(self, other: Any) -> Signal:
         if isinstance(other, Wireable):
@@ -78,7 +85,34 @@ class Wireable:
         return _outputs(self)
 
 
-class Signal(Wireable):
+class Wired(Wireable):
+    """A signal or a call: its values are those of a run, so nothing can be decided on it while wiring."""
+
+    __hash__ = object.__hash__
+
+    def _undecided(self, what: str) -> WiringError:
+        signal = getattr(self, "block", None) or getattr(self, "source", None)
+        return WiringError(
+            f"{self!r} has no {what} while the diagram is wired: its values come with the run. Write the decision as a "
+            "block's equation, with np.where(…).",
+            block=getattr(signal, "label", None),
+        )
+
+    def __bool__(self) -> bool:
+        raise self._undecided("truth value")
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, int | float | np.number | np.ndarray):
+            raise self._undecided("value to compare")
+        return self is other
+
+    def __lt__(self, other: object) -> bool:
+        raise self._undecided("value to compare")
+
+    __le__ = __gt__ = __ge__ = __lt__
+
+
+class Signal(Wired):
     """One output port of a block, or a part of it.
 
     Attributes
@@ -152,14 +186,14 @@ def _outputs(source: Wireable) -> list[str]:
     return []
 
 
-class Call(Wireable):
+class Call(Wired):
     """A block with its inputs: one node of a diagram."""
 
     def __init__(
         self, block: Block, wires: dict[str, Signal], names: tuple[str | None, ...] = (), origin: Call | None = None
     ):
         self.block, self.wires, self.names = block, wires, names
-        self.origin = origin or self
+        self.origin = self if origin is None else origin
         if origin is None:
             calls = recorder.get()
             if calls is not None:
@@ -316,6 +350,6 @@ def _product(left: Any, right: Any) -> Signal:
         return hinted(Product(), name)(left, right)._signal()
     if not isinstance(right, int | float | np.number | np.ndarray) or np.ndim(right) > 1:
         raise ShapeError(
-            "a signal is multiplied by a number, a vector or another signal; for a matrix use Gain(gain=…)."
+            "a signal is multiplied by a number, a vector or another signal; a matrix is applied as K @ signal."
         )
     return hinted(Gain(gain=right), f"gain_of_{_operand(left, 'constant')}")(left)._signal()

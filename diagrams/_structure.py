@@ -68,6 +68,9 @@ class _Inside:
     box: SubsystemCall
 
 
+_ROOT: Any = object()  # the diagram itself, as the place where its roots are used
+
+
 def join(frame: str, name: str) -> str:
     """Return the dotted path of ``name`` in a frame."""
     return f"{frame}.{name}" if frame else name
@@ -87,7 +90,7 @@ class Collector:
         for root in roots:
             if not isinstance(root, Wireable):
                 raise WiringError(f"found {root!r}; expected calls of blocks or subsystems, such as plant(force=u).")
-            self._follow(root._signal() if isinstance(root, Signal) else root, None)
+            self._follow(root._signal() if isinstance(root, Signal) else root, _ROOT)
             while self.stack:
                 self._follow(*self.stack.pop())
 
@@ -166,6 +169,8 @@ class Collector:
         def frame_of_item(item: Any) -> str | None:
             if item is None:
                 return None
+            if item is _ROOT:
+                return ""
             if isinstance(item, _Inside):
                 return box_path(item.box)
             outer = inner.get(id(item))

@@ -63,8 +63,10 @@ def equations(block, T, method="exact"):
 
     def evaluate(state, reference, force, desired=0.0, offset=0.0):
         given = {"force": force, "reference": ca.DM(reference), "desired_force": desired, "offset": offset}
-        found = made.function.call([0.0, ca.DM(state), *(given[name] for name in block.inputs), p])
-        return [np.array(value).ravel() for value in found[:2]]
+        n = len(block.states)  # without limits, none can have acted
+        found = made.function.call([0.0, ca.DM(state[:n]), *(given[name] for name in block.inputs), p])
+        row, after = (np.array(value).ravel() for value in found[:2])
+        return [row, np.concatenate([after, np.zeros(3 - n)])]
 
     return evaluate
 

@@ -5,7 +5,20 @@ import inspect
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Constant, Gain, Input, Output, Saturation, SmoothStep, State, Sum, WiringError
+from loopwright.blocks import (
+    Block,
+    Constant,
+    Gain,
+    Input,
+    Output,
+    Saturation,
+    SmoothStep,
+    State,
+    Sum,
+    UnitError,
+    UnknownNameError,
+    WiringError,
+)
 from loopwright.diagrams import Diagram
 
 
@@ -19,6 +32,16 @@ class Pair(Block):
 
     def output(self, t, x, u):
         return u.u, 2.0 * u.u, 3.0 * u.u
+
+
+class ForceIn(Block):
+    """An input in N."""
+
+    u = Input(unit="N")
+    y = Output()
+
+    def output(self, t, x, u):
+        return u.u
 
 
 class Silent(Block):
@@ -127,3 +150,53 @@ def test_an_output_like_an_input_has_its_unit_and_the_shape_of_the_equations():
     run = Diagram("d", limited).simulate(1.0, step=0.5, progress=False)
     assert run.unit("limited.y") == "N"
     assert run["limited.y"][0].tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    "decide",
+    [
+        lambda s: bool(s),
+        lambda s: s and 1,
+        lambda s: s == 0,
+        lambda s: s != 0.0,
+        lambda s: s > 0,
+        lambda s: s <= 0,
+        lambda s: s < s,
+    ],
+)
+@pytest.mark.parametrize("signal", [Constant(value=1.0).y, Gain(gain=2.0)(1.0)], ids=["signal", "call"])
+def test_nothing_is_decided_on_a_signal_while_wiring(decide, signal):
+    with pytest.raises(WiringError, match=r"while the diagram is wired: its values come with the run.*np\.where"):
+        decide(signal)
+
+
+def test_signals_are_still_told_apart_and_hashed():
+    a, b = Constant(value=1.0).y, Constant(value=1.0).y
+    assert a != b
+    assert {a, b} == {b, a}
+    assert len({a, b, a}) == 2
+
+
+def test_minus_keeps_the_unit():
+    force = Constant(value=2.0, unit="m").named("u")
+    with pytest.raises(UnitError, match="is in m; expected in N"):
+        Diagram("d", ForceIn()(-force))
+    run = Diagram("d", Gain(gain=3.0)(-force).named("y")).simulate(0.1, step=0.1, progress=False)
+    assert run["y"].tolist() == [-6.0, -6.0]
+
+
+def test_a_matrix_is_applied_from_the_left():
+    K = np.array([[1.0, 2.0], [0.0, -1.0], [5.0, 0.0]])
+    run = Diagram("d", (K @ Constant(value=(3.0, 4.0)).named("u")).named("y")).simulate(0.1, step=0.1, progress=False)
+    assert run["y"][0].tolist() == [11.0, -4.0, 15.0]
+
+
+def test_a_misspelt_port_offers_near_names():
+    with pytest.raises(UnknownNameError, match=r"gain: it has no output or parameter 'gian'.*Did you mean 'gain'"):
+        _ = Gain(gain=1.0).gian
+    assert not hasattr(Gain(gain=1.0), "velocty")
+
+
+def test_a_source_names_its_wire():
+    run = Diagram("d", Constant(value=2.0).named("two")).simulate(0.1, step=0.1, progress=False)
+    assert run["two"].tolist() == [2.0, 2.0]

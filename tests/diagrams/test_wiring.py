@@ -394,7 +394,7 @@ def test_signals_in_sums_products_and_quotients():
     assert run["y"][-1].tolist() == [0.0, 4.0]
     with pytest.raises(WiringError, match="can't be divided by a signal"):
         _ = a / b
-    with pytest.raises(ShapeError, match=r"for a matrix use Gain\(gain=…\)"):
+    with pytest.raises(ShapeError, match=r"a matrix is applied as K @ signal"):
         _ = a.y * np.eye(2)
 
 
