@@ -558,3 +558,17 @@ def test_an_equation_of_another_shape_than_declared():
 
     with pytest.raises(ShapeError, match=r"wide\.y: its output gives shape \(2,\); expected \(\)"):
         Diagram("d", Wide()(Constant(value=1.0)))
+
+
+def test_a_name_given_outside_a_box_belongs_to_where_it_is_given():
+    @subsystem(sample_time=0.1)
+    def split(u):
+        return Gain(gain=1.0)(u), Gain(gain=2.0)(u)
+
+    left, right = split(Constant(value=1.0)).named("left", "right")
+    assert sorted(Diagram("d", left, right).names) == ["left", "right"]
+
+
+def test_a_part_that_is_not_there_is_refused_on_a_named_wire():
+    with pytest.raises(ShapeError, match=r"constant\.y\[5\] is out of range: the port has shape \(2,\)"):
+        Diagram("d", Constant(value=(1.0, 2.0)).y[5].named("a"))
