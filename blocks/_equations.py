@@ -12,7 +12,7 @@ from casadi import ArrayInterface
 
 from ._block import Block
 from ._errors import DefinitionError, LoopwrightError, ShapeError, TraceError
-from ._ports import Port, Shape
+from ._ports import Port, Shape, State
 from ._symbols import flat_column, size
 
 _ARGUMENTS = {
@@ -215,6 +215,15 @@ def start_values(block: Block, shapes: Mapping[str, Shape]) -> dict[str, np.ndar
                 port=port.start if isinstance(port.start, str) else name,
             ) from error
     return values
+
+
+def start_shapes(block: Block) -> list[Shape]:
+    """Return the shapes that the start values have by themselves, whatever the inputs' shapes are."""
+    shapes = []
+    for port in block.states.values():
+        alone = State(start=port.start)
+        shapes.append(tuple(alone.start_value(block, {}).shape))
+    return shapes
 
 
 def initial_state(block: Any, states: Mapping[str, Shape], u: Any) -> np.ndarray:

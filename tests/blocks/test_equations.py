@@ -21,7 +21,7 @@ from loopwright.blocks import (
     UnitDelay,
     parameter,
 )
-from loopwright.blocks._equations import initial_state
+from loopwright.blocks._equations import initial_state, start_shapes
 from loopwright.blocks._symbols import bundle
 from loopwright.blocks._tracing import trace
 from loopwright.diagrams import Diagram
@@ -449,6 +449,11 @@ def test_a_delays_initial_value_that_does_not_fit_its_input(shape):
     ):
         trace(UnitDelay(initial_value=(7, 8)), {"u": shape}, sampled=True)
     assert trace(UnitDelay(initial_value=(7, 8)), {"u": (2,)}, sampled=True).outputs == {"y": (2,)}
+
+
+def test_the_shape_of_a_start_value_by_itself():
+    assert start_shapes(UnitDelay(initial_value=(7, 8))) == [(2,)]
+    assert start_shapes(UnitDelay()) == [()]
 
 
 # --- NumPy beside the trace -------------------------------------------------------------------------------------------
