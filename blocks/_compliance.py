@@ -194,9 +194,9 @@ class AdmittanceFilter(Block):
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> Array:
         """Return r^p with its derivatives."""
-        e, e_rate = self.deviation(x, u)
-        a = self.derivative(t, x, u)[1] if T is None else self.step(x, u, T)[1]
-        return u.reference + np.stack([e, e_rate, a])
+        if T is None:
+            return u.reference + np.stack([x.error, x.error_rate, self.derivative(t, x, u)[1]])
+        return u.reference + np.stack([*self.deviation(x, u), self.step(x, u, T)[1]])
 
     def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, ...]:
         """Return ė and ë; at a velocity limit the acceleration points inwards."""

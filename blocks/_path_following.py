@@ -111,6 +111,8 @@ class PathTracking(Block):
             "left": left - xi,
             "right": right + xi,
         }
+        if self.path.period is not None:  # half a lap off, the lap would be a guess
+            checks["lap"] = 0.5 * self.path.period - np.abs(theta - x.foot)
         if self.path.domain is not None:
             slack = 1e-12 * (high - low)
             checks |= {"start": theta - low + slack, "end": high - theta + slack}

@@ -352,7 +352,7 @@ class _Tracer:
             if jacobian.nnz_out(0) == 0:
                 return "integrator", None, x + self.T * dx, unused
             at_zero = jacobian(*(ca.DM.zeros(a.shape) for a in arguments[:-1]), self.p)
-            matrix = ca.Function("A", [self.p], [ca.densify(at_zero).T])
+            matrix = ca.Function("A", [self.p], [ca.densify(at_zero)])
             numbers = ca.MX.sym("hold", 2 * n * n)
             Ad, Phi = (ca.reshape(numbers[i * n * n : (i + 1) * n * n], n, n).T for i in (0, 1))
             return "affine", matrix, Ad @ x + Phi @ ca.substitute(dx, x, ca.MX(ca.DM.zeros(n))), numbers
@@ -386,8 +386,10 @@ def _where(error: Exception, block: Block, what: str) -> str:
         if step.tb_frame.f_code.co_filename == file:
             line = f" in line {step.tb_lineno} of {file}"
         step = step.tb_next
+    text = f"its {what} can't be traced{line}: {type(error).__name__}: {error}."
+    if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
+        return f"{text} Correct the equation there."
     return (
-        f"its {what} can't be traced{line}: {type(error).__name__}: {error}. Use NumPy functions of (t, x, "
-        f"u): np.where for "
-        "branches, np.stack for vectors, np.sqrt and not math.sqrt."
+        f"{text} Use NumPy functions of (t, x, u): np.where for branches, np.stack for vectors, np.sqrt and not "
+        "math.sqrt."
     )

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..blocks._block import Block
-from ..blocks._errors import ShapeError, UnitError, UnknownNameError, UnwiredInputError, WiringError, near
+from ..blocks._equations import start_shapes
+from ..blocks._errors import LoopwrightError, ShapeError, UnitError, UnknownNameError, UnwiredInputError, near
 from ..blocks._ports import Shape
 from ..blocks._tracing import Traced, trace
 from ..blocks._units import describe_mismatch, same_unit
@@ -158,7 +159,7 @@ def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, 
     sampled, method = table.rate(frame) is not None, table.frames[frame].method
     try:
         return trace(block, shapes, sampled=sampled, method=method, cache=shared)
-    except WiringError as error:
+    except LoopwrightError as error:
         error.block = path
         raise
 
@@ -179,8 +180,7 @@ def _assume(table: Structure, shapes: dict[Port, Shape], stuck: Iterable[str]) -
 
     path = min(stuck, key=lambda p: (not known(p), not table.blocks[p].states, p))
     block = table.blocks[path]
-    starts = [port.start_value(block, dict.fromkeys(block.inputs, ())).shape for port in block.states.values()]
-    shape = next(iter([*known(path), *starts]), ())
+    shape = next(iter([*known(path), *start_shapes(block)]), ())
     return {
         (path, port): shape
         for port, spec in block.inputs.items()

@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..blocks._comparison import GUARDS, NEXT
+from ..blocks._equations import initial_state
 from ..blocks._errors import LoopwrightError, NonFiniteError, OptionError, SimulationError
 from ..blocks._symbols import bundle
 from ._flat import FlatDiagram
@@ -299,22 +300,17 @@ class _Loop:
 
 
 def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]]) -> np.ndarray:
-    """Return a block's initial state from its inputs, flat."""
-    expected = ", ".join(f"{name} of shape {shape}" for name, shape in states.items())
+    """Return a block's initial state from its inputs, flat; whatever fails says whose it is."""
     try:
-        made = block.initial(u)
-        parts = (made,) if len(states) == 1 else tuple(made)
-        shaped = [np.broadcast_to(np.asarray(v, float), s) for v, s in zip(parts, states.values(), strict=True)]
-    except LoopwrightError as error:
+        return initial_state(block, states, u)
+    except SimulationError as error:
         raise error.at(block=path, t=0.0) from error.__cause__
     except Exception as error:
+        expected = ", ".join(f"{name} of shape {shape}" for name, shape in states.items())
+        what = str(error) if isinstance(error, LoopwrightError) else f"{type(error).__name__}: {error}"
         raise SimulationError(
-            f"its initial(u) failed with {_inputs_text(u._asdict())[:-1]}: {type(error).__name__}: {error}. Expected "
-            f"{expected}.",
-            block=path,
-            t=0.0,
+            f"its initial(u) failed: {what} {_inputs_text(u._asdict())} Expected {expected}.", block=path, t=0.0
         ) from error
-    return np.concatenate([np.ravel(v) for v in shaped])
 
 
 def _view(vector: np.ndarray) -> Any:
