@@ -8,15 +8,45 @@ from typing import Any
 import numpy as np
 
 from ._block import Block
-from ._errors import ParameterError
-from ._ports import Input, Output
+from ._errors import ParameterError, ShapeError
+from ._ports import Input, Output, Shape
 from ._values import Array, parameter
 
 
-class Sum(Block):
-    """Sum with signs: y = ± u1 ± u2 ….
+def _shape(value: Array) -> Shape:
+    return tuple(getattr(value, "shape", ()))
 
-    Ports: inputs ``u1``, ``u2``, …, all of one shape and unit; output ``y``.
+
+def _check_shapes(**values: Array) -> None:
+    """Refuse values of different shapes; a scalar goes with any.
+
+    Raises
+    ------
+    ShapeError
+        Two shapes that differ.
+    """
+    first = next(((name, _shape(v)) for name, v in values.items() if _shape(v)), ("", ()))
+    for name, value in values.items():
+        if _shape(value) not in ((), first[1]):
+            raise ShapeError(
+                f"found shape {_shape(value)} beside {first[0]} of shape {first[1]}; expected one shape for both, or a "
+                "scalar. Take a part of the longer one, such as signal[0:2], or wire another.",
+                port=name,
+            )
+
+
+class Sum(Block):
+    """Sum with signs: y = ± u₁ ± u₂ ….
+
+    Inputs ``u1``, ``u2``, …, one for each sign, are of one shape and unit (a scalar goes with any); the output ``y``
+    has them too.
+
+    Raises
+    ------
+    ParameterError
+        Anything but plus and minus among the signs.
+    ShapeError
+        Inputs of different shapes, when the diagram is built.
     """
 
     same_units = True
@@ -37,6 +67,7 @@ class Sum(Block):
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the sum."""
+        _check_shapes(**u._asdict())
         total = u[0] if self.signs[0] == "+" else -u[0]
         for sign, value in zip(self.signs[1:], u[1:], strict=True):
             total = total + value if sign == "+" else total - value
@@ -44,29 +75,61 @@ class Sum(Block):
 
 
 class Gain(Block):
-    """Gain: y = k u, element by element, or the matrix product K u for a matrix.
+    """Gain: y = k u, element by element, or the matrix product y = K u for a matrix K.
 
     The output's unit is not declared: a gain may convert one.
+
+    Raises
+    ------
+    ParameterError
+        A gain of more than two dimensions.
+    ShapeError
+        An input with another number of entries than the vector or the matrix takes, when the diagram is built.
     """
 
     gain: Array = parameter(description="number, array of the signal's shape, or matrix")
-    u = Input(shape=None)
-    y = Output(shape=None)
+    u = Input(shape=None, description="what is multiplied, of any shape")
+    y = Output(shape=None, description="the product")
+
+    def check(self) -> None:
+        """Refuse a gain of more than two dimensions."""
+        if np.ndim(self.gain) > 2:
+            raise ParameterError(
+                f"found an array of shape {np.shape(self.gain)}; expected a number, a vector or a matrix.",
+                block=self.label,
+                port="gain",
+            )
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the product."""
+        gain, found = _shape(self.gain), _shape(u.u)
+        if len(gain) < 2:
+            _check_shapes(gain=self.gain, u=u.u)
+        elif found[:1] != gain[1:]:
+            raise ShapeError(
+                f"found shape {found}; the gain is a matrix of {gain[0]} × {gain[1]} and takes {gain[1]} entries. "
+                "Take a part of the signal, or give another matrix.",
+                port="u",
+            )
         return self.gain @ u.u if getattr(self.gain, "ndim", 0) == 2 else self.gain * u.u
 
 
 class Product(Block):
-    """Product, element by element: y = u1 u2."""
+    """Product, element by element: y = u₁ u₂.
 
-    u1 = Input(shape=None)
-    u2 = Input(shape=None)
-    y = Output(shape=None)
+    Raises
+    ------
+    ShapeError
+        Inputs of different shapes (a scalar goes with any), when the diagram is built.
+    """
+
+    u1 = Input(shape=None, description="first factor, of any shape")
+    u2 = Input(shape=None, description="second factor, of the same shape or a scalar")
+    y = Output(shape=None, description="the product")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the product."""
+        _check_shapes(**u._asdict())
         return u.u1 * u.u2
 
 
@@ -75,15 +138,21 @@ class Saturation(Block):
 
     The secondary output ``excess`` is what was cut off, u − y: zero exactly while no limit acts. It drives the
     anti-windup of `ErrorDynamics`.
+
+    Raises
+    ------
+    ShapeError
+        Limits and a signal of different shapes, when the diagram is built.
     """
 
     limit: Array = parameter(above=0.0, description="largest magnitude, a number or one for each element")
-    u = Input(shape=None)
-    y = Output(like="u")
-    excess = Output(like="u", secondary=True)
+    u = Input(shape=None, description="what is limited, of any shape")
+    y = Output(like="u", description="the limited signal")
+    excess = Output(like="u", secondary=True, description="what was cut off, u − y")
 
     def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
         """Return the limited signal and what was cut off."""
+        _check_shapes(limit=self.limit, u=u.u)
         low = np.where(u.u < -self.limit, -self.limit, u.u)
         y = np.where(u.u > self.limit, self.limit, low)
         return y, u.u - y

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from ._errors import DefinitionError, GuardError
+from ._documentation import port_section, with_section
+from ._errors import DefinitionError, GuardError, WiringError, near
 from ._ports import Event, Input, Output, Port, State
-from ._signals import Call, Signal, Wireable, as_signal, bind, check_name, primary_outputs
+from ._signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, bind, check_name, primary_outputs
 from ._values import Value
+
+_ABSENT = frozenset({"output", "derivative", "update", "indicators", "jump", "guards", "initial", "constants"})
+_ABSENT |= {"inputs", "outputs", "states", "events"}
 
 
 class Block(Value, Wireable):
@@ -90,13 +94,20 @@ class Block(Value, Wireable):
                     ports.pop(name, None)
         for clash in ports.keys() & cls.parameter_specs.keys():
             raise DefinitionError("a port and a parameter share this name; rename one.", block=cls.__name__, port=clash)
-        for attribute, kind in (("inputs", Input), ("states", State), ("events", Event)):
-            if not isinstance(cls.__dict__.get(attribute), property):
-                setattr(cls, attribute, {k: p for k, p in ports.items() if isinstance(p, kind)})
-        if not isinstance(cls.__dict__.get("outputs"), property):
-            cls.outputs = {
-                k: p for k, p in ports.items() if isinstance(p, Output) or (isinstance(p, State) and p.output)
-            }
+        for attribute in ("inputs", "outputs", "states", "events"):
+            chosen = {k: p for k, p in ports.items() if _is_kind(p, attribute)}
+            if not isinstance(getattr(cls, attribute), property):  # ports that follow from the parameters
+                setattr(cls, attribute, chosen)
+            cls.__doc__ = with_section(cls.__doc__ or "", attribute.capitalize(), port_section(chosen))
+        if isinstance(cls.inputs, Mapping):
+            for name, port in ports.items():
+                like = getattr(port, "like", None)
+                if like is not None and like not in cls.inputs:
+                    raise DefinitionError(
+                        f"found like={like!r}; expected an input of this block. {near(like, cls.inputs)}",
+                        block=cls.__name__,
+                        port=name,
+                    )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         name = kwargs.get("name")
@@ -123,10 +134,28 @@ class Block(Value, Wireable):
         """Wire the block: signals by position in the order of the inputs, or by keyword."""
         return Call(self, bind(self, args, kwargs))
 
+    def named(self, *names: str) -> Call:
+        """Name the wires of the outputs of a block without inputs; see `Call.named`."""
+        return self().named(*names)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name in _ABSENT or name in self.parameter_specs:
+            raise AttributeError(name)  # what is not written is asked for often; the rest would come back here
+        if isinstance(port := getattr(type(self), name, None), Port):
+            return port.__get__(self)  # type: ignore[attr-defined]  # its own error: it is no signal
+        known = {*self.outputs, *self.parameter_specs}
+        raise UnknownAttributeError(f"it has no output or parameter {name!r}. {near(name, known)}", block=self.label)
+
     def _signal(self) -> Signal:
         if any(port.default is None for port in self.inputs.values()) or len(primary_outputs(self)) != 1:
             return as_signal_error(self)
         return Signal(self, primary_outputs(self)[0])
+
+    def __iter__(self) -> Iterator[Signal]:
+        names = primary_outputs(self)
+        if len(names) < 2 or any(port.default is None for port in self.inputs.values()):
+            return iter(self._signal())  # one signal, or none: its error says what to do
+        return iter([Signal(self, name) for name in names])
 
     def __repr__(self) -> str:
         text = super().__repr__()
@@ -140,10 +169,15 @@ class Block(Value, Wireable):
         )
 
 
+def _is_kind(port: Port, attribute: str) -> bool:
+    """Whether a port belongs among a class's inputs, outputs, states or events."""
+    if attribute == "outputs":
+        return isinstance(port, Output) or (isinstance(port, State) and port.output)
+    return isinstance(port, {"inputs": Input, "states": State, "events": Event}[attribute])
+
+
 def as_signal_error(block: Block) -> Signal:
     """Raise the error of a block used as a signal that isn't one."""
-    from ._errors import WiringError
-
     outputs = ", ".join(primary_outputs(block)) or "none"
     needed = [name for name, port in block.inputs.items() if port.default is None]
     if needed:

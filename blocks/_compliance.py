@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -87,8 +87,9 @@ class AdmittanceFilter(Block):
     set-point without derivatives, measured from the reference: it adds k·offset to the force (E27).
 
     ``velocity_limit`` and ``acceleration_limit`` bound the path reference by conditional integration (end of section
-    IV-A): in a tick in which one would be exceeded the acceleration is cut to the admissible value and held over the
-    tick.
+    IV-A): in a tick in which one would be exceeded its acceleration a is cut to the admissible value and held over the
+    tick, and r^p and ṙ^p advance by v T + a T²/2 and a T. Whether it would be is foreseen with ṙ^d + r̈^d T for the rate
+    of the reference at the next tick; what a reference with a jerk is off that (by T² times it) is cut from ṙ^p then.
     """
 
     mass: float = parameter(unit="kg", above=0.0, description="rendered mass m")
@@ -106,6 +107,19 @@ class AdmittanceFilter(Block):
     forcing: ClassVar[Array]
     error = State(unit="m", description="e")
     error_rate = State(unit="m/s", description="ė")
+    limited = State(description="1 after a tick in which a limit acted: then the states hold r^p and ṙ^p, not e and ė")
+
+    @property
+    def has_limits(self) -> bool:
+        """Whether the path reference is bounded."""
+        return self.velocity_limit is not None or self.acceleration_limit is not None
+
+    @property
+    def states(self) -> Mapping[str, State]:  # type: ignore[override]
+        """E and ė, and where there are limits whether one acted."""
+        cls = type(self)
+        free = {"error": cls.error, "error_rate": cls.error_rate}
+        return {**free, "limited": cls.limited} if self.has_limits else free
 
     def check(self) -> None:
         """Refuse a damping that is given twice or not at all."""
@@ -133,19 +147,37 @@ class AdmittanceFilter(Block):
         transition, forcing = hold(A, T, method)
         return {"transition": transition, "forcing": forcing}
 
-    def free_acceleration(self, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return the driving part of ë, and ë itself while no limit acts."""
-        drive = (u.force - u.desired_force + self.stiffness * u.offset) / self.mass
-        return drive, drive - (self.effective_damping * x.error_rate + self.stiffness * x.error) / self.mass
+    def driving_acceleration(self, u: Any) -> Array:
+        """Return the part of ë that the force and the set-point drive."""
+        return (u.force - u.desired_force + self.stiffness * u.offset) / self.mass
 
-    def step(self, x: Any, u: Any, T: Array) -> tuple[Array, Array, Array]:
-        """Return e and ė at the next tick, and ë that is held over this one."""
-        drive, a = self.free_acceleration(x, u)
-        free = self.transition @ np.stack([x.error, x.error_rate]) + self.forcing @ np.stack([0.0 * drive, drive])
-        if self.velocity_limit is None and self.acceleration_limit is None:
-            return free[0], free[1], a
-        v_d, a_d = u.reference[1], u.reference[2]
-        wanted, v = a_d + a, v_d + x.error_rate
+    def acceleration(self, e: Array, e_rate: Array, drive: Array) -> Array:
+        """Return ë of (15) while no limit acts."""
+        return drive - (self.effective_damping * e_rate + self.stiffness * e) / self.mass
+
+    def deviation(self, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return e and ė at this tick."""
+        if not self.has_limits:
+            return x.error, x.error_rate
+        after_cut = x.limited > 0.5
+        e = np.where(after_cut, x.error - u.reference[0], x.error)
+        e_rate = np.where(after_cut, x.error_rate - u.reference[1], x.error_rate)
+        if self.velocity_limit is not None:
+            v = u.reference[1] + e_rate
+            admissible = _clip(v, -self.velocity_limit, self.velocity_limit)
+            e_rate = np.where(v == admissible, e_rate, admissible - u.reference[1])
+        return e, e_rate
+
+    def step(self, x: Any, u: Any, T: Array) -> tuple[tuple[Array, ...], Array]:
+        """Return the states at the next tick, and ë that is held over this one."""
+        e, e_rate = self.deviation(x, u)
+        drive = self.driving_acceleration(u)
+        a = self.acceleration(e, e_rate, drive)
+        free = self.transition @ np.stack([e, e_rate]) + self.forcing @ np.stack([0.0 * drive, drive])
+        if not self.has_limits:
+            return (free[0], free[1]), a
+        r_d, v_d, a_d = u.reference[0], u.reference[1], u.reference[2]
+        p, v, wanted = r_d + e, v_d + e_rate, a_d + a
         cut, acts = wanted, wanted != wanted
         if self.velocity_limit is not None:
             acts = np.abs(v_d + a_d * T + free[1]) > self.velocity_limit
@@ -153,21 +185,22 @@ class AdmittanceFilter(Block):
         if self.acceleration_limit is not None:
             acts = np.logical_or(acts, np.abs(wanted) > self.acceleration_limit)
             cut = _clip(cut, -self.acceleration_limit, self.acceleration_limit)
-        cut = cut - a_d
-        return (
-            np.where(acts, x.error + x.error_rate * T + 0.5 * cut * T**2, free[0]),
-            np.where(acts, x.error_rate + cut * T, free[1]),
-            np.where(acts, cut, a),
+        new = (
+            np.where(acts, p + v * T + 0.5 * cut * T**2, free[0]),
+            np.where(acts, v + cut * T, free[1]),
+            np.where(acts, 1.0, 0.0),
         )
+        return new, np.where(acts, cut - a_d, a)
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> Array:
         """Return r^p with its derivatives."""
-        a = self.derivative(t, x, u)[1] if T is None else self.step(x, u, T)[2]
-        return u.reference + np.stack([x.error, x.error_rate, a])
+        if T is None:
+            return u.reference + np.stack([x.error, x.error_rate, self.derivative(t, x, u)[1]])
+        return u.reference + np.stack([*self.deviation(x, u), self.step(x, u, T)[1]])
 
-    def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+    def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, ...]:
         """Return ė and ë; at a velocity limit the acceleration points inwards."""
-        _, a = self.free_acceleration(x, u)
+        a = self.acceleration(x.error, x.error_rate, self.driving_acceleration(u))
         v_d, a_d = u.reference[1], u.reference[2]
         wanted = a_d + a
         if self.acceleration_limit is not None:
@@ -176,12 +209,11 @@ class AdmittanceFilter(Block):
             v = v_d + x.error_rate
             outwards = np.logical_and(np.abs(v) >= self.velocity_limit, v * wanted > 0.0)
             wanted = np.where(outwards, 0.0, wanted)
-        limited = self.acceleration_limit is not None or self.velocity_limit is not None
-        return x.error_rate, wanted - a_d if limited else a
+        return (x.error_rate, wanted - a_d, 0.0 * t) if self.has_limits else (x.error_rate, a)
 
-    def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
-        """Return e and ė at the next tick."""
-        return self.step(x, u, T)[:2]
+    def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, ...]:
+        """Return the states at the next tick."""
+        return self.step(x, u, T)[0]
 
 
 def _clip(value: Array, low: Array, high: Array) -> Array:

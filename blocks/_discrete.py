@@ -16,12 +16,17 @@ class UnitDelay(Block):
 
     The first output is ``initial_value``; without one it is the first input itself, so that u[0] acts in both of the
     first two ticks.
+
+    Raises
+    ------
+    ShapeError
+        An ``initial_value`` of another shape than the input's, when the diagram is built; a number fits any.
     """
 
     initial_value: Array | None = parameter(default=None, description="first output; None takes the first input")
-    u = Input(shape=None)
-    y = Output(like="u")
-    last = State(start="initial_value", like="u")
+    u = Input(shape=None, description="what is delayed, of any shape")
+    y = Output(like="u", description="the input one tick ago")
+    last = State(start="initial_value", like="u", description="the last input")
 
     @property
     def starts_from_inputs(self) -> bool:
@@ -44,15 +49,20 @@ class UnitDelay(Block):
 class Encoder(Block):
     """Position encoder: quantized positions, velocities by differences.
 
-    p = Δ round(position / Δ), v = (p[k] − p[k − 1]) / T; at the first tick v is the true velocity. Its derivative is
-    zero almost everywhere: it linearizes to zero.
+    p = Δ ⌊position / Δ + ½⌋, v = (p[k] − p[k − 1]) / T; at the first tick v is the true velocity. Its derivative is
+    zero almost everywhere: it linearizes to zero. Part of the rig (docs/experiments.md), not of the paper.
+
+    Raises
+    ------
+    SampleTimeError
+        In a continuous frame, when the diagram is built.
     """
 
     quantum: float = parameter(unit="m", above=0.0, description="smallest step of the position, Δ")
     position = Input(shape=None, description="true position")
     velocity = Input(shape=None, description="true velocity, used at the first tick only")
-    measured_position = Output(like="position")
-    measured_velocity = Output(like="velocity")
+    measured_position = Output(like="position", description="p, whole quanta")
+    measured_velocity = Output(like="velocity", description="v, whole quanta per tick")
     last = State(like="position", description="last measured position")
     running = State(description="0 before the first tick, then 1")
 
@@ -69,21 +79,16 @@ class Encoder(Block):
 class ForceSensor(Block):
     """Force sensor between the robot and its tool: the tool's inertia acts on it (E25).
 
-    F = force + contact force − m_tool · acceleration; the gravity part is tared. At the first tick the acceleration
-    counts as zero, since no force has acted yet.
+    F = force + contact force − m_tool · acceleration; the gravity part is tared. At t = 0 the acceleration counts as
+    zero, since no force has acted yet.
     """
 
     tool_mass: float = parameter(default=0.0, unit="kg", minimum=0.0, description="mass on the far side of the sensor")
     force = Input(shape=(2,), unit="N", description="external force on the robot")
     acceleration = Input(shape=(2,), unit="m/s2", description="acceleration at the end of the last step")
     contact_force = Input(shape=(2,), unit="N", default=(0.0, 0.0), description="force of a contact inside the plant")
-    measured = Output(shape=(2,), unit="N")
-    running = State(description="0 before the first tick, then 1")
+    measured = Output(shape=(2,), unit="N", description="F, what the sensor shows")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the measured force."""
-        return u.force + u.contact_force - self.tool_mass * np.where(x.running > 0.5, u.acceleration, 0.0)
-
-    def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Remember that a step has been made."""
-        return 1.0 + 0.0 * t
+        return u.force + u.contact_force - self.tool_mass * np.where(t > 0.0, u.acceleration, 0.0)

@@ -17,8 +17,8 @@ class HandForce(PathTracking):
     The two parts are inputs, so that any source can be the hand: ``HandForce(path)(position, f_par=Pulse(…))``.
     """
 
-    f_par = Input(default=0.0, description="tangential part F∥ in N")
-    f_perp = Input(default=0.0, description="transversal part F⊥ in N")
+    f_par = Input(unit="N", default=0.0, description="tangential part F∥")
+    f_perp = Input(unit="N", default=0.0, description="transversal part F⊥")
     force = Output(shape=(2,), unit="N", description="force on the robot")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:

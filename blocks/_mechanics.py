@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from ._block import Block
+from ._errors import DefinitionError
 from ._values import Array
 
 
@@ -17,6 +18,11 @@ class PlanarModel(Block):
     and (3): y = h(x_c). A subclass gives `f_v` and `G_v`, and `h` with its first two derivatives where h is not the
     identity. It is a block too where it declares ports and states: the plant and the model that a controller inverts
     are then one definition.
+
+    Raises
+    ------
+    DefinitionError
+        When f_v or G_v is needed and not written.
     """
 
     coordinate_unit: ClassVar[str] = "m"
@@ -26,11 +32,16 @@ class PlanarModel(Block):
 
     def f_v(self, x_c: Array, x_v: Array) -> Array:
         """Return the drift f_v of (2), shape (2,), in the coordinates' unit per s²."""
-        raise NotImplementedError
+        raise self._undefined("f_v(x_c, x_v)")
 
     def G_v(self, x_c: Array) -> Array:  # noqa: N802 - the paper's symbol
         """Return the input matrix G_v of (2), shape (2, 2)."""
-        raise NotImplementedError
+        raise self._undefined("G_v(x_c)")
+
+    def _undefined(self, what: str) -> DefinitionError:
+        return DefinitionError(
+            f"found no {what}; expected a PlanarModel to define it, equation (2). Write it.", block=type(self).__name__
+        )
 
     def h(self, x_c: Array) -> Array:
         """Return the output y = h(x_c), (3), in m."""

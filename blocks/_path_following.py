@@ -15,20 +15,59 @@ import numpy as np
 from ._block import Block
 from ._errors import GuardError, ParameterError, PathDomainError
 from ._mechanics import PlanarModel
-from ._paths import Path
+from ._paths import Path, limited
 from ._ports import Input, Output, State
-from ._values import Array, parameter
+from ._values import Array, parameter, short
 
 _NEWTON = 4  # iterations a tick: from 1 mm off, three reach the last digit
 _CONVERGED = 1e-9  # largest remaining Newton step, as a part of the path's parameter range
+
+
+def expect_path(block: Block) -> None:
+    """Refuse a ``path`` that is none.
+
+    Raises
+    ------
+    ParameterError
+        Anything but a `Path`.
+    """
+    path = block.parameters["path"]
+    if not isinstance(path, Path):
+        hint = " The path comes first, then the model." if isinstance(path, PlanarModel) else ""
+        raise ParameterError(
+            f"found {short(path)}; expected a Path, such as Ellipse(semi_axes=(0.3, 0.15)).{hint}",
+            block=block.label,
+            port="path",
+        )
+
+
+def expect_model(block: Block, model: Any) -> None:
+    """Refuse a ``model`` that is none.
+
+    Raises
+    ------
+    ParameterError
+        Anything but a `PlanarModel`.
+    """
+    if not isinstance(model, PlanarModel):
+        raise ParameterError(
+            f"found {short(model)}; expected a PlanarModel, such as gantry.nominal.", block=block.label, port="model"
+        )
 
 
 class PathTracking(Block):
     """Base of blocks that follow the foot point of a position on a path.
 
     At the start the foot point is the global arg min of (4); from then on Newton's method on (6) starts from the last
-    one, so that θ counts laps (E17). Leaving the domain of the path's coordinates stops the run with a
-    `PathDomainError`: q below ``minimum_q``, at or beyond the medial axis, or beyond an end of an open path.
+    one, so that θ counts laps (E17). The state ``foot`` is the last foot point, nothing else.
+
+    Raises
+    ------
+    ParameterError
+        A ``path`` that is none, when the block is made.
+    PathDomainError
+        In a run, where the path's coordinates end: q below ``minimum_q``, at or beyond the medial axis, beyond an end
+        of an open path, or where the foot point jumps within one tick (E18).
     """
 
     memory = True
@@ -36,6 +75,10 @@ class PathTracking(Block):
     minimum_q: float = parameter(default=0.05, minimum=0.0, description="smallest allowed q = 1 − κ ξ₁")
     position = Input(shape=(2,), unit="m", description="position y in the plane")
     foot = State(description="last path parameter")
+
+    def check(self) -> None:
+        """Refuse a path that is none."""
+        expect_path(self)
 
     def initial(self, u: Any) -> float:
         """Return the global arg min of (4), in [0, period); a rounding error before the seam counts as after it."""
@@ -68,41 +111,65 @@ class PathTracking(Block):
             "left": left - xi,
             "right": right + xi,
         }
+        if self.path.period is not None:  # half a lap off, the lap would be a guess
+            checks["lap"] = 0.5 * self.path.period - np.abs(theta - x.foot)
         if self.path.domain is not None:
             slack = 1e-12 * (high - low)
             checks |= {"start": theta - low + slack, "end": high - theta + slack}
         return checks
 
-    def guard_error(self, name: str, value: float, u: Any, y: Any) -> GuardError:
-        """Return the `PathDomainError` with position, θ, ξ and the local reach."""
+    def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
+        """Return the `PathDomainError` with position, θ, ξ and the local reach; ``x`` tells how far the foot jumped."""
         position = np.asarray(u.position)
         theta = float(self.path.project(position))
         frame = self.path.frame(theta)
         xi = float(frame.normal @ (position - frame.sigma))
-        left, right = (float(r) for r in self.path.reach(theta))
-        reach = left if xi > 0 else right
-        why = {
-            "newton": "the foot point jumped: the position moved too far within one tick, or it is near the medial "
-            "axis",
-            "q": f"q = 1 − κ ξ = {1 - float(frame.curvature) * xi:.4g} is below {self.minimum_q:g}",
-            "left": "it is at or beyond the medial axis, where the nearest point of the path is not unique",
-            "right": "it is at or beyond the medial axis, where the nearest point of the path is not unique",
-            "start": "it is before the start of the open path",
-            "end": "it is beyond the end of the open path",
-        }[name]
+        q = 1.0 - float(frame.curvature) * xi
+        left, right = self.path.reach(theta)
+        reach = limited(float(left if xi > 0 else right))
+        if name in ("start", "end"):
+            beyond = abs(float(frame.tangent @ (position - frame.sigma)))
+            where = "before the start" if name == "start" else "beyond the end"
+            why = f"it is {beyond:.3g} m {where} of the open path"
+        elif name in ("left", "right"):
+            why = "it is at or beyond the medial axis, where the nearest point of the path is not unique"
+        elif name == "q" and q <= self.minimum_q:
+            why = f"q = 1 − κ ξ = {q:.4g} is below {self.minimum_q:g}"
+        else:
+            why = (
+                f"the foot point jumped{self._jump(theta, x)}: the position moved too far within one tick, or it is "
+                "near the medial axis"
+            )
+        shown = "unlimited" if np.isinf(reach) else f"{reach:.6g} m"
         error = PathDomainError(
             f"position {position.tolist()} m has no valid path coordinates: {why}. Nearest foot point θ = {theta:.6g}, "
-            f"ξ = {xi:.6g} m, local reach on that side {reach:.6g} m. Start nearer to the path, or limit what "
+            f"ξ = {xi:.6g} m, local reach on that side {shown}. Start nearer to the path, or limit what "
             f"drives it off."
         )
         error.position, error.theta, error.xi, error.reach = tuple(position.tolist()), theta, xi, reach
         return error
+
+    def _jump(self, theta: float, x: Any) -> str:
+        """Say how far the nearest foot point is from the last one, where that is known."""
+        if x is None or not np.all(np.isfinite(x.foot)):
+            return ""
+        apart = float(np.ravel(x.foot)[0]) - theta
+        period = self.path.period
+        if period is not None:
+            apart -= period * np.floor(apart / period + 0.5)
+        way = float(self.path.arc_length(theta + apart)) - float(self.path.arc_length(theta))
+        return f" by {abs(way):.3g} m along the path"
 
 
 class PathProjection(PathTracking):
     """Projection of a position onto the path: θ̂ = arg min ‖y − σ̂(θ̂)‖, (4), tracked through (6).
 
     The secondary output ``q`` is 1 − κ ξ₁, which scales tangential motion off the path.
+
+    Raises
+    ------
+    ParameterError, PathDomainError
+        As `PathTracking`.
     """
 
     theta = Output(description="path parameter θ̂ of the foot point, counted over laps (E17)")
@@ -120,8 +187,13 @@ class TransverseTransform(Block):
 
     η₁ = g(θ̂), (5), lifted over laps (E17); ξ₁ = nᵀ(y − σ); η₂ = tᵀẏ / q; ξ₂ = nᵀẏ.
 
-    Without a model the inputs are the output y = h(x_c) and its rate; with one they are x_c and x_v, and y = h(x_c),
-    ẏ = dh x_v, (3).
+    Inputs are ``theta``, the path parameter θ̂ of the foot point, then ``position`` and ``velocity``: without a model
+    the output y = h(x_c) and its rate; with one x_c and x_v, and y = h(x_c), ẏ = dh x_v, (3).
+
+    Raises
+    ------
+    ParameterError
+        A path or a model that is none, when the block is made.
     """
 
     path: Path = parameter(kw_only=False, description="the path")
@@ -130,6 +202,12 @@ class TransverseTransform(Block):
     )
     eta = Output(shape=(2,), unit=("m", "m/s"), description="tangential state η")
     xi = Output(shape=(2,), unit=("m", "m/s"), description="transversal state ξ")
+
+    def check(self) -> None:
+        """Refuse a path or a model that is none."""
+        expect_path(self)
+        if self.model is not None:
+            expect_model(self, self.model)
 
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
@@ -146,13 +224,23 @@ class TransverseTransform(Block):
 
 
 class ForceProjection(Block):
-    """Force in the path frame, (13): F∥ = tᵀF, F⊥ = nᵀF."""
+    """Force in the path frame, (13): F∥ = tᵀF, F⊥ = nᵀF, with F the force on the robot (E6).
+
+    Raises
+    ------
+    ParameterError
+        A path that is none, when the block is made.
+    """
 
     path: Path = parameter(kw_only=False, description="the path")
     theta = Input(description="path parameter of the foot point")
     force = Input(shape=(2,), unit="N", description="measured force on the robot")
     f_par = Output(unit="N", description="tangential part F∥")
     f_perp = Output(unit="N", description="transversal part F⊥")
+
+    def check(self) -> None:
+        """Refuse a path that is none."""
+        expect_path(self)
 
     def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
         """Return F∥ and F⊥."""
@@ -170,6 +258,17 @@ class FeedbackLinearization(Block):
 
     For any fully actuated planar model with ẋ_v = f_v + G_v (u + dhᵀ F), y = h(x_c); the gantry is the case h =
     identity. The measured force F on the robot is cancelled with the sign of E6.
+
+    Inputs are ``theta``, θ̂ of the foot point; ``position`` x_c and ``velocity`` x_v in the model's coordinates;
+    ``force`` F on the robot; ``v_par`` and ``v_perp``, the wanted η̈₁ and ξ̈₁. The output ``motor_force`` is u in the
+    model's unit.
+
+    Raises
+    ------
+    ParameterError
+        A path or a model that is none, or a model without f_v or G_v, when the block is made.
+    GuardError
+        In a run, where |det(dh G_v)| falls to ``minimum_determinant``.
     """
 
     path: Path = parameter(kw_only=False, description="the path")
@@ -202,11 +301,17 @@ class FeedbackLinearization(Block):
         return Signal(self, "motor_force")
 
     def check(self) -> None:
-        """Refuse a model that is none."""
-        if not isinstance(self.model, PlanarModel):
-            raise ParameterError(
-                f"found {self.model!r}; expected a PlanarModel, such as gantry.nominal.", block=self.label, port="model"
-            )
+        """Refuse a path or a model that is none, and a model without its equations."""
+        expect_path(self)
+        expect_model(self, self.model)
+        for name, text in (("f_v", "f_v(x_c, x_v)"), ("G_v", "G_v(x_c)")):
+            if getattr(type(self.model), name) is getattr(PlanarModel, name):
+                raise ParameterError(
+                    f"{type(self.model).__name__} has no {text}; expected a PlanarModel that defines it, equation (2). "
+                    "Write it.",
+                    block=self.label,
+                    port="model",
+                )
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the motor force."""
@@ -227,6 +332,14 @@ class FeedbackLinearization(Block):
         """Return the margin to a singular model."""
         A = self.model.dh(u.position) @ self.model.G_v(u.position)
         return {"determinant": np.abs(A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]) - self.minimum_determinant}
+
+    def guard_error(self, name: str, value: float, u: Any, y: Any) -> GuardError:
+        """Return the error of a model that can't be inverted where it is."""
+        return GuardError(
+            f"|det(dh G_v)| of {type(self.model).__name__} is {value + self.minimum_determinant:.6g} at the position "
+            f"{np.asarray(u.position).tolist()} {self.model.coordinate_unit}; expected more than minimum_determinant = "
+            f"{self.minimum_determinant:g}, as it is inverted there. Keep away from singular positions, or correct G_v."
+        )
 
 
 def _measured(model: PlanarModel | None) -> dict[str, Input]:

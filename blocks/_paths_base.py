@@ -66,7 +66,7 @@ class Path(Value):
                 y = np.cos(theta + turn) + self.bend * 2.0**order * np.cos(2.0 * theta + turn)
                 return self.radius * np.stack([y, np.sin(theta + turn)])
 
-    The path must not meet itself (its reach is next to nothing there).
+    The path must not meet itself (its reach is next to nothing there), and its σ′ must not vanish (E19).
 
     All methods take a parameter θ as a number, as an array of N numbers (vectors then have the shape (2, N)) or, unless
     they say that they are NumPy only, as a traced scalar.
@@ -243,8 +243,13 @@ class Path(Value):
         -------
         float or array
             θ within one period, or within the domain.
+
+        Raises
+        ------
+        ParameterError
+            A position of another shape.
         """
-        y = np.asarray(y, dtype=float)
+        y = tables.positions(self, y)
         theta = np.array([tables.nearest(self, column) for column in y.reshape(2, -1).T])
         return self._lapped(theta).reshape(y.shape[1:]) if y.ndim > 1 else float(self._lapped(theta)[0])
 
@@ -302,7 +307,7 @@ class Path(Value):
         Raises
         ------
         PathDomainError
-            ξ₁ is at or beyond the reach of the path there, or η₁ is beyond an end of an open path.
+            ξ₁ is at or beyond the reach of the path there, η₁ is beyond an end of an open path, or one is not finite.
         """
         return self._placed(eta, xi)[0]
 
@@ -327,6 +332,11 @@ class Path(Value):
 
     def _placed(self, eta: Array, xi: Array) -> tuple[Array, Frame]:
         eta, xi = np.broadcast_arrays(np.asarray(eta, dtype=float), np.asarray(xi, dtype=float))
+        for name, given in (("eta", eta), ("xi", xi)):
+            if not np.all(np.isfinite(given)):
+                raise PathDomainError(
+                    f"found {name} = {given[~np.isfinite(given)].flat[0]:g} m; expected finite path coordinates."
+                )
         theta = self.parameter_at(eta)
         frame = self.frame(theta)
         position = frame.sigma + frame.normal * xi
@@ -350,10 +360,12 @@ class Path(Value):
         self, *, eta: float, xi: float, theta: float, limit: float, position: tuple[float, ...], beyond: bool
     ) -> PathDomainError:
         if beyond:
+            end, by = ("end", eta - self.length) if eta > 0.0 else ("start", -eta)
             text = (
-                f"found eta = {eta:.6g} m; expected 0 to {self.length:.6g} m, the length of the open "
-                f"{type(self).__name__}. Stay between its ends, or lengthen the path."
+                f"found eta = {eta:.6g} m, {by:.3g} m beyond its {end}; expected 0 to {self.length:.6g} m, the length "
+                f"of the open {type(self).__name__}. Stay between its ends, or lengthen the path."
             )
+            limit = tables.limited(limit)
         else:
             side, sign = ("left", "") if xi >= 0.0 else ("right", "-")
             text = (

@@ -8,6 +8,7 @@ import numpy as np
 
 from ._errors import ParameterError
 from ._paths_base import UNLIMITED, Path, check_order
+from ._paths_tables import positions
 from ._values import Array, parameter
 
 __all__ = ["Circle", "Ellipse", "Line"]
@@ -24,7 +25,13 @@ def _turned(theta: Array, order: int) -> tuple[Array, Array]:
 class Ellipse(Path):
     """Ellipse σ(θ) = c + (a cos θ, ± b sin θ), counter-clockwise (+) or clockwise (−), period 2π; equation (16).
 
-    Its normal points inwards when it runs counter-clockwise (ξ > 0 is inside), else outwards.
+    a and b are the semi-axes (E12). Its normal points inwards when it runs counter-clockwise (ξ > 0 is inside), else
+    outwards; inwards its reach is that of docs/paper.md, b²/a at the ends of the major axis.
+
+    Raises
+    ------
+    ParameterError
+        Semi-axes that are not positive.
     """
 
     semi_axes: Array = parameter(unit="m", above=0.0, shape=(2,), description="semi-axes a along y and b along z")
@@ -107,7 +114,7 @@ class Ellipse(Path):
         enough. On the medial axis, of two points equally near, that with positive sin θ (or cos θ) is taken.
         """
         a, b = self.semi_axes
-        y = np.asarray(y, dtype=float)
+        y = positions(self, y)
         u, v = y[0] - self.center[0], y[1] - self.center[1]
         if self.clockwise:
             v = -v
@@ -130,7 +137,13 @@ class Ellipse(Path):
 
 
 class Circle(Path):
-    """Circle σ(θ) = c + r (cos θ, ± sin θ), counter-clockwise (+) or clockwise (−), period 2π."""
+    """Circle σ(θ) = c + r (cos θ, ± sin θ), counter-clockwise (+) or clockwise (−), period 2π: (16) with a = b.
+
+    Raises
+    ------
+    ParameterError
+        A radius that is not positive.
+    """
 
     radius: float = parameter(unit="m", above=0.0, description="radius r")
     center: Array = parameter(default=np.zeros(2), unit="m", shape=(2,), description="the centre (y, z)")
@@ -169,14 +182,22 @@ class Circle(Path):
 
     def project(self, y: Array) -> Array:
         """Return the parameter of the nearest point, equation (4) (0 for the centre); NumPy only."""
-        y = np.asarray(y, dtype=float)
+        y = positions(self, y)
         v = y[1] - self.center[1]
         theta = self._lapped(np.arctan2(-v if self.clockwise else v, y[0] - self.center[0]))
         return theta if theta.ndim else float(theta)
 
 
 class Line(Path):
-    """Straight line σ(θ) = p₀ + θ (p₁ − p₀), θ from 0 to 1; it goes straight on beyond its ends."""
+    """Straight line σ(θ) = p₀ + θ (p₁ − p₀), θ from 0 to 1; it goes straight on beyond its ends.
+
+    Its κ is zero and its reach unlimited: path following is then that of two Cartesian axes, turned.
+
+    Raises
+    ------
+    ParameterError
+        A start and an end in the same place.
+    """
 
     start: Array = parameter(unit="m", shape=(2,), description="where it starts (y, z)")
     end: Array = parameter(unit="m", shape=(2,), description="where it ends (y, z)")
@@ -223,6 +244,6 @@ class Line(Path):
 
     def project(self, y: Array) -> Array:
         """Return the parameter of the nearest point between the ends, equation (4); NumPy only."""
-        y, d = np.asarray(y, dtype=float), self.end - self.start
+        y, d = positions(self, y), self.end - self.start
         theta = np.clip(((y[0] - self.start[0]) * d[0] + (y[1] - self.start[1]) * d[1]) / (d @ d), 0.0, 1.0)
         return theta if theta.ndim else float(theta)

@@ -15,12 +15,19 @@ __all__ = ["CubicSpline"]
 
 
 class CubicSpline(Path):
-    """Cubic spline through points, twice continuously differentiable, closed or open.
+    """Cubic spline σ(θ) through points, twice continuously differentiable, closed or open.
+
+    σ(θ) = Σⱼ cᵢⱼ (θ − θᵢ)ʲ, j = 0 … 3, between the points i and i + 1.
 
     The parameter θ is the accumulated distance of the points (chord length, m), 0 at the first. A closed spline goes
     from the last point back to the first. An open one is natural (σ″ = 0 at its ends) and goes straight on beyond them.
 
-    Its κ is continuous and its κ_s jumps at the points: off the path, a moving robot's motor force jumps there.
+    Its κ is continuous and its κ_s jumps at the points: off the path, a moving robot's motor force (10) jumps there.
+
+    Raises
+    ------
+    ParameterError
+        Too few points, points that coincide, or a curve with a cusp, where σ′ vanishes (E19).
     """
 
     points: Array = parameter(unit="m", description="the points (y, z) it passes through, shape (N, 2)")

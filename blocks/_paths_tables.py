@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import pairwise
@@ -10,11 +11,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.polynomial import chebyshev, polynomial
 
+from ._errors import ParameterError
+
 if TYPE_CHECKING:
     from ._paths_base import Path
 
 UNLIMITED = 1e6
-"""What a path's reach is where there is no limit, m."""
+"""What a path's reach is where there is no limit, m: a number, so that equations can be traced and compared."""
+
+
+def limited(reach: float) -> float:
+    """Return the reach as it is told: infinite where there is no limit."""
+    return math.inf if reach >= UNLIMITED * (1.0 - 1e-9) else reach
+
 
 _DEGREE = 12  # of the polynomials that are fitted to the speed
 _MOST_MINIMA = 256  # of a sampled distance: more of them are rounding errors, as at the centre of an arc
@@ -113,6 +122,27 @@ def invert(path: Path, s: np.ndarray) -> np.ndarray:
         if np.all(moved <= 4e-16 * (1.0 + np.abs(result))):
             break
     return result
+
+
+def positions(path: Path, y: object) -> np.ndarray:
+    """Return positions as an array, and refuse what is none.
+
+    Raises
+    ------
+    ParameterError
+        Another shape than (2,) or (2, N).
+    """
+    try:
+        array = np.asarray(y, dtype=float)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.ndim not in (1, 2) or len(array) != 2:
+        raise ParameterError(
+            f"found a position of shape {array.shape}; expected (2,), in m, or (2, N) for N of them.",
+            block=type(path).__name__,
+            port="project",
+        )
+    return array
 
 
 def nearest(path: Path, y: np.ndarray) -> float:

@@ -100,7 +100,8 @@ class Output(Port):
     Parameters
     ----------
     like : str, optional
-        Name of the input whose unit (and shape, where none is given) it takes over.
+        Name of the input whose unit it takes over. The shape, where none is given, is what the equations give: a sum
+        of a scalar and a vector is a vector.
     secondary : bool, optional
         True for an output that is read by name only (``saturation.excess``): it is recorded as any other, but the
         block's call neither unpacks into it nor stands for it.

@@ -6,13 +6,23 @@ one. Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` an
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator
+from contextlib import suppress
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ._errors import DoubleDriveError, ShapeError, UnknownNameError, UnwiredInputError, WiringError, near
+from ._errors import (
+    DoubleDriveError,
+    LoopwrightError,
+    ShapeError,
+    UnknownNameError,
+    UnwiredInputError,
+    WiringError,
+    near,
+)
 
 if TYPE_CHECKING:
     from ._block import Block
@@ -42,13 +52,20 @@ class Wireable:
         return _sum(other, self, "+-")
 
     def __neg__(self) -> Signal:
-        return -1.0 * self
+        from ._algebra import Sum  # it keeps the unit, which a gain would not
+
+        return hinted(Sum(signs="-"), f"minus_{_operand(self, 'constant')}")(self)._signal()
 
     def __mul__(self, other: Any) -> Signal:
         return _product(self, other)
 
     def __rmul__(self, other: Any) -> Signal:
         return _product(self, other)
+
+    def __rmatmul__(self, matrix: Any) -> Signal:
+        from ._algebra import Gain
+
+        return hinted(Gain(gain=matrix), f"gain_of_{_operand(self, 'constant')}")(self)._signal()
 
     def __truediv__(self, other: Any) -> Signal:
         if isinstance(other, Wireable):
@@ -58,8 +75,44 @@ class Wireable:
     def __getitem__(self, index: int | slice) -> Signal:
         return self._signal()[index]
 
+    def __iter__(self) -> Iterator[Signal]:  # without it Python would index from 0 on and never stop
+        return iter(self._signal())
 
-class Signal(Wireable):
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *(name for name in _outputs(self) if name.isidentifier())]
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return _outputs(self)
+
+
+class Wired(Wireable):
+    """A signal or a call: its values are those of a run, so nothing can be decided on it while wiring."""
+
+    __hash__ = object.__hash__
+
+    def _undecided(self, what: str) -> WiringError:
+        signal = getattr(self, "block", None) or getattr(self, "source", None)
+        return WiringError(
+            f"{self!r} has no {what} while the diagram is wired: its values come with the run. Write the decision as a "
+            "block's equation, with np.where(…).",
+            block=getattr(signal, "label", None),
+        )
+
+    def __bool__(self) -> bool:
+        raise self._undecided("truth value")
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, int | float | np.number | np.ndarray):
+            raise self._undecided("value to compare")
+        return self is other
+
+    def __lt__(self, other: object) -> bool:
+        raise self._undecided("value to compare")
+
+    __le__ = __gt__ = __ge__ = __lt__
+
+
+class Signal(Wired):
     """One output port of a block, or a part of it.
 
     Attributes
@@ -89,12 +142,11 @@ class Signal(Wireable):
     def __getitem__(self, index: int | slice) -> Signal:
         if self.index is not None:
             raise WiringError("a part of a part of a signal; index the port once.", port=self.port)
-        if not isinstance(index, int | slice):
-            raise WiringError(f"a signal is indexed by an integer or a slice, found {index!r}.", port=self.port)
-        return Signal(self.source, self.port, index, None, self.call)
+        return Signal(self.source, self.port, _index(index, self.port), None, self.call)
 
     def __iter__(self) -> Iterator[Signal]:
-        raise WiringError("this is one signal and can't be unpacked; index it, as in y[0].", port=self.port)
+        who = getattr(self.source, "label", None)
+        raise WiringError("this is one signal and can't be unpacked; index it, as in y[0].", block=who, port=self.port)
 
     def named(self, name: str) -> Signal:
         """Name the wire: a log channel, and a point at which the loop can be opened.
@@ -108,14 +160,40 @@ class Signal(Wireable):
         return f"<signal {getattr(self.source, 'label', self.source)}.{self.port}{part}>"
 
 
-class Call(Wireable):
+def _index(index: Any, port: str) -> int | slice:
+    """Return an index of plain integers, so that NumPy's integers wire (and compare) as Python's do."""
+
+    def integer(value: Any) -> int:
+        if isinstance(value, bool | np.bool_):
+            raise TypeError
+        return operator.index(value)
+
+    try:
+        if not isinstance(index, slice):
+            return integer(index)
+        return slice(*(None if i is None else integer(i) for i in (index.start, index.stop, index.step)))
+    except TypeError:
+        raise WiringError(
+            f"found the index {index!r}; expected an integer or a slice of integers, as in y[0] or y[:2].", port=port
+        ) from None
+
+
+def _outputs(source: Wireable) -> list[str]:
+    """Return the names that complete in a notebook; nothing where they can't be had, for completion never fails."""
+    with suppress(LoopwrightError):
+        if not isinstance(source, Signal):
+            return list(getattr(source.block if isinstance(source, Call) else source, "outputs", ()))
+    return []
+
+
+class Call(Wired):
     """A block with its inputs: one node of a diagram."""
 
     def __init__(
         self, block: Block, wires: dict[str, Signal], names: tuple[str | None, ...] = (), origin: Call | None = None
     ):
         self.block, self.wires, self.names = block, wires, names
-        self.origin = origin or self
+        self.origin = self if origin is None else origin
         if origin is None:
             calls = recorder.get()
             if calls is not None:
@@ -272,6 +350,6 @@ def _product(left: Any, right: Any) -> Signal:
         return hinted(Product(), name)(left, right)._signal()
     if not isinstance(right, int | float | np.number | np.ndarray) or np.ndim(right) > 1:
         raise ShapeError(
-            "a signal is multiplied by a number, a vector or another signal; for a matrix use Gain(gain=…)."
+            "a signal is multiplied by a number, a vector or another signal; a matrix is applied as K @ signal."
         )
     return hinted(Gain(gain=right), f"gain_of_{_operand(left, 'constant')}")(left)._signal()

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from ._block import Block
-from ._errors import ParameterError
-from ._ports import Output
+from ._errors import ParameterError, UnitError
+from ._ports import Output, Unit
+from ._units import parse_unit, rate_of
 from ._values import Array, parameter
 
 
@@ -29,28 +30,53 @@ def smooth_step(
     return value, rate, acceleration
 
 
-class Constant(Block):
-    """A constant number or array."""
+class Source(Block):
+    """Base of the sources: one output, ``y``, in the unit that the parameter ``unit`` declares.
 
-    value: Array = parameter(description="number or array")
+    Where y holds a value with its first two time derivatives, ``unit`` is that of the value.
+    """
+
     unit: str | None = parameter(default=None, description="unit of the output, where it is to be checked")
+    y = Output(shape=None)
+
+    def check(self) -> None:
+        """Refuse a unit that can't be read."""
+        if self.unit is not None and not isinstance(self.unit, str):
+            raise ParameterError(
+                f"found {self.unit!r}; expected a unit as FMI spells it, such as 'm/s2'.", block=self.label, port="unit"
+            )
+        try:
+            parse_unit(self.unit or "1")
+        except UnitError as error:
+            error.at(block=self.label, port="unit")
+            raise
 
     @property
     def outputs(self) -> dict[str, Output]:  # type: ignore[override]
-        """One output, ``y``, in the declared unit."""
-        return {"y": Output(shape=np.shape(self.value), unit=self.unit, name="y")}
+        """The output in the declared unit."""
+        declared, unit = type(self).y, self.unit
+        each: Unit = unit
+        if unit is not None and declared.shape == (3,):
+            each = (unit, rate_of(unit), rate_of(rate_of(unit)))
+        return {"y": Output(declared.shape, each, declared.description, name="y")}
+
+
+class Constant(Source):
+    """A constant number or array."""
+
+    value: Array = parameter(description="number or array")
 
     @property
-    def y(self) -> Any:
-        """The output."""
-        return self._signal()
+    def outputs(self) -> dict[str, Output]:  # type: ignore[override]
+        """The output in the declared unit, of the value's shape."""
+        return {"y": Output(shape=np.shape(self.value), unit=self.unit, name="y")}
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the constant."""
         return self.value
 
 
-class Reference(Block):
+class Reference(Source):
     """A constant reference that comes with its time derivatives: y = (value, rate, acceleration)."""
 
     value: float = parameter(kw_only=False, description="the value held")
@@ -61,7 +87,7 @@ class Reference(Block):
         return np.stack([self.value + 0.0 * t, 0.0 * t, 0.0 * t])
 
 
-class SmoothStep(Block):
+class SmoothStep(Source):
     """A reference made of 7th-order smooth steps, with its first two time derivatives.
 
     y = (r, ṙ, r̈), r running through ``levels``: from ``levels[i]`` to ``levels[i + 1]`` from ``start_times[i]`` on,
@@ -75,6 +101,7 @@ class SmoothStep(Block):
 
     def check(self) -> None:
         """Refuse steps that overlap and lists of unequal length."""
+        super().check()
         levels, starts, durations = (np.atleast_1d(v) for v in (self.levels, self.start_times, self.durations))
         if not len(levels) - 1 == len(starts) == len(durations):
             raise ParameterError(
@@ -101,32 +128,23 @@ class SmoothStep(Block):
         return np.stack([value, rate, acceleration])
 
 
-class Step(Block):
+class Step(Source):
     """Steps: y is ``initial_value``, and ``values[i]`` from ``times[i]`` on."""
 
     times: Array = parameter(unit="s", description="when it steps, rising; a number or several")
     values: Array = parameter(description="the value from then on, one for each time")
     initial_value: float = parameter(default=0.0, description="value before the first step")
-    unit: str | None = parameter(default=None, description="unit of the output, where it is to be checked")
+    y = Output()
 
     def check(self) -> None:
         """Refuse lists of unequal length and times that do not rise."""
+        super().check()
         if np.shape(self.times) != np.shape(self.values) or np.any(np.diff(np.atleast_1d(self.times)) <= 0):
             raise ParameterError(
                 f"found times {self.times!r} and values {self.values!r}; expected rising times, one value each.",
                 block=self.label,
                 port="times",
             )
-
-    @property
-    def outputs(self) -> dict[str, Output]:  # type: ignore[override]
-        """One output, ``y``, in the declared unit."""
-        return {"y": Output(unit=self.unit, name="y")}
-
-    @property
-    def y(self) -> Any:
-        """The output."""
-        return self._signal()
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the value at t."""
@@ -136,7 +154,7 @@ class Step(Block):
         return y
 
 
-class Pulse(Block):
+class Pulse(Source):
     """A smooth pulse: up at the start, down towards the end, each a 7th-order step over ``rise_time``.
 
     y = A [smooth(t; t₀, r) − smooth(t; t₁ − r, r)].
@@ -150,6 +168,7 @@ class Pulse(Block):
 
     def check(self) -> None:
         """Refuse a pulse that is shorter than its two flanks."""
+        super().check()
         if self.end_time - self.start_time < 2 * self.rise_time * (1 - 1e-12):
             raise ParameterError(
                 f"found {self.end_time - self.start_time:g} s between start and end; expected at least the two flanks, "
@@ -165,7 +184,7 @@ class Pulse(Block):
         return self.amplitude * (up - down)
 
 
-class Sine(Block):
+class Sine(Source):
     """Sine wave: y = A sin(2π f t + φ) + bias."""
 
     amplitude: float = parameter(default=1.0, description="amplitude")

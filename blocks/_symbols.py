@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from casadi import ArrayInterface
 
-from ._errors import ShapeError, TraceError
+from ._errors import ShapeError
 from ._ports import Shape
 
 
@@ -73,26 +73,3 @@ def flat_column(value: Any) -> Any:
         inner = value.to_casadi()
         return ca.vec(inner.T) if value.ndim == 2 else ca.vec(inner)
     return ca.MX(ca.DM(np.ravel(np.asarray(value, dtype=float))))
-
-
-def split(result: Any, declared: Mapping[str, Shape | None], what: str) -> tuple[dict[str, Any], dict[str, Shape]]:
-    """Match what an equation returned with the ports declared."""
-    names = list(declared)
-    parts = (result,) if len(names) == 1 else result
-    if isinstance(parts, ArrayInterface | np.ndarray) or len(parts) != len(names):
-        raise TraceError(
-            f"its {what} returned {len(parts)} values; expected a tuple of {len(names)}: {', '.join(names)}."
-        )
-    made, shapes = {}, {}
-    for name, part in zip(names, parts, strict=True):
-        shape = tuple(part.shape) if isinstance(part, ArrayInterface) else np.shape(part)
-        expected = declared[name]
-        if expected is not None and shape != expected:
-            raise ShapeError(f"its {what} gives shape {shape}; expected {expected} as declared.", port=name)
-        flat = flat_column(part)
-        if flat.numel() != size(shape):
-            raise ShapeError(
-                f"its {what} gives {flat.numel()} entries for shape {shape}; index it explicitly.", port=name
-            )
-        made[name], shapes[name] = ca.densify(flat), shape
-    return made, shapes

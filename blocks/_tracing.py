@@ -6,7 +6,8 @@ What is traced becomes one CasADi function per block,
 
 with flat columns (vectors and matrices in C order). ``next`` is the state at the next tick in a sampled frame, the time
 derivative in a continuous one. ``p`` holds the parameters, then the sample time, then what was computed from them.
-Parameters are symbols, except exact zeros, which are structure. Traces are shared among blocks of equal structure.
+Parameters are symbols, except exact zeros, which are structure. Traces are shared among blocks of equal structure: the
+library's own in the whole process, those of users' classes within one build of a diagram.
 
 Events add two functions in a continuous frame, indicators(t, x, u₁ … uₘ, p) → z and jump(t, x, u₁ … uₘ, p, fired) → x⁺.
 """
@@ -24,9 +25,10 @@ import numpy as np
 from ._block import Block
 from ._comparison import GUARDS, NEXT, compare
 from ._discretization import hold
+from ._equations import check_definition, guards_of, split, start_values
 from ._errors import LoopwrightError, SampleTimeError, TraceError
 from ._ports import Shape
-from ._symbols import bundle, expanded, flat_column, size, split, with_values, wrap
+from ._symbols import bundle, expanded, flat_column, size, with_values, wrap
 from ._values import Value, identity
 
 
@@ -92,11 +94,23 @@ def constants_of(block: Block, T: float, method: str) -> dict[str, Any]:
     compute: Callable[..., dict[str, Any]] | None = getattr(block, "constants", None)
     if compute is None or not np.isfinite(T):
         return {}
-    return dict(sorted(compute(T, method).items()))
+    made = compute(T, method)
+    if not isinstance(made, Mapping):
+        raise TraceError(
+            f"its constants returned a {type(made).__name__}; expected a dictionary of numbers by name. Return one.",
+            block=block.label,
+        )
+    return dict(sorted(made.items()))
 
 
 def trace(
-    block: Block, shapes: Mapping[str, Shape], *, sampled: bool, method: str = "exact", zeros: bool = True
+    block: Block,
+    shapes: Mapping[str, Shape],
+    *,
+    sampled: bool,
+    method: str = "exact",
+    zeros: bool = True,
+    cache: dict[Any, Traced] | None = None,
 ) -> Traced:
     """Trace ``block`` for inputs of the given shapes.
 
@@ -112,6 +126,9 @@ def trace(
         Discretization of a continuous block in a sampled frame.
     zeros : bool
         Whether parameters that are exactly zero are structure; False keeps every number a symbol (for export).
+    cache : dict, optional
+        Traces of users' blocks that may be shared: one dictionary for each build of a diagram. The library's own
+        blocks share theirs in the whole process.
 
     Raises
     ------
@@ -120,21 +137,40 @@ def trace(
     ShapeError
         An equation that returns another shape than declared.
     """
+    shared = _CACHE if _is_ours(block) else cache
     key = (structure(block), tuple(shapes.items()), sampled, method, zeros)
-    found = _CACHE.get(key)
+    found = None if shared is None else shared.get(key)
     if found is None:
         try:
             found = _Tracer(block, dict(shapes), sampled, method, zeros).run()
         except LoopwrightError as error:
             error.at(block=block.label)
             raise
-        if len(_CACHE) > 2048:
-            _CACHE.clear()
-        _CACHE[key] = found
+        if shared is _CACHE and len(shared) > 2048:
+            shared.clear()
+        if shared is not None:
+            shared[key] = found
     return found
 
 
 _CACHE: dict[Any, Traced] = {}
+_OURS = __name__.partition(".")[0]
+
+
+def _is_ours(value: Any) -> bool:
+    """Whether a value's meaning is in it: it is data, or its class and those of its parameters come from this package.
+
+    The equations of other classes, and functions, may read what changes between two builds: a constant of their
+    module, a class attribute, a helper.
+    """
+    if isinstance(value, Value):
+        own = type(value).__module__.partition(".")[0] == _OURS
+        return own and all(_is_ours(v) for v in value.parameters.values())
+    if isinstance(value, Mapping):
+        return all(_is_ours(v) for v in value.values())
+    if isinstance(value, list | tuple | set | frozenset):
+        return all(_is_ours(v) for v in value)
+    return value is None or isinstance(value, bool | int | float | complex | str | bytes | np.ndarray)
 
 
 class _Tracer:
@@ -142,7 +178,8 @@ class _Tracer:
 
     def __init__(self, block: Block, shapes: dict[str, Shape], sampled: bool, method: str, zeros: bool):
         self.block, self.shapes, self.sampled, self.method, self.zeros = block, shapes, sampled, method, zeros
-        self.starts = {name: port.start_value(block, shapes) for name, port in block.states.items()}
+        check_definition(block)
+        self.starts = start_values(block, shapes)
         self.states = {name: v.shape for name, v in self.starts.items()}
         self.entries = list(traced_parameters(block))
         self.constants = constants_of(block, 1.0 if sampled else np.nan, method)
@@ -250,9 +287,9 @@ class _Tracer:
     def _guards(self) -> Any:
         if not hasattr(self.block, "guards"):
             return ca.MX(0, 1)
-        made = self._call("guards")
+        made = guards_of(self._call("guards"))
         self.guard_names = tuple(made)
-        return ca.vertcat(*(flat_column(v) for v in made.values())) if made else ca.MX(0, 1)
+        return ca.vertcat(*made.values()) if made else ca.MX(0, 1)
 
     def _events(self) -> tuple[Any, Any]:
         """Return the functions of the event indicators and of the jump."""
@@ -315,7 +352,7 @@ class _Tracer:
             if jacobian.nnz_out(0) == 0:
                 return "integrator", None, x + self.T * dx, unused
             at_zero = jacobian(*(ca.DM.zeros(a.shape) for a in arguments[:-1]), self.p)
-            matrix = ca.Function("A", [self.p], [ca.densify(at_zero).T])
+            matrix = ca.Function("A", [self.p], [ca.densify(at_zero)])
             numbers = ca.MX.sym("hold", 2 * n * n)
             Ad, Phi = (ca.reshape(numbers[i * n * n : (i + 1) * n * n], n, n).T for i in (0, 1))
             return "affine", matrix, Ad @ x + Phi @ ca.substitute(dx, x, ca.MX(ca.DM.zeros(n))), numbers
@@ -341,14 +378,18 @@ class _Tracer:
 
 def _where(error: Exception, block: Block, what: str) -> str:
     """Say which line of the user's equations an operation failed on."""
-    file = inspect.getsourcefile(type(block)) if type(block).__module__ != "__main__" else None
+    # by the code's own file, which a notebook's cell and a script have too; helpers beside the equation count as well
+    equation = inspect.unwrap(getattr(type(block), what))
+    file = getattr(getattr(equation, "__code__", None), "co_filename", None)
     line, step = "", error.__traceback__
     while step is not None:
-        if file is None or step.tb_frame.f_code.co_filename == file or step.tb_frame.f_code.co_name == what:
-            line = f" in line {step.tb_lineno} of {step.tb_frame.f_code.co_filename}"
+        if step.tb_frame.f_code.co_filename == file:
+            line = f" in line {step.tb_lineno} of {file}"
         step = step.tb_next
+    text = f"its {what} can't be traced{line}: {type(error).__name__}: {error}."
+    if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
+        return f"{text} Correct the equation there."
     return (
-        f"its {what} can't be traced{line}: {type(error).__name__}: {error}. Use NumPy functions of (t, x, "
-        f"u): np.where for "
-        "branches, np.stack for vectors, np.sqrt and not math.sqrt."
+        f"{text} Use NumPy functions of (t, x, u): np.where for branches, np.stack for vectors, np.sqrt and not "
+        "math.sqrt."
     )

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import inspect
 import numbers
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from dataclasses import replace as replace_fields
 from typing import Any, ClassVar, Self, TypeAlias, dataclass_transform
 
 import numpy as np
 
+from ._documentation import ParameterSignature, parameter_section, with_section
 from ._errors import ParameterError, near
+from ._frozen import freeze
 
 Array: TypeAlias = Any
 """A number or a NumPy array of floats; inside an equation that is being traced, its symbolic stand-in."""
@@ -88,6 +91,8 @@ class Value:
 
     parameter_specs: ClassVar[Mapping[str, ParameterSpec]] = {}
     _keywords: ClassVar[frozenset[str]] = frozenset()  # constructor keywords that are no parameters (a block's name)
+    _content: ClassVar[Any] = None  # what else tells two values apart, such as the digest of a file
+    __signature__ = ParameterSignature()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -100,8 +105,10 @@ class Value:
             spec = declared if isinstance(declared, ParameterSpec) else ParameterSpec(default=declared)
             if name in cls.__dict__:
                 delattr(cls, name)  # the instance attribute is the only one
-            specs[name] = ParameterSpec(**{**spec.__dict__, "annotation": text})
+            specs[name] = replace_fields(spec, annotation=text, default=freeze(spec.default))
         cls.parameter_specs = specs
+        written = cls.__dict__.get("__doc__") or f"{cls.__name__}."
+        cls.__doc__ = with_section(inspect.cleandoc(written), "Parameters", parameter_section(cls))
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         cls = type(self)
@@ -154,6 +161,12 @@ class Value:
         """
         return type(self)(**{**self.parameters, **changes})
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for name in type(self).parameter_specs:  # a pickled array comes back writable
+            if name in state:
+                self.__dict__[name] = freeze(state[name])
+
     def __setattr__(self, name: str, value: Any) -> None:
         raise ParameterError(
             f"a {type(self).__name__} is a value and can't be changed; use .replace({name}=…) and keep the result.",
@@ -171,26 +184,32 @@ class Value:
     def __hash__(self) -> int:
         return hash(identity(self))
 
+    def _is_default(self, name: str, value: Any) -> bool:
+        spec = type(self).parameter_specs[name]
+        return not spec.required and identity(value) == identity(convert(spec.default, spec, "", name))
+
     def __repr__(self) -> str:
-        shown = (
-            f"{name}={short(value)}"
-            for name, value in self.parameters.items()
-            if identity(value) != identity(type(self).parameter_specs[name].default)
-        )
+        shown = (f"{n}={short(v)}" for n, v in self.parameters.items() if not self._is_default(n, v))
         return f"{type(self).__name__}({', '.join(shown)})"
 
 
 def identity(value: Any) -> Any:
-    """Return a hashable stand-in for a parameter value that is equal exactly when the values are."""
+    """Return a hashable stand-in for a parameter value that is equal exactly when type and value are.
+
+    The type counts because equations may branch on it: ``1 == True``, but their traces differ.
+    """
     if isinstance(value, Value):
-        return type(value), tuple((k, identity(v)) for k, v in value.parameters.items())
+        return type(value), tuple((k, identity(v)) for k, v in value.parameters.items()), value._content
     if isinstance(value, np.ndarray):
-        return value.shape, value.tobytes()
+        content = tuple(map(identity, value.flat)) if value.dtype == object else value.tobytes()
+        return np.ndarray, value.dtype.str, value.shape, content
     if isinstance(value, Mapping):
-        return tuple(sorted((k, identity(v)) for k, v in value.items()))
+        return Mapping, frozenset((identity(k), identity(v)) for k, v in value.items())
     if isinstance(value, list | tuple):
-        return tuple(identity(v) for v in value)
-    return value
+        return type(value), tuple(identity(v) for v in value)
+    if isinstance(value, frozenset):
+        return frozenset, frozenset(identity(v) for v in value)
+    return type(value), value
 
 
 def short(value: Any) -> str:
@@ -206,12 +225,12 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
     """Bring one parameter value into its stored form and check it against its declaration.
 
     Numbers become float, sequences of numbers read-only float64 arrays, integers stay integers where the declaration
-    says ``int``.
+    says ``int``. Mappings, lists and sets become read-only copies.
 
     Raises
     ------
     ParameterError
-        Wrong kind, wrong shape, not finite, or out of bounds.
+        Wrong kind, wrong shape, not finite, out of bounds, or nothing that can be hashed.
     """
 
     def bad(found: str, expected: str) -> ParameterError:
@@ -244,7 +263,7 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
     elif numeric:
         raise bad(repr(value), "a number")
     else:
-        return value
+        return _frozen(value, bad)
     for bound, holds, words in (
         (spec.above, np.greater, "above"),
         (spec.minimum, np.greater_equal, "at least"),
@@ -258,3 +277,17 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
             return float(result)
         result.flags.writeable = False
     return result
+
+
+def _frozen(value: Any, bad: Callable[[str, str], ParameterError]) -> Any:
+    """Return a read-only copy of a value that is no number."""
+    frozen = freeze(value)
+    try:
+        hash(identity(frozen))
+    except TypeError:  # it could be compared with nothing, and its trace not be found again
+        raise bad(
+            f"{short(value)} of type {type(value).__name__}, which can't be hashed",
+            "a number, a text, a tuple, a mapping, a function or an object that is hashable and never changes, such as "
+            "one of a @dataclass(frozen=True)",
+        ) from None
+    return frozen

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import heapq
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..blocks._block import Block
-from ..blocks._errors import ShapeError, UnitError, UnknownNameError, UnwiredInputError, WiringError, near
+from ..blocks._equations import start_shapes
+from ..blocks._errors import LoopwrightError, ShapeError, UnitError, UnknownNameError, UnwiredInputError, near
 from ..blocks._ports import Shape
 from ..blocks._tracing import Traced, trace
 from ..blocks._units import describe_mismatch, same_unit
 from ._structure import Structure, Wire
 
 Unit = str | tuple[str, ...] | None
+Port = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -22,8 +26,8 @@ class Checked:
     """What the checks found out: traces, and shape and unit of every output."""
 
     traced: dict[str, Traced]
-    shapes: dict[tuple[str, str], Shape]
-    units: dict[tuple[str, str], Unit]
+    shapes: dict[Port, Shape]
+    units: dict[Port, Unit]
 
 
 def check(table: Structure) -> Checked:
@@ -61,14 +65,14 @@ def part_shape(shape: Shape, wire: Wire, who: str, port: str) -> Shape:
 
 
 def _check_ports(table: Structure) -> None:
+    for (consumer, port), wire in table.wires.items():
+        outputs = table.blocks[wire.block].outputs
+        if wire.port not in outputs:
+            raise UnknownNameError(
+                f"it has no output {wire.port!r}, which {consumer}.{port} is wired to. {near(wire.port, outputs)}",
+                block=wire.block,
+            )
     for path, block in sorted(table.blocks.items()):
-        for (consumer, port), wire in table.wires.items():
-            if wire.block == path and wire.port not in block.outputs:
-                raise UnknownNameError(
-                    f"it has no output {wire.port!r}, which {consumer}.{port} is wired to. "
-                    f"{near(wire.port, block.outputs)}",
-                    block=path,
-                )
         for port, spec in block.inputs.items():
             if (path, port) not in table.wires and spec.default is None:
                 raise UnwiredInputError("nothing is wired to it; wire it in the block's call.", block=path, port=port)
@@ -80,52 +84,87 @@ def _check_ports(table: Structure) -> None:
             )
 
 
-def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[tuple[str, str], Shape]]:
+def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[Port, Shape]]:
+    """Trace every block as soon as the shapes at its inputs are known, then compare both ends of every wire."""
     traced: dict[str, Traced] = {}
-    shapes: dict[tuple[str, str], Shape] = {
+    shapes: dict[Port, Shape] = {
         (path, name): port.shape
         for path, block in table.blocks.items()
         for name, port in block.outputs.items()
         if port.shape is not None
     }
-    waiting = sorted(table.blocks)
-    assumed: dict[tuple[str, str], Shape] = {}
-    while waiting:
-        still = []
-        for path in waiting:
-            block = table.blocks[path]
-            inputs = _input_shapes(table, shapes, path, assumed)
-            if inputs is None:
-                still.append(path)
-            elif not block.opaque:
-                frame = table.frames[table.frame_of[path]]
-                traced[path] = _trace(block, inputs, frame.sample_time is not None, frame.method, path)
-                shapes.update({(path, name): shape for name, shape in traced[path].outputs.items()})
-        if len(still) == len(waiting):
-            assumed.update(_assume(table, shapes, still))
-        waiting = still
-    for (path, port), shape in assumed.items():
-        wire = table.wires[path, port]
+    assumed: dict[Port, Shape] = {}
+    shared: dict[Any, Traced] = {}  # traces of users' classes: what they close over may change between two builds
+    consumers: dict[Port, list[Port]] = {}
+    unknown: dict[str, set[str]] = {path: set() for path in table.blocks}
+    for (path, port), wire in table.wires.items():
+        source = (wire.block, wire.port)
+        if table.blocks[path].inputs[port].shape is None and source not in shapes:
+            unknown[path].add(port)
+            consumers.setdefault(source, []).append((path, port))
+    ready = [path for path, ports in unknown.items() if not ports]
+    heapq.heapify(ready)
+    waiting = set(table.blocks) - set(ready)
+    while ready or waiting:
+        if not ready:
+            guess = _assume(table, shapes, waiting)
+            assumed.update(guess)
+            path = next(iter(guess))[0]
+            unknown[path].clear()
+            waiting.discard(path)
+            heapq.heappush(ready, path)
+        path = heapq.heappop(ready)
+        block = table.blocks[path]
+        if block.opaque:
+            continue
+        traced[path] = _trace(block, _input_shapes(table, shapes, path, assumed), table, path, shared)
+        for name, shape in traced[path].outputs.items():
+            if (path, name) not in shapes:
+                shapes[path, name] = shape
+                for consumer, port in consumers.get((path, name), ()):
+                    unknown[consumer].discard(port)
+                    if not unknown[consumer] and consumer in waiting:
+                        waiting.discard(consumer)
+                        heapq.heappush(ready, consumer)
+    _check_shapes(table, traced, shapes, assumed)
+    return traced, shapes
+
+
+def _check_shapes(
+    table: Structure, traced: dict[str, Traced], shapes: dict[Port, Shape], assumed: dict[Port, Shape]
+) -> None:
+    for (path, port), wire in sorted(table.wires.items()):
         found = part_shape(shapes[wire.block, wire.port], wire, path, port)
-        if found != shape:
+        expected = traced[path].inputs[port] if path in traced else table.blocks[path].inputs[port].shape
+        if found == expected:
+            continue
+        if (path, port) in assumed:
             raise ShapeError(
-                f"{wire} has shape {found}, where the loop that it closes asks for {shape}. Give the loop's shape "
+                f"{wire} has shape {found}, where the loop that it closes asks for {expected}. Give the loop's shape "
                 "where it starts, for instance UnitDelay(initial_value=…).",
                 block=path,
                 port=port,
             )
-    return traced, shapes
+        raise ShapeError(
+            f"{wire} has shape {found}; expected {expected}. Index the signal, or wire another one.",
+            block=path,
+            port=port,
+        )
+    for name, wire in sorted(table.names.items()):
+        part_shape(shapes[wire.block, wire.port], wire, wire.block, f"{wire.port} (named {name!r})")
 
 
-def _trace(block: Block, shapes: dict[str, Shape], sampled: bool, method: str, path: str) -> Traced:
+def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, shared: dict[Any, Traced]) -> Traced:
+    frame = table.frame_of[path]
+    sampled, method = table.rate(frame) is not None, table.frames[frame].method
     try:
-        return trace(block, shapes, sampled=sampled, method=method)
-    except WiringError as error:
+        return trace(block, shapes, sampled=sampled, method=method, cache=shared)
+    except LoopwrightError as error:
         error.block = path
         raise
 
 
-def _assume(table: Structure, shapes: dict[tuple[str, str], Shape], stuck: list[str]) -> dict[tuple[str, str], Shape]:
+def _assume(table: Structure, shapes: dict[Port, Shape], stuck: Iterable[str]) -> dict[Port, Shape]:
     """Return an assumption that lets a loop of unknown shapes go on; it is checked once the shapes are known.
 
     A block's unknown inputs are assumed to have the shape of a known one beside them, else of its first state.
@@ -141,8 +180,7 @@ def _assume(table: Structure, shapes: dict[tuple[str, str], Shape], stuck: list[
 
     path = min(stuck, key=lambda p: (not known(p), not table.blocks[p].states, p))
     block = table.blocks[path]
-    starts = [port.start_value(block, dict.fromkeys(block.inputs, ())).shape for port in block.states.values()]
-    shape = next(iter([*known(path), *starts]), ())
+    shape = next(iter([*known(path), *start_shapes(block)]), ())
     return {
         (path, port): shape
         for port, spec in block.inputs.items()
@@ -151,42 +189,25 @@ def _assume(table: Structure, shapes: dict[tuple[str, str], Shape], stuck: list[
 
 
 def _input_shapes(
-    table: Structure,
-    shapes: dict[tuple[str, str], Shape],
-    path: str,
-    assumed: dict[tuple[str, str], Shape],
-) -> dict[str, Shape] | None:
+    table: Structure, shapes: dict[Port, Shape], path: str, assumed: dict[Port, Shape]
+) -> dict[str, Shape]:
+    """Return the shapes to trace a block with; what a wire brings is compared with them at the end."""
     found: dict[str, Shape] = {}
-    unknown = False
     for port, spec in table.blocks[path].inputs.items():
         wire = table.wires.get((path, port))
         if wire is None:
-            assert spec.default is not None
-            found[port] = np.shape(spec.default)
-            continue
-        whole = shapes.get((wire.block, wire.port))
-        if (path, port) in assumed:
+            found[port] = np.shape(np.asarray(spec.default)) if spec.shape is None else spec.shape
+        elif spec.shape is not None:
+            found[port] = spec.shape
+        elif (path, port) in assumed:
             found[port] = assumed[path, port]
-            continue
-        if whole is None:
-            if spec.shape is None:
-                unknown = True
-            else:
-                found[port] = spec.shape
-            continue
-        shape = part_shape(whole, wire, path, port)
-        if spec.shape is not None and shape != spec.shape:
-            raise ShapeError(
-                f"{wire} has shape {shape}; expected {spec.shape}. Index the signal, or wire another one.",
-                block=path,
-                port=port,
-            )
-        found[port] = shape
-    return None if unknown else found
+        else:
+            found[port] = part_shape(shapes[wire.block, wire.port], wire, path, port)
+    return found
 
 
-def _check_units(table: Structure, shapes: dict[tuple[str, str], Shape]) -> dict[tuple[str, str], Unit]:
-    units: dict[tuple[str, str], Unit] = {}
+def _check_units(table: Structure, shapes: dict[Port, Shape]) -> dict[Port, Unit]:
+    units: dict[Port, Unit] = {}
     for path, block in table.blocks.items():
         for name, port in block.outputs.items():
             if port.unit is not None:
@@ -223,7 +244,7 @@ def _check_units(table: Structure, shapes: dict[tuple[str, str], Shape]) -> dict
     return units
 
 
-def _part_unit(units: dict[tuple[str, str], Unit], wire: Wire) -> Unit:
+def _part_unit(units: dict[Port, Unit], wire: Wire) -> Unit:
     unit = units.get((wire.block, wire.port))
     if isinstance(unit, tuple) and wire.index is not None:
         return unit[wire.index]

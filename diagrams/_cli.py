@@ -1,7 +1,7 @@
 """The command line, ``loopwright``.
 
-Exit status: 0 done, 1 a run or a build failed (a run's files are kept) or an FMU has problems, 2 wrong usage, 130
-interrupted.
+Exit status: 0 done, 1 a run or a build failed (what a run recorded is written) or an FMU has problems, 2 wrong usage,
+130 interrupted.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from inspect import signature
 from pathlib import Path
+from tempfile import TemporaryFile
+from types import MappingProxyType
 from typing import Any
 
 from ..blocks._errors import FmuError, FmuFileError, LoopwrightError, OptionError, near
@@ -44,6 +46,9 @@ SIGNALS = (
 """Signals of the CSV file, in order."""
 
 _INTERRUPTED = "interrupted"
+_WORDS: Mapping[str, bool | None] = MappingProxyType(
+    {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False, "none": None, "null": None}
+)
 _SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0), "m/s2": ("m/s²", 1.0)}
 
 
@@ -86,14 +91,18 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Run experiments of the paper: A path following, B compliance, C hand guiding, D force tracking.\n"
         "Writes the samples (A.csv), the key numbers (A.json, SI units) and two figures (A_path, A_signals;\n"
-        ".png and .svg) of each.",
+        ".png and .svg) of each, in place of an earlier run's. A run that fails writes what it recorded, and why it\n"
+        'failed ("error" in A.json); one that recorded nothing writes nothing, and an earlier run\'s files stay.',
         epilog="options (--option), with their defaults:\n  "
         + "\n  ".join(_option_lines())
         + "\n  An option that only some experiments have is given to those.\n\nkey numbers:\n"
         + "\n".join(f"  {name:{width}}  [{unit}] {text}" for name, (unit, text) in DEFINITIONS.items())
-        + "\n\nexit status: 0 done, 1 a run failed (its files are kept), 2 wrong usage",
+        + '\n  In A.json a number that there is none of is null; "never" lists the settling times without end.\n\n'
+        "exit status:\n  0    done\n  1    a run failed, or a plant could not be built\n"
+        "  2    wrong usage; nothing was run\n"
+        "  130  interrupted (Ctrl-C); what was recorded until then is written",
     )
-    run.add_argument("letters", nargs="*", metavar="LETTER", help="A, B, C, D; all four without one")
+    run.add_argument("letters", nargs="*", metavar="LETTER", help="A, B, C, D, also as A,B or AB; all four without one")
     run.add_argument("--out", metavar="DIR", default="out", help="folder for the files (default: out)")
     run.add_argument("--plant", metavar="FILE.fmu", help="another plant in place of the gantry")
     run.add_argument(
@@ -134,10 +143,12 @@ def _option_lines() -> Iterable[str]:
 
 
 def _letters(given: Sequence[str]) -> list[str]:
-    for letter in given:
-        if letter.upper() not in EXPERIMENTS:
-            raise OptionError(f"there is no experiment {letter!r}. {near(letter.upper(), EXPERIMENTS)}")
-    return list(dict.fromkeys(letter.upper() for letter in given)) or list(EXPERIMENTS)
+    """Return the experiments that are meant: ``A B``, ``A,B`` and ``AB`` alike."""
+    pieces = [piece.strip() for text in given for piece in text.split(",")]
+    for piece in pieces:
+        if (not piece and len(pieces) == 1) or any(letter not in EXPERIMENTS for letter in piece.upper()):
+            raise OptionError(f"there is no experiment {piece!r}. Known: {', '.join(EXPERIMENTS)}.")
+    return list(dict.fromkeys("".join(pieces).upper())) or list(EXPERIMENTS)
 
 
 def _options(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -147,6 +158,12 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
         name = name.strip().replace("-", "_")
         if not equals or not name:
             raise OptionError(f"found --option {text!r}; expected NAME=VALUE, such as --option delay=1.")
+        if name == "path":
+            raise OptionError(
+                "a path can't be given on the command line; take Python: "
+                "loopwright.diagrams.experiments.path_following(path=…).simulate().",
+                port="--option path",
+            )
         if name in options:
             raise OptionError("it is given twice; give it once.", port=f"--option {name}")
         options[name] = _value(value.strip())
@@ -158,10 +175,9 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def _value(text: str) -> Any:
-    """Read a Python or JSON literal; anything else is text."""
-    words = {"true": True, "false": False, "none": None, "null": None}
-    if text.lower() in words:
-        return words[text.lower()]
+    """Read a word of `_WORDS`, or a Python or JSON literal; anything else is text."""
+    if text.lower() in _WORDS:
+        return _WORDS[text.lower()]
     try:
         return ast.literal_eval(text)
     except (ValueError, SyntaxError, MemoryError, RecursionError):
@@ -174,24 +190,39 @@ def _share(letters: Sequence[str], options: Mapping[str, Any]) -> dict[str, dict
         owners = [letter for letter in EXPERIMENTS if name in _known(letter)]
         without = [letter for letter in letters if letter not in owners]
         if not owners:
-            known = {name for letter in EXPERIMENTS for name in _known(letter)}
+            known = {name for letter in EXPERIMENTS for name in _known(letter)} - {"path"}
             raise OptionError(f"no experiment has such an option. {near(name, known)}", port=f"--option {name}")
         if len(without) == len(letters):
             raise OptionError(
-                f"{' and '.join(without)} can't take it; an option of {', '.join(owners)} only.",
+                f"{_and(without)} can't take it; an option of {_and(owners)} only.",
                 port=f"--option {name}",
             )
         if without:
-            _say(f"{', '.join(without)}: without {name}, which only {', '.join(owners)} has.", sys.stderr)
+            have = "has" if len(owners) == 1 else "have"
+            _say(f"{', '.join(without)}: without {name}, which only {_and(owners)} {have}.", sys.stderr)
     return {letter: {k: v for k, v in options.items() if k in _known(letter)} for letter in letters}
 
 
+def _and(letters: Sequence[str]) -> str:
+    """Write A; A and B; A, B and C."""
+    *first, last = letters
+    return f"{', '.join(first)} and {last}" if first else last
+
+
 def _folder(name: str) -> Path:
+    """Make the folder, and find out whether files can be written there."""
     folder = Path(name).expanduser()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OptionError(f"the folder {name!r} can't be made: {error}. Name another one.", port="--out") from error
+    try:
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OptionError(
+            f"nothing can be written to the folder {name!r}: {error}. Name another one.", port="--out"
+        ) from error
     return folder
 
 
@@ -221,6 +252,11 @@ def _run(arguments: argparse.Namespace) -> int:
         if problem is not None:
             failed[letter] = problem
             _say(f"loopwright: experiment {letter} failed: {problem}", sys.stderr)
+        if run is None or not len(run.t):
+            _say(f"{letter}: nothing was recorded, so nothing is written{_kept(letter, folder)}.", sys.stderr)
+            if problem == _INTERRUPTED:
+                break
+            continue
         try:
             numbers, names = _write(experiment, run, problem, folder)
         except OSError as error:
@@ -250,28 +286,39 @@ def _simulate(experiment: Experiment) -> tuple[Run | None, str | None]:
 
 
 def _write(
-    experiment: Experiment, run: Run | None, problem: str | None, folder: Path
+    experiment: Experiment, run: Run, problem: str | None, folder: Path
 ) -> tuple[dict[str, float | None], list[str]]:
     """Write all files of a run; return its key numbers and the files' names. Older files of the experiment go."""
+    from ._figures import plot_experiment, plot_path
+    from ._plots import save
+
     letter = experiment.letter
-    for ending in (".csv", ".json", *(f"_{kind}.{form}" for kind in ("path", "signals") for form in ("png", "svg"))):
-        (folder / f"{letter}{ending}").unlink(missing_ok=True)
-    numbers = dict.fromkeys(DEFINITIONS) if run is None else key_numbers(experiment, run)
+    for file in _files(letter, folder):
+        file.unlink(missing_ok=True)
+    numbers = key_numbers(experiment, run)
     content: dict[str, Any] = {n: v if v is None or math.isfinite(v) else None for n, v in numbers.items()}
+    content["never"] = [n for n, v in numbers.items() if v is not None and not math.isfinite(v)]
     if problem is not None:
         content["error"] = problem
-    names = [f"{letter}.json"]
-    (folder / names[0]).write_text(
+    run.to_csv(folder / f"{letter}.csv", *SIGNALS)
+    names = [f"{letter}.csv", f"{letter}.json"]
+    (folder / names[1]).write_text(
         json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )
-    if run is not None:
-        from ._figures import plot_experiment, plot_path, save
-
-        run.to_csv(folder / f"{letter}.csv", *SIGNALS)
-        names.insert(0, f"{letter}.csv")
-        for name, plot in (("path", plot_path), ("signals", plot_experiment)):
-            names += [file.name for file in save(plot(experiment, run), folder / f"{letter}_{name}")]
+    for name, plot in (("path", plot_path), ("signals", plot_experiment)):
+        names += [file.name for file in save(plot(experiment, run), folder / f"{letter}_{name}")]
     return numbers, names
+
+
+def _files(letter: str, folder: Path) -> list[Path]:
+    """Return every file that a run of an experiment writes."""
+    figures = (f"_{kind}.{form}" for kind in ("path", "signals") for form in ("png", "svg"))
+    return [folder / f"{letter}{ending}" for ending in (".csv", ".json", *figures)]
+
+
+def _kept(letter: str, folder: Path) -> str:
+    """Say that an earlier run's files stay, where there are some."""
+    return f"; the files of an earlier run stay in {folder}" if any(f.exists() for f in _files(letter, folder)) else ""
 
 
 # --- printing -------------------------------------------------------------------------------------------------------

@@ -8,11 +8,13 @@ from fractions import Fraction
 from typing import Any
 
 from ..blocks._block import Block
+from ..blocks._discretization import check_method
 from ..blocks._errors import UnknownNameError, WiringError, near
 from ..blocks._signals import check_name
 from ..blocks._values import Value
 from ._check import Checked, check
 from ._flat import FlatDiagram, flatten
+from ._order import evaluation_order
 from ._run import Run
 from ._structure import Collector, Frame, Structure, Wire
 from ._subsystem import exact_time
@@ -47,18 +49,27 @@ class Diagram:
     """
 
     def __init__(self, name: str, *roots: Any):
+        if not isinstance(name, str):
+            raise WiringError(
+                f'found {name!r} where the name is expected; write Diagram("name", …), the calls after the name.'
+            )
         if not roots:
             raise WiringError("a diagram needs at least one call, such as plant(motor_force=u).", block=name)
         self._set(check_name(name), Collector(roots).structure())
 
-    def _set(self, name: str, table: Structure) -> None:
-        self.name = name
-        self._table = table
-        self._checked: Checked = check(table)
-        self._flat: dict[Fraction | None, FlatDiagram] = {}
-        from ._order import evaluation_order
+    name: str
+    _table: Structure
+    _checked: Checked
+    _flat: dict[Fraction | None, FlatDiagram]
 
-        evaluation_order(table, self._checked.traced)
+    def _set(self, name: str, table: Structure) -> None:
+        checked = check(table)
+        for start in (False, True):
+            evaluation_order(table, checked.traced, start=start)
+        self.__dict__.update(name=name, _table=table, _checked=checked, _flat={})
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"a diagram is a value: {name!r} can't be set. Use replace(…), or build another one.")
 
     @classmethod
     def _of(cls, name: str, table: Structure) -> Diagram:
@@ -98,15 +109,7 @@ class Diagram:
         return self._table.blocks[self._find(path)]
 
     def _find(self, path: str) -> str:
-        blocks = self._table.blocks
-        if path in blocks:
-            return path
-        found = sorted(p for p in blocks if p.endswith("." + path))
-        if len(found) == 1:
-            return found[0]
-        if found:
-            raise UnknownNameError(f"{path!r} stands for several blocks: {', '.join(found)}. Write more of the path.")
-        raise UnknownNameError(f"no block {path!r} in diagram {self.name!r}. {near(path, blocks)}")
+        return _unique(path, self._table.blocks, "block", self.name)
 
     def replace(self, changes: Mapping[str, Any] | None = None, /, **more: Any) -> Diagram:
         """Return a variant: other blocks, parameters or sample times.
@@ -116,7 +119,8 @@ class Diagram:
         changes : mapping, optional
             By dotted path, or its unique end: a block (``"plant"``), a parameter
             (``"controller.admittance_par.stiffness"``), a subsystem's ``sample_time`` or ``method``
-            (``"controller.sample_time"``), a plant's start value (``"plant.start.position"``).
+            (``"controller.sample_time"``; None: that of what surrounds it), a plant's start value
+            (``"plant.start.position"``).
         **more
             The same, for paths that are identifiers: ``replace(plant=Fmu("other.fmu"))``.
 
@@ -135,13 +139,30 @@ class Diagram:
         if isinstance(value, Block):
             full = self._find(path)
             table.blocks[full] = value.replace(name=full.rpartition(".")[2])
-        elif head in table.frames and last in ("sample_time", "method"):
-            new = exact_time(value, block=head) if last == "sample_time" else value
+        elif last in ("sample_time", "method") and (frame := self._frame(table, head, last)) is not None:
+            new = exact_time(value, block=frame) if last == "sample_time" and value is not None else value
+            if last == "method":
+                check_method(value)
             changed: dict[str, Any] = {last: new}
-            table.frames[head] = replace_fields(table.frames[head], **changed)
+            table.frames[frame] = replace_fields(table.frames[frame], **changed)
+        elif path in table.blocks:
+            raise WiringError(
+                f"found {value!r}; expected a block in its place, such as Fmu('other.fmu'), or the name of a parameter "
+                f"({path}.…).",
+                block=path,
+            )
         else:
             full, keys = self._split(table, path)
             table.blocks[full] = _changed(table.blocks[full], keys, value)
+
+    def _frame(self, table: Structure, path: str, what: str) -> str | None:
+        """Return the subsystem that a path means; None where it means none, but perhaps a block."""
+        boxes = {frame: None for frame in table.frames if frame}
+        if path:
+            found = [f for f in boxes if f == path or f.endswith("." + path)]
+            return _unique(path, boxes, "subsystem", self.name) if found else None
+        offered = ", ".join(f"{frame}.{what}" for frame in boxes) or "none: this diagram has no subsystem"
+        raise UnknownNameError(f"a diagram has no {what!r} of its own; its subsystems have: {offered}.")
 
     def _split(self, table: Structure, path: str) -> tuple[str, list[str]]:
         """Return the block and the parameter path that a dotted path means."""
@@ -205,6 +226,20 @@ class Diagram:
         from ._simulation import simulate
 
         return simulate(self, duration, step=step, progress=progress)
+
+
+def _unique(path: str, known: Mapping[str, Any], kind: str, diagram: str) -> str:
+    """Return the full path that ``path`` is, or is the unique end of."""
+    if not isinstance(path, str):
+        raise UnknownNameError(f"found {path!r}; expected the path of a {kind}, such as {next(iter(known), '')!r}.")
+    if path in known:
+        return path
+    found = sorted(p for p in known if p.endswith("." + path))
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise UnknownNameError(f"{path!r} stands for several {kind}s: {', '.join(found)}. Write more of the path.")
+    raise UnknownNameError(f"no {kind} {path!r} in diagram {diagram!r}. {near(path, known)}")
 
 
 def _changed(block: Value, keys: list[str], value: Any) -> Any:

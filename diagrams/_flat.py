@@ -13,6 +13,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -83,6 +84,8 @@ class FlatDiagram:
     p: np.ndarray
     order: list[Step]
     start_order: list[Step]
+    ports: dict[str, tuple[str, str]]
+    """Block and port behind every dotted path; an FMU's port may have dots of its own."""
     _functions: dict[frozenset[int], Any]
     _slices: dict[Any, Any]
 
@@ -91,14 +94,18 @@ class FlatDiagram:
         """The function of a tick at which every sampled subsystem acts."""
         return self.at_tick(0)
 
-    @property
-    def hyperperiod(self) -> int:
-        """Number of ticks after which the pattern of acting subsystems repeats."""
-        return math.lcm(*self.divisors.values())
+    @cached_property
+    def rates(self) -> tuple[int, ...]:
+        """The different numbers of ticks after which subsystems act."""
+        return tuple(sorted(set(self.divisors.values())))
+
+    def acting(self, k: int) -> frozenset[int]:
+        """Return which of `rates` act in tick ``k``."""
+        return frozenset(d for d in self.rates if k % d == 0)
 
     def at_tick(self, k: int) -> Any:
         """Return the function of tick ``k``; equal patterns of acting subsystems share one."""
-        acting = frozenset(d for d in self.divisors.values() if k % d == 0)
+        acting = self.acting(k)
         if acting not in self._functions:
             self._functions[acting] = self._build(acting)
         return self._functions[acting]
@@ -161,14 +168,14 @@ class FlatDiagram:
         )
         values: dict[tuple[str, str], Any] = {}
         for name, where in self.plant_outputs.slices.items():
-            values[_path_and_port(name)] = w[where]
+            values[self.ports[name]] = _rows(w, where)
         new: dict[str, Any] = {}
         guards: list[Any] = []
         acts = {path: self.divisors[table.frame_of[path]] in acting for path in traced}
         for name, where in self.held.slices.items():
-            path, port = _path_and_port(name)
+            path, port = self.ports[name]
             if not acts[path]:
-                values[path, port] = x[where]
+                values[path, port] = _rows(x, where)
         for path, names in self.order:
             if not acts[path]:
                 continue
@@ -177,8 +184,8 @@ class FlatDiagram:
                 self.source(path, port, values) if self.is_made(path, port, values) else np.zeros(size(shape))
                 for port, shape in trace.inputs.items()  # what is not made yet is not depended on
             ]
-            state = x[self.states.slices[path]]
-            made = self.block_function(path, names).call([t, state, *arguments, p[self.parameters.slices[path]]])
+            state, numbers = _rows(x, self.states.slices[path]), _rows(p, self.parameters.slices[path])
+            made = self.block_function(path, names).call([t, state, *arguments, numbers])
             for name, column in zip(names, map(ca.densify, made), strict=True):
                 if name == NEXT:
                     new[path] = column
@@ -187,12 +194,13 @@ class FlatDiagram:
                 else:
                     values[path, name] = column
         outputs = [values[path, name] for path in sorted(traced) for name in traced[path].outputs]
-        kept = [values[_path_and_port(name)] for name in self.held.slices]
-        x_next = ca.vertcat(*(new.get(path, x[where]) for path, where in self.states.slices.items()), *kept)
+        kept = [values[self.ports[name]] for name in self.held.slices]
+        old = {path: _rows(x, where) for path, where in self.states.slices.items()}
+        x_next = ca.vertcat(*(new.get(path, state) for path, state in old.items()), *kept)
         z = ca.vertcat(
             *(
                 ca.MX(ca.densify(ca.DM(column))) if isinstance(column, np.ndarray) else column
-                for column in (self.source(*_path_and_port(name), values) for name in self.plant_inputs.slices)
+                for column in (self.source(*self.ports[name], values) for name in self.plant_inputs.slices)
             )
         )
         log = ca.vertcat(w, *outputs, x)
@@ -278,23 +286,24 @@ def flatten(table: Structure, checked: Checked, step: Fraction | None = None) ->
         p=np.concatenate([*packed.values(), np.zeros(0)]),
         order=evaluation_order(table, traced),
         start_order=evaluation_order(table, traced, start=True),
+        ports={join(*port): port for port in checked.shapes} | {join(*port): port for port in table.wires},
         _functions={},
         _slices={},
     )
 
 
-def _path_and_port(name: str) -> tuple[str, str]:
-    path, _, port = name.rpartition(".")
-    return path, port
+def _rows(vector: Any, where: slice) -> Any:
+    """Return a part of a column; an empty one stays a column, which slicing a single entry would not give."""
+    return vector[where] if where.stop > where.start else ca.MX(0, 1)
 
 
 def _period(table: Structure, path: str, base: Fraction) -> float:
-    rate = table.frames[table.frame_of[path]].sample_time
+    rate = table.rate(table.frame_of[path])
     return float(rate if rate is not None else base)
 
 
 def _clock(table: Structure, step: Fraction | None) -> tuple[Fraction, dict[str, int]]:
-    rates = {path: frame.sample_time for path, frame in table.frames.items() if frame.sample_time is not None}
+    rates = {path: rate for path in table.frames if (rate := table.rate(path)) is not None}
     used: Iterable[Fraction] = list(rates.values())
     if not rates and step is None:
         raise SampleTimeError(

@@ -24,7 +24,8 @@ class Snapshot:
     values: dict[str, Any]
     state: np.ndarray
     """The state vector x of the flattened diagram."""
-    names: dict[str, str]
+    names: dict[str, Wire]
+    """The named wires: two of one short name are told apart by what they carry."""
 
     def __getitem__(self, name: str) -> Any:
         return self.values[resolve(name, self.names, self.values)]
@@ -81,6 +82,9 @@ class Run:
         values = values if index is None else values[:, index]
         return np.ascontiguousarray(values)
 
+    def _ipython_key_completions_(self) -> list[str]:
+        return self.names
+
     def __contains__(self, name: str) -> bool:
         try:
             resolve(name, self.wires, self.layout.slices)
@@ -114,7 +118,7 @@ class Run:
             whole = values[f"{wire.block}.{wire.port}"]
             values[name] = whole if wire.index is None else whole[wire.index]
         width = self.layout.total
-        return Snapshot(float(self.t[k]), k, values, self.data[k, width:].copy(), dict.fromkeys(self.wires, ""))
+        return Snapshot(float(self.t[k]), k, values, self.data[k, width:].copy(), dict(self.wires))
 
     def plot(self, *names: str, axes: Any = None) -> Figure:
         """Draw signals over time, one below the other, and return the figure.
@@ -131,7 +135,7 @@ class Run:
         UnknownNameError
             For a name that was not recorded.
         """
-        from ._figures import plot_signals
+        from ._plots import plot_signals
 
         return plot_signals(self, names, axes)
 

@@ -2,8 +2,8 @@
 
 At tick k, t = k · base exactly:
 
-1. The outputs of the FMUs are those at the end of their last step (at k = 0, of initialization): a co-simulation FMU
-   has no feedthrough between communication points (FMI 3.0, Step Mode).
+1. The outputs of the FMUs are those at the end of their last step: a co-simulation FMU has no feedthrough between
+   communication points (FMI 3.0, Step Mode). At k = 0 they are those of initialization, with the inputs of k = 0.
 2. All blocks are evaluated once, each port after what it depends on: `FlatDiagram`. A sampled subsystem acts in the
    ticks of its own rate; between them its outputs are held.
 3. Everything is recorded.
@@ -16,8 +16,10 @@ name the first one that is concerned; the run until then is kept in the error.
 
 from __future__ import annotations
 
+import math
+import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
 from importlib.util import find_spec
@@ -26,25 +28,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..blocks._comparison import GUARDS, NEXT
+from ..blocks._equations import initial_state
 from ..blocks._errors import LoopwrightError, NonFiniteError, OptionError, SimulationError
 from ..blocks._symbols import bundle
 from ._flat import FlatDiagram
 from ._run import Run
 from ._structure import join
-from ._subsystem import exact_time
 
 if TYPE_CHECKING:
     from ._diagram import Diagram
 
 _CHUNK = 1000  # ticks between two looks at the progress bar
+_MAX_PASSES = 100  # over inputs and outputs of the FMUs at the start
+_SETTLED = 1e-13  # relative change of an input between two passes, a few hundred ulps
 
 
 def simulate(diagram: Diagram, duration: float, *, step: float | Fraction | None, progress: bool | None) -> Run:
     """Run a diagram; see `Diagram.simulate`."""
     flat = diagram.flatten(step)
     n = _ticks(duration, flat.base, diagram.name)
-    times = [k * flat.base.numerator / flat.base.denominator for k in range(n + 1)]
     width = flat.log.total + flat.states.total + flat.held.total
+    _check_memory(n + 1, width, flat.base, diagram.name)
+    times = [k * flat.base.numerator / flat.base.denominator for k in range(n + 1)]
     recorded = _Recorded(diagram, flat, np.array(times), np.empty((n + 1, width)))
     with ExitStack() as stack:
         plants = []
@@ -62,8 +67,8 @@ def simulate(diagram: Diagram, duration: float, *, step: float | Fraction | None
             except LoopwrightError as error:
                 error.at(block=path)
                 raise
-        tick = stack.enter_context(_progress(diagram.name, times[-1], progress))
-        return _Loop(flat, plants, recorded).run(times, tick)
+        show = stack.enter_context(_progress(diagram.name, times[-1], progress))
+        return _Loop(flat, plants, recorded).run(times, show)
 
 
 class _Recorded:
@@ -100,21 +105,19 @@ class _Loop:
         self.z = np.zeros(flat.plant_inputs.total)
         self.log = np.zeros(recorded.data.shape[1])
         self.ok = np.zeros(1)
-        for path, plant in plants:
-            plant.bind(self._part(flat.plant_inputs, path, self.z), self._part(flat.plant_outputs, path, self.w))
+        self._calls: dict[frozenset[int], tuple[Any, Any]] = {}
 
-    @staticmethod
-    def _part(layout: Any, path: str, vector: np.ndarray) -> np.ndarray:
-        mine = [s for name, s in layout.slices.items() if name.rpartition(".")[0] == path]
+    def _part(self, layout: Any, path: str, vector: np.ndarray) -> np.ndarray:
+        mine = [s for name, s in layout.slices.items() if self.flat.ports[name][0] == path]
         return vector[mine[0].start : mine[-1].stop] if mine else vector[:0]
 
     def run(self, times: list[float], progress: Any) -> Run:
         started = time.perf_counter()
         k = 0
         try:
+            self._evaluator(0)
             self.start()
-            evaluate = self._evaluators()
-            k = self._first(evaluate, progress, times)
+            k = self._advance(progress, times)
         except _Stopped as stop:
             k = stop.tick
             error = stop.error
@@ -127,36 +130,32 @@ class _Loop:
         messages = tuple(m for _, plant in self.plants for m in plant.messages)
         return self.recorded.until(k + 1, elapsed, messages)
 
-    def _evaluators(self) -> list[Any]:
-        """Return one call per tick of the hyperperiod; all share the run's vectors."""
-        made: dict[int, Any] = {}
-        calls = []
-        for k in range(self.flat.hyperperiod):
+    def _evaluator(self, k: int) -> Any:
+        """Return the call that evaluates tick ``k``; all calls share the run's vectors."""
+        acting = self.flat.acting(k)
+        if acting not in self._calls:
             function = self.flat.evaluator(k)
-            if id(function) not in made:
-                buffer, trigger = function.buffer()
-                for i, vector in enumerate((self.t, self.x, self.w, self.flat.p)):
-                    buffer.set_arg(i, _view(vector))
-                for i, vector in enumerate((self.x_next, self.z, self.log, self.ok)):
-                    buffer.set_res(i, _view(vector))
-                made[id(function)] = (trigger, buffer)
-            calls.append(made[id(function)][0])
-        self._keep = made
-        return calls
+            buffer, trigger = function.buffer()
+            for i, vector in enumerate((self.t, self.x, self.w, self.flat.p)):
+                buffer.set_arg(i, _view(vector))
+            for i, vector in enumerate((self.x_next, self.z, self.log, self.ok)):
+                buffer.set_res(i, _view(vector))
+            self._calls[acting] = (trigger, buffer)  # the buffer lives as long as its call
+        return self._calls[acting][0]
 
-    def _first(self, evaluate: list[Any], progress: Any, times: list[float]) -> int:
+    def _advance(self, progress: Any, times: list[float]) -> int:
         """Run all ticks and return the last one."""
         t, ok, x, x_next = _view(self.t), _view(self.ok), _view(self.x), _view(self.x_next)
         log, data, plants = self.log, self.recorded.data, [plant for _, plant in self.plants]
-        h, period, last = float(self.flat.base), len(evaluate), len(times) - 1
-        single = evaluate[0] if period == 1 else None
+        h, last = float(self.flat.base), len(times) - 1
+        single = self._evaluator(0) if self.flat.rates == (1,) else None
         only = plants[0].step if len(plants) == 1 else None
         k = 0
         while True:
             end = min(last, k + _CHUNK)
             for k in range(k, end):  # noqa: B020 - continues where the last chunk ended
                 t[0] = now = times[k]
-                (single or evaluate[k % period])()
+                (single or self._evaluator(k))()
                 if not ok[0]:
                     raise _Stopped(k, self.failure(now, k))
                 data[k] = log
@@ -175,7 +174,7 @@ class _Loop:
             if k == last:
                 break
         t[0] = times[k]
-        evaluate[k % period]()
+        self._evaluator(k)()
         if not ok[0]:
             raise _Stopped(k, self.failure(times[k], k))
         data[k] = log
@@ -191,6 +190,47 @@ class _Loop:
     # --- the start, and the replay of a failed tick: block by block, with numbers -----------------------------------
 
     def start(self) -> None:
+        """Initialize: inputs and outputs of the FMUs that agree at t = 0, and the blocks' initial states.
+
+        In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). What they change is given on
+        until it changes no more than by rounding.
+        """
+        try:
+            for path, plant in self.plants:
+                plant.bind(
+                    self._part(self.flat.plant_inputs, path, self.z), self._part(self.flat.plant_outputs, path, self.w)
+                )
+            for _ in range(_MAX_PASSES):
+                self._initial_states()
+                self._evaluator(0)()
+                if not self.ok[0]:
+                    raise _Stopped(0, self.failure(0.0, 0))
+                before = self.z.copy()
+                for _, plant in self.plants:
+                    plant.exchange()
+                self._evaluator(0)()
+                if np.allclose(before, self.z, rtol=_SETTLED, atol=0.0, equal_nan=True):
+                    break
+            else:
+                raise self._unsettled(before)
+            for _, plant in self.plants:
+                plant.begin()
+        except SimulationError as error:
+            raise _Stopped(0, self._who(error)) from error.__cause__
+
+    def _unsettled(self, before: np.ndarray) -> SimulationError:
+        slices = self.flat.plant_inputs.slices
+        name = next(n for n, s in slices.items() if not np.allclose(before[s], self.z[s], rtol=_SETTLED, atol=0.0))
+        path, port = self.flat.ports[name]
+        return SimulationError(
+            f"its value at the start depends on the FMU's own outputs, and is not found: after {_MAX_PASSES} passes it "
+            f"still changes, from {before[slices[name]].tolist()} to {self.z[slices[name]].tolist()}. Put a "
+            "UnitDelay(initial_value=…) on one of the wires between.",
+            block=path,
+            port=port,
+        )
+
+    def _initial_states(self) -> None:
         """Compute the initial states of the blocks that ask for their inputs first."""
         table = self.flat.table
         if not any(table.blocks[path].starts_from_inputs for path in self.flat.checked.traced):
@@ -202,7 +242,7 @@ class _Loop:
         """Return the error of the first block that made a value that is not finite or whose guard fails."""
         for name, where in self.flat.plant_outputs.slices.items():
             if not np.all(np.isfinite(self.w[where])):
-                path, _, port = name.rpartition(".")
+                path, port = self.flat.ports[name]
                 return _non_finite(path, port, self.w[where], "It comes out of the FMU.")
         for path, names, inputs, made in self._blocks(self.flat.order, t, k):
             block = self.flat.table.blocks[path]
@@ -221,7 +261,7 @@ class _Loop:
         layout = self.flat.log
         sizes = {name: float(np.max(np.abs(self.log[where]), initial=0.0)) for name, where in layout.slices.items()}
         largest = max(sizes, key=lambda name: sizes[name])
-        path, _, port = largest.rpartition(".")
+        path, port = self.flat.ports[largest]
         return NonFiniteError(
             f"found {sizes[largest]:g}; the signals of this tick overflow when they are added up, and this "
             "is the largest. Look at what drives it in the last samples of error.run.",
@@ -236,11 +276,9 @@ class _Loop:
         flat, table = self.flat, self.flat.table
         values: dict[tuple[str, str], np.ndarray] = {}
         for name, where in flat.plant_outputs.slices.items():
-            path, _, port = name.rpartition(".")
-            values[path, port] = self.w[where]
+            values[flat.ports[name]] = self.w[where]
         for name, where in flat.held.slices.items():
-            path, _, port = name.rpartition(".")
-            values[path, port] = self.x[where]
+            values[flat.ports[name]] = self.x[where]
         ready: set[str] = set()
         for path, names in order:
             if k % flat.divisors[table.frame_of[path]]:
@@ -250,9 +288,7 @@ class _Loop:
             shaped = {p: np.reshape(known[p], trace.inputs[p]) if p in known else None for p in trace.inputs}
             if initialize and block.starts_from_inputs and path not in ready:
                 ready.add(path)
-                initial: Any = block.initial(bundle("u", shaped))  # type: ignore[attr-defined]
-                parts = (initial,) if len(trace.states) == 1 else initial
-                self.x[flat.states.slices[path]] = np.concatenate([np.ravel(p) for p in parts])
+                self.x[flat.states.slices[path]] = _initial(path, block, bundle("u", shaped), trace.states)
             columns = [known.get(p, np.zeros(int(np.prod(s)))) for p, s in trace.inputs.items()]
             result = flat.block_function(path, names).call(
                 [t, self.x[flat.states.slices[path]], *columns, flat.p[flat.parameters.slices[path]]]
@@ -261,6 +297,20 @@ class _Loop:
             values.update({(path, n): v for n, v in made.items()})
             shaped_known: Any = dict(shaped)
             yield path, names, shaped_known, made
+
+
+def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]]) -> np.ndarray:
+    """Return a block's initial state from its inputs, flat; whatever fails says whose it is."""
+    try:
+        return initial_state(block, states, u)
+    except SimulationError as error:
+        raise error.at(block=path, t=0.0) from error.__cause__
+    except Exception as error:
+        expected = ", ".join(f"{name} of shape {shape}" for name, shape in states.items())
+        what = str(error) if isinstance(error, LoopwrightError) else f"{type(error).__name__}: {error}"
+        raise SimulationError(
+            f"its initial(u) failed: {what} {_inputs_text(u._asdict())} Expected {expected}.", block=path, t=0.0
+        ) from error
 
 
 def _view(vector: np.ndarray) -> Any:
@@ -289,18 +339,38 @@ def _non_finite(path: str, port: str, values: np.ndarray, hint: str) -> NonFinit
 
 
 def _ticks(duration: float, base: Fraction, name: str) -> int:
-    span = exact_time(duration, block=name) if duration > 0 else None
-    if span is None:
-        raise OptionError(f"found a duration of {duration!r} s; expected a positive one.", block=name, port="duration")
-    if (span / base).denominator != 1:
-        nearest = round(span / base) or 1
+    """Return the number of ticks in a duration; rounding of a few ulps, as in 0.1 + 0.2, is forgiven."""
+    try:
+        span = float(duration)
+    except (TypeError, ValueError):
+        span = math.nan
+    if not 0 < span < math.inf or isinstance(duration, str | bool):
+        raise OptionError(f"found a duration of {duration!r}; expected seconds, positive.", block=name, port="duration")
+    n = round(Fraction(span) / base)
+    if n < 1 or abs(Fraction(span) - n * base) > Fraction(span) * Fraction(1, 10**12):
         raise OptionError(
             f"found a duration of {duration!r} s, no multiple of the {float(base):g} s between ticks; take "
-            f"{float(nearest * base)!r} s.",
+            f"{float(max(n, 1) * base)!r} s.",
             block=name,
             port="duration",
         )
-    return int(span / base)
+    return n
+
+
+def _check_memory(samples: int, width: int, base: Fraction, name: str) -> None:
+    """Refuse a run whose samples can't fit, before it takes the machine down."""
+    needed = samples * (8 * width + 40)
+    try:
+        there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):  # not on Windows
+        there = 16 * 2**30
+    if needed > 0.8 * there:
+        raise OptionError(
+            f"found {samples - 1} ticks of {float(base):g} s; {width} numbers each need {needed / 2**30:.0f} GiB, "
+            f"and this machine has {there / 2**30:.0f}. Is the duration in s? Take a shorter one, or a larger step.",
+            block=name,
+            port="duration",
+        )
 
 
 @contextmanager

@@ -18,7 +18,10 @@ from ._subsystem import FrameInput, SubsystemCall
 
 @dataclass(frozen=True)
 class Frame:
-    """A box: the diagram itself (path "") or a subsystem."""
+    """A box: the diagram itself (path "") or a subsystem.
+
+    ``sample_time`` is its own; None where it has the rate of what surrounds it.
+    """
 
     path: str
     sample_time: Fraction | None
@@ -51,6 +54,22 @@ class Structure:
     wires: dict[tuple[str, str], Wire] = field(default_factory=dict)
     names: dict[str, Wire] = field(default_factory=dict)
 
+    def rate(self, frame: str) -> Fraction | None:
+        """Return the sample time that holds in a frame: its own, or that of the nearest one around it."""
+        while frame and self.frames[frame].sample_time is None:
+            frame = frame.rpartition(".")[0]
+        return self.frames[frame].sample_time
+
+
+@dataclass(frozen=True, eq=False)
+class _Inside:
+    """The inside of a box, as the place where what it returns is used."""
+
+    box: SubsystemCall
+
+
+_ROOT: Any = object()  # the diagram itself, as the place where its roots are used
+
 
 def join(frame: str, name: str) -> str:
     """Return the dotted path of ``name`` in a frame."""
@@ -71,7 +90,7 @@ class Collector:
         for root in roots:
             if not isinstance(root, Wireable):
                 raise WiringError(f"found {root!r}; expected calls of blocks or subsystems, such as plant(force=u).")
-            self._follow(root._signal() if isinstance(root, Signal) else root, None)
+            self._follow(root._signal() if isinstance(root, Signal) else root, _ROOT)
             while self.stack:
                 self._follow(*self.stack.pop())
 
@@ -108,7 +127,7 @@ class Collector:
             if id(item) not in self.seen:
                 self.seen.add(id(item))
                 self.boxes[id(item)] = item
-                self.stack.extend((s, item) for s in reversed(list(item.results.values())))
+                self.stack.extend((s, _Inside(item)) for s in reversed(list(item.results.values())))
                 self.stack.extend((c, None) for c in reversed(item.calls))
                 self.stack.extend((s, item) for s in reversed(list(item.wires.values())))
         else:
@@ -121,7 +140,6 @@ class Collector:
     def structure(self) -> Structure:
         """Return the table."""
         table = Structure(frames={"": Frame("", None, "exact")})
-        home: dict[int, str] = {}  # identity of a call or box → path of the frame that holds it
         inner = {id(c): box for box in self.boxes.values() for c in box.calls}
         path_of_box: dict[int, str] = {}
         taken: dict[str, Any] = {}
@@ -145,21 +163,22 @@ class Collector:
             if id(box) not in path_of_box:
                 outer = inner.get(id(box))
                 frame = "" if outer is None else box_path(outer)
-                home[id(box)] = frame
                 path_of_box[id(box)] = place(frame, box.label, box.label)
             return path_of_box[id(box)]
 
         def frame_of_item(item: Any) -> str | None:
             if item is None:
                 return None
+            if item is _ROOT:
+                return ""
+            if isinstance(item, _Inside):
+                return box_path(item.box)
             outer = inner.get(id(item))
             return "" if outer is None else box_path(outer)
 
         for box in sorted(self.boxes.values(), key=lambda b: (box_path(b).count("."), box_path(b))):
-            path, rate = box_path(box), box.subsystem.sample_time
-            if rate is None:
-                rate = table.frames[home[id(box)]].sample_time
-            table.frames[path] = Frame(path, rate, box.subsystem.method, tuple(box.wires), tuple(box.outputs))
+            path, made = box_path(box), box.subsystem
+            table.frames[path] = Frame(path, made.sample_time, made.method, tuple(box.wires), tuple(box.outputs))
         # frames of all blocks, then the given names, then the numbered ones
         frames: dict[int, str] = {}
         for key, block in self.blocks.items():

@@ -205,6 +205,10 @@ def subsystem(
     >>> controller
     <subsystem controller(error), sample_time=0.001>
     """
+    if function is not None and not callable(function):
+        raise WiringError(
+            f"found {function!r}; expected a function, or keywords: @subsystem(sample_time={function!r})."
+        )
 
     def decorate(f: Callable[..., Any]) -> Subsystem:
         return Subsystem(f, sample_time, method, name)

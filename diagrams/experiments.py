@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path as File
 from types import MappingProxyType
@@ -17,7 +17,6 @@ import numpy as np
 
 from ..blocks import (
     AdmittanceFilter,
-    Ellipse,
     HandForce,
     OptionError,
     Path,
@@ -31,16 +30,25 @@ from ..blocks import (
 from ..blocks._errors import near
 from ..fmus import Fmu, gantry
 from ._diagram import Diagram
+from ._options import DEFAULTS, ELLIPSE, merge
 from ._run import Run
-from .fig3 import IMPEDANCE_PAR, IMPEDANCE_PERP, Channel, Rig, fig3
+from .fig3 import IMPEDANCE_PAR, IMPEDANCE_PERP, Channel, Rig, check_plant, fig3
 
-ELLIPSE = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))
-"""The path of the experiments, equation (16)."""
+__all__ = [
+    "DEFAULTS",
+    "ELLIPSE",
+    "EXPERIMENTS",
+    "Experiment",
+    "compliance",
+    "force_tracking",
+    "hand_guiding",
+    "path_following",
+]
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """An experiment, ready to run.
+    """An experiment, ready to run; it can be pickled.
 
     Attributes
     ----------
@@ -62,6 +70,12 @@ class Experiment:
     duration: float
     options: Mapping[str, Any]
     path: Path
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "options", MappingProxyType(dict(self.options)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Experiment, (self.letter, self.title, self.diagram, self.duration, dict(self.options), self.path)
 
     def simulate(self, **run_options: Any) -> Run:
         """Run it to its end.
@@ -85,33 +99,6 @@ class Experiment:
         return self.diagram.simulate(self.duration, **run_options)
 
 
-DEFAULTS: Mapping[str, Any] = MappingProxyType(
-    {
-        "plant": None,
-        "path": ELLIPSE,
-        "sample_time": 1e-3,
-        "coulomb_scale": 1.0,
-        "viscous_scale": 1.0,
-        "friction_width": 0.01,
-        "tool_mass": 0.0,
-        "encoder": 0.0,
-        "delay": 0,
-        "motor_force_limit": None,
-        "velocity_limit": None,
-        "acceleration_limit": None,
-        "admittance_method": "exact",
-    }
-)
-"""Options of every experiment, with their defaults.
-
-``plant``: path of an FMU, or an `Fmu`, in place of the gantry. ``coulomb_scale``, ``viscous_scale``: factors on the
-plant's friction only. ``friction_width``: w of plant and model, m/s. ``tool_mass``: kg beyond the force sensor.
-``encoder``: quantum in m. ``delay``: 0 or 1 samples. ``motor_force_limit``: N, a number or one for each axis.
-``velocity_limit``, ``acceleration_limit``: of the path reference, m/s and m/s², a number or one for each direction
-(∥, ⊥); experiments with admittance only. ``sample_time``: s. ``admittance_method``: ``exact`` or ``semi_implicit``.
-"""
-
-
 def _gantry() -> File:
     return gantry.build()
 
@@ -121,48 +108,56 @@ def _internal_step(width: float) -> float:
     return float(gantry.INTERNAL_STEP * min(1.0, width / DEFAULTS["friction_width"]))
 
 
-def _options(letter: str, given: Mapping[str, Any], **own: Any) -> dict[str, Any]:
-    """Merge options with their defaults and check them."""
-    known = {**DEFAULTS, **own}
-    for name in given:
-        if name not in known:
-            raise OptionError(f"experiment {letter} has no option {name!r}. {near(name, known)}", port=name)
-    options = {**known, **given}
-
-    def refuse(name: str, expected: str) -> None:
-        raise OptionError(f"found {options[name]!r}; expected {expected}.", block=f"experiment {letter}", port=name)
-
-    for name in ("sample_time", "friction_width"):
-        if not _is_number(options[name]) or options[name] <= 0:
-            refuse(name, "a positive number")
-    for name in ("coulomb_scale", "viscous_scale", "tool_mass", "encoder"):
-        if not _is_number(options[name]) or options[name] < 0:
-            refuse(name, "a number that is not negative")
-    for name in ("motor_force_limit", "velocity_limit", "acceleration_limit"):
-        value = options[name]
-        if value is not None:
-            values = np.atleast_1d(value) if np.ndim(value) or _is_number(value) else np.zeros(1)
-            if values.dtype.kind not in "fi" or values.size not in (1, 2) or not np.all(values > 0):
-                refuse(name, "a positive number, a pair of them, or None")
-    if options["delay"] not in (0, 1) or isinstance(options["delay"], bool):
-        refuse("delay", "0 or 1 samples")
-    if options["admittance_method"] not in ("exact", "semi_implicit"):
-        refuse("admittance_method", "'exact' or 'semi_implicit'")
-    if not isinstance(options["path"], Path):
-        refuse("path", "a path, such as Ellipse(…)")
-    return options
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool) and bool(np.isfinite(value))
-
-
 def _admittance(options: Mapping[str, Any], side: int, **impedance: Any) -> AdmittanceFilter:
     limits: dict[str, Any] = {}
     for name in ("velocity_limit", "acceleration_limit"):
-        if options[name] is not None:
-            limits[name] = float(np.broadcast_to(np.asarray(options[name], dtype=float), (2,))[side])
+        limit = options[name]
+        limits[name] = limit[side] if isinstance(limit, tuple) else limit
     return AdmittanceFilter(**impedance, **limits)
+
+
+def _plant(letter: str, options: Mapping[str, Any], given: Collection[str], position: Any) -> Fmu:
+    """Return the plant at the experiment's start, with the options that are its own.
+
+    A plant of one's own keeps what its ``start`` says, and what nobody has given.
+    """
+    own = options["plant"] is not None
+    plant = options["plant"] if own else _gantry()
+    plant = plant.replace(name="plant") if isinstance(plant, Fmu) else Fmu(plant, name="plant")
+    check_plant(plant)
+    variables = plant.description.variables
+    place = {new: old for old, new in plant.rename.items()}.get("position", "position")
+    start: dict[str, Any] = {}
+    if variables[place].start is not None:
+        start[place] = position
+    elif not plant.start:
+        raise OptionError(
+            f"its {place} is computed and can't be set to ({position[0]:g}, {position[1]:g}) m, where experiment "
+            f"{letter} starts. Give the plant with start values of its own that place it there: "
+            "plant=Fmu(file, start={…}).",
+            block=f"experiment {letter}",
+            port="plant",
+        )
+    for name in ("coulomb_scale", "viscous_scale", "friction_width"):
+        if own and (name not in given or (name not in variables and options[name] == DEFAULTS[name])):
+            continue
+        if name not in variables:
+            raise OptionError(
+                f"the plant has no parameter {name!r}, found {options[name]:g} for it. Leave the option out, or give "
+                "the plant such a parameter.",
+                block=f"experiment {letter}",
+                port=name,
+            )
+        if name in plant.start and float(plant.start[name]) != options[name]:
+            raise OptionError(
+                f"found {options[name]:g}, and {float(plant.start[name]):g} in the plant's start values; give it once.",
+                block=f"experiment {letter}",
+                port=name,
+            )
+        start[name] = options[name]
+    if not own:
+        start["internal_step"] = _internal_step(options["friction_width"])
+    return plant.replace(start={**start, **plant.start})
 
 
 def _build(
@@ -174,22 +169,12 @@ def _build(
     par: Channel,
     perp: Channel,
     environment: Callable[[Any], Any] | None = None,
+    *,
+    given: Collection[str],
 ) -> Experiment:
     """Place the plant at its start, and wire Fig. 3."""
     path = options["path"]
-    plant = options["plant"]
-    if plant is None:
-        plant = Fmu(_gantry(), name="plant")
-    elif not isinstance(plant, Fmu):
-        plant = Fmu(plant, name="plant")
-    position = path.to_plane(*start)
-    values = {"position": position}
-    for name in ("coulomb_scale", "viscous_scale", "friction_width"):
-        if options[name] != DEFAULTS[name] or name in plant.description.variables:
-            values[name] = options[name]
-    if options["plant"] is None:
-        values["internal_step"] = _internal_step(options["friction_width"])
-    plant = plant.replace(name="plant", start={**values, **plant.start} if options["plant"] is not None else values)
+    plant = _plant(letter, options, given, path.to_plane(*start))
     rig = Rig(
         tool_mass=options["tool_mass"],
         encoder=options["encoder"],
@@ -200,7 +185,7 @@ def _build(
     )
     model = gantry.nominal.replace(friction_width=options["friction_width"])
     diagram = fig3(plant, path, par, perp, environment=environment, model=model, rig=rig, name=title.split(":")[0])
-    return Experiment(letter, title, diagram, duration, MappingProxyType(options), path)
+    return Experiment(letter, title, diagram, duration, options, path)
 
 
 def path_following(**options: Any) -> Experiment:
@@ -221,7 +206,7 @@ def path_following(**options: Any) -> Experiment:
     PathDomainError
         If the start is outside the domain of the path's coordinates.
     """
-    o = _options("A", options)
+    o = merge("A", 11.0, options)
     for name in ("velocity_limit", "acceleration_limit"):
         if o[name] is not None:
             raise OptionError(
@@ -229,11 +214,13 @@ def path_following(**options: Any) -> Experiment:
                 block="experiment A",
                 port=name,
             )
-    par = SmoothStep(levels=(0.12, 0.75, 1.60), start_times=(1.0, 5.5), durations=(2.0, 2.0), name="eta_d")
+    par = SmoothStep(levels=(0.12, 0.75, 1.60), start_times=(1.0, 5.5), durations=(2.0, 2.0), unit="m", name="eta_d")
     perp = SmoothStep(
-        levels=(0.0, -0.03, 0.03, 0.0), start_times=(4.0, 8.5, 9.5), durations=(0.5, 0.5, 0.5), name="xi_d"
+        levels=(0.0, -0.03, 0.03, 0.0), start_times=(4.0, 8.5, 9.5), durations=(0.5, 0.5, 0.5), unit="m", name="xi_d"
     )
-    return _build("A", "path_following: experiment A", 11.0, o, (0.10, 0.01), Channel(par), Channel(perp))
+    return _build(
+        "A", "path_following: experiment A", 11.0, o, (0.10, 0.01), Channel(par), Channel(perp), given=options
+    )
 
 
 def compliance(*, smooth_reference: bool = False, **options: Any) -> Experiment:
@@ -254,11 +241,14 @@ def compliance(*, smooth_reference: bool = False, **options: Any) -> Experiment:
     OptionError, PathDomainError
         As in `path_following`.
     """
-    o = _options("B", {**options, "smooth_reference": smooth_reference}, smooth_reference=False)
-    reference: Any = Reference(0.0, name="eta_d")
+    o = merge("B", 15.0, {**options, "smooth_reference": smooth_reference}, smooth_reference=False)
+    reference: Any = Reference(0.0, unit="m", name="eta_d")
     offset: Any = Step(times=1.0, values=0.3, unit="m", name="set_point")
     if smooth_reference:
-        reference, offset = SmoothStep(levels=(0.0, 0.3), start_times=(1.0,), durations=(1.0,), name="eta_d"), None
+        reference, offset = (
+            SmoothStep(levels=(0.0, 0.3), start_times=(1.0,), durations=(1.0,), unit="m", name="eta_d"),
+            None,
+        )
     par = Channel(
         reference,
         _admittance(o, 0, **IMPEDANCE_PAR),
@@ -266,11 +256,11 @@ def compliance(*, smooth_reference: bool = False, **options: Any) -> Experiment:
         offset,
     )
     perp = Channel(
-        Reference(0.0, name="xi_d"),
+        Reference(0.0, unit="m", name="xi_d"),
         _admittance(o, 1, **IMPEDANCE_PERP),
         Step(times=(4.0, 11.0), values=(5.0, -5.0), unit="N", name="desired_force_perp"),
     )
-    return _build("B", "compliance: experiment B", 15.0, o, (0.0, 0.0), par, perp)
+    return _build("B", "compliance: experiment B", 15.0, o, (0.0, 0.0), par, perp, given=options)
 
 
 def hand_guiding(**options: Any) -> Experiment:
@@ -286,28 +276,29 @@ def hand_guiding(**options: Any) -> Experiment:
     OptionError, PathDomainError
         As in `path_following`.
     """
-    o = _options("C", options)
+    o = merge("C", 12.0, options)
     f_par = (
-        Pulse(start_time=0.5, end_time=1.5, amplitude=1.5)
-        + Pulse(start_time=2.5, end_time=3.5, amplitude=-1.5)
-        + Pulse(start_time=8.5, end_time=9.7, amplitude=1.5)
+        Pulse(start_time=0.5, end_time=1.5, amplitude=1.5, unit="N")
+        + Pulse(start_time=2.5, end_time=3.5, amplitude=-1.5, unit="N")
+        + Pulse(start_time=8.5, end_time=9.7, amplitude=1.5, unit="N")
     )
     f_perp = (
-        Pulse(start_time=0.5, end_time=4.5, amplitude=0.3) * Sine(frequency=1.0)
-        + Pulse(start_time=5.0, end_time=6.0, amplitude=6.0)
-        + Pulse(start_time=6.5, end_time=7.5, amplitude=-6.0)
-        + Pulse(start_time=8.5, end_time=9.7, amplitude=-6.0)
+        Pulse(start_time=0.5, end_time=4.5, amplitude=0.3, unit="N") * Sine(frequency=1.0, unit="1")
+        + Pulse(start_time=5.0, end_time=6.0, amplitude=6.0, unit="N")
+        + Pulse(start_time=6.5, end_time=7.5, amplitude=-6.0, unit="N")
+        + Pulse(start_time=8.5, end_time=9.7, amplitude=-6.0, unit="N")
     )
     par = Channel(
-        Reference(0.2, name="eta_d"), _admittance(o, 0, mass=0.5, stiffness=0.0, damping=_damping(IMPEDANCE_PAR))
+        Reference(0.2, unit="m", name="eta_d"),
+        _admittance(o, 0, mass=0.5, stiffness=0.0, damping=_damping(IMPEDANCE_PAR)),
     )
-    perp = Channel(Reference(0.0, name="xi_d"), _admittance(o, 1, **IMPEDANCE_PERP))
+    perp = Channel(Reference(0.0, unit="m", name="xi_d"), _admittance(o, 1, **IMPEDANCE_PERP))
     path = o["path"]
 
     def hand(position: Any) -> Any:
         return HandForce(path, name="hand")(position, f_par=f_par, f_perp=f_perp)
 
-    return _build("C", "hand_guiding: experiment C", 12.0, o, (0.2, 0.0), par, perp, hand)
+    return _build("C", "hand_guiding: experiment C", 12.0, o, (0.2, 0.0), par, perp, hand, given=options)
 
 
 def force_tracking(*, cubic: bool = False, **options: Any) -> Experiment:
@@ -325,13 +316,13 @@ def force_tracking(*, cubic: bool = False, **options: Any) -> Experiment:
     OptionError, PathDomainError
         As in `path_following`.
     """
-    o = _options("D", {**options, "cubic": cubic}, cubic=False)
+    o = merge("D", 9.0, {**options, "cubic": cubic}, cubic=False)
     par = Channel(
-        SmoothStep(levels=(0.2, 1.0), start_times=(3.0,), durations=(3.0,), name="eta_d"),
+        SmoothStep(levels=(0.2, 1.0), start_times=(3.0,), durations=(3.0,), unit="m", name="eta_d"),
         _admittance(o, 0, **IMPEDANCE_PAR),
     )
     perp = Channel(
-        Reference(0.0, name="xi_d"),
+        Reference(0.0, unit="m", name="xi_d"),
         _admittance(o, 1, mass=2.0, stiffness=0.0, damping=_damping(IMPEDANCE_PERP)),
         Step(times=0.5, values=-5.0, unit="N", name="desired_force_perp"),
     )
@@ -341,7 +332,7 @@ def force_tracking(*, cubic: bool = False, **options: Any) -> Experiment:
     def spring(position: Any) -> Any:
         return PathSpring(path, **law, name="spring")(position)
 
-    return _build("D", "force_tracking: experiment D", 9.0, o, (0.2, 0.0), par, perp, spring)
+    return _build("D", "force_tracking: experiment D", 9.0, o, (0.2, 0.0), par, perp, spring, given=options)
 
 
 def _damping(impedance: Mapping[str, float]) -> float:

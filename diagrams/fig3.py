@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
+
+import numpy as np
 
 from ..blocks import (
     AdmittanceFilter,
@@ -21,6 +24,7 @@ from ..blocks import (
     TransverseTransform,
     UnitDelay,
 )
+from ..blocks._errors import ShapeError, UnknownNameError
 from ..fmus import Fmu, gantry
 from ._diagram import Diagram
 from ._subsystem import subsystem
@@ -30,6 +34,13 @@ POLES_PAR, POLES_PERP = (-20.0,) * 3, (-40.0,) * 3
 IMPEDANCE_PAR = {"mass": 0.5, "damping_ratio": 0.6, "stiffness": 10.0}
 IMPEDANCE_PERP = {"mass": 2.0, "damping_ratio": 0.3, "stiffness": 200.0}
 """Table III, with d = 2 ζ √(m k) (E7)."""
+
+INPUTS: Mapping[str, str] = MappingProxyType({"motor_force": "N", "external_force": "N"})
+"""Inputs that a plant must have, each of two entries (axes y and z), with their units."""
+OUTPUTS: Mapping[str, str] = MappingProxyType({"position": "m", "velocity": "m/s", "acceleration": "m/s2"})
+"""Outputs that a plant must have."""
+OPTIONAL: Mapping[str, str] = MappingProxyType({"contact_force": "N"})
+"""Outputs that a plant may have."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +56,7 @@ class Rig:
     delay : int
         Samples of computational delay, 0 or 1.
     motor_force_limit : float or pair, optional
-        Largest motor force of each axis in N.
+        Largest motor force of each axis in N; None in a pair is no limit.
     sample_time : float
         Sample time of the controller in s.
     admittance_method : str
@@ -104,7 +115,7 @@ def fig3(
     ----------
     plant : Fmu
         Plant with the ports of the gantry: in ``motor_force``, ``external_force``; out ``position``, ``velocity``,
-        ``acceleration`` and, where it has one, ``contact_force``.
+        ``acceleration`` and, where it has one, ``contact_force``. Others get these names by ``Fmu(…, rename={…})``.
     path : Path
         The path to follow.
     par, perp : Channel
@@ -122,7 +133,13 @@ def fig3(
     Diagram
         With the wires ``eta``, ``xi``, ``theta``, ``q``, ``position``, ``velocity``, ``force``, ``motor_force``,
         ``v_par``, ``v_perp``, ``eta_p`` and ``xi_p``.
+
+    Raises
+    ------
+    UnknownNameError, ShapeError
+        If the plant has other ports.
     """
+    check_plant(plant)
     position, velocity = plant.position.named("position"), plant.velocity.named("velocity")
     if environment is None:
         external_force = Constant(value=(0.0, 0.0), unit="N", name="free_space")
@@ -144,7 +161,7 @@ def fig3(
         f_par, f_perp = ForceProjection(path)(theta, force)
 
         linearization = FeedbackLinearization(path, model)
-        saturation = None if rig.motor_force_limit is None else Saturation(limit=rig.motor_force_limit)
+        saturation = None if rig.motor_force_limit is None else Saturation(limit=_limits(rig.motor_force_limit))
         excess = {} if saturation is None else {"excess": saturation.excess}
 
         eta_p = _path_reference(par, "par", f_par, eta_d, extras).named("eta_p")
@@ -164,6 +181,45 @@ def fig3(
     extras = {f"{k}_{side}": v for side, channel in (("par", par), ("perp", perp)) for k, v in channel.extras().items()}
     motor_force = controller(*sensed, par.reference, perp.reference, **extras)
     return Diagram(name, plant(motor_force=motor_force.named("motor_force"), external_force=external_force))
+
+
+def check_plant(plant: Fmu) -> None:
+    """Refuse a plant without the ports that Fig. 3 wires, and say which they are.
+
+    Raises
+    ------
+    UnknownNameError
+        If a port is missing.
+    ShapeError
+        If one has other than two entries.
+    """
+    inputs, outputs = plant.inputs, plant.outputs
+    missing = [f"input {n!r}" for n in INPUTS if n not in inputs] + [
+        f"output {n!r}" for n in OUTPUTS if n not in outputs
+    ]
+    shapes = {n: p.shape for n, p in inputs.items() if n in INPUTS}
+    shapes |= {n: p.shape for n, p in outputs.items() if n in OUTPUTS or n in OPTIONAL}
+    wrong = [f"{n!r} of shape {shape}" for n, shape in shapes.items() if shape != (2,)]
+    if not missing and not wrong:
+        return
+
+    def listed(names: Mapping[str, str]) -> str:
+        return ", ".join(f"{name} [2] in {unit}" for name, unit in names.items())
+
+    found = f"it has no {', no '.join(missing)}" if missing else f"it has {', '.join(wrong)}"
+    raise (UnknownNameError if missing else ShapeError)(
+        f"{found}. Fig. 3 needs a plant with the inputs {listed(INPUTS)}, and the outputs {listed(OUTPUTS)}; "
+        f"{listed(OPTIONAL)} is optional (axes y and z). This one has the inputs {', '.join(inputs) or '(none)'}, "
+        f"and the outputs {', '.join(outputs) or '(none)'}. Where only a name differs, give it "
+        "the expected one, in Python: Fmu(file, rename={'name in the FMU': 'position'}).",
+        block=plant.label,
+    )
+
+
+def _limits(limit: Any) -> Any:
+    """Return limits as a saturation takes them: where there is none, the largest number."""
+    entries = [np.finfo(float).max if v is None or v == np.inf else v for v in np.ravel(np.array(limit, dtype=object))]
+    return entries if np.ndim(limit) else entries[0]
 
 
 def _path_reference(channel: Channel, side: str, force: Any, reference: Any, extras: dict[str, Any]) -> Any:

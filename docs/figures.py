@@ -2,6 +2,7 @@
 
 import re
 import sys
+from contextlib import chdir
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -18,10 +19,9 @@ def main(folder: Path) -> None:
     from loopwright.diagrams import experiments
     from loopwright.diagrams._figures import plot_path
 
-    lines = first_example().strip().splitlines()
-    scope: dict = {}
-    exec("\n".join([*lines[:-1], f"figure = {lines[-1]}"]), scope)
-    scope["figure"].savefig(folder / "loop.png", dpi=120)
+    folder.mkdir(parents=True, exist_ok=True)
+    with chdir(folder):
+        exec(first_example(), {})  # it writes loop.png
     experiment = experiments.hand_guiding()
     plot_path(experiment, experiment.simulate(progress=False)).savefig(folder / "C_path.png", dpi=120)
 

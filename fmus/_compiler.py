@@ -12,17 +12,20 @@ import os
 import platform as _platform
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import platformdirs
 
-from ..blocks._errors import CompilerError, near
+from ..blocks._errors import CompilerError, FmuError, near
 
 #: FMI 3.0 platform tuples (2.5.1.4) that can be built for, and zig's name of each with the oldest system:
 #: glibc 2.17, macOS 11. On Windows the C library is the system's own since version 10.
@@ -37,6 +40,9 @@ SUFFIXES = {"linux": ".so", "windows": ".dll", "darwin": ".dylib"}
 
 # -ffp-contract=off: no fused multiply-add, so that every platform and every compiler rounds alike.
 FLAGS = ("-O2", "-std=c11", "-shared", "-fvisibility=hidden", "-ffp-contract=off", "-g0", "-s")
+TIMEOUT = 600.0
+"""Seconds after which a compilation is given up; the first one on a machine takes some, a slow machine a minute."""
+
 _INSTALL = 'Install one: pip install "loopwright[build]" (it brings ziglang), or set LOOPWRIGHT_CC to a command line.'
 
 
@@ -73,6 +79,27 @@ def cache_folder() -> Path:
     return Path(given).expanduser() if given else Path(platformdirs.user_cache_dir("loopwright", appauthor=False))
 
 
+def check_cache() -> Path:
+    """Return the cache folder, after making it and writing to it.
+
+    Raises
+    ------
+    FmuError
+        If it can't be written.
+    """
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise FmuError(
+            f"can't write the cache folder {str(folder)!r}: {error}. Set LOOPWRIGHT_CACHE to a folder that can be "
+            "written."
+        ) from error
+    return folder
+
+
 def find_compiler() -> Compiler:
     """Find the compiler to use: LOOPWRIGHT_CC, the ziglang package, else the system's cc, gcc or clang.
 
@@ -100,7 +127,7 @@ def find_compiler() -> Compiler:
 def _version(command: tuple[str, ...]) -> str:
     try:
         done = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=60, check=False)
-    except OSError as error:
+    except (OSError, subprocess.TimeoutExpired) as error:
         raise CompilerError(f"the C compiler {shlex.join(command)} can't be run: {error}. {_INSTALL}") from error
     return done.stdout + done.stderr
 
@@ -152,8 +179,11 @@ def compile_shared(
     Raises
     ------
     CompilerError
-        If there is no compiler, or it fails: then its own message is quoted.
+        If there is no compiler, it does not come to an end, or it fails: then its own message is quoted.
+    FmuError
+        If the cache can't be written.
     """
+    check_cache()  # zig tries for ever where it can't
     compiler = compiler or find_compiler()
     platform = platform or native_platform()
     check_platform(compiler, platform)
@@ -179,17 +209,52 @@ def _run(command: Sequence[str], folder: Path, platform: str) -> None:
     zig = cache_folder() / "zig"
     environment.setdefault("ZIG_GLOBAL_CACHE_DIR", str(zig))
     environment.setdefault("ZIG_LOCAL_CACHE_DIR", str(zig))
-    try:
-        done = subprocess.run(
-            command, cwd=folder, env=environment, capture_output=True, text=True, errors="replace", check=False
-        )
-    except OSError as error:
-        raise CompilerError(f"the C compiler {command[0]} can't be run: {error}. {_INSTALL}") from error
-    if done.returncode:
-        lines = (done.stderr.strip() or done.stdout.strip() or "(nothing)").splitlines()
+    code, output, errors = _wait(command, folder, environment)
+    if code:
+        lines = (errors.strip() or output.strip() or "(nothing)").splitlines()
         said = "\n".join(lines if len(lines) <= 40 else [*lines[:20], "...", *lines[-20:]])  # the first error counts
         raise CompilerError(
-            f"the C compiler failed for {platform} with exit code {done.returncode}. Its message:\n{said}\n"
+            f"the C compiler failed for {platform} with exit code {code}. Its message:\n{said}\n"
             f"The command was: {shlex.join(command)}\n"
             "Check the model's equations, or try another compiler with LOOPWRIGHT_CC."
         )
+
+
+def _wait(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, str, str]:
+    """Run a compiler to its end; it and what it started end with this call, whatever happens."""
+    group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
+    try:
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            **group,
+        )
+    except OSError as error:
+        raise CompilerError(f"the C compiler {command[0]} can't be run: {error}. {_INSTALL}") from error
+    with process:
+        try:
+            output, errors = process.communicate(timeout=TIMEOUT)
+        except BaseException as error:
+            _kill(process)
+            if isinstance(error, subprocess.TimeoutExpired):
+                raise CompilerError(
+                    f"the C compiler did not end within {TIMEOUT:g} s and was stopped. The command was: "
+                    f"{shlex.join(command)}\nRun it by hand, or try another compiler with LOOPWRIGHT_CC."
+                ) from error
+            raise
+    return process.returncode, output, errors
+
+
+def _kill(process: subprocess.Popen[str]) -> None:
+    """End a process and, where there are process groups, all that it started."""
+    with suppress(OSError):
+        if sys.platform != "win32":
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..blocks._block import Block
 from ..blocks._errors import FmuError, FmuFileError, FmuRuntimeError, ParameterError, UnknownNameError, near
+from ..blocks._frozen import FrozenMapping
 from ..blocks._ports import Input, Output
 from ..blocks._signals import Signal, UnknownAttributeError
 from ..blocks._values import parameter
@@ -31,7 +32,9 @@ class Fmu(Block):
     (``plant["axis.phi"]``) or get another name by ``rename``. Between communication points its inputs are held and its
     outputs are those at the end of the last step. Inputs must be wired, or be given a value in ``start``.
 
-    The file is checked when the block is made, and loaded only while a run lasts.
+    The file is checked when the block is made, and loaded only while a run lasts. The SHA-256 digest of what it held
+    then belongs to the block: two blocks are equal only if the files' contents were, and a file that has changed since
+    is an error.
     """
 
     opaque = True
@@ -57,7 +60,9 @@ class Fmu(Block):
                 raise UnknownNameError(
                     f"it has no port {old!r} to rename. {near(old, ports)}", block=who, port="rename"
                 )
-        object.__setattr__(self, "start", {k: self._start_value(description, k, v) for k, v in self.start.items()})
+        start = {k: self._start_value(description, k, v) for k, v in self.start.items()}
+        object.__setattr__(self, "start", FrozenMapping(start))
+        object.__setattr__(self, "_content", description.digest)
         new = [self.rename.get(name, name) for name in ports]
         if len(set(new)) < len(new):
             raise ParameterError("two ports get the same name; rename them apart.", block=who, port="rename")
@@ -94,8 +99,27 @@ class Fmu(Block):
 
     @property
     def description(self) -> FmuDescription:
-        """What the FMU's description says."""
-        return read_description(self.file)
+        """What the FMU's description says.
+
+        Raises
+        ------
+        FmuFileError
+            If the file is gone, or is no longer the one that the block was made with.
+        """
+        try:
+            found = read_description(self.file)
+        except FmuError as error:
+            error.at(block=self.label)
+            raise
+        if found.digest != self._content:
+            raise FmuFileError(
+                f"the file {str(self.file)!r} has changed since this block was made: found SHA-256 "
+                f"{found.digest[:12]}…, expected {str(self._content)[:12]}…. Make the block again from the new file, "
+                "with Fmu(…) or .replace(), and build the diagram with it.",
+                block=self.label,
+                port="file",
+            )
+        return found
 
     @property
     def label(self) -> str:
@@ -146,7 +170,7 @@ class Fmu(Block):
         stop_time : float
             End of the run in s.
         """
-        instance = FmuInstance(self, wired)
+        instance = FmuInstance(self, wired)  # it reads the description, and so checks the file
         try:
             instance.initialize(stop_time)
             yield instance
@@ -166,6 +190,8 @@ class FmuInstance:
         back = {new: old for old, new in block.rename.items()}
         self._inputs = [description.variables[back.get(name, name)] for name in wired]
         self._outputs = list(description.of("output").values())
+        self._open = self._stepping = False
+        folder = Path.cwd()
         try:
             self._fmu = FMU3Slave(
                 guid=description.token,
@@ -180,6 +206,8 @@ class FmuInstance:
                 f"'fmpy validate {description.file}'.",
                 block=block.label,
             ) from error
+        finally:
+            os.chdir(folder)  # FMPy stays in the binary's folder when loading it fails
         self._open = True
 
     def _log(self, environment: Any, status: int, category: bytes | None, message: bytes | None) -> None:
@@ -191,20 +219,29 @@ class FmuInstance:
         return f". The FMU says: {' / '.join(self.messages[-5:])}." if self.messages else "."
 
     def initialize(self, stop_time: float) -> None:
-        """Set start values and initialize at t = 0."""
+        """Set start values and enter Initialization Mode at t = 0."""
         variables = self.block.description.variables
         try:
             for name, value in self.block.start.items():
                 self._fmu.setFloat64([variables[name].reference], [float(v) for v in np.ravel(value)])
             self._fmu.enterInitializationMode(startTime=0.0, stopTime=stop_time)
+        except Exception as error:
+            raise self._initialization_error(error) from error
+
+    def _initialization_error(self, error: Exception) -> FmuRuntimeError:
+        self.failed = True
+        return FmuRuntimeError(
+            f"initialization failed ({error}){self._quoted()} Check its start values.", block=self.block.label, t=0.0
+        )
+
+    def begin(self) -> None:
+        """Leave Initialization Mode and read the outputs with which the run begins."""
+        try:
             self._fmu.exitInitializationMode()
         except Exception as error:
-            self.failed = True
-            raise FmuRuntimeError(
-                f"initialization failed ({error}){self._quoted()} Check its start values.",
-                block=self.block.label,
-                t=0.0,
-            ) from error
+            raise self._initialization_error(error) from error
+        self._stepping = True
+        self._read(0.0)
 
     def bind(self, inputs: np.ndarray, outputs: np.ndarray) -> None:
         """Take the vectors that hold the inputs to set and the outputs to get, and get the outputs once."""
@@ -238,9 +275,17 @@ class FmuInstance:
             if has_outputs and get_values(*get_arguments) > 1:
                 raise self._error("reading the outputs", t)
 
-        self.step = step
-        if has_outputs and get_values(*get_arguments) > 1:
-            raise self._error("reading the outputs", 0.0)
+        def read(t: float) -> None:
+            if has_outputs and get_values(*get_arguments) > 1:
+                raise self._error("reading the outputs", t)
+
+        def exchange() -> None:
+            if has_inputs and set_values(*set_arguments) > 1:
+                raise self._error("setting the inputs", 0.0)
+            read(0.0)
+
+        self.step, self.exchange, self._read = step, exchange, read
+        read(0.0)
 
     def _error(self, what: str, t: float) -> FmuRuntimeError:
         self.failed = True
@@ -260,7 +305,7 @@ class FmuInstance:
             return
         self._open = False
         with suppress(Exception):
-            if not self.failed:
+            if self._stepping and not self.failed:
                 self._fmu.terminate()
         with suppress(Exception):
             self._fmu.freeInstance()

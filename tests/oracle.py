@@ -276,13 +276,23 @@ class Admittance:
         self.m, self.d, self.k, self.T = m, d, k, options.sample_time
         self.v_max, self.a_max, self.exact = v_max, a_max, options.admittance_method == "exact"
         self.e = self.e1 = 0.0
+        self.cut: Pair | None = None  # position and velocity of the path reference after a tick in which a limit acted
         generator = np.array([[0.0, 1.0, 0.0], [-k / m, -d / m, 1 / m], [0.0, 0.0, 0.0]])
         self.phi = expm(generator * self.T)[:2].tolist()  # (e, e')_{k+1} = phi (e, e', F)_k, force held
 
     def step(self, reference: Motion, force: float) -> Motion:
-        """The path reference at t_k; the state advances to t_{k+1}."""
+        """The path reference at t_k; the state advances to t_{k+1}.
+
+        While no limit acts, e advances exactly. After a tick in which one acted, the path reference itself is known:
+        position and velocity as they advanced under the cut acceleration, whatever the reference did meanwhile.
+        """
         r, r1, r2 = reference
-        e, e1, T = self.e, self.e1, self.T
+        T = self.T
+        if self.cut is not None:
+            self.e, self.e1 = self.cut[0] - r, self.cut[1] - r1
+        e, e1 = self.e, self.e1
+        if abs(r1 + e1) > self.v_max:  # foreseen with r' + r'' T, which a jerk misses by T^2 times it
+            e1 = math.copysign(self.v_max, r1 + e1) - r1
         e2 = (force - self.d * e1 - self.k * e) / self.m
         position, v, a = r + e, r1 + e1, r2 + e2
         if self.exact:
@@ -290,11 +300,11 @@ class Admittance:
         else:
             self.e1 = e1 + T * e2
             self.e = e + T * self.e1
-        if abs(a) > self.a_max or abs(r1 + self.e1) > self.v_max:  # r' of t_k: the channel knows no later one
+        self.cut = None
+        if abs(a) > self.a_max or abs(r1 + r2 * T + self.e1) > self.v_max:
             a = min(max(a, (-self.v_max - v) / T), (self.v_max - v) / T)
             a = min(max(a, -self.a_max), self.a_max)
-            self.e = e + e1 * T + (a - r2) * T * T / 2
-            self.e1 = e1 + (a - r2) * T
+            self.cut = (position + v * T + a * T * T / 2, v + a * T)
         return position, v, a
 
 

@@ -13,8 +13,9 @@ import pytest
 from loopwright.blocks import OptionError, PathDomainError
 from loopwright.diagrams import _cli, experiments
 from loopwright.diagrams._cli import main
-from loopwright.diagrams._figures import STYLE, plot_experiment, plot_path, save
+from loopwright.diagrams._figures import plot_experiment, plot_path
 from loopwright.diagrams._keynumbers import DEFINITIONS, key_numbers
+from loopwright.diagrams._plots import STYLE, save
 
 HEADER = (
     "t,eta[1],eta[2],xi[1],xi[2],position[1],position[2],velocity[1],velocity[2],force[1],force[2],"
@@ -57,7 +58,8 @@ def test_key_numbers_are_strict_json(done):
     folder, experiment, run = done
     content = json.loads((folder / "A.json").read_text(), parse_constant=finite)
     expected = key_numbers(experiment, run)
-    assert list(content) == list(DEFINITIONS)
+    assert list(content) == [*DEFINITIONS, "never"]
+    assert content["never"] == []
     for name in set(DEFINITIONS) - {"real_time_factor"}:
         assert content[name] == expected[name], name
     assert content["overshoot_par"] == pytest.approx(0.248935, abs=2e-3)
@@ -101,8 +103,12 @@ def test_table_fits_eighty_columns(tmp_path, capsys):
     assert main(["run", "D", "B", "--out", str(tmp_path), "--option", "cubic=true", "--option", "delay=1"]) == 0
     out, err = capsys.readouterr()
     lines = out.splitlines()
-    assert max(map(len, lines)) <= 80
-    head = next(line for line in lines if "key number" in line)
+    first = next(i for i, line in enumerate(lines) if "key number" in line)
+    last = max(i for i, line in enumerate(lines) if line.split()[:1] and line.split()[0] in DEFINITIONS)
+    table = lines[first : last + 1]  # what stands around it holds the folder's path, of any length
+    assert len(table) >= 1 + len(DEFINITIONS) / 2
+    assert max(map(len, table)) <= 80
+    head = lines[first]
     assert head.split() == ["key", "number", "unit", "D", "B"]
     row = next(line for line in lines if "offset_perp" in line)
     assert row.split() == ["offset_perp", "mm", "-", "-25"]
@@ -124,7 +130,9 @@ def test_what_never_settles_is_null(tmp_path, capsys):
     assert main(["run", "A", "--out", str(tmp_path), "--option", "motor_force_limit=5"]) == 0
     row = next(line for line in capsys.readouterr().out.splitlines() if "settling_par" in line)
     assert row.split() == ["settling_par", "s", "never"]
-    assert json.loads((tmp_path / "A.json").read_text(), parse_constant=finite)["settling_par"] is None
+    content = json.loads((tmp_path / "A.json").read_text(), parse_constant=finite)
+    assert content["settling_par"] is content["offset_par"] is None
+    assert content["never"] == ["settling_par", "settling_perp"]  # the offset is not there, but is not awaited either
 
 
 @pytest.mark.parametrize(
@@ -173,18 +181,21 @@ def test_a_failed_run_keeps_its_files_and_the_others_run(tmp_path, capsys):
     assert next(line for line in out.splitlines() if "key number" in line).split()[3:] == ["B", "failed", "A"]
 
 
-def test_a_run_that_fails_before_its_first_sample(tmp_path, capsys, monkeypatch):
-    error = PathDomainError("nothing was recorded", block="controller", t=0.0)
-
+@pytest.mark.parametrize("older", [True, False])
+def test_a_run_that_fails_before_its_first_sample_leaves_an_older_ones_files(tmp_path, capsys, monkeypatch, older):
     def fail(self, **options):
-        raise error
+        raise PathDomainError("nothing was recorded", block="controller", t=0.0)
 
     monkeypatch.setattr(experiments.Experiment, "simulate", fail)
-    (tmp_path / "A.csv").write_text("of an older run")
+    if older:
+        (tmp_path / "A.csv").write_text("of an older run")
     assert main(["run", "A", "--out", str(tmp_path)]) == 1
-    assert "experiment A failed: controller, t = 0 s: nothing was recorded" in capsys.readouterr().err
-    assert files(tmp_path) == ["A.json"]
-    assert json.loads((tmp_path / "A.json").read_text())["error"] == str(error)
+    out, err = capsys.readouterr()
+    assert "experiment A failed: controller, t = 0 s: nothing was recorded" in err
+    kept = f"; the files of an earlier run stay in {tmp_path}" if older else ""
+    assert f"A: nothing was recorded, so nothing is written{kept}.\n" in err
+    assert files(tmp_path) == (["A.csv"] if older else [])
+    assert not out
 
 
 @pytest.mark.parametrize("ticks", [0, 1])
@@ -236,7 +247,10 @@ def test_interrupted(tmp_path, capsys, monkeypatch):
             "experiment A.encoder: found 'nan'; expected a number that is not negative.",
         ),
         (["run", "A", "C", "--option", "cubic=true"], "--option cubic: A and C can't take it; an option of D only."),
-        (["run", "A", "--option", "velocity_limit=1"], "velocity_limit: A can't take it; an option of B, C, D only."),
+        (
+            ["run", "A", "--option", "velocity_limit=1"],
+            "velocity_limit: A can't take it; an option of B, C and D only.",
+        ),
         (
             ["run", "A", "--option", "delay=1", "--option", "delay=0"],
             "--option delay: it is given twice; give it once.",

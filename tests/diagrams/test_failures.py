@@ -252,16 +252,6 @@ def test_an_fmu_that_fails_in_a_step_is_named_with_its_own_log_and_keeps_the_run
     assert error.value.run["step.y"][-1] == 1e300
 
 
-def test_the_plant_is_freed_after_a_failure_and_runs_again():
-    experiment = unstable()
-    lengths = set()
-    for _ in range(5):
-        with pytest.raises(PathDomainError) as error:
-            experiment.simulate(progress=False)
-        lengths.add(len(error.value.run.t))
-    assert len(lengths) == 1
-
-
 # --- options ----------------------------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,162 @@
+"""Algebraic blocks, against NumPy on the same numbers."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Block, Gain, Input, Output, ParameterError, Product, Saturation, Sum
+from loopwright.blocks._tracing import trace
+from loopwright.diagrams import Diagram
+
+RNG = np.random.default_rng(7)
+
+
+def results(block, *inputs):
+    """All outputs of a block for inputs by position."""
+    given = {name: np.asarray(value, dtype=float) for name, value in zip(block.inputs, inputs, strict=True)}
+    made = trace(block, {name: value.shape for name, value in given.items()}, sampled=False)
+    columns = [value.ravel() for value in given.values()]
+    raw = made.function.call([0.0, np.zeros(0), *columns, made.pack(block, np.nan)])
+    return [np.array(r).reshape(shape) for r, shape in zip(raw, made.outputs.values(), strict=False)]
+
+
+def result(block, *inputs):
+    return results(block, *inputs)[0]
+
+
+# --- sums -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("signs", ["+", "-", "++", "+-", "-+", "--", "-+-", "+--+-"])
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3)], ids=str)
+def test_a_sum_adds_with_the_sign_of_each_input(signs, shape):
+    values = RNG.standard_normal((len(signs), *shape))
+    weights = np.array([1.0 if sign == "+" else -1.0 for sign in signs])
+    got = result(Sum(signs=signs), *values)
+    assert got.shape == shape
+    np.testing.assert_allclose(got, np.tensordot(weights, values, axes=1), rtol=0, atol=4e-15)
+
+
+def test_a_sum_adds_two_unless_told():
+    assert list(Sum().inputs) == ["u1", "u2"]
+    assert result(Sum(), 2.0, 5.0) == 7.0
+
+
+@pytest.mark.parametrize("signs", ["", "+*", "+ -", "1"])
+def test_signs_that_are_none_are_refused(signs):
+    with pytest.raises(ParameterError, match=r"sum\.signs: found .*; expected a \+ or - for each input, such as '\+-'"):
+        Sum(signs=signs)
+
+
+# --- gains ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 3)], ids=str)
+def test_a_number_scales_every_element(shape):
+    u = RNG.standard_normal(shape)
+    np.testing.assert_array_equal(result(Gain(gain=-2.5), u), -2.5 * u)
+
+
+def test_an_array_scales_element_by_element():
+    assert result(Gain(gain=(2.0, -3.0, 0.5)), (1.0, 10.0, 100.0)).tolist() == [2.0, -30.0, 50.0]
+    assert result(Gain(gain=(2.0, -3.0, 0.5)), 4.0).tolist() == [8.0, -12.0, 2.0]
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(2, 2), (3, 2), (2, 3), (1, 3), (3, 1)])
+def test_a_matrix_multiplies_a_vector_from_the_left(rows, columns):
+    K, u = RNG.standard_normal((rows, columns)), RNG.standard_normal(columns)
+    got = result(Gain(gain=K), u)
+    assert got.shape == (rows,)
+    want = [sum(K[i, j] * u[j] for j in range(columns)) for i in range(rows)]
+    np.testing.assert_allclose(got, want, rtol=0, atol=2e-15)
+
+
+def test_a_matrix_with_zeros_keeps_its_places():
+    # exact zeros are left out of the trace: what is left must stay where it was
+    K = np.array([[0.0, 2.0, 0.0], [3.0, 0.0, 5.0]])
+    assert result(Gain(gain=K), (1.0, 10.0, 100.0)).tolist() == [20.0, 503.0]
+
+
+def test_a_matrix_multiplies_a_matrix():
+    K, U = RNG.standard_normal((2, 3)), RNG.standard_normal((3, 4))
+    want = [[sum(K[i, k] * U[k, j] for k in range(3)) for j in range(4)] for i in range(2)]
+    np.testing.assert_allclose(result(Gain(gain=K), U), want, rtol=0, atol=4e-15)
+
+
+# --- products ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(), (3,), (2, 2)], ids=str)
+def test_a_product_multiplies_element_by_element(shape):
+    a, b = RNG.standard_normal((2, *shape))
+    want = [x * y for x, y in zip(a.ravel(), b.ravel(), strict=True)]
+    np.testing.assert_array_equal(result(Product(), a, b).ravel(), want)
+
+
+def test_a_scalar_factor_scales_a_vector():
+    assert result(Product(), -2.0, (1.0, 3.0)).tolist() == [-2.0, -6.0]
+
+
+# --- saturation -------------------------------------------------------------------------------------------------------
+
+
+def test_a_saturation_limits_both_sides_and_gives_what_it_cut_off():
+    u = np.array([-7.0, -2.5, -2.0, -0.0, 1.0, 2.0, 2.25])
+    y, excess = results(Saturation(limit=2.0), u)
+    assert y.tolist() == [-2.0, -2.0, -2.0, 0.0, 1.0, 2.0, 2.0]
+    assert excess.tolist() == [-5.0, -0.5, 0.0, 0.0, 0.0, 0.0, 0.25]
+
+
+def test_each_element_can_have_a_limit_of_its_own():
+    y, excess = results(Saturation(limit=(1.0, 10.0, 0.5)), (-3.0, -3.0, 3.0))
+    assert y.tolist() == [-1.0, -3.0, 0.5]
+    assert excess.tolist() == [-2.0, 0.0, 2.5]
+
+
+def test_nothing_is_cut_off_of_what_is_within_the_limits():
+    u = RNG.uniform(-1.0, 1.0, 50)
+    y, excess = results(Saturation(limit=1.0), u)
+    assert y.tobytes() == u.tobytes()
+    assert not excess.any()
+
+
+def test_what_is_no_number_passes_through():
+    y, excess = results(Saturation(limit=1.0), (np.nan, 5.0, -np.inf))
+    assert np.isnan(y[0])
+    assert np.isnan(excess[0])
+    assert y[1:].tolist() == [1.0, -1.0]
+    assert excess[1] == 4.0
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, (1.0, 0.0)])
+def test_a_limit_that_is_not_positive_is_refused(limit):
+    with pytest.raises(ParameterError, match=r"Saturation\.limit: found .*; expected a value above 0"):
+        Saturation(limit=limit)
+
+
+# --- in a diagram -----------------------------------------------------------------------------------------------------
+
+
+def test_they_compute_the_same_in_a_diagram():
+    class Source(Block):
+        y = Output(shape=(2,))
+
+        def output(self, t, x, u):
+            return np.stack([3.0 * t, 1.0 - t])
+
+    class Pair(Block):
+        u = Input(shape=(3,))
+        y = Output(shape=(3,))
+
+        def output(self, t, x, u):
+            return 1.0 * u.u
+
+    K = np.array([[1.0, 2.0], [0.0, -1.0], [4.0, 0.5]])
+    source = Source()
+    wide = Gain(gain=K)(source())
+    limited = Saturation(limit=3.0)(wide)
+    total = Sum(signs="-+")(limited.y, Product()(wide, limited.excess))
+    run = Diagram("algebra", Pair()(total).y.named("y")).simulate(2.0, step=0.5, progress=False)
+    u = np.stack([3.0 * run.t, 1.0 - run.t], axis=1) @ K.T
+    cut = np.clip(u, -3.0, 3.0)
+    np.testing.assert_allclose(run["y"], -cut + u * (u - cut), rtol=1e-14, atol=1e-14)
+    assert np.abs(u).max() > 3.0

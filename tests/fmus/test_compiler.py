@@ -1,0 +1,104 @@
+"""Compilers that don't end, and a cache that can't be written."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from loopwright.blocks import CompilerError, FmuError
+from loopwright.fmus import _compiler, gantry
+from loopwright.fmus._compiler import Compiler, compile_shared
+
+LINUX = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks processes up in /proc")
+
+SPINNING = """
+import os, subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+with open(sys.argv[1] + ".new", "w") as file:
+    file.write(f"{os.getpid()} {child.pid}")
+os.rename(sys.argv[1] + ".new", sys.argv[1])
+time.sleep(60)
+"""
+
+
+@pytest.fixture
+def spinning(tmp_path):
+    """A compiler that never ends, has a child, and writes both process numbers to a file."""
+    (tmp_path / "spin.py").write_text(SPINNING)
+    pids = tmp_path / "pids"
+    return Compiler((sys.executable, str(tmp_path / "spin.py"), str(pids)), "spinning"), pids
+
+
+def running(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+def assert_ended(pids):
+    ids = [int(pid) for pid in pids.read_text().split()]
+    assert len(ids) == 2
+    for _ in range(100):
+        if not any(map(running, ids)):
+            return
+        time.sleep(0.05)
+    pytest.fail(f"{[pid for pid in ids if running(pid)]} still run")
+
+
+@LINUX
+def test_a_compiler_that_does_not_end_is_stopped_with_its_children(tmp_path, spinning, monkeypatch):
+    compiler, pids = spinning
+    monkeypatch.setattr(_compiler, "TIMEOUT", 2.0)
+    with pytest.raises(
+        CompilerError, match=r"the C compiler did not end within 2 s and was stopped\. The command was: "
+    ):
+        compile_shared({"a.c": ""}, tmp_path / "a.so", compiler=compiler)
+    assert_ended(pids)
+
+
+@LINUX
+def test_an_interrupt_ends_the_compiler(tmp_path, spinning):
+    compiler, pids = spinning
+    script = (
+        "import sys; from pathlib import Path; from loopwright.fmus._compiler import Compiler, compile_shared\n"
+        f"compile_shared({{'a.c': ''}}, Path({str(tmp_path / 'a.so')!r}), compiler=Compiler({compiler.command!r}, ''))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.PIPE)
+    for _ in range(600):
+        if pids.exists():
+            break
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    assert b"KeyboardInterrupt" in process.communicate(timeout=20)[1]
+    assert_ended(pids)
+
+
+def test_a_version_that_never_comes(monkeypatch):
+    def hang(command, timeout, **options):
+        raise subprocess.TimeoutExpired(command, timeout)
+
+    monkeypatch.setattr(_compiler.subprocess, "run", hang)
+    monkeypatch.setenv("LOOPWRIGHT_CC", f"{sys.executable} -hang")
+    with pytest.raises(CompilerError, match=r"can't be run: .* timed out after 60 seconds\. Install one"):
+        _compiler.find_compiler()
+
+
+@pytest.mark.parametrize("where", ["file", "/proc/none", "/sys/none"])
+def test_a_cache_that_can_not_be_written_is_named(where, tmp_path, monkeypatch):
+    if where == "file":
+        (tmp_path / "file").write_text("")
+        where = str(tmp_path / "file" / "cache")
+    elif not os.path.isdir(os.path.dirname(where)):
+        pytest.skip("no such folder on this system")
+    monkeypatch.setenv("LOOPWRIGHT_CACHE", where)
+    monkeypatch.setattr(_compiler, "TIMEOUT", 20.0)
+    with pytest.raises(FmuError) as caught:
+        gantry.build(gantry.nominal.replace(gravity=1.0), out=tmp_path / "out.fmu")
+    assert not isinstance(caught.value, CompilerError)
+    assert str(caught.value).startswith(f"can't write the cache folder {where!r}: ")
+    assert str(caught.value).endswith("Set LOOPWRIGHT_CACHE to a folder that can be written.")
