@@ -102,7 +102,8 @@ def _loaded(path: Path) -> Iterator[ModuleType]:
 def _stands_in(module: ModuleType, name: str, folder: Path) -> bool:
     """Return whether a module was found in a folder itself, and not in an environment below it."""
     top = folder / name.partition(".")[0]
-    places = [getattr(module, "__file__", None), *(getattr(module, "__path__", None) or ())]
+    own = getattr(module, "__dict__", {})  # not through the module's own __getattr__, which may warn
+    places = [own.get("__file__"), *(own.get("__path__") or ())]
     found = [Path(place) for place in places if place]
     return any(p == top.with_suffix(".py") or p == top or top in p.parents for p in found)
 

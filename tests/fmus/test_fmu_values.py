@@ -28,7 +28,7 @@ def other(file, tmp_path):
 
     path = shutil.copy(file, tmp_path / "other.fmu")
     with zipfile.ZipFile(path, "a") as archive:
-        archive.writestr("documentation/index.html", "<p>Another edition.</p>")
+        archive.writestr("documentation/edition.html", "<p>Another edition.</p>")
     return path
 
 

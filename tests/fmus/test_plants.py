@@ -38,6 +38,7 @@ def run(file, T, start=None, **inputs):
     u, y = np.zeros(rows.shape[1]), np.zeros(sum(int(np.prod(p.shape)) for p in plant.outputs.values()))
     with plant.instantiate(list(inputs), T * len(rows)) as instance:
         instance.bind(u, y)
+        instance.begin()
         found = [y.copy()]
         for k, row in enumerate(rows):
             u[:] = row

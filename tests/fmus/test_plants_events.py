@@ -69,6 +69,7 @@ def ball(file, T, n, **start):
     y, names = np.zeros(4), list(plant.outputs)
     with plant.instantiate([], n * T) as instance:
         instance.bind(np.zeros(0), y)
+        instance.begin()
         rows = [y.copy()]
         for k in range(n):
             instance.step(k * T, T)
