@@ -161,8 +161,8 @@ class Block(Value, Wireable):
         text = super().__repr__()
         return text if self.name is None else f"{text[:-1]}{', ' if text[-2] != '(' else ''}name={self.name!r})"
 
-    def guard_error(self, name: str, value: float, u: Any, y: Any) -> GuardError:
-        """Return the error for a failed guard; ``u`` and ``y`` are named tuples of the inputs and outputs then."""
+    def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
+        """Return the error for a failed guard; ``u``, ``y``, ``x`` are named tuples of inputs, outputs, states then."""
         return GuardError(
             f"guard {name!r} is {value:.6g}; expected a positive value. Check what its inputs are: "
             f"{', '.join(f'{k} = {np.asarray(v).tolist()}' for k, v in u._asdict().items())}."

@@ -47,15 +47,18 @@ class ErrorDynamics(Block):
         ParameterError
             If there are not three, they don't come in conjugate pairs, or one is not in the left half plane.
         """
-        p = np.asarray(poles, dtype=complex)
-        coefficients = np.poly(p)
+        try:
+            p = np.asarray(poles, dtype=complex)
+        except (TypeError, ValueError):
+            p = np.zeros(0, dtype=complex)
+        coefficients = np.poly(p) if p.shape == (3,) else p
         if (
             p.shape != (3,)
             or np.any(p.real >= 0)
             or np.max(np.abs(np.imag(coefficients))) > 1e-9 * np.abs(p).max() ** 3
         ):
             raise ParameterError(
-                f"found {list(poles)}; expected three poles in the left half plane, complex ones in conjugate pairs, "
+                f"found {poles!r}; expected three poles in the left half plane, complex ones in conjugate pairs, "
                 f"such as "
                 "[-20, -20, -20].",
                 block=name or cls.__name__,

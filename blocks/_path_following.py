@@ -333,7 +333,7 @@ class FeedbackLinearization(Block):
         A = self.model.dh(u.position) @ self.model.G_v(u.position)
         return {"determinant": np.abs(A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]) - self.minimum_determinant}
 
-    def guard_error(self, name: str, value: float, u: Any, y: Any) -> GuardError:
+    def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
         """Return the error of a model that can't be inverted where it is."""
         return GuardError(
             f"|det(dh G_v)| of {type(self.model).__name__} is {value + self.minimum_determinant:.6g} at the position "

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from ._errors import DefinitionError
+from ._units import parse_unit
 
 if TYPE_CHECKING:
     from ._block import Block
@@ -48,6 +49,8 @@ class Port:
     ):
         self.shape, self.unit, self.description, self.name = shape, unit, description, name
         self.nominal, self.minimum, self.maximum = nominal, minimum, maximum
+        for one in (unit,) if isinstance(unit, str) else unit or ():
+            parse_unit(one)
         if nominal is not None and not nominal > 0:
             raise DefinitionError(f"found nominal {nominal!r}; expected a positive number.")
 

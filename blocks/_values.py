@@ -8,19 +8,30 @@ from __future__ import annotations
 
 import inspect
 import numbers
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from dataclasses import replace as replace_fields
-from typing import Any, ClassVar, Self, TypeAlias, dataclass_transform
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, dataclass_transform
 
 import numpy as np
 
 from ._documentation import ParameterSignature, parameter_section, with_section
-from ._errors import ParameterError, near
+from ._errors import DefinitionError, ParameterError, near
 from ._frozen import freeze
+from ._units import parse_unit
 
-Array: TypeAlias = Any
-"""A number or a NumPy array of floats; inside an equation that is being traced, its symbolic stand-in."""
+if TYPE_CHECKING:
+    Array: TypeAlias = Any
+else:
+
+    class Array:
+        """A number or a NumPy array of floats; inside an equation that is being traced, its symbolic stand-in.
+
+        It stands in annotations only: ``mass: Array = parameter(…)``. Type checkers take it for ``Any``.
+        """
+
 
 _MISSING: Any = object()
 
@@ -81,7 +92,14 @@ def parameter(
         False for the one defining object that may come first by position.
     tunable : bool, optional
         False when an FMU made from it must not change the value during a run (FMI's variability "fixed").
+
+    Raises
+    ------
+    UnitError
+        A unit that can't be read.
     """
+    if unit is not None:
+        parse_unit(unit)
     return ParameterSpec(default, unit, description, above, minimum, maximum, shape, structural, kw_only, tunable)
 
 
@@ -98,7 +116,7 @@ class Value:
         super().__init_subclass__(**kwargs)
         specs = dict(cls.parameter_specs)
         for name, annotation in inspect.get_annotations(cls).items():
-            text = annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
+            text = annotation if isinstance(annotation, str) else _annotation_text(annotation)
             if "ClassVar" in text or name.startswith("_") or name in cls._keywords:
                 continue
             declared = cls.__dict__.get(name, _MISSING)
@@ -106,6 +124,13 @@ class Value:
             if name in cls.__dict__:
                 delattr(cls, name)  # the instance attribute is the only one
             specs[name] = replace_fields(spec, annotation=text, default=freeze(spec.default))
+        for name, declared in vars(cls).items():
+            if isinstance(declared, ParameterSpec):
+                raise DefinitionError(
+                    f"the parameter has no annotation; write {name}: float = parameter(…), or Array for a vector.",
+                    block=cls.__name__,
+                    port=name,
+                )
         cls.parameter_specs = specs
         written = cls.__dict__.get("__doc__") or f"{cls.__name__}."
         cls.__doc__ = with_section(inspect.cleandoc(written), "Parameters", parameter_section(cls))
@@ -239,10 +264,15 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
             f"found {found}; expected {expected}{unit}. {spec.description}".rstrip(), block=who, port=name
         )
 
-    numeric = "float" in spec.annotation or "Array" in spec.annotation
-    if value is None and ("None" in spec.annotation or not numeric):
+    kinds = _kinds(spec.annotation)
+    array = bool(kinds & {"Array", "ndarray", "NDArray"})
+    numeric = array or "float" in kinds
+    if value is None and ("None" in kinds or not numeric):
         return None
-    if "int" in spec.annotation.split(" | ") and not numeric:
+    for kind, accepted, word in (("bool", bool | np.bool_, "True or False"), ("str", str, "a text")):
+        if kinds - {"None"} == {kind} and not isinstance(value, accepted):
+            raise bad(repr(value), word)
+    if "int" in kinds and not numeric:
         if isinstance(value, bool) or not isinstance(value, numbers.Integral):
             raise bad(repr(value), "an integer")
         result: Any = int(value)
@@ -256,7 +286,7 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
                 result = np.array(np.broadcast_to(result, spec.shape))
             except ValueError:
                 raise bad(f"shape {result.shape}", f"shape {spec.shape}") from None
-        elif result.ndim and "Array" not in spec.annotation:
+        elif result.ndim and not array:
             raise bad(f"{result.size} numbers", "a single number")
         if not np.all(np.isfinite(result)):
             raise bad(repr(value), "finite numbers")
@@ -277,6 +307,26 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
             return float(result)
         result.flags.writeable = False
     return result
+
+
+def _annotation_text(annotation: Any) -> str:
+    """Return an annotation as it is written; ``float | None`` and ``NDArray[…]`` have no name of their own."""
+    if isinstance(annotation, type):
+        return annotation.__name__
+    return re.sub(r"\b(?:\w+\.)+(?=\w)", "", str(annotation))
+
+
+@lru_cache(maxsize=1024)
+def _kinds(annotation: str) -> frozenset[str]:
+    """Return the alternatives of an annotation by their bare names: ``np.ndarray | None`` → ndarray, None."""
+    depth, parts = 0, [""]
+    for character in annotation:
+        depth += {"[": 1, "]": -1}.get(character, 0)
+        if character == "|" and not depth:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return frozenset(part.partition("[")[0].strip().rpartition(".")[2] for part in parts)
 
 
 def _frozen(value: Any, bad: Callable[[str, str], ParameterError]) -> Any:

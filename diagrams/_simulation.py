@@ -17,7 +17,6 @@ name the first one that is concerned; the run until then is kept in the error.
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -29,8 +28,9 @@ import numpy as np
 
 from ..blocks._comparison import GUARDS, NEXT
 from ..blocks._equations import initial_state
-from ..blocks._errors import LoopwrightError, NonFiniteError, OptionError, SimulationError
+from ..blocks._errors import LoopwrightError, NonFiniteError, SimulationError
 from ..blocks._symbols import bundle
+from ._duration import check_memory, ticks_in
 from ._flat import FlatDiagram
 from ._run import Run
 from ._structure import join
@@ -46,9 +46,9 @@ _SETTLED = 1e-13  # relative change of an input between two passes, a few hundre
 def simulate(diagram: Diagram, duration: float, *, step: float | Fraction | None, progress: bool | None) -> Run:
     """Run a diagram; see `Diagram.simulate`."""
     flat = diagram.flatten(step)
-    n = _ticks(duration, flat.base, diagram.name)
+    n = ticks_in(duration, flat.base, diagram.name)
     width = flat.log.total + flat.states.total + flat.held.total
-    _check_memory(n + 1, width, flat.base, diagram.name)
+    check_memory(n + 1, width, flat.base, diagram.name)
     times = [k * flat.base.numerator / flat.base.denominator for k in range(n + 1)]
     recorded = _Recorded(diagram, flat, np.array(times), np.empty((n + 1, width)))
     with ExitStack() as stack:
@@ -254,7 +254,8 @@ class _Loop:
                     for guard, value in zip(self.flat.checked.traced[path].guards, values, strict=True):
                         if not value > 0:
                             y = bundle("y", {n: made.get(n) for n in shapes})
-                            return block.guard_error(guard, float(value), u, y).at(block=path)  # type: ignore[return-value]
+                            x = self._states_of(path)
+                            return block.guard_error(guard, float(value), u, y, x).at(block=path)  # type: ignore[return-value]
                 elif not np.all(np.isfinite(values)):
                     what = "the next state" if name == NEXT else name
                     return _non_finite(path, what, values, _inputs_text(inputs))
@@ -268,6 +269,15 @@ class _Loop:
             block=path,
             port=port,
         )
+
+    def _states_of(self, path: str) -> Any:
+        """Return the states of a block at the failed tick, as its equations see them."""
+        flat, position, parts = self.x[self.flat.states.slices[path]], 0, {}
+        for name, shape in self.flat.checked.traced[path].states.items():
+            n = math.prod(shape)
+            parts[name] = flat[position : position + n].reshape(shape)
+            position += n
+        return bundle("x", parts)
 
     def _blocks(
         self, order: list[Any], t: float, k: int, *, initialize: bool = False
@@ -336,41 +346,6 @@ def _non_finite(path: str, port: str, values: np.ndarray, hint: str) -> NonFinit
         block=path,
         port=port,
     )
-
-
-def _ticks(duration: float, base: Fraction, name: str) -> int:
-    """Return the number of ticks in a duration; rounding of a few ulps, as in 0.1 + 0.2, is forgiven."""
-    try:
-        span = float(duration)
-    except (TypeError, ValueError):
-        span = math.nan
-    if not 0 < span < math.inf or isinstance(duration, str | bool):
-        raise OptionError(f"found a duration of {duration!r}; expected seconds, positive.", block=name, port="duration")
-    n = round(Fraction(span) / base)
-    if n < 1 or abs(Fraction(span) - n * base) > Fraction(span) * Fraction(1, 10**12):
-        raise OptionError(
-            f"found a duration of {duration!r} s, no multiple of the {float(base):g} s between ticks; take "
-            f"{float(max(n, 1) * base)!r} s.",
-            block=name,
-            port="duration",
-        )
-    return n
-
-
-def _check_memory(samples: int, width: int, base: Fraction, name: str) -> None:
-    """Refuse a run whose samples can't fit, before it takes the machine down."""
-    needed = samples * (8 * width + 40)
-    try:
-        there = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, OSError, ValueError):  # not on Windows
-        there = 16 * 2**30
-    if needed > 0.8 * there:
-        raise OptionError(
-            f"found {samples - 1} ticks of {float(base):g} s; {width} numbers each need {needed / 2**30:.0f} GiB, "
-            f"and this machine has {there / 2**30:.0f}. Is the duration in s? Take a shorter one, or a larger step.",
-            block=name,
-            port="duration",
-        )
 
 
 @contextmanager

@@ -309,5 +309,5 @@ def test_a_reference_carries_the_units_of_its_derivatives(source):
 def test_a_unit_that_cannot_be_read_is_refused_when_the_source_is_made(source):
     with pytest.raises(UnitError, match=r"^s\.unit: the unit 'meter/s' has an unknown symbol 'meter'"):
         source.replace(unit="meter/s", name="s")
-    with pytest.raises(ParameterError, match=r"^s\.unit: found 3; expected a unit as FMI spells it"):
+    with pytest.raises(ParameterError, match=r"^s\.unit: found 3; expected a text"):
         source.replace(unit=3, name="s")
