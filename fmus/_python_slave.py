@@ -5,10 +5,14 @@ from a file of its own, that file. PythonFMU makes one object of the class for e
 """
 
 # PythonFMU finds the class by importing this file: nothing here may be imported that the FMU doesn't need.
+import atexit
+import contextlib
+import ctypes
 import importlib.util
 import inspect
 import json
 import math
+import os
 import pickle
 import sys
 from collections import namedtuple
@@ -18,6 +22,28 @@ from typing import Any
 
 import numpy as np
 from pythonfmu import DefaultExperiment, Fmi2Causality, Fmi2Initial, Fmi2Slave, Fmi2Variability, Real
+
+_KEPT: list[Any] = []
+"""What PythonFMU 0.7 would free twice after an exception: it lets go of an instance when a call fails, and once more
+with the FMU. Without more references to it, the process crashes sooner or later."""
+
+
+def _end_cleanly(resources: Path, name: str) -> None:
+    """Have the FMU's library let go of the interpreter while Python still runs.
+
+    PythonFMU 0.7 does so once more when the process ends, by a pointer that has been freed by then: the process aborts
+    now and then, after all its work. On the second call the pointer is null.
+    """
+    library = resources.parent / "binaries" / "linux64" / f"{name}.so"
+    if not sys.platform.startswith("linux") or str(library) in _ENDING:
+        return
+    with contextlib.suppress(OSError, AttributeError):  # not loaded from there (while it is built), or mended
+        _ENDING[str(library)] = end = ctypes.CDLL(str(library), mode=os.RTLD_NOLOAD).finalizePythonInterpreter
+        end.argtypes, end.restype = [], None
+        atexit.register(end)
+
+
+_ENDING: dict[str, Any] = {}
 
 
 class _Unpickler(pickle.Unpickler):
@@ -63,6 +89,7 @@ class LoopwrightSlave(Fmi2Slave):  # type: ignore[misc]
         folder = Path(kwargs["resources"])
         about = json.loads((folder / "loopwright.json").read_text(encoding="utf-8"))
         self.modelName, self.description, self.guid = about["name"], about["description"], about["guid"]
+        _end_cleanly(folder, self.modelName)
         self.default_experiment = DefaultExperiment(0.0, about["stop_time"], about["step_size"])
         self._about, self._given = about, _load(folder, about)
         self._block, self._changed, self._stale, self._t = self._given, False, True, 0.0
@@ -85,7 +112,10 @@ class LoopwrightSlave(Fmi2Slave):  # type: ignore[misc]
 
     def _get(self, name: str, index: int) -> float:
         if self._stale and self._about["values"][name]["kind"] == "output":
-            self._evaluate()
+            try:
+                self._evaluate()
+            except Exception as error:
+                raise self._failed(error) from error
         return float(self._values[name].flat[index])
 
     def _set(self, name: str, index: int, value: float) -> None:
@@ -98,7 +128,26 @@ class LoopwrightSlave(Fmi2Slave):  # type: ignore[misc]
         self._t = start_time
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Advance the states."""
+        """Advance the states; where that fails, they stay as they were."""
+        before = self._get_fmu_state()
+        try:
+            self._advance(current_time, step_size)
+        except Exception as error:
+            self._set_fmu_state(before)
+            raise self._failed(error) from error
+        return True
+
+    def _failed(self, error: Exception) -> Exception:
+        """Return the error to raise: PythonFMU shows no more of it than its text."""
+        _KEPT.extend([self, self.log_queue, type(self)] * 4)
+        line, step = "", error.__traceback__
+        while step is not None:
+            if step.tb_frame.f_code.co_filename != __file__:
+                line = f" in line {step.tb_lineno} of {Path(step.tb_frame.f_code.co_filename).name}"
+            step = step.tb_next
+        return RuntimeError(f"{type(error).__name__}{line}: {error}")
+
+    def _advance(self, current_time: float, step_size: float) -> None:
         self._t, kind = current_time, self._about["kind"]
         if kind == "continuous":
             n = max(1, math.ceil(step_size / self._about["internal_step"] * (1.0 - 1e-9)))
@@ -112,7 +161,6 @@ class LoopwrightSlave(Fmi2Slave):  # type: ignore[misc]
                 self._store(self._flat("update", current_time + i * T, self._states()))
         self._t, self._stale = current_time + step_size, True
         self._evaluate()
-        return True
 
     def _integrate(self, t: float, h: float, n: int) -> None:
         """Take n steps of the Runge-Kutta method of order 4, inputs held."""

@@ -1,5 +1,6 @@
 """FMUs that carry Python: numbers against closed forms, what they say about themselves, what is refused."""
 
+import gc
 import importlib.util
 import json
 import subprocess
@@ -198,9 +199,10 @@ def test_it_runs_where_nothing_of_it_is_imported(built, tmp_path):
         f"r = fmpy.simulate_fmu({str(built)!r}, stop_time=1.0, output_interval=1.0, output={NAMES!r})\n"
         "print(json.dumps(list(map(float, r[-1]))))\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
-    row = json.loads(done.stdout.splitlines()[-1])
-    assert row[1:] == pytest.approx(closed_form(1.0), abs=2e-11)
+    for _ in range(3):  # the end of the process counts too: PythonFMU's own has aborted one run in two
+        done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+        row = json.loads(done.stdout.splitlines()[-1])
+        assert row[1:] == pytest.approx(closed_form(1.0), abs=2e-11)
 
 
 def test_it_says_that_it_needs_python(built):
@@ -257,6 +259,8 @@ def test_sampled_block_against_its_recursion(models, beside, tmp_path, slave):
     assert fmpy.read_model_description(str(file)).coSimulation.canHandleVariableCommunicationStepSize is False
     with pytest.raises(fmpy.fmi1.FMICallException, match="fmi2DoStep failed"):
         fmu.doStep(2.5, 0.3)
+    fmu.doStep(2.5, 0.25)  # the step refused has changed nothing
+    assert fmu.getReal([vr["n"]]) == [0.0]
 
 
 def test_a_run_cut_and_restored_elsewhere_is_the_same(built, slave):
@@ -320,12 +324,17 @@ def test_errors_while_it_runs_are_quoted(models, beside, tmp_path):
 
     def run(**options):
         log.clear()
-        with pytest.raises(fmpy.fmi1.FMICallException, match="fmi2DoStep failed"):
+        gc.collect()  # what PythonFMU might have freed twice shows here
+        with pytest.raises(fmpy.fmi1.FMICallException, match="fmi2DoStep failed with status 4"):
             fmpy.simulate_fmu(str(file), logger=lambda *a: log.append(a[-1].decode()), debug_logging=True, **options)
         return " ".join(log)
 
-    assert "y is nan; expected finite numbers" in run(stop_time=1.0, output_interval=0.125)
-    assert "past one half" in run(stop_time=1.0, output_interval=1.0)
+    line = next(i for i, text in enumerate(MODELS.splitlines(), 1) if "past one half" in text)
+    for _ in range(5):
+        assert "'ValueError: y is nan; expected finite numbers'" in run(stop_time=1.0, output_interval=0.125)
+        assert f"'RuntimeError in line {line} of my_models.py: past one half'" in run(
+            stop_time=1.0, output_interval=1.0
+        )
     assert "found -1; expected a value above 0" in run(start_values={"k": -1.0}, stop_time=0.1, output_interval=0.1)
 
 
