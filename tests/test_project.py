@@ -7,11 +7,15 @@ import importlib.metadata
 import inspect
 import os
 import re
+import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
+import zipfile
 from contextlib import chdir
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import matplotlib
 import nbformat
@@ -133,6 +137,19 @@ def blocks_of_code(text):
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
 
 
+def run_commands(text, folder):
+    """Run the lines of a page's shell code that are commands of an installed package."""
+    lines = [line for part in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in part.splitlines()]
+    commands = [shlex.split(line, comments=True) for line in lines if line.startswith(("loopwright ", "fmpy "))]
+    assert len(commands) >= 3
+    for program, *arguments in commands:
+        found = shutil.which(program, path=os.path.dirname(sys.executable))
+        done = subprocess.run(
+            [found, *arguments], cwd=folder, capture_output=True, text=True, check=False, env=os.environ
+        )
+        assert done.returncode == 0, f"{program} {arguments}: {done.stdout}{done.stderr}"
+
+
 def test_the_readme_opens_with_a_closed_loop_in_ten_lines_that_runs(tmp_path):
     first, *more = blocks_of_code((ROOT / "README.md").read_text(encoding="utf-8"))
     lines = [line for line in first.splitlines() if line.strip()]
@@ -146,9 +163,45 @@ def test_the_readme_opens_with_a_closed_loop_in_ten_lines_that_runs(tmp_path):
     scope = {}
     with chdir(tmp_path):
         exec(first, scope)
-    assert isinstance(scope["run"].plot("position"), matplotlib.figure.Figure)  # which a notebook shows
-    for snippet in more:
-        exec(snippet, scope)
+        assert isinstance(scope["run"].plot("position"), matplotlib.figure.Figure)  # which a notebook shows
+        for snippet in more:
+            exec(snippet, scope)
+    run_commands((ROOT / "README.md").read_text(encoding="utf-8"), tmp_path)
+
+
+def test_the_page_on_export_runs(tmp_path):
+    text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
+    model, *more = blocks_of_code(text)
+    (tmp_path / "thermostat.py").write_text(model, encoding="utf-8")
+    (tmp_path / "page.py").write_text("\n".join(more), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "page.py"], cwd=tmp_path, capture_output=True, text=True, check=False, env=os.environ
+    )
+    assert done.returncode == 0, done.stderr
+    run_commands(text, tmp_path)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("model", ["gantry", "bouncing_ball"])
+def test_the_page_on_export_tells_the_flags_as_they_are(fmi, model, tmp_path):
+    path = getattr(loopwright.fmus, model).build(out=tmp_path, fmi=fmi)
+    with zipfile.ZipFile(path) as archive:
+        tree = ET.fromstring(archive.read("modelDescription.xml"))
+    text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)`(?: \(2\.0: `(\w+)`\))? \|(.*)\|$", text.split("## Integrators")[0], re.MULTILINE)
+    with_events = "true" if model == "bouncing_ball" else "false"
+    spelling = {"canGetAndSetFMUState": "canGetAndSetFMUstate", "canSerializeFMUState": "canSerializeFMUstate",
+                "providesDirectionalDerivatives": "providesDirectionalDerivative"}  # fmt: skip
+    for column, interface in enumerate(("CoSimulation", "ModelExchange"), 0 if fmi == 3 else 2):
+        told = {}
+        for name, name2, cells in rows:
+            cell = [c.strip() for c in cells.split("|")][column]
+            if cell != "–":
+                key = name if fmi == 3 else name2 or spelling.get(name, name)
+                told[key] = with_events if cell == "with events" else cell
+        attributes = dict(tree.find(interface).attrib)
+        del attributes["modelIdentifier"]
+        assert told == attributes, interface
 
 
 def test_the_notebooks_run():
