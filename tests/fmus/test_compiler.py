@@ -65,7 +65,8 @@ def test_a_compiler_that_does_not_end_is_stopped_with_its_children(tmp_path, spi
 def test_an_interrupt_ends_the_compiler(tmp_path, spinning):
     compiler, pids = spinning
     script = (
-        "import sys; from pathlib import Path; from loopwright.fmus._compiler import Compiler, compile_shared\n"
+        "import signal, sys; from pathlib import Path; from loopwright.fmus._compiler import Compiler, compile_shared\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a background job begins with it ignored
         f"compile_shared({{'a.c': ''}}, Path({str(tmp_path / 'a.so')!r}), compiler=Compiler({compiler.command!r}, ''))"
     )
     process = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.PIPE)

@@ -20,6 +20,10 @@ from loopwright.fmus import bouncing_ball, build_python
 from loopwright.fmus._summary import summarize
 from loopwright.fmus._validation import validate
 
+# Slow: they load PythonFMU's library into this process, and its memory faults (see _python_slave.py) would take the
+# whole quick set with them.
+pytestmark = pytest.mark.slow
+
 MODELS = '''
 """Models of mine."""
 import math
