@@ -272,7 +272,7 @@ def _dimensions(spec: ModelSpec, token: str, equations: _Equations, n: int, fmi:
     groups = {"P": spec.parameters, "U": spec.inputs, "X": spec.continuous, "D": spec.discrete, "Y": spec.outputs}
     nonzeros = equations.nonzeros
     lines = [f'#define LW_MODEL_NAME "{spec.name}"', f'#define LW_TOKEN "{token}"']
-    lines += [f'#define LW_API "fmi{fmi}"', f'#define LW_ORDER "{_ORDER[fmi]}"']
+    lines += [f'#define LW_API "fmi{fmi}"', f"#define LW_FMI {fmi}", f'#define LW_ORDER "{_ORDER[fmi]}"']
     lines += [f"#define LW_N_{letter} {sum(v.size for v in group)}" for letter, group in groups.items()]
     lines += [f"#define LW_N_Z {len(spec.events)}", f"#define LW_N_J {len(nonzeros or ())}"]
     lines += [f"#define LW_N_VARIABLES {n}", f"#define LW_HAS_DERIVATIVES {int(nonzeros is not None)}"]

@@ -207,6 +207,7 @@ def _variable(e: Entry, reinitialized: set[str]) -> str:
         "causality": _CAUSALITY.get(e.kind, "output" if e.is_output else "local"),
         "variability": "continuous" if e.kind in ("time", "derivative") else v.variability,
         "initial": _INITIAL.get(e.kind),
+        "intermediateUpdate": True if (e.kind == "input" or e.is_output) and v.variability == "continuous" else None,
         "unit": v.unit,
         "min": None if v.minimum is None else float(v.minimum),
         "max": None if v.maximum is None else float(v.maximum),
@@ -262,7 +263,9 @@ def model_description(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
     stepping = {
         "canHandleVariableCommunicationStepSize": True,
         "maxOutputDerivativeOrder": 0,
+        "providesIntermediateUpdate": True,
         "mightReturnEarlyFromDoStep": bool(spec.events),
+        "canReturnEarlyAfterIntermediateUpdate": True,
         "hasEventMode": bool(spec.events),
     }
     experiment = {

@@ -120,7 +120,7 @@ def model_description2(spec: ModelSpec, token: str, *, derivatives: bool) -> str
     }
     stepping = {
         "canHandleVariableCommunicationStepSize": True,
-        "canInterpolateInputs": False,
+        "canInterpolateInputs": True,
         "maxOutputDerivativeOrder": 0,
         "canRunAsynchronuously": False,
     }

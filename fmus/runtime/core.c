@@ -46,7 +46,7 @@ static bool lw_fail(lw_instance *self, const char *format, ...) {
 }
 
 static const char *const lw_mode_names[] = {"Instantiated", "Initialization Mode", "Step Mode", "Event Mode",
-                                            "Continuous-Time Mode", "Terminated"};
+                                            "Continuous-Time Mode", "Terminated", "Intermediate Update Mode"};
 
 static bool lw_in_mode(lw_instance *self, const char *function, lw_mode expected) {
     if (self->s.mode == (int32_t)expected) return true;
@@ -79,10 +79,36 @@ static bool lw_check_finite(lw_instance *self, const double *values, size_t firs
                    first + i - lw_variables[v].first, values[i], t);
 }
 
+/* The inputs at t: u, those held over the step; where u is NULL they move by their derivatives since its start. */
+static inline const double *lw_inputs(lw_instance *self, const double *u, double t) {
+#if LW_MOVING_INPUTS
+    if (!u) {
+        const double since = t - self->step_start;
+        for (int i = 0; i < LW_N_U; i++) {
+            double sum = 0.0;
+            for (int k = LW_MAX_ORDER; k > 0; k--) sum = since / k * (self->s.slopes[k - 1][i] + sum);
+            self->inputs[i] = self->s.values[LW_U + i] + sum;
+        }
+        return self->inputs;
+    }
+#else
+    (void)self, (void)t;
+#endif
+    return u;
+}
+
+/* What to give as u within a step. */
+static inline const double *lw_inputs_of_step(const lw_instance *self) {
+#if LW_MOVING_INPUTS
+    if (self->s.moving) return NULL;
+#endif
+    return self->s.values + LW_U;
+}
+
 static inline int lw_call(lw_instance *self, lw_function *f, const double *t, const double *x, const double *u, double *out) {
     self->arg[0] = t;
     self->arg[1] = x;
-    self->arg[2] = u;
+    self->arg[2] = lw_inputs(self, u, *t);
     self->arg[3] = self->s.values + LW_P;
     self->res[0] = out;
     return f(self->arg, self->res, self->iw, self->w, 0);
@@ -185,6 +211,8 @@ static const char *lw_why_not_set(lw_instance *self, const lw_variable *variable
     if (kind == LW_STATE && (mode == LW_EVENT || mode == LW_CONTINUOUS) && self->s.model_exchange)
         return NULL; /* some importers of Model Exchange set states as variables; it is the same as SetContinuousStates */
     if (kind == LW_STATE || kind == LW_DISCRETE) return "is a state; set its start value before " LW_API "ExitInitializationMode";
+    if (mode == LW_INTERMEDIATE && kind == LW_TUNABLE) return "is a tunable parameter; set it between two steps";
+    if (mode == LW_INTERMEDIATE && variable->is_discrete) return "is a discrete input; set it between two steps";
     if (mode == LW_CONTINUOUS && kind == LW_TUNABLE) return "is a tunable parameter; set it in Event Mode";
     if (mode == LW_CONTINUOUS && variable->is_discrete) return "is a discrete input; set it in Event Mode";
     return NULL;
@@ -221,7 +249,7 @@ static bool lw_set(lw_instance *self, const char *function, const uint32_t *refe
             self->s.step_size = 0.0;
         }
         memcpy(self->s.values + variable->first, values, variable->size * sizeof(double));
-        if (self->s.mode != LW_STEPPING) lw_changed(self);
+        if (self->s.mode != LW_STEPPING && self->s.mode != LW_INTERMEDIATE) lw_changed(self);
         if (variable->first == LW_TOLERANCE) self->s.tolerance_given = 1;
         values += variable->size;
         left -= variable->size;
@@ -283,7 +311,8 @@ static bool lw_derive(lw_instance *self, const char *function, bool adjoint, con
                       size_t n_sensitivity) {
     double *in = self->seed, *out = self->sensitivity;
     size_t n_in = adjoint ? n_unknowns : n_knowns, n_out = adjoint ? n_knowns : n_unknowns;
-    if (self->s.mode != LW_INITIALIZING && !lw_is_initialized(self, function)) return false;
+    bool between = self->s.mode == LW_INITIALIZING || self->s.mode == LW_INTERMEDIATE;
+    if (!between && !lw_is_initialized(self, function)) return false;
     memset(in, 0, sizeof self->seed);
     if (!lw_transfer(self, function, adjoint ? unknowns : knowns, n_in, adjoint, seed, NULL, in, n_seed)) return false;
     memcpy(out, in, sizeof self->seed); /* a state that is an output depends on itself */
@@ -327,6 +356,7 @@ static lw_instance *lw_create(const char *name, size_t length) {
 static void lw_destroy(lw_instance *self) {
     if (!self) return;
     free(self->matrix);
+    free(self->before);
     free(self->name);
     free(self);
 }
@@ -335,6 +365,8 @@ static void lw_destroy(lw_instance *self) {
 static bool lw_accept_state(lw_instance *self, const char *function, const lw_state *state) {
     if (state->magic != LW_MAGIC || state->mode < LW_INSTANTIATED || state->mode > LW_TERMINATED)
         return lw_fail(self, "%s: this is no state of this FMU. Give one that it has made itself.", function);
+    if (self->s.mode == LW_INTERMEDIATE)
+        return lw_fail(self, "%s was called in Intermediate Update Mode. Call it when the step has ended.", function);
     if (state->model_exchange != self->s.model_exchange)
         return lw_fail(self, "%s: this is the state of a %s instance. Give one of the same interface type.", function,
                        state->model_exchange ? "Model Exchange" : "Co-Simulation");

@@ -130,12 +130,19 @@ static bool lw_evaluate(lw_instance *self, const lw_span *span, double t, lw_poi
     lw_dense_state(self, span, t, self->stage);
 #if LW_HAS_DERIVATIVES
     int failed = lw_call(self, lw_crossing, &t, self->stage, span->u, self->scratch);
+    memcpy(at->z, self->scratch, sizeof at->z);
     memcpy(at->rate, self->scratch + LW_N_Z, sizeof at->rate);
+#if LW_MOVING_INPUTS
+    if (!span->u) {
+        failed |= lw_along_inputs(self, t, self->stage);
+        for (int i = 0; i < LW_N_Z; i++) at->rate[i] += self->scratch[LW_N_X + LW_N_Y + i];
+    }
+#endif
 #else
     int failed = lw_call(self, lw_indicator, &t, self->stage, span->u, self->scratch);
+    memcpy(at->z, self->scratch, sizeof at->z);
     memset(at->rate, 0, sizeof at->rate);
 #endif
-    memcpy(at->z, self->scratch, sizeof at->z);
     return failed ? lw_fail(self, "the event indicators can't be evaluated at t = %.9g s.", t)
                   : lw_check_finite(self, at->z, LW_Z, LW_N_Z, t);
 }

@@ -123,6 +123,50 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nv
     return LW_OK(lw_set(self, "fmi2SetReal", vr, nvr, value, nvr));
 }
 
+/* ---- inputs that move over the next step, by their derivatives at its start (FMI 2.0, 4.2.1) ---- */
+
+#if LW_MOVING_INPUTS
+/* Derivatives of inputs by time, for the next step alone: u(t) = u + u1 (t - t0) + u2 (t - t0)^2 / 2 + ... from its start t0.
+ * A later value of the input leaves them as they are. The limits of an input are those of the values that are set. */
+static bool lw_set_slopes(lw_instance *self, const char *function, const fmi2ValueReference *references, size_t n,
+                          const fmi2Integer *orders, const double *values) {
+    lw_mode mode = (lw_mode)self->s.mode;
+    if (mode != LW_INSTANTIATED && mode != LW_INITIALIZING && !lw_in_mode(self, function, LW_STEPPING)) return false;
+    for (size_t i = 0; i < n; i++) {
+        const lw_variable *variable = lw_variable_at(self, function, references[i], 1);
+        if (!variable) return false;
+        if (variable->kind != LW_INPUT || variable->is_discrete)
+            return lw_fail(self, "%s: %s is no continuous input. Give derivatives of such inputs alone.", function, variable->name);
+        if (orders[i] < 1 || orders[i] > LW_MAX_ORDER)
+            return lw_fail(self, "%s: the order of a derivative of %s is %d, expected 1 to %d.", function, variable->name,
+                           orders[i], LW_MAX_ORDER);
+        if (!isfinite(values[i]))
+            return lw_fail(self, "%s: derivative %d of %s was set to %g at t = %.9g s, expected a finite number. Check what "
+                           "computes it.", function, orders[i], variable->name, values[i], self->s.values[0]);
+        self->s.slopes[orders[i] - 1][variable->first - LW_U] = values[i];
+    }
+    self->s.moving = 0;
+    for (int k = 0; k < LW_MAX_ORDER; k++)
+        for (int i = 0; i < LW_N_U; i++)
+            if (self->s.slopes[k][i] != 0.0) self->s.moving = 1;
+    return true;
+}
+#endif
+
+fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, const fmi2Integer order[],
+        const fmi2Real value[]) {
+    LW_SELF;
+    const char *function = "fmi2SetRealInputDerivatives";
+    if (self->s.model_exchange)
+        return LW_OK(lw_fail(self, "%s: this is a Model Exchange instance. Set inputs at each time by fmi2SetReal.", function));
+#if LW_MOVING_INPUTS
+    return LW_OK(lw_set_slopes(self, function, vr, nvr, order, value));
+#else
+    (void)vr, (void)order, (void)value;
+    return LW_OK(!nvr || lw_fail(self, "%s: this FMU has no inputs.", function));
+#endif
+}
+
 /* ---- stepping (FMI 2.0, 4.2.2) ---- */
 
 static bool lw_check_step(lw_instance *self, double t, double h) {

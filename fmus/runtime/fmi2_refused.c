@@ -30,10 +30,8 @@ LW_NO_TYPE(Integer)
 LW_NO_TYPE(Boolean)
 LW_NO_TYPE(String)
 
-/* ---- derivatives of inputs and outputs by time ---- */
+/* ---- derivatives of outputs by time ---- */
 
-LW_REFUSE(fmi2SetRealInputDerivatives, "inputs are held over a step (canInterpolateInputs = false)", const fmi2ValueReference vr[],
-          size_t nvr, const fmi2Integer order[], const fmi2Real value[])
 LW_REFUSE(fmi2GetRealOutputDerivatives, "maxOutputDerivativeOrder is 0", const fmi2ValueReference vr[], size_t nvr,
           const fmi2Integer order[], fmi2Real value[])
 

@@ -63,12 +63,40 @@ fmi3Instance fmi3InstantiateModelExchange(fmi3String instanceName, fmi3String in
     return lw_instantiate_fmi3(instanceName, instantiationToken, loggingOn, instanceEnvironment, logMessage, true);
 }
 
+/* Intermediate update at the end of an internal step (FMI 3.0, 4.2.2). What the standard leaves open:
+ * - it is called at accepted states alone, so intermediateStepFinished is always true; the last call of a step is that at its
+ *   end, where canReturnEarly is false; where an event returns to Event Mode there is none, where one is handled inside doStep
+ *   it comes after the jump;
+ * - all variables may be read and all continuous inputs be set, whether or not they are required intermediate variables;
+ * - inputs are held until they are set again, so an input sampled in this way enters with order 1 in the internal step; those
+ *   that are set at the end of the communication step hold for the next one;
+ * - an earlyReturnTime beyond the present is met exactly, one that is not returns at once. */
+static bool lw_update_fmi3(lw_instance *self, double t, bool can_return_early, double *until) {
+    fmi3IntermediateUpdateCallback update = (fmi3IntermediateUpdateCallback)self->update_sink;
+    fmi3Boolean requested = fmi3False;
+    fmi3Float64 time = t;
+    update(self->environment, t, fmi3True, fmi3True, fmi3True, can_return_early, &requested, &time);
+    *until = time;
+    return requested;
+}
+
+static bool lw_is_intermediate(lw_instance *self, fmi3ValueReference reference) {
+    if (reference < LW_N_VARIABLES) {
+        const lw_variable *variable = &lw_variables[reference];
+        if (variable->kind == LW_INPUT ? !variable->is_discrete : variable->is_output && variable->kind != LW_DISCRETE) return true;
+        return lw_fail(self, "requiredIntermediateVariables: %s has intermediateUpdate = false in modelDescription.xml. Give "
+                       "continuous inputs and outputs.", variable->name);
+    }
+    return lw_fail(self, "requiredIntermediateVariables: there is no variable with value reference %u. modelDescription.xml "
+                   "lists 0 to %d.", (unsigned)reference, LW_N_VARIABLES - 1);
+}
+
 fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String instantiationToken, fmi3String resourcePath,
         fmi3Boolean visible, fmi3Boolean loggingOn, fmi3Boolean eventModeUsed, fmi3Boolean earlyReturnAllowed,
         const fmi3ValueReference requiredIntermediateVariables[], size_t nRequiredIntermediateVariables,
         fmi3InstanceEnvironment instanceEnvironment, fmi3LogMessageCallback logMessage,
         fmi3IntermediateUpdateCallback intermediateUpdate) {
-    (void)resourcePath, (void)visible, (void)requiredIntermediateVariables, (void)intermediateUpdate;
+    (void)resourcePath, (void)visible;
     lw_instance *self =
         lw_instantiate_fmi3(instanceName, instantiationToken, loggingOn, instanceEnvironment, logMessage, false);
     if (!self) return NULL;
@@ -77,8 +105,13 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String ins
     bool ok = true;
     if (eventModeUsed && !LW_N_Z)
         ok = lw_fail(self, "this FMU has no events, and no Event Mode. Instantiate it with eventModeUsed = fmi3False.");
-    else if (nRequiredIntermediateVariables)
-        ok = lw_fail(self, "this FMU has no intermediate update. Instantiate it without requiredIntermediateVariables.");
+    for (size_t i = 0; ok && i < nRequiredIntermediateVariables; i++)
+        ok = lw_is_intermediate(self, requiredIntermediateVariables[i]);
+    if (ok && intermediateUpdate) {
+        self->update = lw_update_fmi3;
+        self->update_sink = (void (*)(void))intermediateUpdate;
+        if (!(self->before = malloc(sizeof *self->before))) ok = lw_fail(self, "out of memory.");
+    }
     if (ok) return self;
     lw_destroy(self);
     return NULL;
@@ -88,6 +121,8 @@ void fmi3FreeInstance(fmi3Instance instance) { lw_destroy(instance); }
 
 fmi3Status fmi3Reset(fmi3Instance instance) {
     LW_SELF;
+    if (self->s.mode == LW_INTERMEDIATE) return LW_OK(lw_fail(self, "fmi3Reset was called in Intermediate Update Mode. "
+                                                              "Call it when the step has ended."));
     lw_reset(self);
     return fmi3OK;
 }
@@ -162,6 +197,8 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoi
 
 fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *FMUState) {
     LW_SELF;
+    if (self->s.mode == LW_INTERMEDIATE) return LW_OK(lw_fail(self, "fmi3GetFMUState was called in Intermediate Update Mode. "
+                                                              "Call it when the step has ended."));
     lw_state *copy = *FMUState ? *FMUState : malloc(sizeof *copy);
     if (!copy) return LW_OK(lw_fail(self, "fmi3GetFMUState: out of memory."));
     *copy = self->s;

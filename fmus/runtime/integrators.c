@@ -1,13 +1,13 @@
-/* One step of each integrator, inputs and discrete states held: rk4 (explicit Runge-Kutta, order 4), dopri5 (explicit,
- * embedded order 5(4): Dormand & Prince 1980) and rodas (linearly implicit, order 4(3), stiffly accurate, L-stable:
- * Hairer & Wanner, Solving Ordinary Differential Equations II, IV.7). */
+/* One step of each integrator, discrete states held, and inputs too unless they move (u is NULL then, see lw_inputs): rk4
+ * (explicit Runge-Kutta, order 4), dopri5 (explicit, embedded order 5(4): Dormand & Prince 1980) and rodas (linearly
+ * implicit, order 4(3), stiffly accurate, L-stable: Hairer & Wanner, Solving Ordinary Differential Equations II, IV.7). */
 #define LW_MAX_SUBSTEPS 1e9
 
 /* The slope k at (t, x + h * previous slope); on the stack, the compiler keeps small models in registers. */
 static inline int lw_slope(lw_instance *self, double t, const double *x, double h, const double *previous, const double *u,
                            double *k) {
     LW_SCRATCH(stage);
-    const double *arg[LW_SZ_ARG] = {&t, stage, u, self->s.values + LW_P};
+    const double *arg[LW_SZ_ARG] = {&t, stage, lw_inputs(self, u, t), self->s.values + LW_P};
     double *res[LW_SZ_RES] = {k};
     for (int i = 0; i < LW_N_X; i++) stage[i] = previous ? x[i] + h * previous[i] : x[i];
 #if LW_N_D
@@ -41,8 +41,7 @@ static long lw_substeps(lw_instance *self, double h) {
 
 #if !LW_N_Z
 /* Integrate from t0 over h in n substeps into self->next; with `watch`, log the first substep that isn't finite. */
-static bool lw_integrate(lw_instance *self, double t0, double h, long n, bool watch) {
-    const double *u = self->s.values + LW_U;
+static inline bool lw_integrate(lw_instance *self, double t0, double h, long n, const double *u, bool watch) {
     LW_SCRATCH(x);
     int failed = 0;
     memcpy(x, self->s.values + LW_X, LW_N_S * sizeof(double));
@@ -59,8 +58,10 @@ static bool lw_integrate(lw_instance *self, double t0, double h, long n, bool wa
 static bool lw_fixed_steps(lw_instance *self, double t, double h) {
     long n = lw_substeps(self, h);
     if (n < 0) return false;
-    if (lw_integrate(self, t, h, n, false)) return true;
-    lw_integrate(self, t, h, n, true); /* again, to name the variable and the time */
+    const double *u = lw_inputs_of_step(self);
+    /* two calls, that held inputs cost nothing in the loop */
+    if (u ? lw_integrate(self, t, h, n, self->s.values + LW_U, false) : lw_integrate(self, t, h, n, NULL, false)) return true;
+    lw_integrate(self, t, h, n, u, true); /* again, to name the variable and the time */
     return false;
 }
 #endif
@@ -111,13 +112,14 @@ static void lw_combine(lw_instance *self, double h, const double *c, int n, doub
     }
 }
 
-/* ---- rk4 where there are events: with the cubic Hermite interpolant ---- */
+/* ---- rk4 step by step; where there are events: with the cubic Hermite interpolant ---- */
 
-#if LW_N_Z
 static int lw_rk4_step(lw_instance *self, double t, double h, const double *u) {
     double *const x = self->x, *const next = self->next;
     memcpy(next, x, LW_N_S * sizeof(double));
-    int failed = lw_rk4(self, t, h, u, next) | lw_rate(self, t, x, u, self->k1) | lw_rate(self, t + h, next, u, self->k7);
+    int failed = lw_rk4(self, t, h, u, next);
+#if LW_N_Z
+    failed |= lw_rate(self, t, x, u, self->k1) | lw_rate(self, t + h, next, u, self->k7);
     for (int i = 0; i < LW_N_X; i++) {
         double d0 = next[i] - x[i], d1 = h * self->k1[i] - d0;
         self->dense[0][i] = d0;
@@ -125,9 +127,9 @@ static int lw_rk4_step(lw_instance *self, double t, double h, const double *u) {
         self->dense[2][i] = d0 - h * self->k7[i] - d1;
         self->dense[3][i] = 0.0;
     }
+#endif
     return failed;
 }
-#endif
 
 /* ---- dopri5: k1 is given; after an accepted step, k7 is the slope at its end. Returns the error, 1 is the tolerance ---- */
 
@@ -178,15 +180,43 @@ static double lw_dopri5_step(lw_instance *self, double t, double h, const double
 #if LW_HAS_DERIVATIVES
 #define LW_MATRIX(i, j) m[(size_t)(i) * LW_N_X + (j)]
 
+#if LW_MOVING_INPUTS
+/* How the unknowns change at (t, x) because the inputs move, per unit of time: into self->scratch. */
+static int lw_along_inputs(lw_instance *self, double t, const double *x) {
+    double *knowns = self->sensitivity, *seed = self->seed, since = t - self->step_start;
+    memcpy(knowns, self->s.values, LW_DX * sizeof(double));
+    memcpy(knowns + LW_U, lw_inputs(self, NULL, t), LW_N_U * sizeof(double));
+    memcpy(knowns + LW_X, x, LW_N_S * sizeof(double));
+    knowns[0] = t;
+    memset(seed, 0, LW_DX * sizeof(double));
+    for (int i = 0; i < LW_N_U; i++) {
+        double sum = 0.0;
+        for (int k = LW_MAX_ORDER; k > 1; k--) sum = since / (k - 1) * (self->s.slopes[k - 1][i] + sum);
+        seed[LW_U + i] = self->s.slopes[0][i] + sum;
+    }
+    self->arg[0] = knowns;
+    self->arg[1] = seed;
+    self->res[0] = self->scratch;
+    return lw_forward(self->arg, self->res, self->iw, self->w, 0);
+}
+#endif
+
 /* Evaluate the Jacobian of the derivatives by the continuous states (its nonzeros), and the slope by time. */
 static int lw_linearize(lw_instance *self, double t, const double *u) {
     self->arg[0] = &t;
     self->arg[1] = self->x;
-    self->arg[2] = u;
+    self->arg[2] = lw_inputs(self, u, t);
     self->arg[3] = self->s.values + LW_P;
     self->res[0] = self->jacobian;
     self->res[1] = self->slope;
-    return lw_jacobian(self->arg, self->res, self->iw, self->w, 0);
+    int failed = lw_jacobian(self->arg, self->res, self->iw, self->w, 0);
+#if LW_MOVING_INPUTS
+    if (!u) {
+        failed |= lw_along_inputs(self, t, self->x);
+        for (int i = 0; i < LW_N_X; i++) self->slope[i] += self->scratch[i];
+    }
+#endif
+    return failed;
 }
 
 /* Factorize diagonal * I - J, with row pivoting; nonzero if it is singular. */

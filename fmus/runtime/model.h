@@ -16,7 +16,7 @@
 #include <stddef.h>
 #include <stdint.h>
 
-/* Generated: LW_MODEL_NAME, LW_TOKEN; elements: LW_N_P, LW_N_U, LW_N_X (continuous states), LW_N_D (discrete states),
+/* Generated: LW_MODEL_NAME, LW_TOKEN; LW_FMI, the version; elements: LW_N_P, LW_N_U, LW_N_X (continuous states), LW_N_D (discrete states),
  * LW_N_Y; LW_N_Z events; LW_N_J nonzeros of the Jacobian; LW_N_VARIABLES; LW_HAS_DERIVATIVES; LW_SZ_ARG, LW_SZ_RES,
  * LW_SZ_IW, LW_SZ_W (work of the equations, the largest of all); LW_API, how names of FMI's functions begin. */
 #define LW_N_S (LW_N_X + LW_N_D) /* all states, as the equations see them */
@@ -34,6 +34,8 @@
 #define LW_N_VALUES (LW_HELD + LW_N_U)
 #define LW_N_UNKNOWNS (LW_N_X + LW_N_Y + LW_N_Z) /* derivatives, outputs, event indicators: from LW_DX on */
 #define LW_AT_LEAST_1(n) ((n) > 0 ? (n) : 1)
+#define LW_MOVING_INPUTS (LW_FMI == 2 && LW_N_U > 0) /* may inputs move within a step, by given derivatives? */
+#define LW_MAX_ORDER 4                               /* of these derivatives */
 
 /* Scratch of a state's size: on the stack for small models, else the instance's own. */
 #if LW_N_S <= 64
@@ -67,7 +69,8 @@ typedef int lw_function(const double **arg, double **res, long long int *iw, dou
 
 typedef enum { LW_RK4 = 1, LW_DOPRI5 = 2, LW_RODAS = 3 } lw_integrator;
 typedef enum {
-    LW_INSTANTIATED, LW_INITIALIZING, LW_STEPPING, LW_EVENT, LW_CONTINUOUS, LW_TERMINATED
+    LW_INSTANTIATED, LW_INITIALIZING, LW_STEPPING, LW_EVENT, LW_CONTINUOUS, LW_TERMINATED,
+    LW_INTERMEDIATE /* within a step: no state is ever taken in it */
 } lw_mode;
 typedef enum { LW_LOG_WARNING = 1, LW_LOG_ERROR = 2 } lw_category;
 
@@ -77,10 +80,14 @@ typedef struct {
     int32_t mode;
     uint8_t have_outputs, have_derivatives, have_indicators; /* are the values of these those of now? */
     uint8_t model_exchange;
-    uint8_t stop_time_defined, tolerance_given, iterations, unused[5]; /* iterations in this visit of Event Mode */
+    uint8_t stop_time_defined, tolerance_given, iterations; /* iterations in this visit of Event Mode */
+    uint8_t moving, moved, unused[3]; /* do the inputs move in the next step; have they in the last one? */
     double stop_time;
     double step_size; /* of the adaptive integrators: to be tried next; 0: to be chosen anew */
     double values[LW_N_VALUES];
+#if LW_MOVING_INPUTS
+    double slopes[LW_MAX_ORDER][LW_N_U]; /* derivatives of the inputs by time at the start of the next step, from order 1 on */
+#endif
 #if LW_N_Z
     double last_fired[LW_N_Z], last_but_one[LW_N_Z]; /* times at which doStep has found the event */
     uint8_t positive[(LW_N_Z + 7) / 8 * 8];          /* the domain of each indicator: z > 0? */
@@ -92,6 +99,13 @@ struct lw_instance {
     lw_state s;
     bool event_mode_used, early_return_allowed; /* as the importer wants it */
     bool event_found;                           /* the last step ended at an event */
+    /* Intermediate update, or NULL: true if the step is to end early, at *until or now. */
+    bool (*update)(lw_instance *self, double t, bool can_return_early, double *until);
+    void (*update_sink)(void);
+    lw_state *before; /* with an update: the state before the step */
+#if LW_MOVING_INPUTS
+    double step_start, inputs[LW_N_U]; /* where the derivatives of the inputs hold; the inputs at a time from there on */
+#endif
     /* scratch of the integrators and of the equations */
     double x[LW_AT_LEAST_1(LW_N_S)], stage[LW_AT_LEAST_1(LW_N_S)], next[LW_AT_LEAST_1(LW_N_S)];
     double k1[LW_AT_LEAST_1(LW_N_X)], k2[LW_AT_LEAST_1(LW_N_X)], k3[LW_AT_LEAST_1(LW_N_X)], k4[LW_AT_LEAST_1(LW_N_X)];

@@ -2,16 +2,25 @@
 #define LW_MAX_STEPS 10000000
 #define LW_PIECES 4 /* of an adaptive step, each looked through for events */
 
+#define LW_SAME_INPUT 1e-12 /* an input that has moved to a value and is then set to it: equal but for rounding */
+
 /* Have the inputs jumped since the last step? Then an adaptive integrator starts anew. */
 static bool lw_inputs_jumped(const lw_instance *self) {
     const double *v = self->s.values;
+#if LW_MOVING_INPUTS
+    for (int i = 0; i < LW_N_U && self->s.moved; i++) {
+        double now = v[LW_U + i], last = v[LW_HELD + i];
+        if (fabs(now - last) > LW_SAME_INPUT * (fabs(now) + fabs(last))) return true;
+    }
+    if (self->s.moved) return false;
+#endif
     return memcmp(v + LW_U, v + LW_HELD, LW_N_U * sizeof(double)) != 0;
 }
 
 static bool lw_step_too_small(lw_instance *self, double t, double h) {
     int worst = 0;
     double largest = -1.0;
-    lw_rate(self, t, self->x, self->s.values + LW_U, self->k1);
+    lw_rate(self, t, self->x, lw_inputs_of_step(self), self->k1);
     for (int i = 0; i < LW_N_X; i++) {
         double change = fabs(self->k1[i]) / lw_scale(self, i, self->x[i], self->x[i]);
         if (!isfinite(change)) change = INFINITY;
@@ -27,8 +36,9 @@ static bool lw_step_too_small(lw_instance *self, double t, double h) {
 /* Steps within a communication step: what is kept from one to the next. */
 typedef struct {
     lw_integrator integrator;
-    double end;     /* of the communication step */
+    double end;     /* of the communication step, or where it is to end early */
     double segment; /* rk4: where the equal substeps began, since the last event */
+    double length;  /* rk4: of all of them */
     long n, i;      /* rk4: substeps in all, and done */
     bool fresh;     /* after a jump: slope and step size are to be found anew */
     bool rejected;
@@ -36,7 +46,7 @@ typedef struct {
 
 /* An accepted step of an adaptive integrator from self->x at t, into self->next; `to` is where it ends. */
 static inline bool lw_adaptive_step(lw_instance *self, lw_run *run, double t, double *to) {
-    const double *u = self->s.values + LW_U;
+    const double *u = lw_inputs_of_step(self);
     const bool implicit = run->integrator == LW_RODAS;
     const double exponent = implicit ? -1.0 / 4.0 : -1.0 / 5.0, left = run->end - t;
     const double shortest = 16.0 * 2.3e-16 * fmax(fabs(t), fabs(run->end));
@@ -47,8 +57,11 @@ static inline bool lw_adaptive_step(lw_instance *self, lw_run *run, double t, do
     if (implicit && (lw_linearize(self, t, u) || !lw_is_finite(self->jacobian, LW_N_J) || !lw_is_finite(self->slope, LW_N_X)))
         return lw_fail(self, "the Jacobian can't be evaluated at t = %.9g s. Set integrator = 1 or 2.", t);
 #endif
+    /* With an intermediate update, internal_step bounds how long the importer isn't asked for inputs. */
+    const double longest = self->update ? self->s.values[LW_STEP] : INFINITY;
     double h = self->s.step_size;
     if (run->fresh && !(h > 0.0)) h = lw_first_step(self, t, u, implicit ? 4 : 5, left);
+    h = fmin(h, longest);
     run->fresh = run->rejected = false;
     for (;;) {
         bool last = h >= left * (1.0 - 1e-10);
@@ -74,81 +87,117 @@ static inline bool lw_adaptive_step(lw_instance *self, lw_run *run, double t, do
 
 /* The next step from self->x at t into self->next. */
 static bool lw_next_step(lw_instance *self, lw_run *run, double t, double *to) {
-#if LW_N_X == 0 && !LW_N_Z
-    *to = run->end;
-    return true;
-#else
 #if LW_N_X
     if (run->integrator != LW_RK4) return lw_adaptive_step(self, run, t, to);
 #endif
-#if LW_N_Z
     if (run->fresh) {
+        if (t != run->segment || LW_N_Z) run->length = run->end - t;
         run->segment = t;
         run->i = 0;
-        run->n = lw_substeps(self, run->end - t);
+        run->n = lw_substeps(self, run->length);
         run->fresh = false;
         if (run->n < 0) return false;
     }
+    /* in the operations of lw_integrate where there are no events: who only watches the step changes nothing */
+    double from = LW_N_Z ? t : run->segment + run->length * ((double)run->i / (double)run->n);
     run->i++;
-    *to = run->i == run->n ? run->end : run->segment + (run->end - run->segment) * ((double)run->i / (double)run->n);
-    if (lw_rk4_step(self, t, *to - t, self->s.values + LW_U))
+    double next = run->segment + run->length * ((double)run->i / (double)run->n);
+    *to = run->i == run->n ? run->end : next;
+    if (lw_rk4_step(self, from, LW_N_Z ? *to - t : run->length / (double)run->n, lw_inputs_of_step(self)))
         return lw_fail(self, "the equations can't be evaluated at t = %.9g s.", *to);
-    return lw_check_finite(self, self->next, LW_X, LW_N_X, *to);
-#else
-    (void)t;
-    *to = run->end;
-    return true;
-#endif
-#endif
+    return !LW_N_X || lw_check_finite(self, self->next, LW_X, LW_N_X, *to);
 }
 
-/* Integrate from t to end: adaptively, or with events. The states there are in self->next afterwards, the time is in
- * `reached`. Where Event Mode is used, an event ends the step: self->event_found. */
-static bool lw_advance(lw_instance *self, double t, double end, double *reached) {
-    lw_run run = {.integrator = (lw_integrator)self->s.values[LW_INTEGRATOR], .end = end, .fresh = true};
+/* ---- intermediate update ---- */
+
+/* Within a step, the values of the instance become those at t. Outputs and derivatives are computed when asked for. */
+static void lw_publish(lw_instance *self, double t) {
+    double *v = self->s.values;
+    v[0] = t;
+    memcpy(v + LW_X, self->next, LW_N_S * sizeof(double));
+    lw_changed(self);
+}
+
+/* Ask the importer at t, the end of an accepted internal step (FMI 3.0, 4.2.2). It may read all variables, set continuous
+ * inputs (held from t on; outputs still belong to the inputs before), and end the step early: `leave`, or run->end moves. */
+static bool lw_intermediate_update(lw_instance *self, lw_run *run, double t, bool *leave) {
+    const bool can_return_early = self->early_return_allowed && t < run->end;
+    double until = t;
+    lw_publish(self, t);
+    self->s.mode = LW_INTERMEDIATE;
+    bool wanted = self->update(self, t, can_return_early, &until);
+    if (self->s.mode == LW_TERMINATED) return false; /* what was refused has logged why */
+    if (self->s.mode != LW_INTERMEDIATE)
+        return lw_fail(self, "the intermediate update at t = %.9g s has left its mode, as by a reset. Get and set variables "
+                       "in it, nothing else.", t);
+    self->s.mode = LW_STEPPING;
+    *leave = can_return_early && wanted && !(until > t);
+    if (can_return_early && wanted && until > t && until < run->end) {
+        run->end = until;
+        if (run->integrator == LW_RK4 || !LW_N_X) run->fresh = true;
+    }
+    return true;
+}
+
+/* ---- a communication step ---- */
+
+#if LW_N_Z
+/* Inputs may have jumped at t: what fires by that happens first. `event`: it is left to Event Mode. */
+static bool lw_meet_inputs(lw_instance *self, double t, const double *u, bool *event) {
+    double z[LW_N_Z], fired[LW_N_Z];
+    bool any;
+    if (!lw_find_fired(self, t, self->x, u, z, fired, &any)) return false;
+    *event = any && self->event_mode_used && self->early_return_allowed;
+    if (*event) return true;
+    if (!lw_iterate(self, t, self->x, u, &any)) return false;
+    if (any) self->s.step_size = 0.0;
+    memcpy(self->next, self->x, LW_N_S * sizeof(double));
+    return true;
+}
+#endif
+
+/* Integrate from t over h to end: adaptively, with events, or with an intermediate update. The states there are in
+ * self->next afterwards, the time is in `end`. Where Event Mode is used, an event ends the step: self->event_found. */
+static bool lw_advance(lw_instance *self, double t, double h, double *end) {
+    lw_run run = {.integrator = (lw_integrator)self->s.values[LW_INTEGRATOR], .end = *end, .fresh = true};
+    run.segment = t;
+    run.length = h;
     memcpy(self->x, self->s.values + LW_X, LW_N_S * sizeof(double));
     memcpy(self->next, self->x, LW_N_S * sizeof(double));
     if (lw_inputs_jumped(self)) self->s.step_size = 0.0;
 #if LW_HAS_DERIVATIVES
     if (run.integrator == LW_RODAS && !lw_need_matrix(self)) return false;
 #endif
+    bool leave = false;
 #if LW_N_Z
     double z[LW_N_Z], fired[LW_N_Z];
-    const double *u = self->s.values + LW_U;
+    const double *u = lw_inputs_of_step(self);
     bool any;
     long count = 0;
-    if (!lw_find_fired(self, t, self->x, u, z, fired, &any)) return false; /* the inputs may have jumped */
-    if (any && self->event_mode_used && self->early_return_allowed) {
-        self->event_found = true;
-        *reached = t;
-        return true;
-    }
-    if (!lw_iterate(self, t, self->x, u, &any)) return false;
-    if (any) self->s.step_size = 0.0;
-    memcpy(self->next, self->x, LW_N_S * sizeof(double));
+    if (!lw_meet_inputs(self, t, u, &self->event_found)) return false;
+    leave = self->event_found;
 #endif
-    for (long steps = 0; t < end; steps++) {
-        double to = end;
+    for (long steps = 0; t < run.end && !leave; steps++) {
+        double to = run.end;
         if (run.integrator != LW_RK4 && steps == LW_MAX_STEPS)
             return lw_fail(self, "the integrator has taken %d steps up to t = %.9g s. A stiff model needs integrator = 3; else take "
                            "shorter communication steps, or a larger tolerance.", LW_MAX_STEPS, t);
         if (!lw_next_step(self, &run, t, &to)) return false;
+        double first = INFINITY;
 #if LW_N_Z
         lw_span span = {t, to, LW_ULPS * fmax(fabs(t), fabs(to)), u};
-        double first;
         if (!lw_scan(self, &span, run.integrator == LW_RK4 ? 1 : LW_PIECES, &first)) return false;
         if (isfinite(first)) {
             lw_dense_state(self, &span, first, self->stage);
             memcpy(self->x, self->stage, LW_N_S * sizeof(double));
             t = first;
-            if (!lw_find_fired(self, t, self->x, u, z, fired, &any) || !lw_record(self, t, fmax(fabs(t), fabs(end)), fired)) return false;
+            if (!lw_find_fired(self, t, self->x, u, z, fired, &any)
+                || !lw_record(self, t, fmax(fabs(t), fabs(run.end)), fired)) return false;
             run.fresh = true;
             self->s.step_size = 0.0;
-            self->event_found = any && self->event_mode_used && (self->early_return_allowed || t == end);
-            if (self->event_found) {
-                memcpy(self->next, self->x, LW_N_S * sizeof(double));
-                break;
-            }
+            self->event_found = any && self->event_mode_used && (self->early_return_allowed || t == run.end);
+            memcpy(self->next, self->x, LW_N_S * sizeof(double));
+            if (self->event_found) break;
             if (++count > LW_MAX_EVENTS) {
                 char names[256];
                 return lw_fail(self, "more than %d events within one communication step, the last %s at t = %.9g s. Take shorter "
@@ -156,33 +205,58 @@ static bool lw_advance(lw_instance *self, double t, double end, double *reached)
             }
             if (!lw_iterate(self, t, self->x, u, &any)) return false;
             memcpy(self->next, self->x, LW_N_S * sizeof(double));
-            continue;
         }
 #endif
-        memcpy(self->x, self->next, LW_N_S * sizeof(double));
-        if (run.integrator == LW_DOPRI5) memcpy(self->k1, self->k7, LW_N_X * sizeof(double));
-        t = to;
+        if (!isfinite(first)) {
+            memcpy(self->x, self->next, LW_N_S * sizeof(double));
+            if (run.integrator == LW_DOPRI5) memcpy(self->k1, self->k7, LW_N_X * sizeof(double));
+            t = to;
+        }
+        if (!self->update) continue;
+        if (!lw_intermediate_update(self, &run, t, &leave)) return false;
+        if (leave || t >= run.end || !lw_inputs_jumped(self)) continue; /* set at the end, they are those of the next step */
+        self->s.step_size = 0.0;
+        if (run.integrator != LW_RK4 && LW_N_X) run.fresh = true;
+#if LW_N_Z
+        if (!lw_meet_inputs(self, t, u, &self->event_found)) return false;
+        leave = self->event_found;
+#endif
     }
-    *reached = t;
+    *end = t;
     return true;
 }
 
 static bool lw_try_step(lw_instance *self, double t, double h) {
     double *v = self->s.values, end = t + h;
+    if (self->update) { /* time, states and held inputs are those of the last update */
+        if (!lw_advance(self, t, h, &end)) return false;
+        if (self->event_found) lw_publish(self, end);
+        return lw_update_outputs(self);
+    }
 #if LW_N_Z
-    if (!lw_advance(self, t, end, &end)) return false;
+    if (!lw_advance(self, t, h, &end)) return false;
 #else
     if (v[LW_INTEGRATOR] == LW_RK4 || !LW_N_X) {
         if (!lw_fixed_steps(self, t, h)) return false;
-    } else if (!lw_advance(self, t, end, &end)) return false;
+    } else if (!lw_advance(self, t, h, &end)) return false;
 #endif
+    const double *u = lw_inputs_of_step(self);
     if (LW_N_Y) {
-        if (lw_call(self, lw_output, &end, self->next, v + LW_U, self->scratch))
+        if (lw_call(self, lw_output, &end, self->next, u, self->scratch))
             return lw_fail(self, "the outputs can't be evaluated at t = %.9g s.", end);
         if (!lw_check_finite(self, self->scratch, LW_Y, LW_N_Y, end)) return false;
     }
     memcpy(v + LW_Y, self->scratch, LW_N_Y * sizeof(double));
     memcpy(v + LW_X, self->next, LW_N_S * sizeof(double));
+#if LW_MOVING_INPUTS
+    /* Derivatives hold for one step (FMI 2.0.5, 4.2.1). Where nothing is set then, an input stays where it has moved to. */
+    self->s.moved = self->s.moving;
+    if (!u) {
+        memcpy(v + LW_U, lw_inputs(self, NULL, end), LW_N_U * sizeof(double));
+        memset(self->s.slopes, 0, sizeof self->s.slopes);
+        self->s.moving = 0;
+    }
+#endif
     memcpy(v + LW_HELD, v + LW_U, LW_N_U * sizeof(double));
     v[0] = end;
     self->s.have_outputs = 1;
@@ -202,8 +276,16 @@ static bool lw_step(lw_instance *self, double t, double h) {
     memcpy(positive, self->s.positive, sizeof positive);
 #endif
     self->event_found = false;
+#if LW_MOVING_INPUTS
+    self->step_start = t;
+#endif
+    if (self->update) *self->before = self->s;
     if (lw_try_step(self, t, h)) return true;
     self->event_found = false;
+    if (self->update) {
+        self->s = *self->before;
+        self->s.mode = LW_TERMINATED;
+    }
     self->s.step_size = step_size;
 #if LW_N_Z
     memcpy(self->s.last_fired, last_fired, sizeof last_fired);

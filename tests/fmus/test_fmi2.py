@@ -133,7 +133,7 @@ def test_capabilities_are_true(msd2):
     assert xml(msd2).find("ModelExchange").attrib == both | {"completedIntegratorStepNotNeeded": "true"}
     assert xml(msd2).find("CoSimulation").attrib == both | {
         "canHandleVariableCommunicationStepSize": "true",
-        "canInterpolateInputs": "false",
+        "canInterpolateInputs": "true",
         "maxOutputDerivativeOrder": "0",
         "canRunAsynchronuously": "false",
     }
