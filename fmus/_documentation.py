@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from html import escape
@@ -32,12 +33,17 @@ _EQUATIONS = ("derivative", "output", "indicators", "jump")  # they may be inher
 _MOST = 12  # numbers of a start value that are listed
 
 
+_GENERATED = re.compile(r"\n\n(?:Parameters|Inputs|Outputs|States|Events)\n-+\n")
+
+
 def block_text(block: Block) -> str:
     """Give the text of a block's documentation: its docstrings, and the source of its equations where there is one."""
     cls = type(block)
     module = inspect.getmodule(cls)
     about = module.__doc__ if module is not None and module.__name__ != "__main__" else None
-    parts = [inspect.cleandoc(cls.__doc__ or ""), inspect.cleandoc(about or "")]
+    # the first line is the model's description, and the sections on parameters and ports are the table's rows
+    written = _GENERATED.split(inspect.cleandoc(cls.__doc__ or ""), maxsplit=1)[0].partition("\n")[2]
+    parts = [written, inspect.cleandoc(about or "")]
     inherited = {name: getattr(cls, name) for name in _EQUATIONS if getattr(cls, name, None) is not None}
     for member in {**inherited, **vars(cls)}.values():
         function = member.fget if isinstance(member, property) else member
@@ -104,15 +110,21 @@ def _start(variable: Variable) -> str:
     return ", ".join(number(v) for v in values[:_MOST]) + more
 
 
+def _least(minimum: float) -> str:
+    """Write a minimum; the least number above another, which stands for an open bound, as that bound."""
+    below = 0.0 if minimum == np.finfo(float).tiny else float(np.nextafter(minimum, -np.inf))
+    return f"> {number(below)}" if len(number(below)) < len(number(minimum)) else number(minimum)
+
+
 def _row(e: Entry) -> str:
     v = e.variable
     shape = f" ({' × '.join(map(str, v.shape))})" if v.shape else ""
     cells = [
-        _CAUSALITY.get(e.kind, "output" if e.is_output else "local"),
+        _CAUSALITY.get(e.kind, "output" if e.is_output else "local") + (", state" if e.kind == "state" else ""),
         "continuous" if e.kind in ("time", "derivative") else v.variability,
         v.unit or "",
         _start(v),
-        "" if v.minimum is None else number(v.minimum),
+        "" if v.minimum is None else _least(v.minimum),
         "" if v.maximum is None else number(v.maximum),
         v.description,
     ]

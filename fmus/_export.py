@@ -167,7 +167,7 @@ def build(
         The model's name; the class name in lower case without one.
     internal_step : float
         Start value, in s, of the FMU's parameter ``internal_step``: the longest step of its Runge-Kutta integrator
-        (order 4), and the longest of the others.
+        (order 4); the adaptive ones choose their own.
     integrator : {"rk4", "dopri5", "rodas"}
         Start value of the FMU's parameter ``integrator``, for co-simulation: explicit with a fixed step, explicit with
         an adaptive one, or implicit for stiff models.

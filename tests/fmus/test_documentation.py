@@ -75,7 +75,7 @@ def test_every_variable_is_in_the_table():
     rows = {row[0]: row[1:] for row in read.rows[1:]}
     assert rows["mass"] == ["parameter", "fixed", "kg", "2", "1e-06", "", ""]
     assert rows["force"] == ["input", "continuous", "N", "0", "", "", 'Force "from outside"']
-    assert rows["position"][:4] == ["output", "continuous", "m", "0.1"]
+    assert rows["position"][:4] == ["output, state", "continuous", "m", "0.1"]
     assert {"velocity", "der(velocity)", "acceleration", "internal_step"} < set(rows)
 
 
@@ -120,7 +120,10 @@ def test_a_model_that_is_too_long_says_where_its_equations_are():
 def test_a_blocks_page_has_its_docstring_and_the_source_of_its_equations():
     text = Reader(page(build(gantry.nominal))).blocks[0]
     assert text == block_text(gantry.nominal)
-    assert text.startswith(type(gantry.nominal).__doc__.strip().splitlines()[0])
+    assert text.startswith(gantry.__doc__.strip().splitlines()[0])  # the class's first line is the description above
+    assert (
+        "start_position" not in text.partition("def ")[0]
+    )  # no parameter of the FMU, nor are the table's rows repeated
     assert "(m_t,i + m_J,i) s̈_i = u_i − F_F,i(ṡ_i) − F_G,i + F_i" in text
     assert "def derivative(self, " in text
     assert "    coulomb = self.coulomb_scale * self.coulomb_friction * np.tanh(" in text
@@ -228,3 +231,9 @@ def test_numbers_are_in_full():
     assert [number(v) for v in (2.0, 0.1, 1e-6, 1 / 3, 1e300, -4)] == [
         "2", "0.1", "1e-06", "0.3333333333333333", "1e+300", "-4",
     ]  # fmt: skip
+
+
+def test_an_open_bound_is_shown_as_one():
+    rows = {row[0]: row[1:] for row in Reader(page(build(gantry.nominal))).rows[1:]}
+    assert rows["translational_mass (2)"][4] == "> 0"
+    assert rows["coulomb_scale"][4] == "0"
