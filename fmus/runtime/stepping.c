@@ -98,12 +98,10 @@ static bool lw_next_step(lw_instance *self, lw_run *run, double t, double *to) {
         run->fresh = false;
         if (run->n < 0) return false;
     }
-    /* in the operations of lw_integrate where there are no events: who only watches the step changes nothing */
-    double from = LW_N_Z ? t : run->segment + run->length * ((double)run->i / (double)run->n);
     run->i++;
-    double next = run->segment + run->length * ((double)run->i / (double)run->n);
-    *to = run->i == run->n ? run->end : next;
-    if (lw_rk4_step(self, from, LW_N_Z ? *to - t : run->length / (double)run->n, lw_inputs_of_step(self)))
+    *to = run->i == run->n ? run->end : run->segment + run->length * ((double)run->i / (double)run->n);
+    /* where there are no events, as long as in lw_integrate: who only watches the step changes no bit */
+    if (lw_rk4_step(self, t, LW_N_Z ? *to - t : run->length / (double)run->n, lw_inputs_of_step(self)))
         return lw_fail(self, "the equations can't be evaluated at t = %.9g s.", *to);
     return !LW_N_X || lw_check_finite(self, self->next, LW_X, LW_N_X, *to);
 }
