@@ -26,6 +26,9 @@ _ORDER = {3: "FMI 3.0, 2.3, 3.2 and 4.2", 2: "FMI 2.0, 3.2.3 and 4.2.4"}
 
 # Longest function that is expanded: beyond, calls of shared functions keep the code small (compile time grows faster).
 _SCALAR_LIMIT = 20_000
+# Longest function of the rates that is put into every stage of the integrators: left alone, the compiler calls it.
+_INLINE_LIMIT = 300
+_INLINE = "static inline __attribute__((always_inline))"
 _STEP_DESCRIPTION = (
     "Longest step of the explicit Runge-Kutta method of order 4 (integrator = 1); a communication step h, or what an "
     "event leaves of it, takes ceil(h / internal_step) equal substeps, at least one"
@@ -286,6 +289,10 @@ def _generated(functions: Sequence[ca.Function]) -> str:
     for f in functions:
         generator.add(f)
     text: str = generator.dump()
+    rates = functions[0]
+    if rates.is_a("SXFunction") and rates.n_instructions() <= _INLINE_LIMIT:
+        for declared in ("static int casadi_f0(", f"int {rates.name()}("):
+            text = text.replace(f"\n{declared}", f"\n{_INLINE} int {declared.partition('int ')[2]}")
     if missing := re.search(r"CASADI_MEM|_alloc_mem\(", text):
         raise DefinitionError(
             f"the equations need memory of their own ({missing[0]}), as solvers and external functions do. "

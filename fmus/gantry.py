@@ -69,6 +69,11 @@ class Gantry(PlanarModel):
         """Inertia of each axis, m_t + m_J, in kg: 36.87 and 21.20 by Table II."""
         return self.translational_mass + self.equivalent_mass
 
+    @property
+    def weight(self) -> Array:
+        """Weight F_G of each axis in N: that of the moved mass, on z alone."""
+        return self.gravity * self.translational_mass * np.array([0.0, 1.0])
+
     def friction(self, x_v: Array) -> Array:
         """Return the friction force F_F of each axis in N at the velocity x_v in m/s."""
         coulomb = self.coulomb_scale * self.coulomb_friction * np.tanh(x_v / self.friction_width)
@@ -76,12 +81,15 @@ class Gantry(PlanarModel):
 
     def f_v(self, x_c: Array, x_v: Array) -> Array:
         """Return the drift of (2): friction and weight over inertia, m/s²."""
-        weight = self.gravity * self.translational_mass * np.array([0.0, 1.0])
-        return (-self.friction(x_v) - weight) / self.mass
+        return (-self.friction(x_v) - self.weight) / self.mass
 
     def G_v(self, x_c: Array) -> Array:  # noqa: N802 - the paper's symbol
         """Return the input matrix of (2), 1/kg."""
         return np.eye(2) / self.mass
+
+    def coordinate_acceleration(self, x_c: Array, x_v: Array, motor_force: Array, force: Array) -> Array:
+        """Return ẋ_v of (1): f_v + G_v (u + F) with one division, which is what an FMU of it spends its time on."""
+        return (motor_force + force - self.friction(x_v) - self.weight) / self.mass
 
     def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
         """Return the right-hand side of (1)."""
