@@ -58,3 +58,10 @@ def test_a_foot_point_that_is_reached_goes_on(jump):
     np.testing.assert_allclose(run["tracked.theta"], np.where(run.t > 0.0025, jump, 0.0), rtol=0, atol=1e-9 * 2 * np.pi)
     w = np.hypot(A * np.sin(jump), B * np.cos(jump))
     assert run["tracked.q"][-1] == pytest.approx(1.0 - A * B / w**3 * XI, abs=1e-9)
+
+
+@pytest.mark.parametrize("jump", [0.74, -0.74])
+def test_a_jump_never_ends_in_another_lap(jump):
+    # Newton's method from 0.74 rad off converges, but one lap away: eta would jump by the length of the path
+    with pytest.raises(PathDomainError, match="the foot point jumped"):
+        run_of(PathProjection(PATH, name="tracked"), jump)

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from sampled import TICKS, T, Wave, run_of, wave
 from scipy.linalg import expm
 
-from loopwright.blocks import Block, Input, Output, State, parameter
+from loopwright.blocks import Block, Input, State, parameter
 from loopwright.diagrams import Diagram, subsystem
 
 EULER = pytest.mark.parametrize("method", ["forward", "semi_implicit"])
-T, TICKS = 0.02, 150
 
 
 class Network(Block):
@@ -23,29 +23,6 @@ class Network(Block):
 
     def derivative(self, t, x, u):
         return self.A @ x.x + self.B @ u.u + self.g
-
-
-class Wave(Block):
-    """An input that changes from tick to tick."""
-
-    y = Output(shape=(2,))
-
-    def output(self, t, x, u):
-        return np.stack([2.0 * np.sin(5.0 * t + 0.3), np.cos(3.0 * t)])
-
-
-def wave(t):
-    return np.array([2.0 * np.sin(5.0 * t + 0.3), np.cos(3.0 * t)])
-
-
-def run_of(block, signal, method="exact", sample_time=T, ticks=TICKS):
-    """A run of the block alone in a sampled frame."""
-
-    @subsystem(sample_time=sample_time, method=method)
-    def box(u):
-        return block(u)
-
-    return Diagram("discretized", box(signal)).simulate(ticks * sample_time, progress=False)
 
 
 def network(seed, n=3):
