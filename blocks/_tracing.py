@@ -15,6 +15,7 @@ Events add two functions in a continuous frame, indicators(t, x, u₁ … uₘ, 
 from __future__ import annotations
 
 import inspect
+import linecache
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -384,7 +385,8 @@ def _where(error: Exception, block: Block, what: str) -> str:
     line, step = "", error.__traceback__
     while step is not None:
         if step.tb_frame.f_code.co_filename == file:
-            line = f" in line {step.tb_lineno} of {file}"
+            code = linecache.getline(file, step.tb_lineno).strip()
+            line = f" in line {step.tb_lineno} of {file}" + (f", {code!r}" if code else "")
         step = step.tb_next
     text = f"its {what} can't be traced{line}: {type(error).__name__}: {error}."
     if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):

@@ -131,7 +131,8 @@ def run_build(arguments: argparse.Namespace) -> int:
     except OptionError:
         raise
     except TraceError as error:
-        hint = "" if arguments.python else " Or put its Python code inside: --python."
+        mistake = str(error).endswith("Correct the equation there.")  # it would fail as Python, too
+        hint = "" if arguments.python or mistake else " Or put its Python code inside: --python."
         return _complain(f"{error}{hint}")
     except LoopwrightError as error:
         return _complain(error)

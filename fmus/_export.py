@@ -12,7 +12,7 @@ import numpy as np
 
 from ..blocks._block import Block
 from ..blocks._comparison import GUARDS, NEXT
-from ..blocks._errors import DefinitionError
+from ..blocks._errors import DefinitionError, LoopwrightError
 from ..blocks._ports import Port, Shape
 from ..blocks._symbols import size
 from ..blocks._tracing import Traced, trace, traced_parameters
@@ -47,6 +47,22 @@ def model_spec(
         If its equations can't be traced.
     """
     name = name or type(block).__name__.lower()
+    try:
+        return _model_spec(
+            block,
+            name,
+            internal_step=internal_step,
+            stop_time=stop_time,
+            step_size=step_size,
+            integrator=integrator,
+            tolerance=tolerance,
+        )
+    except LoopwrightError as error:
+        error.at(block=name)
+        raise
+
+
+def _model_spec(block: Block, name: str, **experiment: Any) -> ModelSpec:
     _check_exportable(block, name)
     shapes = {port: spec.shape or () for port, spec in block.inputs.items()}
     equations = _Equations(block, trace(block, shapes, sampled=False, zeros=False))
@@ -70,11 +86,7 @@ def model_spec(
         ),
         indicators=equations.indicators(),
         jump=equations.jump(),
-        internal_step=internal_step,
-        stop_time=stop_time,
-        step_size=step_size,
-        integrator=integrator,
-        tolerance=tolerance,
+        **experiment,
     )
 
 
