@@ -103,8 +103,8 @@ def _text(value: Any) -> str:
 def _code_parts(fmi: int) -> list[str]:
     """Give the text of what writes the files, so that a change of it (while developing) builds anew."""
     folder = Path(__file__).parent
-    names = ("_codegen.py", "_description.py", "_description2.py", "_documentation.py", "_scalars.py", "_build.py")
-    modules = [(folder / name).read_text(encoding="utf-8") for name in names]
+    written = ("_codegen", "_description", "_description2", "_documentation", "_quantities", "_scalars", "_build")
+    modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
     return [package_version(), *(text for _, text in sorted(runtime(fmi).items())), *modules]
 
 

@@ -17,6 +17,7 @@ import casadi as ca
 
 from ..blocks._units import BASE_UNITS, parse_unit
 from ._codegen import Entry, layout, scalar, symbolic
+from ._quantities import quantity, type_names
 from ._spec import ModelSpec
 
 #: Log categories (FMI 3.0, 2.4.5) that the runtime uses.
@@ -198,7 +199,7 @@ _INITIAL = dict.fromkeys(("fixed", "tunable", "state", "discrete"), "exact")
 _INITIAL |= dict.fromkeys(("derivative", "output", "indicator"), "calculated")
 
 
-def _variable(e: Entry, reinitialized: set[str]) -> str:
+def _variable(e: Entry, reinitialized: set[str], types: Mapping[str, str]) -> str:
     v = e.variable
     attributes: dict[str, object] = {
         "name": e.name,
@@ -208,6 +209,7 @@ def _variable(e: Entry, reinitialized: set[str]) -> str:
         "variability": "continuous" if e.kind in ("time", "derivative") else v.variability,
         "initial": _INITIAL.get(e.kind),
         "intermediateUpdate": True if (e.kind == "input" or e.is_output) and v.variability == "continuous" else None,
+        "declaredType": types.get(v.unit or ""),
         "unit": v.unit,
         "min": None if v.minimum is None else float(v.minimum),
         "max": None if v.maximum is None else float(v.maximum),
@@ -227,6 +229,17 @@ def _unit(text: str) -> str:
     if unit.offset:
         base["offset"] = unit.offset
     return _element("Unit", {"name": text}, [_element("BaseUnit", base)])
+
+
+def _types(types: Mapping[str, str]) -> list[dict[str, object]]:
+    """Give the attributes of each type."""
+    return [{"name": name, "quantity": quantity(unit), "unit": unit} for unit, name in types.items()]
+
+
+def _units_and_types(units: Iterable[str], types: Iterable[str]) -> list[str]:
+    """Write both lists of definitions; a model without units has neither."""
+    lists = (("UnitDefinitions", [_unit(unit) for unit in units]), ("TypeDefinitions", list(types)))
+    return [_element(tag, {}, items) for tag, items in lists if items]
 
 
 # ---- the files ----
@@ -275,15 +288,15 @@ def model_description(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
         "stepSize": float(spec.step_size),
     }
     reinitialized = _reinitialized(spec)
-    units = sorted({e.variable.unit for e in entries if e.variable.unit is not None})
+    types = type_names(entries)
     categories = [_element("Category", {"name": n, "description": d}) for n, d in LOG_CATEGORIES.items()]
     children = [
         _element("ModelExchange", both | {"needsCompletedIntegratorStep": False}),
         _element("CoSimulation", both | stepping),
-        _element("UnitDefinitions", {}, map(_unit, units)),
+        *_units_and_types(types, [_element("Float64Type", about) for about in _types(types)]),
         _element("LogCategories", {}, categories),
         _element("DefaultExperiment", experiment),
-        _element("ModelVariables", {}, [_variable(e, reinitialized) for e in entries]),
+        _element("ModelVariables", {}, [_variable(e, reinitialized, types) for e in entries]),
         _element("ModelStructure", {}, _structure(spec, entries)),
     ]
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"

@@ -5,7 +5,7 @@ A function of the model alone, as that of FMI 3.0: no time stamp, no random iden
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 
 from ._codegen import Entry, layout
 from ._description import (
@@ -15,14 +15,16 @@ from ._description import (
     Dependency,
     _element,
     _reinitialized,
-    _unit,
+    _types,
+    _units_and_types,
     dependencies,
     package_version,
 )
+from ._quantities import type_names
 from ._spec import ModelSpec
 
 
-def _variable(e: Entry, reinitialized: set[str]) -> str:
+def _variable(e: Entry, reinitialized: set[str], types: Mapping[str, str]) -> str:
     v = e.variable
     about = {
         "name": e.name,
@@ -33,6 +35,7 @@ def _variable(e: Entry, reinitialized: set[str]) -> str:
         "initial": _INITIAL.get(e.kind),
     }
     real = {
+        "declaredType": types.get(v.unit or ""),
         "unit": v.unit,
         "min": None if v.minimum is None else float(v.minimum),
         "max": None if v.maximum is None else float(v.maximum),
@@ -125,7 +128,8 @@ def model_description2(spec: ModelSpec, token: str, *, derivatives: bool) -> str
         "canRunAsynchronuously": False,
     }
     sources = _element("SourceFiles", {}, [_element("File", {"name": "model.c"})])
-    units = sorted({e.variable.unit for e in entries if e.variable.unit is not None})
+    types = type_names(entries)
+    simple = [_element("SimpleType", {"name": about.pop("name")}, [_element("Real", about)]) for about in _types(types)]
     categories = LOG_CATEGORIES | {"logAll": "All of them"}
     experiment = {
         "startTime": 0.0,
@@ -137,12 +141,12 @@ def model_description2(spec: ModelSpec, token: str, *, derivatives: bool) -> str
     children = [
         _element("ModelExchange", both | {"completedIntegratorStepNotNeeded": True}, [sources]),
         _element("CoSimulation", both | stepping, [sources]),
-        _element("UnitDefinitions", {}, map(_unit, units)),
+        *_units_and_types(types, simple),
         _element(
             "LogCategories", {}, [_element("Category", {"name": n, "description": d}) for n, d in categories.items()]
         ),
         _element("DefaultExperiment", experiment),
-        _element("ModelVariables", {}, [_variable(e, reinitialized) for e in entries]),
+        _element("ModelVariables", {}, [_variable(e, reinitialized, types) for e in entries]),
         _element("ModelStructure", {}, _structure(spec, entries)),
     ]
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"
