@@ -30,6 +30,7 @@ def plant_alone(plant, ticks: int) -> float:
     with plant.instantiate(list(plant.inputs), 1e3) as instance:
         inputs, outputs = np.zeros(4), np.zeros(6)
         instance.bind(inputs, outputs)
+        instance.begin()
         inputs[:2] = 70.0, 80.0
         started = time.perf_counter()
         for k in range(ticks):

@@ -92,6 +92,14 @@ def test_every_subpackage_is_listed_for_the_wheel():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
+def test_the_benchmarks_run(path):
+    done = call(sys.executable, str(path))  # what they measure is for people: no time is asserted
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert any(line.strip() for line in done.stdout.splitlines())
+
+
+@pytest.mark.slow
 def test_the_built_wheel_imports_runs_and_holds_the_c_runtime(tmp_path):
     copy = tmp_path / "source"
     assert call("git", "clone", "-q", str(ROOT), str(copy)).returncode == 0
