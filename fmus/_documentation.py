@@ -20,8 +20,8 @@ from ._spec import ModelSpec, Variable
 _STYLE = """
 :root { color-scheme: light dark; }
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; }
-pre { overflow-x: auto; padding: 0.75rem 1rem; border: 1px solid #8886; border-radius: 0.3rem; }
-pre.text { white-space: pre-wrap; border: 0; padding: 0; }
+pre { white-space: pre-wrap; padding: 0.75rem 1rem; border: 1px solid #8886; border-radius: 0.3rem; }
+pre.text { border: 0; padding: 0; }
 table { border-collapse: collapse; width: 100%; }
 caption { text-align: left; padding-bottom: 0.5rem; }
 th, td { text-align: left; vertical-align: top; padding: 0.3rem 0.75rem 0.3rem 0; border-bottom: 1px solid #8886; }
