@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar, Self
@@ -40,10 +41,11 @@ class Block(Value, Wireable):
 
     A block has continuous states if it has a ``derivative``, sampled ones if it has an ``update`` alone. A continuous
     block in a sampled subsystem is discretized by the subsystem's method, unless it has an ``update`` of its own.
-    A continuous block may declare events and discrete states, which its ``jump`` changes.
+    A continuous block may declare events and discrete states, which its ``jump`` changes. With an ``update`` as well it
+    stands in both kinds of frames: its events act in a continuous one, its ``update`` in a sampled one.
 
     Equations (all optional; ``T`` may be declared as a last argument of ``output``, ``update`` and ``guards`` and is
-    then the sample time in s)
+    then the sample time in s; declared as ``T=None`` it is None in a continuous frame)
     ----------------------------------------------------------------------------------------------------------------
     output(t, x, u)
         The outputs that are not states.
@@ -61,6 +63,9 @@ class Block(Value, Wireable):
         Initial states from the inputs at the start: plain Python, not traced.
     constants(T, method)
         Numbers computed from the parameters in plain Python, which the equations then read as attributes.
+    next_instant(t)
+        The next time strictly after t at which the outputs or their derivatives are not smooth, ``math.inf`` if there
+        is none: plain Python, not traced. A solver lands there; it is not asked for in a sampled frame.
 
     Parameters
     ----------
@@ -75,6 +80,8 @@ class Block(Value, Wireable):
     """True where there are no equations to trace."""
     same_units: ClassVar[bool] = False
     """True where all inputs must be in one unit, as in a sum."""
+    stops: ClassVar[str | None] = None
+    """Name of a scalar output that ends the run, normally, at the first instant at which it is above 0.5."""
 
     inputs: ClassVar[Mapping[str, Input]] = {}
     outputs: ClassVar[Mapping[str, Output | State]] = {}
@@ -123,6 +130,10 @@ class Block(Value, Wireable):
     def starts_from_inputs(self) -> bool:
         """Whether the initial state is computed from the inputs at the start, by ``initial``."""
         return hasattr(self, "initial")
+
+    def next_instant(self, t: float) -> float:
+        """Return the next time after t at which the outputs are not smooth in time: never, unless overridden."""
+        return math.inf
 
     def replace(self, **changes: Any) -> Self:
         """Return a variant with some parameters (or the name) changed; it is another node."""

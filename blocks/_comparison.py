@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ._block import Block
-from ._equations import parts_of
+from ._equations import parts_of, takes_update
 from ._errors import LoopwrightError, TraceError
 from ._ports import Shape
 from ._rounding import watched, watching
@@ -196,8 +196,7 @@ def evaluate(
     own = [name for name in block.outputs if name not in block.states]
     if own and own[0] in names:
         result.update(zip(own, parts("output", own), strict=True))
-    has_update = hasattr(block, "update") and (np.isfinite(T) or not hasattr(block, "derivative"))
-    if NEXT in names and states and has_update:
+    if NEXT in names and states and takes_update(block, bool(np.isfinite(T))):
         result[NEXT] = flat("update", states)
     if GUARDS in names and hasattr(block, "guards"):
         result[GUARDS] = np.concatenate([*(_numbers(v, k) for k, v in call("guards").items()), np.zeros(0)])

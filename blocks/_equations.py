@@ -24,6 +24,7 @@ _ARGUMENTS = {
     "jump": ("t", "x", "u", "fired"),
     "initial": ("u",),
     "constants": ("T", "method"),
+    "next_instant": ("t",),
 }
 _SAMPLED = ("output", "update", "guards")  # may take T besides
 
@@ -55,11 +56,18 @@ def check_definition(block: Block) -> None:
             raise TraceError(f"its {what} is {_named(function)}; {expected}. Define it as a function.")
         try:
             signature = inspect.signature(function)
-            given = {"T": None} if what not in ("initial", "constants") and "T" in signature.parameters else {}
+            given = {"T": None} if what in (*_SAMPLED, "derivative") and "T" in signature.parameters else {}
             signature.bind(*names, **given)
         except (TypeError, ValueError):
             written = str(inspect.signature(getattr(cls, what))).partition(" ->")[0]
             raise TraceError(f"found {what}{written}; {expected}. Give it these arguments.") from None
+
+
+def takes_update(block: Block, sampled: bool) -> bool:
+    """Whether the states advance by ``update``: in a sampled frame, else where nothing else advances them."""
+    if not hasattr(block, "update"):
+        return False
+    return sampled or not (hasattr(block, "derivative") or (block.events and not block.memory))
 
 
 def _named(value: Any) -> str:

@@ -26,7 +26,7 @@ import numpy as np
 from ._block import Block
 from ._comparison import GUARDS, NEXT, compare
 from ._discretization import hold
-from ._equations import check_definition, guards_of, split, start_values
+from ._equations import check_definition, guards_of, split, start_values, takes_update
 from ._errors import LoopwrightError, SampleTimeError, TraceError
 from ._ports import Shape
 from ._symbols import bundle, expanded, flat_column, size, with_values, wrap
@@ -297,7 +297,7 @@ class _Tracer:
         events = self.block.events
         lone = [n for n, port in self.block.states.items() if port.discrete]
         if not events:
-            if lone:
+            if lone and not (self.sampled and hasattr(self.block, "update")):
                 raise TraceError(
                     f"its states {', '.join(lone)} are discrete but no event changes them; declare an Event, or leave "
                     "discrete=True out."
@@ -306,10 +306,8 @@ class _Tracer:
         for what in ("indicators", "jump"):
             if not hasattr(self.block, what):
                 raise TraceError(f"it declares the events {', '.join(events)} but has no {what}; write it.")
-        if self.sampled:
-            raise SampleTimeError(
-                f"it has events ({', '.join(events)}), and it stands in a sampled frame; put it outside of it."
-            )
+        if self.sampled:  # its update does at the ticks what its jumps do between them
+            return None, None
         fired = ca.MX.sym("fired", len(events))
         z = ca.vertcat(*split(self._call("indicators"), dict.fromkeys(events, ()), "indicators")[0].values())
         after = self._call("jump", None, bundle("fired", self._columns(dict.fromkeys(events, ()), fired)))
@@ -327,12 +325,17 @@ class _Tracer:
         if not self.states:
             return "none", None, none, ca.MX.sym("none", 0)
         update, derivative = hasattr(self.block, "update"), hasattr(self.block, "derivative")
+        if self.sampled and self.block.events and not update:
+            raise SampleTimeError(
+                f"it has events ({', '.join(self.block.events)}), and it stands in a sampled frame; put it outside of "
+                "it, or give it an update(t, x, u), which acts at the ticks instead of them."
+            )
 
         def states_from(what: str, x: Any = None) -> Any:
             return ca.vertcat(*split(self._call(what, x), self.states, what)[0].values())
 
         unused = ca.MX.sym("none", 0)
-        if update and (self.sampled or not derivative):
+        if takes_update(self.block, self.sampled):
             if not self.sampled and not self.block.memory:
                 raise SampleTimeError(
                     "a sampled block stands in a continuous frame; put it into a @subsystem(sample_time=…)."
