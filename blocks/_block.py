@@ -13,6 +13,7 @@ from ._documentation import port_section, with_section
 from ._errors import DefinitionError, GuardError, WiringError, near
 from ._ports import Event, Input, Output, Port, State
 from ._signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, bind, check_name, primary_outputs
+from ._trapezoid import SOLVED
 from ._values import Value
 
 _ABSENT = frozenset({"output", "derivative", "update", "indicators", "jump", "guards", "initial", "constants"})
@@ -174,6 +175,11 @@ class Block(Value, Wireable):
 
     def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
         """Return the error for a failed guard; ``u``, ``y``, ``x`` are named tuples of inputs, outputs, states then."""
+        if name == SOLVED:
+            return GuardError(
+                f"its trapezoidal step is not solved: after the last of Newton's steps a state is still about "
+                f"{-value:.3g} away. Take a smaller sample time, or another method."
+            )
         return GuardError(
             f"guard {name!r} is {value:.6g}; expected a positive value. Check what its inputs are: "
             f"{', '.join(f'{k} = {np.asarray(v).tolist()}' for k, v in u._asdict().items())}."

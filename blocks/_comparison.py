@@ -76,6 +76,8 @@ def compare(
                 continue
             arguments = [*point.flat(), p, *([np.array(list(point.fired.values()))] if "jump" in names else [])]
             traced = {n: np.ravel(np.array(c)) for n, c in zip(names, function.call(arguments), strict=True)}
+            if GUARDS in expected:  # behind those of the equations may stand the discretization's own
+                traced[GUARDS] = traced[GUARDS][: expected[GUARDS].size]
             for name, value in expected.items():
                 difference = _difference(traced[name], value, name)
                 if difference and not (special and _on_an_edge(traced[name], name, point, numpy_at)):

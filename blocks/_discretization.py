@@ -8,8 +8,8 @@ import numpy as np
 
 from ._errors import SampleTimeError
 
-Method = Literal["exact", "forward", "semi_implicit"]
-METHODS = ("exact", "forward", "semi_implicit")
+Method = Literal["exact", "forward", "semi_implicit", "trapezoidal"]
+METHODS = ("exact", "forward", "semi_implicit", "trapezoidal")
 
 
 def check_method(method: str) -> None:
@@ -27,10 +27,16 @@ def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
         System matrix.
     T : float
         Sample time in s.
-    method : {"exact", "forward", "semi_implicit"}
+    method : {"exact", "forward", "semi_implicit", "trapezoidal"}
         ``exact`` is the zero-order hold, Ad = exp(A T) and Φ = ∫₀ᵀ exp(A s) ds. ``forward`` is forward Euler.
         ``semi_implicit`` is Euler with the states renewed from the last to the first, each with those already renewed:
-        for (position, velocity) the velocity first, then the position with the new velocity.
+        for (position, velocity) the velocity first, then the position with the new velocity. ``trapezoidal`` is
+        Ad = (I − A T/2)⁻¹ (I + A T/2) and Φ = T (I − A T/2)⁻¹, of second order: x(t + T) = x + T/2 (ẋ(t) + ẋ(t + T)).
+
+    Raises
+    ------
+    SampleTimeError
+        Another method, or a trapezoidal step whose I − A T/2 is singular.
     """
     check_method(method)
     n = len(A)
@@ -41,6 +47,15 @@ def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
         upper = np.triu(A, 1)
         solve = np.linalg.inv(eye - T * upper)
         return solve @ (eye + T * (A - upper)), T * solve
+    if method == "trapezoidal":
+        try:
+            solve = np.linalg.inv(eye - T / 2 * A)
+        except np.linalg.LinAlgError:
+            raise SampleTimeError(
+                f"the trapezoidal step of {T:g} s has no solution: a pole is at 2/T = {2 / T:g} 1/s. Take a smaller "
+                "sample time, or method='exact'."
+            ) from None
+        return solve @ (eye + T / 2 * A), T * solve
     from scipy.linalg import expm
 
     both = expm(np.block([[A, eye], [np.zeros((n, 2 * n))]]) * T)

@@ -30,6 +30,7 @@ from ._equations import check_definition, guards_of, split, start_values, takes_
 from ._errors import LoopwrightError, SampleTimeError, TraceError
 from ._ports import Shape
 from ._symbols import bundle, expanded, flat_column, size, with_values, wrap
+from ._trapezoid import SOLVED, trapezoidal
 from ._values import Value, identity
 
 
@@ -185,6 +186,7 @@ class _Tracer:
         self.entries = list(traced_parameters(block))
         self.constants = constants_of(block, 1.0 if sampled else np.nan, method)
         self.guard_names: tuple[str, ...] = ()
+        self.solved = ca.MX(0, 1)
         sizes = [sum(np.size(v) for _, v in self.entries), sum(np.size(v) for v in self.constants.values())]
         self.t = ca.MX.sym("t")
         self.x = ca.MX.sym("x", sum(map(size, self.states.values())))
@@ -195,7 +197,8 @@ class _Tracer:
     def run(self) -> Traced:
         advance, matrix, new, hold_numbers = self._advance()
         outputs, output_shapes = self._outputs()
-        results = [*outputs.values(), new, self._guards()]
+        results = [*outputs.values(), new, ca.vertcat(self._guards(), self.solved)]
+        self.guard_names += (SOLVED,) * self.solved.numel()
         names = [*outputs, NEXT, GUARDS]
         p = ca.MX.sym("p", self.p.numel() + hold_numbers.numel())
         parts = ca.vertsplit(p, [0, self.p.numel(), p.numel()])
@@ -353,6 +356,8 @@ class _Tracer:
         n, arguments = x.numel(), [self.t, x, *self.u, self.p]
         jacobian = expanded(ca.Function("A", arguments, [ca.jacobian(dx, x)]))
         if not any(jacobian.jac_sparsity(0, i).nnz() for i in range(2 + len(self.u))):
+            if self.method == "trapezoidal":  # what depends on time is the mean of both ends
+                dx = (dx + ca.substitute(dx, self.t, self.t + self.T)) / 2
             if jacobian.nnz_out(0) == 0:
                 return "integrator", None, x + self.T * dx, unused
             at_zero = jacobian(*(ca.DM.zeros(a.shape) for a in arguments[:-1]), self.p)
@@ -360,6 +365,11 @@ class _Tracer:
             numbers = ca.MX.sym("hold", 2 * n * n)
             Ad, Phi = (ca.reshape(numbers[i * n * n : (i + 1) * n * n], n, n).T for i in (0, 1))
             return "affine", matrix, Ad @ x + Phi @ ca.substitute(dx, x, ca.MX(ca.DM.zeros(n))), numbers
+        if self.method == "trapezoidal":
+            rates = expanded(ca.Function("rates", arguments, [dx]))
+            nominals = [np.full(size(self.states[n]), port.nominal or 1.0) for n, port in self.block.states.items()]
+            new, self.solved = trapezoidal(rates, arguments, self.T, np.concatenate(nominals))
+            return "trapezoidal", None, new, unused
         if self.method == "semi_implicit":
             new = x
             for i in reversed(range(n)):

@@ -12,6 +12,7 @@ from ..blocks._errors import DoubleDriveError, SampleTimeError, UnknownNameError
 from ..blocks._signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, recorder
 
 FINEST = Fraction(1, 10**9)
+ENABLED, TRIGGERED = ("held", "reset"), ("rising", "falling", "both")
 
 
 def exact_time(value: Any, *, block: str = "") -> Fraction:
@@ -39,6 +40,42 @@ def exact_time(value: Any, *, block: str = "") -> Fraction:
     return time
 
 
+def exact_offset(value: Any, sample_time: Fraction | None, *, block: str) -> Fraction:
+    """Return an offset as an exact fraction of a second.
+
+    Raises
+    ------
+    SampleTimeError
+        If it is negative, not less than the sample time, or there is none.
+    """
+    if isinstance(value, int | float | Fraction) and not isinstance(value, bool) and value == 0:
+        return Fraction(0)
+    offset = exact_time(value, block=block)
+    if sample_time is None:
+        raise SampleTimeError("it has an offset but no sample time; give it sample_time=….", block=block)
+    if offset >= sample_time:
+        raise SampleTimeError(
+            f"found an offset of {float(offset):g} s; expected less than the sample time, {float(sample_time):g} s.",
+            block=block,
+        )
+    return offset
+
+
+def samples_of_delay(value: Any, sample_time: Fraction | None, *, block: str) -> int:
+    """Return a computational delay in samples.
+
+    Raises
+    ------
+    SampleTimeError
+        If it is no whole number, is negative, or there is no sample time.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise SampleTimeError(f"found delay={value!r}; expected a whole number of samples, 0 or more.", block=block)
+    if value and sample_time is None:
+        raise SampleTimeError("it has a delay but no sample time; give it sample_time=….", block=block)
+    return value
+
+
 class FrameInput:
     """The inside of a subsystem's input: stands for the signal that is wired to it outside."""
 
@@ -50,26 +87,58 @@ class FrameInput:
 class Subsystem:
     """A function of signals as a box; made by `subsystem`, called like a block."""
 
-    def __init__(self, function: Callable[..., Any], sample_time: Any, method: str, name: str | None):
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        *,
+        sample_time: Any = None,
+        method: str = "exact",
+        name: str | None = None,
+        offset: Any = 0,
+        delay: int = 0,
+        enabled: str | None = None,
+        triggered: str | None = None,
+    ):
         check_method(method)
         self.function, self.method = function, method
         own = function.__name__ if function.__name__.isidentifier() else "subsystem"
         self.name = check_name(name or own)
         self.sample_time = None if sample_time is None else exact_time(sample_time, block=self.name)
+        self.offset = exact_offset(offset, self.sample_time, block=self.name)
+        self.delay = samples_of_delay(delay, self.sample_time, block=self.name)
+        self.enabled, self.triggered = enabled, triggered
+        if enabled is not None and triggered is not None:
+            raise WiringError("it is both enabled and triggered; put one box into the other.", block=self.name)
+        for value, key, allowed in ((enabled, "enabled", ENABLED), (triggered, "triggered", TRIGGERED)):
+            if value is not None and value not in allowed:
+                raise WiringError(
+                    f"found {key}={value!r}; expected {' or '.join(map(repr, allowed))}.", block=self.name
+                )
+        self.control = "enabled" if enabled else "triggered" if triggered else ""
+        self.when = enabled or triggered or ""
+        self.control_input = {"enabled": "enable", "triggered": "trigger", "": ""}[self.control]
         every = inspect.signature(function).parameters.values()
         self.parameters = [p for p in every if p.kind is not inspect.Parameter.VAR_KEYWORD]
         self.open_ended = len(self.parameters) < len(every)
         self.__doc__, self.__name__ = function.__doc__, self.name
 
     def replace(self, **changes: Any) -> Subsystem:
-        """Return a variant with another ``sample_time``, ``method`` or ``name``.
+        """Return a variant; the keywords are those of `subsystem`.
 
         Raises
         ------
         UnknownNameError
             For any other name.
         """
-        known = {"sample_time": self.sample_time, "method": self.method, "name": self.name}
+        known = {
+            "sample_time": self.sample_time,
+            "method": self.method,
+            "name": self.name,
+            "offset": self.offset,
+            "delay": self.delay,
+            "enabled": self.enabled,
+            "triggered": self.triggered,
+        }
         for key in changes:
             if key not in known:
                 raise UnknownNameError(f"a subsystem has no {key!r}. {near(key, known)}", block=self.name)
@@ -78,6 +147,8 @@ class Subsystem:
     def __call__(self, *args: Any, **kwargs: Any) -> SubsystemCall:
         """Wire the box: run the function on signals that stand for its inputs."""
         names = [p.name for p in self.parameters]
+        if self.control_input and self.control_input not in names:
+            names.append(self.control_input)
         if len(args) > len(names):
             raise WiringError(f"{len(args)} signals for {len(names)} inputs ({', '.join(names)}).", block=self.name)
         given = dict(zip(names, args, strict=False))
@@ -87,7 +158,8 @@ class Subsystem:
             if key in given:
                 raise DoubleDriveError("it is driven twice in one call.", block=self.name, port=key)
             given[key] = value
-        missing = [p.name for p in self.parameters if p.name not in given and p.default is inspect.Parameter.empty]
+        optional = {p.name for p in self.parameters if p.default is not inspect.Parameter.empty}
+        missing = [name for name in names if name not in given and name not in optional - {self.control_input}]
         if missing:
             raise UnwiredInputError(
                 f"nothing is wired to {', '.join(map(repr, missing))}; expected {self.name}({', '.join(names)}).",
@@ -109,7 +181,9 @@ class SubsystemCall(Wireable):
         calls: list[Any] = []
         token = recorder.set(calls)
         try:
-            result = subsystem.function(**{k: Signal(FrameInput(self, k), k) for k in wires})
+            own = {p.name for p in subsystem.parameters}
+            inside = [k for k in wires if k in own or k != subsystem.control_input]
+            result = subsystem.function(**{k: Signal(FrameInput(self, k), k) for k in inside})
         finally:
             recorder.reset(token)
         self.calls = calls
@@ -168,7 +242,14 @@ class SubsystemCall(Wireable):
 def subsystem(function: Callable[..., Any], /) -> Subsystem: ...
 @overload
 def subsystem(
-    *, sample_time: float | Fraction | None = None, method: str = "exact", name: str | None = None
+    *,
+    sample_time: float | Fraction | None = None,
+    method: str = "exact",
+    name: str | None = None,
+    offset: float | Fraction = 0,
+    delay: int = 0,
+    enabled: str | None = None,
+    triggered: str | None = None,
 ) -> Callable[[Callable[..., Any]], Subsystem]: ...
 def subsystem(
     function: Callable[..., Any] | None = None,
@@ -177,6 +258,10 @@ def subsystem(
     sample_time: float | Fraction | None = None,
     method: str = "exact",
     name: str | None = None,
+    offset: float | Fraction = 0,
+    delay: int = 0,
+    enabled: str | None = None,
+    triggered: str | None = None,
 ) -> Any:
     """Make a function of signals a box of a diagram.
 
@@ -185,16 +270,31 @@ def subsystem(
     sample_time : float or Fraction, optional
         Sample time in s. Inputs are sampled at its ticks, outputs held between them, continuous blocks inside
         discretized. A float is read as its shortest decimal. Without one the box has the rate of what surrounds it.
-    method : {"exact", "forward", "semi_implicit"}
+    method : {"exact", "forward", "semi_implicit", "trapezoidal"}
         How continuous blocks inside are discretized: ``exact`` is the zero-order hold for blocks that are linear in
-        their states, forward Euler for others; see `loopwright.blocks.hold`.
+        their states, forward Euler for others; ``trapezoidal`` is of second order, solved by Newton's method where a
+        block is not linear, and the run stops at a step that it does not solve; see `loopwright.blocks.hold`.
     name : str, optional
         Name of the box; without one, the function's.
+    offset : float or Fraction
+        Time of the first tick in s, less than the sample time. Until then the outputs are what the box gives at t = 0,
+        and are held.
+    delay : int
+        Computational delay in samples: what leaves the box at a tick was computed that many ticks before, from the
+        inputs then. In the first ticks it is what was computed first.
+    enabled : {"held", "reset"}, optional
+        The box is called with one more input, ``enable``, and acts only while that is true (above 0.5). Else its
+        outputs and states are held; with "reset" the states start anew when it is enabled again.
+    triggered : {"rising", "falling", "both"}, optional
+        The box is called with one more input, ``trigger``, and acts only at the instants at which that becomes true
+        (rising), false (falling), or either. Between them its outputs are held. Blocks inside have no sample time.
 
     Raises
     ------
     SampleTimeError
-        Not positive, or no multiple of 1 ns; an unknown method.
+        Not positive, or no multiple of 1 ns; an unknown method; an offset or a delay without a sample time.
+    WiringError
+        Another word for ``enabled`` or ``triggered``, or both.
 
     Examples
     --------
@@ -211,6 +311,15 @@ def subsystem(
         )
 
     def decorate(f: Callable[..., Any]) -> Subsystem:
-        return Subsystem(f, sample_time, method, name)
+        return Subsystem(
+            f,
+            sample_time=sample_time,
+            method=method,
+            name=name,
+            offset=offset,
+            delay=delay,
+            enabled=enabled,
+            triggered=triggered,
+        )
 
     return decorate if function is None else decorate(function)

@@ -186,7 +186,9 @@ def test_the_holds_of_eulers_methods_are_their_recurrences(method):
 
 
 def test_a_method_that_is_none_is_refused():
-    with pytest.raises(SampleTimeError, match=r"found the method 'euler'; expected one of exact, forward, semi_impl"):
+    with pytest.raises(
+        SampleTimeError, match=r"found the method 'euler'; expected one of exact, forward, semi_implicit, trap"
+    ):
         hold(np.eye(1), 0.1, "euler")
     with pytest.raises(SampleTimeError, match="found the method 'implicit'"):
         subsystem(sample_time=0.1, method="implicit")(lambda u: Integrator()(u))
