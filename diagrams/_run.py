@@ -169,3 +169,12 @@ def resolve(name: str, wires: Any, ports: Any) -> str:
             raise UnknownNameError(f"{name!r} stands for several signals: {', '.join(found)}. Write more of the path.")
     short = {n.rpartition(".")[2] for n in (*wires, *ports)}
     raise UnknownNameError(f"no signal {name!r} was recorded. {near(name, short | set(wires) | set(ports))}")
+
+
+def entries(full: str, layout: Layout, wires: Any) -> np.ndarray:
+    """Return where a signal stands in the vector of a sample, in the signal's shape."""
+    wire = wires.get(full)
+    port = full if wire is None else f"{wire.block}.{wire.port}"
+    where = layout.slices[port]
+    whole = np.arange(where.start, where.stop).reshape(layout.shapes[port])
+    return whole if wire is None or wire.index is None else np.asarray(whole[wire.index])
