@@ -83,6 +83,8 @@ class Block(Value, Wireable):
     """True where all inputs must be in one unit, as in a sum."""
     stops: ClassVar[str | None] = None
     """Name of a scalar output that ends the run, normally, at the first instant at which it is above 0.5."""
+    transport: ClassVar[bool] = False
+    """True where, in continuous time, the output ``y`` is the input ``u`` a time ``delay`` ago, which the solver keeps."""
 
     inputs: ClassVar[Mapping[str, Input]] = {}
     outputs: ClassVar[Mapping[str, Output | State]] = {}

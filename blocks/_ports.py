@@ -201,10 +201,24 @@ class Event(Port):
         One line for people.
     nominal : float
         Typical size of the indicator, positive: what "close to zero" is measured by.
+    hysteresis : float
+        How far beyond zero, in the indicator's unit, it must go for the event to fire. It ends chattering, and is used
+        in diagrams; an exported FMU has its own.
     """
 
-    def __init__(self, direction: str = "both", description: str = "", *, nominal: float = 1.0, name: str = ""):
+    def __init__(
+        self,
+        direction: str = "both",
+        description: str = "",
+        *,
+        nominal: float = 1.0,
+        hysteresis: float = 0.0,
+        name: str = "",
+    ):
         super().__init__((), None, description, name, nominal=float(nominal))
+        self.hysteresis = float(hysteresis)
+        if not self.hysteresis >= 0.0:
+            raise DefinitionError(f"found hysteresis {hysteresis!r}; expected a number of zero or more.")
         if direction not in ("both", "rising", "falling"):
             raise DefinitionError(f"found direction {direction!r}; expected 'both', 'rising' or 'falling'.")
         self.direction = direction
