@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import os
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 
@@ -30,6 +31,8 @@ class FmuVariable:
     description: str
     minimum: float | None
     maximum: float | None
+    nominal: float | None = None
+    variability: str = "continuous"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +48,22 @@ class FmuDescription:
     variables: dict[str, FmuVariable]
     other: dict[str, str]
     """Variables of other types, with their type."""
+    can_save: bool = False
+    """Whether the state of an instance can be saved and restored (canGetAndSetFMUState)."""
+    can_serialize: bool = False
+    """Whether a saved state can be turned into bytes, for another process (canSerializeFMUState)."""
+    has_derivatives: bool = False
+    """Whether it gives directional derivatives in co-simulation (providesDirectionalDerivatives)."""
+    variable_step: bool = False
+    """Whether communication steps may differ in length (canHandleVariableCommunicationStepSize)."""
+    fixed_internal_step: float | None = None
+    """The step in s that it computes with inside, where it is fixed (fixedInternalStepSize): take multiples of it."""
+    states: dict[str, str] = field(default_factory=dict)
+    """Continuous states that are variables, with their derivatives' names, in the order of the model structure."""
+    model_exchange: str | None = None
+    """Model identifier of the model-exchange interface, None without one."""
+    model_exchange_has_derivatives: bool = False
+    """Whether it gives directional derivatives in model exchange."""
 
     def of(self, causality: str) -> dict[str, FmuVariable]:
         """Return the variables of a causality, in the file's order."""
@@ -74,6 +93,7 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
     try:
         with zipfile.ZipFile(path) as archive:
             entries = set(archive.namelist())
+            text = archive.read("modelDescription.xml") if "modelDescription.xml" in entries else b""
     except zipfile.BadZipFile:
         raise FmuFileError(
             f"{str(path)!r} is no FMU: it is no zip archive (it starts with {data[:8]!r}). Give the .fmu that the "
@@ -111,11 +131,45 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
         start = None if v.start is None else _start(v.start, shape)
         variables[v.name] = FmuVariable(
             v.name, v.valueReference, v.causality or "local", shape, _unit(v.unit), start, v.description or "",
-            None if v.min is None else float(v.min), None if v.max is None else float(v.max),
+            _number(v.min), _number(v.max), _number(v.nominal), v.variability or "continuous",
         )  # fmt: skip
     return FmuDescription(
-        path, hashlib.sha256(data).hexdigest(), model.modelName, identifier, model.instantiationToken, variables, other
-    )
+        path, hashlib.sha256(data).hexdigest(), model.modelName, identifier, model.instantiationToken, variables, other,
+        states=_states(model, variables), **_capabilities(text),
+    )  # fmt: skip
+
+
+def _capabilities(text: bytes) -> dict[str, Any]:
+    """Return what the interfaces claim (FMI 3.0, 3.4 and 4.4); FMPy drops providesDirectionalDerivatives of 3.0."""
+    root = ET.fromstring(text)
+    steps, exchange = root.find("CoSimulation"), root.find("ModelExchange")
+    fixed = None if steps is None else steps.get("fixedInternalStepSize")
+    return {
+        "can_save": _flag(steps, "canGetAndSetFMUState"),
+        "can_serialize": _flag(steps, "canGetAndSetFMUState") and _flag(steps, "canSerializeFMUState"),
+        "has_derivatives": _flag(steps, "providesDirectionalDerivatives"),
+        "variable_step": _flag(steps, "canHandleVariableCommunicationStepSize"),
+        "fixed_internal_step": _number(fixed),
+        "model_exchange": None if exchange is None else exchange.get("modelIdentifier"),
+        "model_exchange_has_derivatives": _flag(exchange, "providesDirectionalDerivatives"),
+    }
+
+
+def _flag(interface: ET.Element | None, name: str) -> bool:
+    return interface is not None and interface.get(name) in ("true", "1")
+
+
+def _states(model: Any, variables: dict[str, FmuVariable]) -> dict[str, str]:
+    """Return the states behind the listed derivatives (FMI 3.0, 2.4.8); none where one is missing or no Float64."""
+    pairs = {
+        u.variable.derivative.name: u.variable.name for u in model.derivatives if u.variable.derivative is not None
+    }
+    complete = len(pairs) == len(model.derivatives) and all(a in variables and b in variables for a, b in pairs.items())
+    return pairs if complete else {}
+
+
+def _number(text: Any) -> float | None:
+    return None if text is None else float(text)
 
 
 def _shape(variable: Any, model: Any) -> tuple[int, ...]:

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from ..blocks._block import Block
-from ..blocks._errors import FmuError, FmuFileError, FmuRuntimeError, ParameterError, UnknownNameError, near
+from ..blocks._errors import FmuError, FmuFileError, ParameterError, UnknownNameError, near
 from ..blocks._frozen import FrozenMapping
 from ..blocks._ports import Input, Output
 from ..blocks._signals import Signal, UnknownAttributeError
 from ..blocks._values import parameter
-from ._compiler import cache_folder
 from ._description_reading import FmuDescription, FmuVariable, read_description
+from ._instance import FmuInstance
 
 _STATUS = ("OK", "warning", "discard", "error", "fatal")
 
@@ -122,6 +118,29 @@ class Fmu(Block):
         return found
 
     @property
+    def variable_step(self) -> bool:
+        """Whether its communication steps may differ in length (canHandleVariableCommunicationStepSize)."""
+        return self.description.variable_step
+
+    @property
+    def fixed_internal_step(self) -> float | None:
+        """The step in s that it computes with inside, None where that is its own matter (fixedInternalStepSize).
+
+        Communication steps are then to be multiples of it.
+        """
+        return self.description.fixed_internal_step
+
+    @property
+    def can_save(self) -> bool:
+        """Whether the state of a run can be saved and restored (canGetAndSetFMUState)."""
+        return self.description.can_save
+
+    @property
+    def can_serialize(self) -> bool:
+        """Whether a saved state can go to another process (canSerializeFMUState)."""
+        return self.description.can_serialize
+
+    @property
     def label(self) -> str:
         """Name for messages: the given one, else ``fmu``."""
         return self.name or self._hint or "fmu"
@@ -160,177 +179,26 @@ class Fmu(Block):
         return super().__getitem__(name)
 
     @contextmanager
-    def instantiate(self, wired: Sequence[str], stop_time: float) -> Iterator[FmuInstance]:
+    def instantiate(
+        self, wired: Sequence[str], stop_time: float | None, *, start_time: float = 0.0
+    ) -> Iterator[FmuInstance]:
         """Load the FMU for a run; it is terminated and freed whatever happens.
 
         Parameters
         ----------
         wired : sequence of str
             The input ports that the run will set at each communication point.
-        stop_time : float
-            End of the run in s.
+        stop_time : float, optional
+            End of the run in s; None for a run that may be continued, as an FMU may refuse to step beyond it.
+        start_time : float
+            Start of the run in s.
         """
         instance = FmuInstance(self, wired)  # it reads the description, and so checks the file
         try:
-            instance.initialize(stop_time)
+            instance.initialize(stop_time, start_time=start_time)
             yield instance
         finally:
             instance.close()
-
-
-class FmuInstance:
-    """A loaded FMU: one step at a time, through vectors that are shared with the scheduler."""
-
-    def __init__(self, block: Fmu, wired: Sequence[str]):
-        from fmpy.fmi3 import FMU3Slave
-
-        self.block, self.failed = block, False
-        self.messages: list[str] = []
-        description = block.description
-        back = {new: old for old, new in block.rename.items()}
-        self._inputs = [description.variables[back.get(name, name)] for name in wired]
-        self._outputs = list(description.of("output").values())
-        self._open = self._stepping = False
-        folder = Path.cwd()
-        try:
-            self._fmu = FMU3Slave(
-                guid=description.token,
-                modelIdentifier=description.identifier,
-                unzipDirectory=str(unpacked(description)),
-                instanceName=block.label,
-            )
-            self._fmu.instantiate(logMessage=self._log, loggingOn=True)
-        except Exception as error:
-            raise FmuFileError(
-                f"the FMU {str(description.file)!r} can't be loaded: {error}{self._quoted()} Check it with "
-                f"'fmpy validate {description.file}'.",
-                block=block.label,
-            ) from error
-        finally:
-            os.chdir(folder)  # FMPy stays in the binary's folder when loading it fails
-        self._open = True
-
-    def _log(self, environment: Any, status: int, category: bytes | None, message: bytes | None) -> None:
-        text = (message or b"").decode(errors="replace")
-        if status and len(self.messages) < 1000:
-            self.messages.append(f"{self.block.label}: {_STATUS[status]}: {text}")
-
-    def _quoted(self) -> str:
-        return f". The FMU says: {' / '.join(self.messages[-5:])}." if self.messages else "."
-
-    def initialize(self, stop_time: float) -> None:
-        """Set start values and enter Initialization Mode at t = 0."""
-        variables = self.block.description.variables
-        try:
-            for name, value in self.block.start.items():
-                self._fmu.setFloat64([variables[name].reference], [float(v) for v in np.ravel(value)])
-            self._fmu.enterInitializationMode(startTime=0.0, stopTime=stop_time)
-        except Exception as error:
-            raise self._initialization_error(error) from error
-
-    def _initialization_error(self, error: Exception) -> FmuRuntimeError:
-        self.failed = True
-        return FmuRuntimeError(
-            f"initialization failed ({error}){self._quoted()} Check its start values.", block=self.block.label, t=0.0
-        )
-
-    def begin(self) -> None:
-        """Leave Initialization Mode and read the outputs with which the run begins."""
-        try:
-            self._fmu.exitInitializationMode()
-        except Exception as error:
-            raise self._initialization_error(error) from error
-        self._stepping = True
-        self._read(0.0)
-
-    def bind(self, inputs: np.ndarray, outputs: np.ndarray) -> None:
-        """Take the vectors that hold the inputs to set and the outputs to get, and get the outputs once."""
-        lib, component = self._fmu.dll, ctypes.c_void_p(self._fmu.component)
-        set_values, get_values, do_step = lib["fmi3SetFloat64"], lib["fmi3GetFloat64"], lib["fmi3DoStep"]
-        for function in (set_values, get_values, do_step):
-            function.restype = ctypes.c_int  # arguments are made once, so their types need no checks at each call
-        flags = (ctypes.c_bool * 3)()
-        reached = ctypes.c_double()
-        ins = (ctypes.c_uint * max(1, len(self._inputs)))(*[v.reference for v in self._inputs])
-        outs = (ctypes.c_uint * max(1, len(self._outputs)))(*[v.reference for v in self._outputs])
-        self._kept = (ins, outs, flags, reached, inputs, outputs)  # alive as long as their addresses are used
-        address, size, now, width = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_double(), ctypes.c_double()
-        set_arguments = (component, ins, size(len(self._inputs)), address(inputs.ctypes.data), size(inputs.size))
-        get_arguments = (component, outs, size(len(self._outputs)), address(outputs.ctypes.data), size(outputs.size))
-        at = ctypes.addressof(flags)
-        step_arguments = (
-            *(component, now, width, ctypes.c_bool(True)),
-            *(address(at), address(at + 1), address(at + 2), ctypes.byref(reached)),
-        )
-        has_inputs, has_outputs = bool(self._inputs), bool(self._outputs)
-
-        def step(t: float, h: float) -> None:
-            if has_inputs and set_values(*set_arguments) > 1:
-                raise self._error("setting the inputs", t)
-            now.value, width.value = t, h
-            if do_step(*step_arguments) > 1:
-                raise self._error(f"the step from t = {t:.9g} s by {h:g} s", t)
-            if flags[1]:
-                raise self._error("the FMU asks to end the simulation: the step", t)
-            if has_outputs and get_values(*get_arguments) > 1:
-                raise self._error("reading the outputs", t)
-
-        def read(t: float) -> None:
-            if has_outputs and get_values(*get_arguments) > 1:
-                raise self._error("reading the outputs", t)
-
-        def exchange() -> None:
-            if has_inputs and set_values(*set_arguments) > 1:
-                raise self._error("setting the inputs", 0.0)
-            read(0.0)
-
-        self.step, self.exchange, self._read = step, exchange, read
-        read(0.0)
-
-    def _error(self, what: str, t: float) -> FmuRuntimeError:
-        self.failed = True
-        inputs = ", ".join(f"{v.name}" for v in self._inputs)
-        values = self._kept[4].tolist()
-        return FmuRuntimeError(
-            f"{what} failed{self._quoted()} The inputs ({inputs}) were {values}. Look at the last samples of "
-            f"error.run, or take "
-            "a smaller step.",
-            block=self.block.label,
-            t=t,
-        )
-
-    def close(self) -> None:
-        """Terminate and free the instance."""
-        if not self._open:
-            return
-        self._open = False
-        with suppress(Exception):
-            if self._stepping and not self.failed:
-                self._fmu.terminate()
-        with suppress(Exception):
-            self._fmu.freeInstance()
-
-
-def unpacked(description: FmuDescription) -> Path:
-    """Return the folder that holds the FMU's files, unpacked once for each content."""
-    import fmpy
-
-    folder = cache_folder() / "unpacked" / description.digest[:32]
-    if folder.is_dir():
-        return folder
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(dir=folder.parent))
-    try:
-        fmpy.extract(description.file, fresh)
-        try:
-            fresh.rename(folder)
-        except OSError:  # another process was faster
-            if not folder.is_dir():
-                raise
-    finally:
-        if fresh.is_dir():
-            shutil.rmtree(fresh, ignore_errors=True)
-    return folder
 
 
 def _in(variable: FmuVariable) -> str:
