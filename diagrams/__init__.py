@@ -4,6 +4,7 @@ from . import experiments
 from ._diagram import Diagram
 from ._flat import FlatDiagram, Layout
 from ._run import Run, Snapshot
+from ._stored import Occurrence, Stopped
 from ._structure import Frame, Wire
 from ._subsystem import Subsystem, subsystem
 from .fig3 import fig3
@@ -13,8 +14,10 @@ __all__ = [
     "FlatDiagram",
     "Frame",
     "Layout",
+    "Occurrence",
     "Run",
     "Snapshot",
+    "Stopped",
     "Subsystem",
     "Wire",
     "experiments",

@@ -185,7 +185,7 @@ class Recorder:
         rows, events = self._files
         if self._k:
             self._tail = self._chunk[self._k - 1].copy()
-        left = memoryview(self._chunk[: self._k]).cast("B") if self._k else memoryview(b"")
+        left = self._chunk[: self._k].data.cast("B") if self._k else memoryview(b"")
         try:
             while left:
                 left = left[rows.write(left) :]

@@ -33,6 +33,7 @@ from ._structure import Wire
 
 FORMAT, VERSION = "loopwright run", 1
 HEADER, ROWS, EVENTS, END = "header.json", "rows.f64", "events.jsonl", "end.json"
+_BLOCK = 2**24  # bytes written at once
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,36 @@ def write_json(path: Path, value: Any) -> None:
 def line(event: Occurrence) -> str:
     """Return the line of an event."""
     return json.dumps(asdict(event), ensure_ascii=False, default=_plain) + "\n"
+
+
+def write(folder: Path, run: Any, overwrite: bool) -> None:
+    """Write a run that is at hand; see `Run.save`."""
+    prepare(folder, overwrite)
+    beyond = run.data.shape[1] if run.columns is None else int(np.sum(run.columns >= run.layout.total))
+    head = header(
+        diagram=run.diagram_name,
+        layout=run.layout,
+        wires=run.wires,
+        units=run.units,
+        width=beyond if run.columns is None else run.layout.total + beyond,
+        columns=run.columns,
+        has_states=run.has_states,
+        residual=run.residual is not None,
+    )
+    events, n = list(run.events), _BLOCK // (8 * len(head["columns"])) + 1
+    rows, lines = create(folder, head)
+    with rows, lines:
+        for k in range(0, len(run.t), n):
+            some = slice(k, k + n)
+            parts = [run.t[some, None], run.data[some], *([] if run.residual is None else [run.residual[some, None]])]
+            left = np.ascontiguousarray(np.hstack(parts), "<f8").data.cast("B")
+            while left:
+                left = left[rows.write(left) :]
+        lines.writelines(map(line, events))
+        lines.flush()
+        for file in (rows, lines):
+            os.fsync(file.fileno())
+    write_json(folder / END, {"elapsed": run.elapsed, "messages": run.messages, "stopped": run.stopped})
 
 
 class StoredEvents(Sequence[Occurrence]):
