@@ -35,6 +35,7 @@ from ._errors import (
     WiringError,
 )
 from ._mechanics import PlanarModel
+from ._opaque import Function, PythonFunction
 from ._path_following import FeedbackLinearization, ForceProjection, PathProjection, PathTracking, TransverseTransform
 from ._paths import Circle, CubicSpline, Ellipse, Frame, Line, Path
 from ._ports import Event, Input, Output, State
@@ -67,6 +68,7 @@ __all__ = [
     "ForceProjection",
     "ForceSensor",
     "Frame",
+    "Function",
     "Gain",
     "GuardError",
     "HandForce",
@@ -85,6 +87,7 @@ __all__ = [
     "PlanarModel",
     "Product",
     "Pulse",
+    "PythonFunction",
     "Reference",
     "SampleTimeError",
     "Saturation",

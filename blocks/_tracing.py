@@ -17,13 +17,14 @@ from __future__ import annotations
 import inspect
 import linecache
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from ._block import Block
+from ._callbacks import Foreign
 from ._comparison import GUARDS, NEXT, compare
 from ._discretization import hold
 from ._equations import check_definition, guards_of, split, start_values, takes_update
@@ -55,6 +56,10 @@ class Traced:
     """CasADi function of (t, x, one column per input, p), one entry for each event; None without events."""
     jump: Any = None
     """CasADi function of the same and a column of ones and zeros, to all states; None without events."""
+    failures: list[BaseException] = field(default_factory=list)
+    """What an opaque block's equations raised, with NaN as their result; see `raise_failure`."""
+    foreign: Foreign | None = None
+    """The equations of an opaque block: their functions live as long as this does."""
 
     def pack(self, block: Block, T: float) -> np.ndarray:
         """Return the numbers of ``p`` for ``block`` (of this structure) at the sample time T."""
@@ -139,7 +144,7 @@ def trace(
     ShapeError
         An equation that returns another shape than declared.
     """
-    shared = _CACHE if _is_ours(block) else cache
+    shared = None if block.opaque else _CACHE if _is_ours(block) else cache
     key = (structure(block), tuple(shapes.items()), sampled, method, zeros)
     found = None if shared is None else shared.get(key)
     if found is None:
@@ -193,6 +198,8 @@ class _Tracer:
         self.u = [ca.MX.sym(f"u{i}", size(s)) for i, s in enumerate(shapes.values())]
         self.p = ca.MX.sym("p", sizes[0] + 1 + sizes[1])
         self.T = self.p[sizes[0]]
+        held = [*self.entries, ("T", 1.0 if sampled else np.nan), *self.constants.items()]
+        self.foreign = Foreign(block, shapes, self.starts, held) if block.opaque else None
 
     def run(self) -> Traced:
         advance, matrix, new, hold_numbers = self._advance()
@@ -223,6 +230,8 @@ class _Tracer:
             method=self.method,
             indicators=indicators,
             jump=jump,
+            failures=[] if self.foreign is None else self.foreign.failures,
+            foreign=self.foreign,
         )
 
     # --- the equations, called with symbols -------------------------------------------------------------------------
@@ -244,9 +253,14 @@ class _Tracer:
 
     def _call(self, what: str, x: Any = None, *more: Any) -> Any:
         """Call an equation; ``x`` replaces the states' own symbols, and ``more`` follows the inputs."""
+        sample_time = self._wants_sample_time(what)
+        if self.foreign is not None:
+            fired = [ca.vertcat(*map(flat_column, bundled)) for bundled in more]
+            arguments = [self.t, self.x if x is None else x, *self.u, self.p, *fired]
+            return self.foreign.call(what, arguments, sample_time=sample_time)
         states = bundle("x", self._columns(self.states, self.x if x is None else x))
         inputs = bundle("u", {n: wrap(c, s) for (n, s), c in zip(self.shapes.items(), self.u, strict=True)})
-        keywords = {"T": wrap(self.T, ())} if self._wants_sample_time(what) else {}
+        keywords = {"T": wrap(self.T, ())} if sample_time else {}
         try:
             return getattr(self._shadow(), what)(wrap(self.t, ()), states, inputs, *more, **keywords)
         except LoopwrightError:
@@ -387,7 +401,8 @@ class _Tracer:
 
     def check(self, function: Any, names: list[str]) -> None:
         """Compare results of a traced function with NumPy's own."""
-        compare(self.block, function, names, self.shapes, self.starts, self.entries, self.constants, self.sampled)
+        if self.foreign is None:
+            compare(self.block, function, names, self.shapes, self.starts, self.entries, self.constants, self.sampled)
 
 
 def _where(error: Exception, block: Block, what: str) -> str:

@@ -55,7 +55,7 @@ def simulate(diagram: Diagram, duration: float, *, step: float | Fraction | None
         plants = []
         for path in sorted(diagram.blocks):
             block: Any = diagram.blocks[path]
-            if not block.opaque:
+            if not hasattr(block, "instantiate"):
                 continue
             try:
                 wired = [port for port in block.inputs if (path, port) in diagram.wires]
