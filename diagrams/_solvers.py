@@ -152,6 +152,38 @@ class Solver(ABC):
         )
 
 
+class VariableStep(Solver):
+    """The base of the variable-step solvers: an interval of a few ulps is crossed by one step of Heun's method."""
+
+    _sliver: tuple[float, np.ndarray] | None = None
+
+    def restart(self, t: float, x: np.ndarray, stop: float) -> None:
+        """Start at (t, x), up to ``stop``."""
+        t, x, self.stop = float(t), np.array(x, dtype=float), float(stop)
+        sliver = self.stop - t <= 100 * math.ulp(max(abs(t), abs(self.stop)))
+        self._sliver = (t, x) if sliver else None
+        if not sliver:
+            self._start(t, x)
+
+    def step(self) -> Step:
+        """Take one step that the error control accepts, at most to ``stop``."""
+        if self._sliver is None:
+            return self._advance()
+        t, x = self._sliver
+        f = self.rate(t, x)
+        self.finite(t, f, "rate")
+        self.statistics.steps += 1
+        return Step(t, self.stop, _heun(self.rate, t, x, f, self.stop), lambda: lambda time: x + (time - t) * f)
+
+    @abstractmethod
+    def _start(self, t: float, x: np.ndarray) -> None:
+        """Start the method at (t, x), up to ``self.stop``."""
+
+    @abstractmethod
+    def _advance(self) -> Step:
+        """Take one step of the method."""
+
+
 class FixedStep(Solver):
     """Explicit Runge-Kutta methods of fixed step.
 
@@ -179,8 +211,9 @@ class FixedStep(Solver):
         t_new = self.stop if last else self._start + self._done * ((self.stop - self._start) / self._count)
         if self.problem.size:
             f = self.rate(t, x)
-            x_new = self._formula(self.rate, t, x, f, t_new)
             self.finite(t, f, "rate")
+            with np.errstate(all="ignore"):
+                x_new = self._formula(self.rate, t, x, f, t_new)
             self.finite(t_new, x_new, "state")
         else:
             f = x_new = x
