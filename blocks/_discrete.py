@@ -46,6 +46,25 @@ class UnitDelay(Block):
         return u.u
 
 
+class Hold(Block):
+    """Zero-order hold: y = u at the ticks of its frame, held between them.
+
+    It brings a signal into the rate of the subsystem that it stands in, and says so in the drawing.
+
+    Raises
+    ------
+    SampleTimeError
+        In a continuous frame, when the diagram is built.
+    """
+
+    u = Input(shape=None, description="what is sampled, of any shape")
+    y = Output(like="u", description="the input at the last tick")
+
+    def output(self, t: Array, x: Any, u: Any, T: Array) -> Array:
+        """Return the input."""
+        return u.u
+
+
 class Encoder(Block):
     """Position encoder: quantized positions, velocities by differences.
 
