@@ -28,7 +28,8 @@ def to_csv(run: Run, path: Any, names: Sequence[str]) -> None:
     """See `Run.to_csv`."""
     table = dict(columns(run, names))
     header = ",".join(["t", *table])
-    np.savetxt(path, np.column_stack([run.t, *table.values()]), "%.17g", ",", header=header, comments="")
+    rows = np.column_stack([run.t, *table.values()])
+    np.savetxt(path, rows, "%.17g", ",", header=header, comments="", encoding="utf-8")
 
 
 def to_pandas(run: Run, names: Sequence[str]) -> Any:
