@@ -7,7 +7,8 @@ compiled from there. Everything here is public; nothing here imports the rooms a
 from ._algebra import Gain, Product, Saturation, Sum
 from ._block import Block
 from ._compliance import AdmittanceFilter, ErrorDynamics
-from ._discrete import Encoder, ForceSensor, UnitDelay
+from ._delays import Delay, PadeDelay, TransportDelay
+from ._discrete import Encoder, ForceSensor, Hold, UnitDelay
 from ._discretization import hold
 from ._environment import HandForce, PathSpring
 from ._errors import (
@@ -34,17 +35,22 @@ from ._errors import (
     UnwiredInputError,
     WiringError,
 )
+from ._integrators import FilteredDerivative, Integrator, LimitedIntegrator, ResettableIntegrator
+from ._linear import DiscreteStateSpace, DiscreteTransferFunction, StateSpace, TransferFunction
 from ._mechanics import PlanarModel
 from ._opaque import Function, PythonFunction
 from ._path_following import FeedbackLinearization, ForceProjection, PathProjection, PathTracking, TransverseTransform
 from ._paths import Circle, CubicSpline, Ellipse, Frame, Line, Path
+from ._pid import PID
 from ._ports import Event, Input, Output, State
+from ._sampled_linear import FIR, IIR, DiscreteIntegrator, MovingAverage
 from ._signals import Call, Signal
 from ._sources import Constant, Pulse, Reference, Sine, SmoothStep, Step
 from ._units import Unit, parse_unit
 from ._values import Array, Value, parameter
+from ._zero_pole import DiscreteZeroPoleGain, ZeroPoleGain
 
-__all__ = [
+__all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "AdmittanceFilter",
     "AlgebraicLoopError",
     "Array",
@@ -55,13 +61,20 @@ __all__ = [
     "Constant",
     "CubicSpline",
     "DefinitionError",
+    "Delay",
+    "DiscreteIntegrator",
+    "DiscreteStateSpace",
+    "DiscreteTransferFunction",
+    "DiscreteZeroPoleGain",
     "DoubleDriveError",
     "DuplicateNameError",
     "Ellipse",
     "Encoder",
     "ErrorDynamics",
     "Event",
+    "FIR",
     "FeedbackLinearization",
+    "FilteredDerivative",
     "FmuError",
     "FmuFileError",
     "FmuRuntimeError",
@@ -72,12 +85,19 @@ __all__ = [
     "Gain",
     "GuardError",
     "HandForce",
+    "Hold",
+    "IIR",
     "Input",
+    "Integrator",
+    "LimitedIntegrator",
     "Line",
     "LoopwrightError",
+    "MovingAverage",
     "NonFiniteError",
     "OptionError",
     "Output",
+    "PID",
+    "PadeDelay",
     "ParameterError",
     "Path",
     "PathDomainError",
@@ -89,6 +109,7 @@ __all__ = [
     "Pulse",
     "PythonFunction",
     "Reference",
+    "ResettableIntegrator",
     "SampleTimeError",
     "Saturation",
     "ShapeError",
@@ -97,9 +118,12 @@ __all__ = [
     "Sine",
     "SmoothStep",
     "State",
+    "StateSpace",
     "Step",
     "Sum",
     "TraceError",
+    "TransferFunction",
+    "TransportDelay",
     "TransverseTransform",
     "Unit",
     "UnitDelay",
@@ -108,6 +132,7 @@ __all__ = [
     "UnwiredInputError",
     "Value",
     "WiringError",
+    "ZeroPoleGain",
     "hold",
     "parameter",
     "parse_unit",
