@@ -1,13 +1,17 @@
 """What a run recorded, reached by name: in the whole, at an instant, and as a picture."""
 
 import ast
+import json
+import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, Gain, Reference, UnknownNameError
-from loopwright.diagrams import Diagram, _plots, subsystem
+from loopwright.blocks import Constant, Gain, OptionError, Reference, Sine, UnitDelay, UnknownNameError
+from loopwright.diagrams import Diagram, Occurrence, Run, Stopped, _plots, _stored, subsystem
+from loopwright.diagrams._recorder import select
 
 
 @subsystem(sample_time=0.5, name="a")
@@ -66,3 +70,143 @@ def test_plots_of_a_run_need_nothing_of_the_experiments():
     modules = [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
     assert "_run" in modules
     assert not any(word in module for word in ("experiments", "_figures", "fig3") for module in modules)
+
+
+# --- selections ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def waves():
+    """Two signals of two entries, and a state each."""
+
+    @subsystem(sample_time=0.125, name="box")
+    def box(u):
+        return UnitDelay(initial_value=(1.0, 2.0), name="delay")(u).named("late")
+
+    r = Reference(2.0, unit="m", name="r")
+    u = Gain(gain=(1.0, -3.0))(Sine(amplitude=2.0, frequency=7.0))
+    return Diagram("waves", box(u).named("out"), Gain(gain=1.0)(r.y[1].named("rate"))).simulate(10.0, progress=False)
+
+
+def chosen(run, *names, states=True):
+    """Return the run as it is when only these signals were recorded."""
+    columns = select(names, run.layout, run.wires, run.data.shape[1], states=states)
+    return replace(run, data=run.data[:, columns], columns=columns, has_states=states)
+
+
+def test_a_run_of_chosen_signals_gives_them_as_the_whole_run_does(waves):
+    part = chosen(waves, "late", "rate")
+    assert part.data.shape[1] == 5  # with the states
+    assert set(part.names) == {"box.late", "out", "rate", "box.delay.y"}
+    for name in (*part.names, "late", "delay.y"):
+        assert np.array_equal(part[name], waves[name])
+        assert np.array_equal(part.part(name, slice(3, 9)), waves[name][3:9])
+        assert part.unit(name) == waves.unit(name)
+
+
+def test_a_signal_that_was_not_recorded_is_told_apart_from_one_that_is_not_there(waves):
+    part = chosen(waves, "late", "rate")
+    with pytest.raises(UnknownNameError, match=r"'sine\.y' was not recorded .* Run again with record=\[…, 'sine\.y'\]"):
+        part["sine.y"]
+    with pytest.raises(UnknownNameError, match=r"'r\.y' was not recorded"):
+        part["r.y"]  # one of its entries was
+    with pytest.raises(UnknownNameError, match=r"no signal 'sime\.y' was recorded\. Did you mean 'sine\.y'"):
+        part["sime.y"]
+    assert "rate" in part
+    assert not {"sine.y", "r.y", "sime"} & {n for n in ("sine.y", "r.y", "sime") if n in part}
+
+
+def test_a_snapshot_of_chosen_signals_has_them_and_all_states(waves):
+    whole, part = waves.at(5.0), chosen(waves, "rate").at(5.0)
+    assert np.array_equal(part.state, whole.state)
+    assert len(part.state) == 2
+    assert set(part.values) == {"rate"}
+    assert (part["rate"], part.t, part.tick) == (whole["rate"], 5.0, 40)
+
+
+def test_an_operating_point_needs_the_states(waves):
+    text = r"the states at t = 5\.0 s were not recorded .* Run again with the states recorded; .* run\[name\]\[40\]"
+    with pytest.raises(OptionError, match=text):
+        chosen(waves, "rate", states=False).at(5.0)
+    with pytest.raises(OptionError, match=r"found t = 11\.0; the run holds 0 s to 10 s"):
+        chosen(waves, "rate", states=False).at(11.0)
+
+
+def test_steps_need_not_be_equal_and_of_two_samples_at_one_time_the_later_counts(waves):
+    t = np.array([0.0, 0.1, 0.1, 0.35, 2.0])
+    run = replace(waves, t=t, data=waves.data[:5])
+    assert [run.at(s).tick for s in (0.0, 0.09, 0.1, 0.2, 0.35, 1.9, 2.0)] == [0, 0, 2, 2, 3, 3, 4]
+
+
+# --- stored runs --------------------------------------------------------------------------------------------------------
+
+EVENTS = (Occurrence(0.25, "wall", "hit", {"v": -1.5}, {"v": 1.5}), Occurrence(1 / 3, "relay", "on", {}, {"on": 1.0}))
+
+
+@pytest.mark.parametrize("names", [None, ("late", "rate"), ()])
+@pytest.mark.parametrize("states", [True, False])
+@pytest.mark.parametrize("block", [2**24, 64])
+def test_a_saved_run_opens_without_its_diagram_exact_to_the_last_bit(
+    waves, names, states, block, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(_stored, "_BLOCK", block)
+    run = waves if names is None and states else chosen(waves, *(names or ()), states=states)
+    residual = np.linspace(0, 1e-15, len(run.t))
+    run = replace(run, events=EVENTS, stopped=Stopped(10.0, "box.stop"), residual=residual, messages=("a", "b"))
+    run.save(tmp_path / "run")
+    again = Run.open(tmp_path / "run")
+    assert again.diagram is None
+    assert again.diagram_name == "waves"
+    assert np.array_equal(again.t, run.t)
+    assert np.array_equal(again.residual, residual)
+    assert again.names == run.names
+    for name in run.names:
+        assert np.array_equal(again[name], run[name])
+        assert again.unit(name) == run.unit(name)
+    assert (tuple(again.events), again.stopped) == (EVENTS, Stopped(10.0, "box.stop"))
+    assert (again.elapsed, again.messages, again.has_states) == (run.elapsed, ("a", "b"), states)
+    if states:
+        assert np.array_equal(again.at(3.0).state, run.at(3.0).state)
+    again.save(tmp_path / "copy")
+    for name in ("rows.f64", "events.jsonl", "end.json"):
+        assert (tmp_path / "copy" / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
+    heads = [json.loads((tmp_path / f / "header.json").read_text(encoding="utf-8")) for f in ("run", "copy")]
+    assert heads[0] | {"created": None} == heads[1] | {"created": None}
+
+
+def test_an_opened_run_reads_only_what_is_asked_for_and_is_drawn_and_pickled(waves, tmp_path):
+    waves.save(tmp_path / "run")
+    run = Run.open(tmp_path / "run")
+    assert isinstance(run.data.base.base, np.memmap)
+    assert not run.data.flags.writeable
+    assert len(run.plot("late", "rate").axes) == 2
+    assert np.array_equal(pickle.loads(pickle.dumps(run))["late"], waves["late"])
+
+
+def test_a_run_that_stands_there_is_replaced_only_when_asked(waves, tmp_path):
+    waves.save(tmp_path / "run")
+    with pytest.raises(OptionError, match=r"found a run at .* already"):
+        waves.save(tmp_path / "run")
+    waves.save(tmp_path / "run", overwrite=True)
+    again = Run.open(tmp_path / "run")
+    again.save(tmp_path / "run", overwrite=True)  # onto itself
+    assert np.array_equal(Run.open(tmp_path / "run")["late"], waves["late"])
+
+
+def test_what_is_no_run_does_not_open(tmp_path):
+    for content in (None, "no JSON", "[]", '{"format": "other"}'):
+        if content:
+            (tmp_path / "header.json").write_text(content)
+        with pytest.raises(OptionError, match=r"found no stored run at .* Check the path"):
+            Run.open(tmp_path)
+
+
+def test_a_run_of_a_later_format_says_which_loopwright_reads_it(waves, tmp_path):
+    waves.save(tmp_path / "run")
+    file = tmp_path / "run" / "header.json"
+    head = json.loads(file.read_text(encoding="utf-8"))
+    file.write_text(json.dumps(head | {"version": 2, "versions": {"loopwright": "9.1"}}), encoding="utf-8")
+    with pytest.raises(
+        OptionError, match=r"of version 2 of the format .* reads version 1\. Open it with loopwright 9\.1"
+    ):
+        Run.open(tmp_path / "run")
