@@ -4,9 +4,10 @@ A block's equations are written once, as NumPy-style functions of (t, x, u), and
 compiled from there. Everything here is public; nothing here imports the rooms above.
 """
 
-from ._algebra import Gain, Product, Saturation, Sum
+from ._algebra import DeadZone, Gain, Maximum, Minimum, Product, Saturation, Sum
 from ._block import Block
 from ._compliance import AdmittanceFilter, ErrorDynamics
+from ._contact import HandProfile, SpringDamper, Wall
 from ._delays import Delay, PadeDelay, TransportDelay
 from ._discrete import Encoder, ForceSensor, Hold, UnitDelay
 from ._discretization import hold
@@ -37,15 +38,20 @@ from ._errors import (
 )
 from ._integrators import FilteredDerivative, Integrator, LimitedIntegrator, ResettableIntegrator
 from ._linear import DiscreteStateSpace, DiscreteTransferFunction, StateSpace, TransferFunction
+from ._logic import And, Compare, Counter, EdgeDetector, Latch, Not, Or, Switch
+from ._lookup_blocks import Lookup1D, Lookup2D
 from ._mechanics import PlanarModel
+from ._nonlinear import Backlash, Quantizer, RateLimiter, Relay
 from ._opaque import Function, PythonFunction
 from ._path_following import FeedbackLinearization, ForceProjection, PathProjection, PathTracking, TransverseTransform
 from ._paths import Circle, CubicSpline, Ellipse, Frame, Line, Path
 from ._pid import PID
 from ._ports import Event, Input, Output, State
+from ._requirements import Requirement, StopCondition
 from ._sampled_linear import FIR, IIR, DiscreteIntegrator, MovingAverage
 from ._signals import Call, Signal
 from ._sources import Constant, Pulse, Reference, Sine, SmoothStep, Step
+from ._state_machine import StateMachine
 from ._units import Unit, parse_unit
 from ._values import Array, Value, parameter
 from ._zero_pole import DiscreteZeroPoleGain, ZeroPoleGain
@@ -53,13 +59,18 @@ from ._zero_pole import DiscreteZeroPoleGain, ZeroPoleGain
 __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "AdmittanceFilter",
     "AlgebraicLoopError",
+    "And",
     "Array",
+    "Backlash",
     "Block",
     "Call",
     "Circle",
+    "Compare",
     "CompilerError",
     "Constant",
+    "Counter",
     "CubicSpline",
+    "DeadZone",
     "DefinitionError",
     "Delay",
     "DiscreteIntegrator",
@@ -68,6 +79,7 @@ __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "DiscreteZeroPoleGain",
     "DoubleDriveError",
     "DuplicateNameError",
+    "EdgeDetector",
     "Ellipse",
     "Encoder",
     "ErrorDynamics",
@@ -85,16 +97,24 @@ __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "Gain",
     "GuardError",
     "HandForce",
+    "HandProfile",
     "Hold",
     "IIR",
     "Input",
     "Integrator",
+    "Latch",
     "LimitedIntegrator",
     "Line",
+    "Lookup1D",
+    "Lookup2D",
     "LoopwrightError",
+    "Maximum",
+    "Minimum",
     "MovingAverage",
     "NonFiniteError",
+    "Not",
     "OptionError",
+    "Or",
     "Output",
     "PID",
     "PadeDelay",
@@ -108,7 +128,11 @@ __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "Product",
     "Pulse",
     "PythonFunction",
+    "Quantizer",
+    "RateLimiter",
     "Reference",
+    "Relay",
+    "Requirement",
     "ResettableIntegrator",
     "SampleTimeError",
     "Saturation",
@@ -117,10 +141,14 @@ __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "SimulationError",
     "Sine",
     "SmoothStep",
+    "SpringDamper",
     "State",
+    "StateMachine",
     "StateSpace",
     "Step",
+    "StopCondition",
     "Sum",
+    "Switch",
     "TraceError",
     "TransferFunction",
     "TransportDelay",
@@ -131,6 +159,7 @@ __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "UnknownNameError",
     "UnwiredInputError",
     "Value",
+    "Wall",
     "WiringError",
     "ZeroPoleGain",
     "hold",

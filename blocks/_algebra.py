@@ -8,31 +8,10 @@ from typing import Any
 import numpy as np
 
 from ._block import Block
+from ._branches import Numbered, check_shapes, shape_of
 from ._errors import ParameterError, ShapeError
-from ._ports import Input, Output, Shape
-from ._values import Array, parameter
-
-
-def _shape(value: Array) -> Shape:
-    return tuple(getattr(value, "shape", ()))
-
-
-def _check_shapes(**values: Array) -> None:
-    """Refuse values of different shapes; a scalar goes with any.
-
-    Raises
-    ------
-    ShapeError
-        Two shapes that differ.
-    """
-    first = next(((name, _shape(v)) for name, v in values.items() if _shape(v)), ("", ()))
-    for name, value in values.items():
-        if _shape(value) not in ((), first[1]):
-            raise ShapeError(
-                f"found shape {_shape(value)} beside {first[0]} of shape {first[1]}; expected one shape for both, or a "
-                "scalar. Take a part of the longer one, such as signal[0:2], or wire another.",
-                port=name,
-            )
+from ._ports import Input, Output
+from ._values import Array, parameter, short
 
 
 class Sum(Block):
@@ -67,7 +46,7 @@ class Sum(Block):
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the sum."""
-        _check_shapes(**u._asdict())
+        check_shapes(**u._asdict())
         total = u[0] if self.signs[0] == "+" else -u[0]
         for sign, value in zip(self.signs[1:], u[1:], strict=True):
             total = total + value if sign == "+" else total - value
@@ -102,9 +81,9 @@ class Gain(Block):
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the product."""
-        gain, found = _shape(self.gain), _shape(u.u)
+        gain, found = shape_of(self.gain), shape_of(u.u)
         if len(gain) < 2:
-            _check_shapes(gain=self.gain, u=u.u)
+            check_shapes(gain=self.gain, u=u.u)
         elif found[:1] != gain[1:]:
             raise ShapeError(
                 f"found shape {found}; the gain is a matrix of {gain[0]} × {gain[1]} and takes {gain[1]} entries. "
@@ -129,30 +108,122 @@ class Product(Block):
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the product."""
-        _check_shapes(**u._asdict())
+        check_shapes(**u._asdict())
         return u.u1 * u.u2
 
 
-class Saturation(Block):
-    """Saturation: y = u limited to ±limit, element by element; NaN passes through.
-
-    The secondary output ``excess`` is what was cut off, u − y: zero exactly while no limit acts. It drives the
-    anti-windup of `ErrorDynamics`.
+class Minimum(Numbered):
+    """Smallest of its inputs, element by element: y = min(u₁, u₂, …); NaN in any of them passes through.
 
     Raises
     ------
     ShapeError
+        Inputs of different shapes (a scalar goes with any), when the diagram is built.
+    """
+
+    same_units = True
+    y = Output(like="u1", description="the smallest")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the smallest."""
+        return self.folded(u, lambda a, b: np.where(a < b, a, np.where(b <= a, b, a + b)))
+
+
+class Maximum(Numbered):
+    """Largest of its inputs, element by element: y = max(u₁, u₂, …); NaN in any of them passes through.
+
+    Raises
+    ------
+    ShapeError
+        Inputs of different shapes (a scalar goes with any), when the diagram is built.
+    """
+
+    same_units = True
+    y = Output(like="u1", description="the largest")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the largest."""
+        return self.folded(u, lambda a, b: np.where(a > b, a, np.where(b >= a, b, a + b)))
+
+
+class Limited(Block):
+    """Base of the blocks with limits: ±limit, or lower and upper ones, or one of them."""
+
+    limit: Array | None = parameter(
+        default=None, above=0.0, description="largest magnitude, a number or one for each element"
+    )
+    lower: Array | None = parameter(default=None, description="lower limit, in place of limit; None for none")
+    upper: Array | None = parameter(default=None, description="upper limit, in place of limit; None for none")
+    u = Input(shape=None, description="what is limited, of any shape")
+
+    def check(self) -> None:
+        """Refuse no limits, two kinds of limits, and limits that cross."""
+
+        def bad(text: str, port: str) -> ParameterError:
+            return ParameterError(text, block=self.label, port=port)
+
+        sides = {k: v for k, v in (("lower", self.lower), ("upper", self.upper)) if v is not None}
+        if (self.limit is None) == (not sides):
+            found = "no limit" if not sides else f"limit and {' and '.join(sides)}"
+            raise bad(
+                f"found {found}; expected limit=… for ±limit, or lower=… or upper=… or both. Give these.", "limit"
+            )
+        if len(sides) == 2:
+            check_shapes(**sides)
+            if np.any(np.asarray(self.lower) >= np.asarray(self.upper)):
+                raise bad(
+                    f"found lower={short(self.lower)} and upper={short(self.upper)}; expected lower below upper. "
+                    "Exchange them, or move one.",
+                    "lower",
+                )
+
+    def limited(self, u: Array) -> Array:
+        """Return u within the limits; NaN passes through."""
+        given = {k: v for k in ("limit", "lower", "upper") if (v := getattr(self, k)) is not None}
+        check_shapes(**given, u=u)
+        low, high = (self.lower, self.upper) if self.limit is None else (-self.limit, self.limit)
+        result = u if low is None else np.where(u < low, low, u)
+        return result if high is None else np.where(u > high, high, result)
+
+
+class Saturation(Limited):
+    """Saturation: y = u limited to ±limit, or to [lower, upper], element by element; NaN passes through.
+
+    The secondary output ``excess`` is what was cut off, u − y: zero exactly while no limit acts. It drives the
+    anti-windup of `ErrorDynamics`. Its kinks need no events.
+
+    Raises
+    ------
+    ParameterError
+        No limit, ``limit`` beside ``lower`` or ``upper``, or limits that cross.
+    ShapeError
         Limits and a signal of different shapes, when the diagram is built.
     """
 
-    limit: Array = parameter(above=0.0, description="largest magnitude, a number or one for each element")
-    u = Input(shape=None, description="what is limited, of any shape")
     y = Output(like="u", description="the limited signal")
     excess = Output(like="u", secondary=True, description="what was cut off, u − y")
 
     def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
         """Return the limited signal and what was cut off."""
-        _check_shapes(limit=self.limit, u=u.u)
-        low = np.where(u.u < -self.limit, -self.limit, u.u)
-        y = np.where(u.u > self.limit, self.limit, low)
+        y = self.limited(u.u)
         return y, u.u - y
+
+
+class DeadZone(Limited):
+    """Dead zone: y = u − (u limited to ±limit, or to [lower, upper]), element by element; NaN passes through.
+
+    y is zero exactly within the limits, and rises from zero outside of them with slope 1. Its kinks need no events.
+
+    Raises
+    ------
+    ParameterError
+        No limit, ``limit`` beside ``lower`` or ``upper``, or limits that cross.
+    ShapeError
+        Limits and a signal of different shapes, when the diagram is built.
+    """
+
+    y = Output(like="u", description="what is beyond the limits")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return what is beyond the limits."""
+        return u.u - self.limited(u.u)

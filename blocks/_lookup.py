@@ -16,7 +16,7 @@ from casadi import ArrayInterface
 from ._errors import TraceError
 from ._values import Array
 
-__all__ = ["is_traced", "jet", "piecewise", "wrap"]
+__all__ = ["bilinear", "is_traced", "jet", "piecewise", "wrap"]
 
 
 def is_traced(value: Any) -> bool:
@@ -105,3 +105,44 @@ def _traced_jet(breaks: np.ndarray, coefficients: np.ndarray, s: Any, highest: i
     values = _horner_function(functions, powers - 1, highest)(gathered, symbol - places[index])
     values = values if isinstance(values, tuple) else (values,)
     return tuple(ArrayInterface(ca.densify(v).T, ndim=1) for v in values)
+
+
+def bilinear(rows: np.ndarray, columns: np.ndarray, values: np.ndarray, a: Array, b: Array) -> Array:
+    """Interpolate a table in two directions at (a, b): bilinear in each cell, the outermost cells continued.
+
+    With the cell rows[i] ≤ a < rows[i + 1], columns[j] ≤ b < columns[j + 1] and α, β from 0 to 1 in it,
+    f = (1 − α)(1 − β) v_ij + α (1 − β) v_(i+1)j + (1 − α) β v_i(j+1) + α β v_(i+1)(j+1). Derivatives are exact.
+
+    Parameters
+    ----------
+    rows, columns : array, shapes (n,) and (m,)
+        Where the cells begin and end, rising.
+    values : array, shape (n, m)
+        The table.
+    a, b : float or traced scalar
+        The arguments.
+    """
+    wide = len(columns)
+    i: Any
+    j: Any
+    corners: Any
+    if is_traced(a):
+        sought, places = (a.to_casadi(), b.to_casadi()), [_constant(rows.tobytes()), _constant(columns.tobytes())]
+        if not all(isinstance(symbol, ca.MX) for symbol in sought):
+            raise TraceError("a table was given traced arguments that are no MX. Trace in MX.")
+        i, j = (ca.low(at, symbol) if at.numel() > 2 else ca.MX(0) for at, symbol in zip(places, sought, strict=True))
+        table = _constant(np.ascontiguousarray(values).tobytes())
+        corners = ca.vertsplit(table[wide * i + j + ca.DM([0, 1, wide, wide + 1])])
+        alpha, beta = (
+            ArrayInterface((symbol - at[k]) / (at[k + 1] - at[k]), ndim=0)
+            for symbol, at, k in zip(sought, places, (i, j), strict=True)
+        )
+        corners = [ArrayInterface(corner, ndim=0) for corner in corners]
+    else:
+        i = int(np.clip(np.searchsorted(rows, a, side="right") - 1, 0, len(rows) - 2))
+        j = int(np.clip(np.searchsorted(columns, b, side="right") - 1, 0, wide - 2))
+        alpha, beta = (a - rows[i]) / (rows[i + 1] - rows[i]), (b - columns[j]) / (columns[j + 1] - columns[j])
+        corners = [values[i, j], values[i, j + 1], values[i + 1, j], values[i + 1, j + 1]]
+    v00, v01, v10, v11 = corners
+    low, high = v00 + beta * (v01 - v00), v10 + beta * (v11 - v10)
+    return low + alpha * (high - low)
