@@ -14,12 +14,17 @@ from ._build import build_fmu, clear_cache
 from ._description_reading import FmuDescription, FmuVariable, read_description
 from ._export import build, model_spec
 from ._fmu import Fmu
+from ._instance import FmuInstance, FmuState
+from ._linearization import FmuLinearization
 from ._pythonfmu import build_python
 from ._spec import ModelSpec, Variable
 
 __all__ = [
     "Fmu",
     "FmuDescription",
+    "FmuInstance",
+    "FmuLinearization",
+    "FmuState",
     "FmuVariable",
     "ModelSpec",
     "Variable",

@@ -33,6 +33,13 @@ class FmuVariable:
     maximum: float | None
     nominal: float | None = None
     variability: str = "continuous"
+    initial: str = "exact"
+    """FMI's initial: exact where the start value is the value (FMI 3.0, 2.4.7.4)."""
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return int(np.prod(self.shape, dtype=int))
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +139,7 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
         variables[v.name] = FmuVariable(
             v.name, v.valueReference, v.causality or "local", shape, _unit(v.unit), start, v.description or "",
             _number(v.min), _number(v.max), _number(v.nominal), v.variability or "continuous",
+            v.initial or ("calculated" if v.causality in ("output", "local", None) else "exact"),
         )  # fmt: skip
     return FmuDescription(
         path, hashlib.sha256(data).hexdigest(), model.modelName, identifier, model.instantiationToken, variables, other,

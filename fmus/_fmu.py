@@ -17,6 +17,7 @@ from ..blocks._signals import Signal, UnknownAttributeError
 from ..blocks._values import parameter
 from ._description_reading import FmuDescription, FmuVariable, read_description
 from ._instance import FmuInstance
+from ._linearization import STEP, FmuLinearization, linear_model, step_difference
 
 _STATUS = ("OK", "warning", "discard", "error", "fatal")
 
@@ -177,6 +178,88 @@ class Fmu(Block):
                 return Signal(self, name)
             raise UnknownNameError(f"it has no output {name!r}. {near(name, self.outputs)}", block=self.label)
         return super().__getitem__(name)
+
+    def linear_model(
+        self,
+        t: float = 0.0,
+        *,
+        state: Any = None,
+        inputs: Any = None,
+        interface: str | None = None,
+        exact: bool | None = None,
+    ) -> FmuLinearization:
+        """Linearize the FMU's continuous equations about an operating point.
+
+        They are found by the first of these that the FMU has: directional derivatives in model exchange
+        (Continuous-Time Mode), in co-simulation (Step Mode); differences in model exchange, in co-simulation
+        (Initialization Mode; FMI 3.0, 2.2.11, 2.3.3, 3.2, 4.2). An instance is loaded for it alone. Discrete states and
+        parameters are frozen.
+
+        Parameters
+        ----------
+        t : float
+            Time in s.
+        state : mapping or array, optional
+            States by the FMU's names, discrete ones too, or all continuous states' elements in the order of the model
+            structure; the others have their start values.
+        inputs : mapping or array, optional
+            Inputs by their ports, or all inputs' elements; the others have their start values.
+        interface : str, optional
+            ``"model_exchange"`` or ``"co_simulation"``, where it matters.
+        exact : bool, optional
+            True for directional derivatives alone, False for differences.
+
+        Returns
+        -------
+        FmuLinearization
+            The matrices, and how they were found.
+
+        Raises
+        ------
+        FmuError
+            If the FMU can't, or does not take over the operating point.
+        FmuRuntimeError
+            If one of its functions fails.
+        ParameterError, UnknownNameError
+            If the operating point is given wrongly.
+        """
+        return linear_model(self, t, state, inputs, interface, exact)
+
+    def step_difference(
+        self, h: float, *, t: float = 0.0, state: Any = None, inputs: Any = None, relative_step: float = STEP
+    ) -> FmuLinearization:
+        """Linearize a communication step: states and outputs after it, by the states before it and the held inputs.
+
+        Differences of ``doStep`` in co-simulation: states move by their start values, since nothing else is allowed
+        there (FMI 3.0, 4.2), inputs in Step Mode, from a saved state where the FMU can save. Impacts and switches
+        within the step are in it. What is no variable of the FMU starts anew: memory of its solver, on which side of a
+        threshold it has been.
+
+        Parameters
+        ----------
+        h : float
+            Length of the step in s.
+        t, state, inputs
+            As for `linear_model`.
+        relative_step : float
+            How far a state or input is moved, relative to its nominal value, or its value where that is larger. An
+            adaptive solver with a coarse tolerance needs more.
+
+        Returns
+        -------
+        FmuLinearization
+            The matrices, and an estimate of their errors.
+
+        Raises
+        ------
+        FmuError
+            If the FMU's states have no exact start values, or it does not take over the operating point.
+        FmuRuntimeError
+            If one of its functions fails.
+        ParameterError, UnknownNameError
+            If the operating point is given wrongly.
+        """
+        return step_difference(self, h, t, state, inputs, relative_step)
 
     @contextmanager
     def instantiate(

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..blocks._errors import FmuError, FmuRuntimeError
 from ._compiler import native_platform
+from ._linearization import operating_point
 from ._loading import LoadedFmu, status_of
 
 if TYPE_CHECKING:
@@ -172,6 +173,10 @@ class FmuInstance(LoadedFmu):
                 block=self.block.label,
                 t=t,
             )
+
+    def operating_point(self) -> dict[str, Any]:
+        """Return the present ``t``, ``state`` and ``inputs``, for `Fmu.linear_model` and `Fmu.step_difference`."""
+        return operating_point(self)
 
     # ---- saved states (FMI 3.0, 2.2.6.4) ----
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..blocks._errors import FmuError, FmuFileError, FmuRuntimeError
+from ..blocks._errors import FmuError, FmuFileError, FmuRuntimeError, UnknownNameError, near
 from ._compiler import cache_folder, check_cache
 from ._description_reading import FmuDescription
 
@@ -30,7 +30,7 @@ class LoadedFmu:
         from fmpy.fmi3 import FMU3Model, FMU3Slave
 
         self.block, self.description = block, block.description
-        self.failed = self.fatal = False
+        self.model_exchange, self.failed, self.fatal = model_exchange, False, False
         self.messages: list[str] = []
         self._open = self._running = False
         self._began = 0.0
@@ -65,7 +65,7 @@ class LoadedFmu:
             self.messages.append(f"{self.block.label}: {_STATUS[status]}: {text}")
 
     def _quoted(self) -> str:
-        return f". The FMU says: {' / '.join(self.messages[-5:])}." if self.messages else "."
+        return f". The FMU says: {' / '.join(m.rstrip('.') for m in self.messages[-5:])}." if self.messages else "."
 
     @property
     def t(self) -> float:
@@ -103,6 +103,11 @@ class LoadedFmu:
             block=self.block.label,
             t=self._began,
         )
+
+    def reset(self) -> None:
+        """Go back to before the initialization (FMI 3.0, 2.3.1)."""
+        self.call("resetting it", "reset")
+        self.failed = self._running = False
 
     def begin(self) -> None:
         """Leave Initialization Mode."""
@@ -143,14 +148,64 @@ class LoadedFmu:
             reference = self.description.variables[name].reference
             self._fmu.setFloat64([reference], [float(v) for v in np.ravel(value)])
 
-    def values(self, names: Any) -> np.ndarray:
+    def values(self, names: Iterable[str]) -> np.ndarray:
         """Return the elements of variables, one after the other."""
         variables = [self.description.variables[name] for name in names]
-        n = sum(int(np.prod(v.shape, dtype=int)) for v in variables)
+        n = sum(v.size for v in variables)
         if not n:
             return np.zeros(0)
         found = self.call(f"reading {', '.join(names)}", "getFloat64", [v.reference for v in variables], n)
         return np.array(found, dtype=float)
+
+    def directional_derivative(
+        self, unknowns: Sequence[str], knowns: Sequence[str], seed: Sequence[float]
+    ) -> np.ndarray:
+        """Return how outputs and derivatives of states answer to a change of knowns (FMI 3.0, 2.2.11).
+
+        The derivative is at the present time, states and inputs, with discrete states frozen.
+
+        Parameters
+        ----------
+        unknowns : sequence of str
+            Outputs and derivatives of states, by the FMU's names.
+        knowns : sequence of str
+            Inputs and continuous states, by the FMU's names.
+        seed : array_like
+            The change of each element of the knowns.
+
+        Returns
+        -------
+        numpy.ndarray
+            The change of each element of the unknowns.
+
+        Raises
+        ------
+        FmuError
+            If the FMU has no directional derivatives.
+        FmuRuntimeError
+            If its function fails.
+        UnknownNameError
+            If it has no such variable.
+        """
+        about = self.description
+        if not (about.model_exchange_has_derivatives if self.model_exchange else about.has_derivatives):
+            raise FmuError(
+                "it gives no directional derivatives: providesDirectionalDerivatives is false in its description. Take "
+                "linear_model(), which falls back on differences.",
+                block=self.block.label,
+            )
+        for name in (*unknowns, *knowns):
+            if name not in about.variables:
+                raise UnknownNameError(
+                    f"it has no variable {name!r}. {near(name, about.variables)}", block=self.block.label
+                )
+        of, by = ([about.variables[name] for name in names] for names in (unknowns, knowns))
+        n = sum(v.size for v in of)
+        if not n:
+            return np.zeros(0)
+        changes = [float(c) for c in np.ravel(seed)]
+        arguments = ([v.reference for v in of], [v.reference for v in by], changes, n)
+        return np.array(self.call("a directional derivative", "getDirectionalDerivative", *arguments), dtype=float)
 
     # ---- the end ----
 
