@@ -49,6 +49,7 @@ from ._pid import PID
 from ._ports import Event, Input, Output, State
 from ._requirements import Requirement, StopCondition
 from ._sampled_linear import FIR, IIR, DiscreteIntegrator, MovingAverage
+from ._signal_sources import BandLimitedNoise, Chirp, Clock, PiecewiseLinear, PulseTrain, Ramp, Recorded
 from ._signals import Call, Signal
 from ._sources import Constant, Pulse, Reference, Sine, SmoothStep, Step
 from ._state_machine import StateMachine
@@ -62,9 +63,12 @@ __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "And",
     "Array",
     "Backlash",
+    "BandLimitedNoise",
     "Block",
     "Call",
+    "Chirp",
     "Circle",
+    "Clock",
     "Compare",
     "CompilerError",
     "Constant",
@@ -124,12 +128,16 @@ __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "PathProjection",
     "PathSpring",
     "PathTracking",
+    "PiecewiseLinear",
     "PlanarModel",
     "Product",
     "Pulse",
+    "PulseTrain",
     "PythonFunction",
     "Quantizer",
+    "Ramp",
     "RateLimiter",
+    "Recorded",
     "Reference",
     "Relay",
     "Requirement",

@@ -1,7 +1,8 @@
-"""Sources: blocks without inputs. Times in s; a change at ``t0`` acts from the first instant t ≥ t0 on."""
+"""Sources that are given by a few numbers. Times in s; a change at ``t0`` acts from the first instant t ≥ t0 on."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,15 @@ class Source(Block):
             each = (unit, rate_of(unit), rate_of(rate_of(unit)))
         return {"y": Output(declared.shape, each, declared.description, name="y")}
 
+    def instants(self) -> Array:
+        """Return the times at which the output or its derivatives are not smooth, in any order: none."""
+        return np.zeros(0)
+
+    def next_instant(self, t: float) -> float:
+        """Return the first of `instants` after t."""
+        times = np.ravel(self.instants())
+        return float(np.min(times[times > t], initial=math.inf))
+
 
 class Constant(Source):
     """A constant number or array."""
@@ -117,6 +127,11 @@ class SmoothStep(Source):
                 port="start_times",
             )
 
+    def instants(self) -> Array:
+        """Return where each step starts and ends."""
+        starts = np.atleast_1d(self.start_times)
+        return np.concatenate([starts, starts + self.durations])
+
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the sum of all steps."""
         levels, starts, durations = self.levels, np.atleast_1d(self.start_times), np.atleast_1d(self.durations)
@@ -145,6 +160,10 @@ class Step(Source):
                 block=self.label,
                 port="times",
             )
+
+    def instants(self) -> Array:
+        """Return when it steps."""
+        return np.atleast_1d(self.times)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the value at t."""
@@ -176,6 +195,11 @@ class Pulse(Source):
                 block=self.label,
                 port="end_time",
             )
+
+    def instants(self) -> Array:
+        """Return where its flanks start and end."""
+        first, last, rise = self.start_time, self.end_time, self.rise_time
+        return np.array([first, first + rise, last - rise, last])
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the pulse."""
