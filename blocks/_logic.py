@@ -113,6 +113,8 @@ class And(_Combined):
         Inputs of different shapes, or vectors in a continuous frame, when the diagram is built.
     """
 
+    _hint = "logical_and"
+
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the product of the truths."""
         check_shapes(**u._asdict())
@@ -130,6 +132,8 @@ class Or(_Combined):
         Inputs of different shapes, or vectors in a continuous frame, when the diagram is built.
     """
 
+    _hint = "logical_or"
+
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return one less the product of the untruths."""
         return 1.0 - self.folded(u._replace(**{k: 1.0 - truth(v) for k, v in u._asdict().items()}), lambda a, b: a * b)
@@ -144,6 +148,7 @@ class Not(Block):
         A vector in a continuous frame, when the diagram is built.
     """
 
+    _hint = "logical_not"
     u = Input(shape=None, description="logic signal, of any shape")
     y = Output(shape=None, description="1 or 0")
     change = Event("both", "the input crosses 0.5")

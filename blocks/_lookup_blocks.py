@@ -90,6 +90,7 @@ class Lookup1D(Block):
         In a run, where u leaves the table, with beyond="error".
     """
 
+    _hint = "lookup_1d"
     breakpoints: Array = parameter(structural=True, description="values of u, rising")
     values: Array = parameter(structural=True, description="values of y there; with several columns y is a vector")
     interpolation: str = parameter(default="linear", description="'linear', 'cubic' or 'monotone'")
@@ -159,6 +160,7 @@ class Lookup2D(Block):
         In a run, where an input leaves the table, with beyond="error".
     """
 
+    _hint = "lookup_2d"
     rows: Array = parameter(structural=True, description="values of u₁, rising")
     columns: Array = parameter(structural=True, description="values of u₂, rising")
     values: Array = parameter(structural=True, description="values of y: one row for each u₁, one column for each u₂")

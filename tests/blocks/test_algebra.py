@@ -3,7 +3,19 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Gain, Input, Output, ParameterError, Product, Saturation, Sum
+from loopwright.blocks import (
+    Block,
+    DeadZone,
+    Gain,
+    Input,
+    Maximum,
+    Minimum,
+    Output,
+    ParameterError,
+    Product,
+    Saturation,
+    Sum,
+)
 from loopwright.blocks._tracing import trace
 from loopwright.diagrams import Diagram
 
@@ -131,6 +143,73 @@ def test_what_is_no_number_passes_through():
 def test_a_limit_that_is_not_positive_is_refused(limit):
     with pytest.raises(ParameterError, match=r"Saturation\.limit: found .*; expected a value above 0"):
         Saturation(limit=limit)
+
+
+@pytest.mark.parametrize(
+    ("limits", "low", "high"),
+    [
+        ({"limit": 1.5}, -1.5, 1.5),
+        ({"lower": -1.0, "upper": 2.0}, -1.0, 2.0),
+        ({"lower": (0.0, 1.0, -2.0), "upper": 3.0}, [0.0, 1.0, -2.0], 3.0),
+        ({"lower": 0.0}, 0.0, np.inf),
+        ({"upper": (0.5, 0.0, -1.0)}, -np.inf, [0.5, 0.0, -1.0]),
+    ],
+    ids=str,
+)
+def test_limits_of_all_kinds_cut_off_and_leave_over(limits, low, high):
+    for u in 3.0 * RNG.standard_normal((20, 3)):
+        y, excess = results(Saturation(**limits), u)
+        np.testing.assert_array_equal(y, np.clip(u, low, high))
+        np.testing.assert_array_equal(excess, u - np.clip(u, low, high))
+        np.testing.assert_array_equal(result(DeadZone(**limits), u), u - np.clip(u, low, high))
+
+
+def test_a_dead_zone_is_zero_within_and_lets_what_is_no_number_through():
+    assert result(DeadZone(limit=1.0), (-1.5, -1.0, 0.3, 1.0, 4.0)).tolist() == [-0.5, 0.0, 0.0, 0.0, 3.0]
+    assert np.isnan(result(DeadZone(lower=0.0, upper=1.0), np.nan))
+    assert np.isnan(result(Saturation(lower=0.0), np.nan))
+
+
+@pytest.mark.parametrize("cls", [Saturation, DeadZone])
+@pytest.mark.parametrize(
+    ("limits", "text"),
+    [
+        ({}, r"limit: found no limit; expected limit=… for ±limit, or lower=… or upper=… or both"),
+        ({"limit": 1.0, "upper": 2.0}, r"limit: found limit and upper; expected limit=…"),
+        ({"lower": 1.0, "upper": 1.0}, r"lower: found lower=1 and upper=1; expected lower below upper"),
+        (
+            {"lower": (0.0, 3.0), "upper": 2.0},
+            r"lower: found lower=\[0\.0, 3\.0\] and upper=2; expected lower below upper",
+        ),
+    ],
+)
+def test_limits_that_are_none_are_refused(cls, limits, text):
+    with pytest.raises(ParameterError, match=text):
+        cls(**limits)
+
+
+# --- smallest and largest ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("cls", "oracle"), [(Minimum, np.minimum), (Maximum, np.maximum)])
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_the_smallest_and_the_largest_of_all_inputs(cls, oracle, count):
+    u = RNG.integers(-3, 4, (count, 2, 3)).astype(float)
+    np.testing.assert_array_equal(result(cls(count=count), *u), oracle.reduce(u))
+    assert result(cls(), (1.0, 5.0), 3.0).tolist() == oracle((1.0, 5.0), 3.0).tolist()
+
+
+@pytest.mark.parametrize("cls", [Minimum, Maximum])
+def test_an_input_that_is_no_number_makes_neither_smallest_nor_largest(cls):
+    for values in ((np.nan, 1.0), (1.0, np.nan), (np.nan, np.nan)):
+        assert np.isnan(result(cls(), *values))
+    assert np.isnan(result(cls(count=3), 1.0, np.nan, 2.0))
+
+
+@pytest.mark.parametrize("cls", [Minimum, Maximum])
+def test_how_many_inputs_is_a_positive_number(cls):
+    with pytest.raises(ParameterError, match=r"\.count: found 0; expected a value at least 1"):
+        cls(count=0)
 
 
 # --- in a diagram -----------------------------------------------------------------------------------------------------
