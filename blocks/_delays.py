@@ -98,7 +98,7 @@ class TransportDelay(Block):
     transport: ClassVar[bool] = True
     """True: the run gives ``u`` of the time ``delay`` ago."""
     delay: float = parameter(unit="s", above=0.0, description="delay τ")
-    initial_value: Array = parameter(default=0.0, description="output while t < τ, a number or of the input's shape")
+    initial_value: Array | None = parameter(default=0.0, description="output while t < τ; None takes the first input")
     u = Input(shape=None, description="what is delayed, of any shape")
     y = Output(like="u", description="the input τ ago")
 

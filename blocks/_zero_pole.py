@@ -78,8 +78,8 @@ def _unfit(roots: Any) -> str | None:
 class _ZeroPoleGain(Block):
     """What both kinds of time share."""
 
-    zeros: Numbers = parameter(default=(), description="zeros; complex ones in conjugate pairs")
-    poles: Numbers = parameter(description="poles, at least one; complex ones in conjugate pairs")
+    zeros: Numbers = parameter(default=(), structural=True, description="zeros; complex ones in conjugate pairs")
+    poles: Numbers = parameter(structural=True, description="poles, at least one; complex ones in conjugate pairs")
     gain: float = parameter(default=1.0, description="factor k")
     u = Input(description="input")
     y = Output(description="output")
@@ -115,16 +115,17 @@ class _ZeroPoleGain(Block):
 
     def cascade(self, x: Any, u: Any) -> tuple[Array, Array]:
         """Return the output and what the sections make of their states."""
-        signal, parts, position = u.u, [], 0
+        signal, parts, position, gain = u.u, [], 0, 1.0
         for b, a in self.factors():
             state = x.x[position : position + len(a) - 1]
-            signal, part = self.one(b, a, state, signal)
+            signal, part, factor = self.one(b, a, state, signal)
             parts.append(part)
             position += len(a) - 1
-        return self.gain * signal, np.concatenate(parts)
+            gain *= factor
+        return self.gain * gain * signal, np.concatenate(parts)
 
-    def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array]:
-        """Return output and advance of one section."""
+    def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
+        """Return output and advance of one section, and the factor that its output is short of."""
         raise NotImplementedError
 
 
@@ -132,7 +133,8 @@ class ZeroPoleGain(_ZeroPoleGain):
     """Zeros, poles and gain: Y(s) = k (s − z₁) … (s − z_m) / ((s − p₁) … (s − p_n)) U(s), m ≤ n; it starts at rest.
 
     Realized as a cascade of real sections of second order, each in its own scaled frequency, zeros beside the nearest
-    poles: the poles are kept to rounding, however close or far apart. Zeros and poles are fixed in the trace; the gain
+    poles, and its numerator scaled to coefficients of at most 1; what that leaves is put into the gain. So the poles
+    are kept to rounding, however close or far apart. Zeros and poles are fixed in the trace; the gain
     is a parameter.
 
     Raises
@@ -146,17 +148,16 @@ class ZeroPoleGain(_ZeroPoleGain):
     ZeroPoleGain(poles=((-1+5j), (-1-5j)), gain=26)
     """
 
-    def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array]:
+    def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
         """Return output and ẋ of a section in controllable canonical form in s / ω."""
         n = len(a) - 1
         w = abs(a[2]) ** 0.5 if n == 2 and a[2] else abs(a[1]) or 1.0
         powers = w ** -np.arange(n + 1.0)
-        scale = w ** (
-            np.argmax(b != 0)
-        )  # a section's numerator starts with 1 in s / ω: its signal is of the input's size
-        a, b = a * powers, b * powers * scale
+        a, b = a * powers, b * powers
+        factor = float(np.abs(b).max())
+        b = b / factor
         rate = w * np.concatenate([x[1:], np.stack([u - a[1:][::-1] @ x])])
-        return (b[0] * u + (b[1:] - b[0] * a[1:])[::-1] @ x) / scale, rate
+        return b[0] * u + (b[1:] - b[0] * a[1:])[::-1] @ x, rate, factor
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the output."""
@@ -185,9 +186,9 @@ class DiscreteZeroPoleGain(SampleTimeOfFrame, _ZeroPoleGain):
         default=None, unit="s", above=0.0, structural=True, description="sample time that it holds for; None: any"
     )
 
-    def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array]:
+    def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
         """Return output and next state of a section."""
-        return section(b, a, x, u)
+        return (*section(b, a, x, u), 1.0)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the output."""
