@@ -8,7 +8,6 @@ instant that is a few rounding errors before such an edge (1e-15 t) counts as th
 
 from __future__ import annotations
 
-import math
 from fractions import Fraction
 from functools import lru_cache
 from typing import Any, Self
@@ -16,35 +15,14 @@ from typing import Any, Self
 import numpy as np
 
 from ._errors import ParameterError
+from ._instants import next_edge, period_of
 from ._lookup import piecewise
 from ._ports import Output
 from ._sources import Source
 from ._values import Array, parameter
 
-_TOLERANCE = 4.0 * float(np.finfo(float).eps)  # of t: t, the period and their ratio are rounded once each
 _HALF = 2.0**24  # counters are mixed in two halves: products of two such numbers are exact
 _ROUNDS = 10
-
-
-def period_of(t: Array, period: Array, delay: Array) -> tuple[Array, Array, Array]:
-    """Return the number of the period at t, the time since it began in periods, and the rounding of it."""
-    passed = (t - delay) / period
-    tolerance = _TOLERANCE * (np.abs(t) + np.abs(delay)) / period
-    number = np.floor(passed + tolerance)
-    return number, passed - number, tolerance
-
-
-def next_edge(t: float, period: float, *offsets: float) -> float:
-    """Return the first time after t that is one of the offsets plus k ≥ 0 periods, each number taken as decimal."""
-    exact = Fraction(repr(float(period)))
-    best = math.inf
-    for offset in offsets:
-        first = Fraction(repr(float(offset)))
-        k = max(math.floor((Fraction(t) - first) / exact), 0)
-        while float(first + k * exact) <= t:
-            k += 1
-        best = min(best, float(first + k * exact))
-    return best
 
 
 class Clock(Source):
@@ -146,7 +124,7 @@ class PulseTrain(Source):
     amplitude: float = parameter(default=1.0, description="height of the pulses, A")
     period: float = parameter(unit="s", above=0.0, description="time from pulse to pulse, P")
     duty: float = parameter(default=0.5, above=0.0, description="part of the period that a pulse lasts, below 1")
-    delay: float = parameter(default=0.0, unit="s", description="when the first pulse begins, t₀")
+    delay: float = parameter(default=0.0, unit="s", minimum=0.0, description="when the first pulse begins, t₀")
     base: float = parameter(default=0.0, description="value between the pulses")
     y = Output()
 

@@ -25,6 +25,7 @@ from loopwright.blocks import (
     SmoothStep,
     Step,
 )
+from loopwright.blocks._instants import left_of
 from loopwright.blocks._tracing import trace
 from loopwright.diagrams import Diagram, subsystem
 
@@ -77,7 +78,7 @@ def test_the_phase_of_a_chirp_is_the_integral_of_its_frequency(sweep):
         inside = min(max(tau, 0), D)
         return f0 + (f1 - f0) * inside / D if sweep == "linear" else f0 * mpmath.mpf(f1 / f0) ** (inside / D)
 
-    times = np.linspace(0.0, 6.0, 25)
+    times = np.linspace(0.0, 6.1, 28)
     turns = [mpmath.quad(frequency, [0, min(t - start, D), t - start]) if t > start else 0 for t in map(float, times)]
     want = [float(2 * mpmath.sin(2 * mpmath.pi * n + 0.3) - 1) for n in turns]
     np.testing.assert_allclose(at(source, times), want, rtol=0, atol=1e-12)
@@ -299,11 +300,18 @@ def test_instants_of_what_repeats_are_the_ticks_themselves(period):
     assert found[:99] == [float((first + k) * exact) for k in range(99)]
 
 
-def test_the_output_at_an_instant_is_already_the_new_one():
+def test_the_output_at_an_instant_is_already_the_new_one_and_left_of_it_the_old_one():
     source = BandLimitedNoise(sample_time=0.0007)
+    assert 0.0 < 5.0 - left_of(5.0) < 2e-14
     for t in instants_of(source, 5.0, 5.05):
-        before, here, after = at(source, [t - 1e-9, t, t + 1e-9])
+        before, here, after = at(source, [left_of(t), t, t + 1e-6])
         assert here == after != before
+    train = PulseTrain(period=0.1, duty=0.3, delay=0.05)
+    for k in (1, 3, 7, 10**4, 10**9 + 1):
+        t = train.next_instant(0.05 + k * 0.1 - 0.01)
+        assert at(train, [left_of(t), t]).tolist() == [0.0, 1.0]
+        t = train.next_instant(t)
+        assert at(train, [left_of(t), t]).tolist() == [1.0, 0.0]
 
 
 @pytest.mark.parametrize("frame", [True, False], ids=["sampled", "continuous"])
