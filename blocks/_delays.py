@@ -163,7 +163,7 @@ class PadeDelay(Block):
     An all-pass: its gain is 1 at every frequency, its phase that of the delay up to about ω τ = n. A jump of the
     input shows in the output at once, with the sign (−1)ⁿ. θ is the reverse Bessel polynomial; it is realized as a
     lossless ladder with a resistor at one end, τ/2 ẋ = (J − b bᵀ / 2) x + b u, y = (−1)ⁿ (u − bᵀ x), which is balanced:
-    both of its Gramians are the unit matrix. It starts in the steady state of ``initial_value``.
+    in the time 2 t / τ both of its Gramians are the unit matrix. It starts in the steady state of ``initial_value``.
     """
 
     delay: float = parameter(unit="s", above=0.0, description="delay τ")
