@@ -1,7 +1,8 @@
 """Equations in arbitrary Python, as functions that a trace calls.
 
-An exception can't pass through CasADi: it is kept in `Foreign.failures`, and the results are NaN, at which every run
-stops. Who evaluates a trace looks there first, with `raise_failure`.
+An exception can't pass through CasADi: the last one is kept in `Foreign.failures`, and the results are NaN, at which
+every run stops. Who looks for the reason of a NaN clears the failures, evaluates again, and looks there first, with
+`raise_failure`: a solver may have got over an earlier one by a shorter step.
 """
 
 from __future__ import annotations
@@ -71,6 +72,11 @@ class Foreign:
         fired = [bundle("fired", _parts(v, dict.fromkeys(self.block.events, ()))) for v in rest[n + 1 :]]
         with np.errstate(all="ignore"):
             return getattr(block, what)(np.float64(t[0]), states, inputs, *fired, **({"T": T} if sample_time else {}))
+
+    def keep(self, failure: BaseException) -> None:
+        """Keep the last failure; an interrupt is never given up for another."""
+        if not self.failures or isinstance(self.failures[0], Exception):
+            self.failures[:] = [failure]
 
     def _results(self, what: str, sample_time: bool) -> dict[str, Shape]:
         """Return name and shape of what an equation gives; what is not declared is found by one trial call."""
@@ -163,7 +169,7 @@ class _Equation(_Foreign):
             made = foreign.evaluate(self.what, [v.copy() for v in arguments], sample_time=self.sample_time)
             return foreign.numbers_of(self.what, made, self.results)
         except BaseException as error:
-            foreign.failures.append(_failure(error, self.what, foreign, arguments))
+            foreign.keep(_failure(error, self.what, foreign, arguments))
             return [np.full(size(s), np.nan) for s in self.results.values()]
 
     def eval_buffer(self, arguments: Any, results: Any) -> int:
@@ -225,11 +231,10 @@ class _Differences(_Foreign):
 
 
 def raise_failure(failures: list[BaseException], path: str) -> None:
-    """Raise the first exception that was kept, if there is one, and forget all."""
+    """Raise the exception that was kept, if there is one, and forget it."""
     if failures:
-        first = failures[0]
-        failures.clear()
-        raise first.at(block=path) if isinstance(first, LoopwrightError) else first
+        last = failures.pop()
+        raise last.at(block=path) if isinstance(last, LoopwrightError) else last
 
 
 def _failure(error: BaseException, what: str, foreign: Foreign, arguments: Sequence[np.ndarray]) -> BaseException:

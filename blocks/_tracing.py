@@ -57,7 +57,7 @@ class Traced:
     jump: Any = None
     """CasADi function of the same and a column of ones and zeros, to all states; None without events."""
     failures: list[BaseException] = field(default_factory=list)
-    """What an opaque block's equations raised, with NaN as their result; see `raise_failure`."""
+    """What an opaque block's equations raised last, with NaN as their result; see `raise_failure`."""
     foreign: Foreign | None = None
     """The equations of an opaque block: their functions live as long as this does."""
 

@@ -315,12 +315,27 @@ def test_an_exception_is_kept_with_its_cause_and_gives_nan():
     raise_failure(found.failures, "box.broken")  # nothing to raise
 
 
+def test_the_last_failure_is_kept():
+    def broken(u):
+        raise ValueError(f"not {u}")
+
+    found = traced(PythonFunction(broken, results={"y": ()}))
+    for u in (1.0, 2.0, 3.0):
+        found.function(0.0, [], u, [np.nan])
+    assert len(found.failures) == 1
+    with pytest.raises(SimulationError, match=r"ValueError: not 3\.0"):
+        raise_failure(found.failures, "broken")
+
+
 def test_an_interrupt_is_kept_as_it_is():
     def stopped(u):
-        raise KeyboardInterrupt
+        if u > 0.0:
+            raise KeyboardInterrupt
+        raise ValueError
 
     found = traced(PythonFunction(stopped, results={"y": ()}))
     found.function(0.0, [], 1.0, [np.nan])
+    found.function(0.0, [], -1.0, [np.nan])
     with pytest.raises(KeyboardInterrupt):
         raise_failure(found.failures, "stopped")
 
