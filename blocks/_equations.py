@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import linecache
 from collections.abc import Mapping
 from typing import Any
 
@@ -68,6 +69,26 @@ def takes_update(block: Block, sampled: bool) -> bool:
     if not hasattr(block, "update"):
         return False
     return sampled or not (hasattr(block, "derivative") or (block.events and not block.memory))
+
+
+def untraceable(error: Exception, block: Block, what: str) -> str:
+    """Say which line of the user's equations an operation failed on."""
+    # by the code's own file, which a notebook's cell and a script have too; helpers beside the equation count as well
+    equation = inspect.unwrap(getattr(type(block), what))
+    file = getattr(getattr(equation, "__code__", None), "co_filename", None)
+    line, step = "", error.__traceback__
+    while step is not None:
+        if step.tb_frame.f_code.co_filename == file:
+            code = linecache.getline(file, step.tb_lineno).strip()
+            line = f" in line {step.tb_lineno} of {file}" + (f", {code!r}" if code else "")
+        step = step.tb_next
+    text = f"its {what} can't be traced{line}: {type(error).__name__}: {error}."
+    if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
+        return f"{text} Correct the equation there."
+    return (
+        f"{text} Use NumPy functions of (t, x, u): np.where for branches, np.stack for vectors, np.sqrt and not "
+        "math.sqrt."
+    )
 
 
 def _named(value: Any) -> str:

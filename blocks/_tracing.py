@@ -15,7 +15,6 @@ Events add two functions in a continuous frame, indicators(t, x, u₁ … uₘ, 
 from __future__ import annotations
 
 import inspect
-import linecache
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -27,7 +26,7 @@ from ._block import Block
 from ._callbacks import Foreign
 from ._comparison import GUARDS, NEXT, compare
 from ._discretization import hold
-from ._equations import check_definition, guards_of, split, start_values, takes_update
+from ._equations import check_definition, guards_of, split, start_values, takes_update, untraceable
 from ._errors import LoopwrightError, SampleTimeError, TraceError
 from ._ports import Shape
 from ._symbols import bundle, expanded, flat_column, size, with_values, wrap
@@ -266,7 +265,7 @@ class _Tracer:
         except LoopwrightError:
             raise
         except Exception as error:
-            raise TraceError(_where(error, self.block, what)) from error
+            raise TraceError(untraceable(error, self.block, what)) from error
 
     def _wants_sample_time(self, what: str) -> bool:
         declared = inspect.signature(getattr(type(self.block), what)).parameters.get("T")
@@ -403,23 +402,3 @@ class _Tracer:
         """Compare results of a traced function with NumPy's own."""
         if self.foreign is None:
             compare(self.block, function, names, self.shapes, self.starts, self.entries, self.constants, self.sampled)
-
-
-def _where(error: Exception, block: Block, what: str) -> str:
-    """Say which line of the user's equations an operation failed on."""
-    # by the code's own file, which a notebook's cell and a script have too; helpers beside the equation count as well
-    equation = inspect.unwrap(getattr(type(block), what))
-    file = getattr(getattr(equation, "__code__", None), "co_filename", None)
-    line, step = "", error.__traceback__
-    while step is not None:
-        if step.tb_frame.f_code.co_filename == file:
-            code = linecache.getline(file, step.tb_lineno).strip()
-            line = f" in line {step.tb_lineno} of {file}" + (f", {code!r}" if code else "")
-        step = step.tb_next
-    text = f"its {what} can't be traced{line}: {type(error).__name__}: {error}."
-    if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
-        return f"{text} Correct the equation there."
-    return (
-        f"{text} Use NumPy functions of (t, x, u): np.where for branches, np.stack for vectors, np.sqrt and not "
-        "math.sqrt."
-    )
