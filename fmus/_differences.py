@@ -45,7 +45,7 @@ class Column:
                 x = float(self.at[i])
                 d = self.relative * max(abs(x), abs(variable.nominal or 1.0))
                 d = (x + d) - x  # a distance that the numbers near x have
-                up, down = x + 2 * d <= high, x - 2 * d >= low
+                up, down = x + 4 * d <= high, x - 4 * d >= low
                 yield name, i, d, 0 if up and down else 1 if up else -1
 
 
@@ -54,8 +54,8 @@ def columns(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the matrix of derivatives and the estimated error of each entry.
 
-    Quotients over d and 2 d are extrapolated, to order 4 in d (order 2 where a bound leaves one side). The difference
-    to the quotient over d bounds the error of smooth functions from above; what rounding adds is eps max abs(f) / d.
+    Quotients over d, 2 d and 4 d are extrapolated twice, to order 6 in d (3 where a bound leaves one side). What the
+    last extrapolation has changed is the estimate; what rounding adds is eps max abs(f) / d.
     """
     found, errors = [], []
     for name, i, d, side in column:
@@ -66,12 +66,14 @@ def columns(
             return evaluate(name, x)
 
         if side == 0:
-            near, far = (moved(1) - moved(-1)) / (2 * d), (moved(2) - moved(-2)) / (4 * d)
-            best = (4 * near - far) / 3
+            one, two, four = ((moved(k) - moved(-k)) / (2 * k * d) for k in (1, 2, 4))
+            fine, coarse = (4 * one - two) / 3, (4 * two - four) / 3
+            best = (16 * fine - coarse) / 15
         else:
-            near, far = (moved(side) - values) / (side * d), (moved(2 * side) - values) / (2 * side * d)
-            best = 2 * near - far
+            one, two, four = ((moved(side * k) - values) / (side * k * d) for k in (1, 2, 4))
+            fine, coarse = 2 * one - two, 2 * two - four
+            best = (4 * fine - coarse) / 3
         found.append(best)
-        errors.append(np.abs(best - near) + _EPS * np.abs(values).max(initial=0.0) / d)
+        errors.append(np.abs(best - fine) + _EPS * np.abs(values).max(initial=0.0) / d)
     shape = (len(found), values.size)
     return np.array(found).reshape(shape).T, np.array(errors).reshape(shape).T

@@ -2,6 +2,7 @@
 
 import re
 import zipfile
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -409,3 +410,14 @@ def test_directional_derivatives_are_refused_by_name(motor, tmp_path):
             FmuRuntimeError, match=r"^m, t = 0 s: a directional derivative failed .*torque is no known in Step Mode"
         ):
             run.directional_derivative(["torque"], ["current", "torque"], [1.0, 1.0])
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_on_fmus_runs(cache):
+    text = (Path(__file__).parents[2] / "docs" / "fmus.md").read_text(encoding="utf-8")
+    scope = {}
+    for snippet in re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+        exec(snippet, scope)
+    assert scope["step"].h == 1e-3
