@@ -40,6 +40,9 @@ from ..blocks._errors import NonFiniteError, OptionError, SimulationError, near
 
 Dense = Callable[[float], np.ndarray]
 
+_STRETCH = 2_000  # steps between two looks at the progress
+_HOPELESS = 1e8  # steps to go, at which a run is given up: hours
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -97,6 +100,7 @@ class Solver(ABC):
     """The interface of all solvers: `restart`, then `step` until ``t == stop``."""
 
     fixed = False
+    stiff = False  # is it made for stiff problems?
 
     def __init__(self, name: str, problem: Problem, rtol: float, atol: float | np.ndarray, max_step: float):
         self.name, self.problem, self.rtol, self.atol, self.max_step = name, problem, rtol, atol, max_step
@@ -131,8 +135,11 @@ class Solver(ABC):
                 t=t,
             )
 
-    def failure(self, t: float, x: np.ndarray, h: float) -> SimulationError:
-        """Return the error of a step that can't be made small enough, at the accepted point (t, x)."""
+    def failure(self, t: float, x: np.ndarray, h: float, found: str = "") -> SimulationError:
+        """Return the error of a step that can't be made small enough, at the accepted point (t, x).
+
+        The entry that it names has the largest weighted error there in a step of Euler's method.
+        """
         f = self.rate(t, x)
         try:
             self.finite(t, f, "rate")
@@ -143,11 +150,14 @@ class Solver(ABC):
             change = h * (self.rate(t + h, x + h * f) - f)
             weighted = np.abs(change) / (self.atol + self.rtol * np.abs(x))
         i = int(np.argmax(np.where(np.isnan(weighted), np.inf, weighted)))
+        found = found or f"can't meet rtol = {self.rtol:g} even with a step of {h:.2g} s"
+        beyond = "changes fastest" if np.isfinite(weighted[i]) else "is not finite just beyond"
+        other = "a larger atol" if self.stiff else "a larger atol or, if it is stiff, solver='Radau'"
         return SimulationError(
-            f"{self.name} can't meet rtol = {self.rtol:g} even with a step of {h:.3g} s: the rate of "
-            f"{self.problem.names[i]} = {x[i]:.6g} is {f[i]:.6g} there and changes fastest. Expected rates that "
-            "are smooth between events; look for growth to infinity, a jump that is no event, or noise in an opaque "
-            "block. If there is none, give a larger atol or solver='Radau'.",
+            f"{self.name} {found}: the rate of {self.problem.names[i]} = {x[i]:.6g} is {f[i]:.6g} there and {beyond}. "
+            "Expected rates that are finite, and smooth between events; look for growth to infinity, a root or a "
+            "logarithm that leaves its domain, a jump that is no event, or noise in an opaque block. If there is none, "
+            f"try {other}.",
             t=t,
         )
 
@@ -156,24 +166,37 @@ class VariableStep(Solver):
     """The base of the variable-step solvers: an interval of a few ulps is crossed by one step of Heun's method."""
 
     _sliver: tuple[float, np.ndarray] | None = None
+    _count, _mark = 0, 0.0
 
     def restart(self, t: float, x: np.ndarray, stop: float) -> None:
         """Start at (t, x), up to ``stop``."""
         t, x, self.stop = float(t), np.array(x, dtype=float), float(stop)
         sliver = self.stop - t <= 100 * math.ulp(max(abs(t), abs(self.stop)))
         self._sliver = (t, x) if sliver else None
+        self._count, self._mark = 0, t
         if not sliver:
             self._start(t, x)
 
     def step(self) -> Step:
         """Take one step that the error control accepts, at most to ``stop``."""
         if self._sliver is None:
-            return self._advance()
+            step = self._advance()
+            self._count += 1
+            if self._count % _STRETCH == 0:
+                self._check_progress(step)
+            return step
         t, x = self._sliver
         f = self.rate(t, x)
         self.finite(t, f, "rate")
         self.statistics.steps += 1
         return Step(t, self.stop, _heun(self.rate, t, x, f, self.stop), lambda: lambda time: x + (time - t) * f)
+
+    def _check_progress(self, step: Step) -> None:
+        """Raise if the last steps were so small that the run would never end: at a jump that is no event, say."""
+        h, self._mark = (step.t - self._mark) / _STRETCH, step.t
+        if self.stop - step.t > _HOPELESS * h:
+            found = f"got no further than {h:.2g} s per step in {_STRETCH} steps, with {self.stop - step.t:.3g} s to go"
+            raise self.failure(step.t, step.x, h, found)
 
     @abstractmethod
     def _start(self, t: float, x: np.ndarray) -> None:

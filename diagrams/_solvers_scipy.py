@@ -27,7 +27,7 @@ from ._solvers import Dense, Problem, Step, VariableStep
 
 _ATTEMPT = {"RK23": 3, "RK45": 6, "DOP853": 12}  # evaluations of the rates per attempted step
 _MULTISTEP = ("BDF", "LSODA")
-_RETRIES = 40
+_RETRIES = 30  # of one step, or of every third step: then the border of the rates' domain is reached
 
 
 class SciPySolver(VariableStep):
@@ -42,15 +42,16 @@ class SciPySolver(VariableStep):
 
         super().__init__(name, problem, rtol, atol, max_step)
         self._method: Any = getattr(scipy.integrate, name)
-        self._attempt = _ATTEMPT.get(name)
+        self._attempt, self.stiff = _ATTEMPT.get(name), name not in _ATTEMPT
         self._options: dict[str, Any] = {"rtol": rtol, "atol": atol, "max_step": max_step}
         if not self._attempt:
             self._options["jac"] = self._usable_jacobian
         self.statistics.rejected = 0 if self._attempt else None
-        self._planned: float | None = None  # the step that the method would take next
+        self.planned: float | None = None  # the step that the method would take next
         self._last_jacobian: np.ndarray | None = None
         self._inner: Any = None
         self.stuck: tuple[float, np.ndarray] | None = None  # where no step was small enough
+        self._retried = 0  # grows if many steps have to be taken again
         self._strange = False  # a rate was not finite since the flag was cleared
 
     def rate(self, t: float, x: np.ndarray) -> np.ndarray:
@@ -68,11 +69,12 @@ class SciPySolver(VariableStep):
         elif self._last_jacobian is not None:
             return self._last_jacobian.copy()
         else:
-            self.finite(t, jacobian.sum(axis=1), "Jacobian's row")
+            self.finite(t, super().rate(t, x), "rate")
+            self.finite(t, jacobian.sum(axis=1), "row in the Jacobian")
         return jacobian
 
     def _start(self, t: float, x: np.ndarray) -> None:
-        first = None if self._planned is None else min(self._planned, self.stop - t)
+        first = None if self.planned is None else min(self.planned, self.stop - t)
         self._strange = False
         if self._attempt and self._inner is not None and first is not None:  # a new object would cost a third of a step
             inner = self._inner
@@ -108,13 +110,14 @@ class SciPySolver(VariableStep):
         if self._attempt and self.statistics.rejected is not None:
             self.statistics.rejected += (self.statistics.rate_evaluations - before) // self._attempt - 1
         if self.name not in _MULTISTEP:  # a step that was cut at the stop says little about the next
-            self._planned = max(planned, inner.h_abs) if inner.t == self.stop else inner.h_abs
+            self.planned = max(planned, inner.h_abs) if inner.t == self.stop else inner.h_abs
         self.statistics.steps += 1
-        return Step(inner.t_old, inner.t, inner.y.copy(), self._dense)
+        return Step(float(inner.t_old), float(inner.t), inner.y.copy(), self._dense)
 
     def _attempt_step(self) -> None:
         """Take a step; go back and take a shorter one if it ended where the rates are not finite."""
-        for _ in range(_RETRIES):
+        first = self._inner
+        for _ in range(_RETRIES if self._retried < _RETRIES else 1):
             inner = self._inner
             t, x = inner.t, inner.y
             self._strange = False
@@ -128,6 +131,7 @@ class SciPySolver(VariableStep):
             if inner.status == "failed":
                 break
             if not self._strange or (self.name != "LSODA" and self._sound(inner)):
+                self._retried = max(0, self._retried - 1) if inner is first else self._retried + 3
                 return
             h = 0.25 * (inner.t - t)
             if h < 10 * math.ulp(t):
@@ -180,17 +184,19 @@ class AutoSolver(VariableStep):
         except SimulationError:
             if self._active is self._implicit or self._explicit.stuck is None:
                 raise
-            self._switch(self._implicit, *self._explicit.stuck, why="no step is small enough")
+            t, x = self._explicit.stuck
             self._explicit.stuck = None
+            self._switch(self._implicit, t, x, None, why="no step is small enough")
             step = self._active.step()
+        h = step.t - step.t_old
         if self._active is self._explicit:
             if (self._hits or not self.statistics.steps % _LOOK_EVERY) and self._stiff(step):
-                self._switch(self._implicit, step.t, step.x, why=f"stiff at steps of {step.t - step.t_old:.2g} s")
+                self._switch(self._implicit, step.t, step.x, h, why=f"stiff at steps of {h:.2g} s")
         elif self._eased(step):
-            self._switch(self._explicit, step.t, step.x, why="no longer stiff")
+            self._switch(self._explicit, step.t, step.x, h, why="no longer stiff")
         return step
 
-    def _switch(self, to: SciPySolver, t: float, x: np.ndarray, *, why: str) -> None:
+    def _switch(self, to: SciPySolver, t: float, x: np.ndarray, h: float | None, *, why: str) -> None:
         self._hits = self._misses = self._easy = 0
         self._switches += 1
         if self._switches <= 10:
@@ -199,7 +205,7 @@ class AutoSolver(VariableStep):
             self.statistics.messages.append("… and more such changes")
         self.statistics.solver = f"auto ({self._explicit.name}, Radau)"
         self.statistics.rejected = None
-        self._active = to
+        self._active, to.planned = to, h
         if t < self.stop:
             to.restart(t, x, self.stop)
 
