@@ -66,7 +66,8 @@ class Block(Value, Wireable):
         Numbers computed from the parameters in plain Python, which the equations then read as attributes.
     next_instant(t)
         The next time strictly after t at which the outputs or their derivatives are not smooth, ``math.inf`` if there
-        is none: plain Python, not traced. A solver lands there; it is not asked for in a sampled frame.
+        is none: plain Python, not traced. A solver lands there, and takes its left limits just before; it is not asked
+        for in a sampled frame.
 
     Parameters
     ----------
@@ -78,7 +79,7 @@ class Block(Value, Wireable):
     memory: ClassVar[bool] = False
     """True where the states are only a warm start for the outputs, such as a projection's last foot point."""
     opaque: ClassVar[bool] = False
-    """True where there are no equations to trace."""
+    """True where the equations are not traced: any Python, called with numbers, differentiated by differences."""
     same_units: ClassVar[bool] = False
     """True where all inputs must be in one unit, as in a sum."""
     stops: ClassVar[str | None] = None

@@ -32,6 +32,11 @@ def trapezoidal(
         The sample time.
     nominals : (n,) ndarray
         Nominal value of every entry of x.
+
+    Notes
+    -----
+    The linear equations are solved in scalar operations, as many as n³ where all states are coupled: 0.4 s to trace and
+    0.2 ms a step for 10 of them, 3.5 s and 1 ms for 20.
     """
     t, x, *held = arguments
     n = x.numel()
