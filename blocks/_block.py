@@ -85,7 +85,7 @@ class Block(Value, Wireable):
     stops: ClassVar[str | None] = None
     """Name of a scalar output that ends the run, normally, at the first instant at which it is above 0.5."""
     transport: ClassVar[bool] = False
-    """True where, in continuous time, the output ``y`` is the input ``u`` a time ``delay`` ago, which the solver keeps."""
+    """True where, in continuous time, the output ``y`` is the input ``u`` a time ``delay`` ago, kept by the solver."""
 
     inputs: ClassVar[Mapping[str, Input]] = {}
     outputs: ClassVar[Mapping[str, Output | State]] = {}
