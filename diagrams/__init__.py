@@ -4,6 +4,8 @@ from . import experiments
 from ._diagram import Diagram
 from ._flat import FlatDiagram, Layout
 from ._run import Run, Snapshot
+from ._simulation import Simulation
+from ._state import RunState
 from ._stored import Occurrence, Stopped
 from ._structure import Frame, Wire
 from ._subsystem import Subsystem, subsystem
@@ -16,6 +18,8 @@ __all__ = [
     "Layout",
     "Occurrence",
     "Run",
+    "RunState",
+    "Simulation",
     "Snapshot",
     "Stopped",
     "Subsystem",

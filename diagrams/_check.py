@@ -11,9 +11,18 @@ import numpy as np
 
 from ..blocks._block import Block
 from ..blocks._equations import start_shapes
-from ..blocks._errors import LoopwrightError, ShapeError, UnitError, UnknownNameError, UnwiredInputError, near
+from ..blocks._errors import (
+    LoopwrightError,
+    SampleTimeError,
+    ShapeError,
+    UnitError,
+    UnknownNameError,
+    UnwiredInputError,
+    WiringError,
+    near,
+)
 from ..blocks._ports import Shape
-from ..blocks._tracing import Traced, trace
+from ..blocks._tracing import Traced, trace, traced_parameters
 from ..blocks._units import describe_mismatch, same_unit
 from ._structure import Structure, Wire
 
@@ -42,6 +51,7 @@ def check(table: Structure) -> Checked:
     """
     _check_ports(table)
     traced, shapes = _infer_shapes(table)
+    _check_boxes(table, traced, shapes)
     return Checked(traced, shapes, _check_units(table, shapes))
 
 
@@ -115,10 +125,14 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[Port, Shape
             heapq.heappush(ready, path)
         path = heapq.heappop(ready)
         block = table.blocks[path]
-        if block.opaque:
-            continue
-        traced[path] = _trace(block, _input_shapes(table, shapes, path, assumed), table, path, shared)
-        for name, shape in traced[path].outputs.items():
+        if table.stepped(path):
+            if not block.transport:
+                continue
+            found = {"y": _input_shapes(table, shapes, path, assumed)["u"]}
+        else:
+            traced[path] = _trace(block, _input_shapes(table, shapes, path, assumed), table, path, shared)
+            found = traced[path].outputs
+        for name, shape in found.items():
             if (path, name) not in shapes:
                 shapes[path, name] = shape
                 for consumer, port in consumers.get((path, name), ()):
@@ -136,6 +150,8 @@ def _check_shapes(
     for (path, port), wire in sorted(table.wires.items()):
         found = part_shape(shapes[wire.block, wire.port], wire, path, port)
         expected = traced[path].inputs[port] if path in traced else table.blocks[path].inputs[port].shape
+        if path not in traced and expected is None:  # a transport delay
+            expected = shapes[path, "y"]
         if found == expected:
             continue
         if (path, port) in assumed:
@@ -154,9 +170,56 @@ def _check_shapes(
         part_shape(shapes[wire.block, wire.port], wire, wire.block, f"{wire.port} (named {name!r})")
 
 
+def _check_boxes(table: Structure, traced: dict[str, Traced], shapes: dict[Port, Shape]) -> None:
+    """Check what controls boxes, and what stands in them."""
+    for box, wire in sorted(table.controls.items()):
+        kind = table.frames[box].control
+        port = {"enabled": "enable", "triggered": "trigger"}[kind]
+        found = part_shape(shapes[wire.block, wire.port], wire, box, port)
+        if found != ():
+            raise ShapeError(
+                f"{wire} has shape {found}; expected a logic signal, one number. Index it.", block=box, port=port
+            )
+    for path in sorted(table.blocks):
+        gates = table.gates(table.frame_of[path])
+        if gates and path not in traced:
+            what = "a transport delay" if table.blocks[path].transport else "an FMU"
+            raise WiringError(
+                f"{what} can't stand in a box that is {table.frames[gates[-1]].control} ({gates[-1]}): it goes on in "
+                "time whatever the box does. Put it outside, and wire its outputs in.",
+                block=path,
+            )
+        box = table.triggered(table.frame_of[path])
+        if box is None:
+            continue
+        trace = traced[path]
+        if trace.advance not in ("none", "update") or _reads_sample_time(table.blocks[path], trace):
+            raise SampleTimeError(
+                f"it needs a sample time, and the triggered box {box} has none: it acts whenever it is triggered. Put "
+                f"it outside the box, or take a block that counts samples.",
+                block=path,
+            )
+        inner = table.clock(table.frame_of[path])
+        outer = table.clock(box)
+        if inner is not outer:
+            raise SampleTimeError(
+                f"the box {inner.path if inner else ''} has a sample time of its own inside of the triggered box "
+                f"{box}; it acts whenever {box} is triggered. Leave the sample time out.",
+                block=path,
+            )
+
+
+def _reads_sample_time(block: Block, trace: Traced) -> bool:
+    """Whether a block's equations, or its precomputed numbers, depend on the sample time."""
+    position = sum(int(np.size(value)) for _, value in traced_parameters(block))
+    last = trace.function.n_in() - 1
+    columns = (trace.function.jac_sparsity(i, last).get_col() for i in range(trace.function.n_out()))
+    return hasattr(block, "constants") or any(position in column for column in columns)
+
+
 def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, shared: dict[Any, Traced]) -> Traced:
     frame = table.frame_of[path]
-    sampled, method = table.rate(frame) is not None, table.frames[frame].method
+    sampled, method = table.sampled(frame), table.frames[frame].method
     try:
         return trace(block, shapes, sampled=sampled, method=method, cache=shared)
     except LoopwrightError as error:

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace as replace_fields
 from fractions import Fraction
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..blocks._block import Block
 from ..blocks._discretization import check_method
-from ..blocks._errors import UnknownNameError, WiringError, near
+from ..blocks._errors import OptionError, UnknownNameError, WiringError, near
 from ..blocks._signals import check_name
 from ..blocks._values import Value
 from ._check import Checked, check
 from ._flat import FlatDiagram, flatten
+from ._lowering import lowered
 from ._order import evaluation_order
 from ._run import Run
 from ._structure import Collector, Frame, Structure, Wire
-from ._subsystem import exact_time
+from ._subsystem import exact_offset, exact_time, samples_of_delay
+
+if TYPE_CHECKING:
+    from ._simulation import Simulation
+    from ._state import RunState
+
+LOOPS = ("error", "solve")
 
 
 class Diagram:
@@ -31,6 +38,10 @@ class Diagram:
         Name of the diagram.
     *roots : Call
         The calls that close it, such as ``plant(motor_force=u)``; what they are wired to belongs to the diagram.
+    loops : {"error", "solve"}
+        What is done about algebraic loops: they are an error, or Newton's method solves them at every instant, from the
+        last solution, with exact derivatives. ``run.residual`` is what is left; above 1e-9 of 1 + the size of the
+        signals the run stops.
 
     Raises
     ------
@@ -48,37 +59,44 @@ class Diagram:
     [0.0, 1.414214, 2.0, 1.414214, 0.0]
     """
 
-    def __init__(self, name: str, *roots: Any):
+    def __init__(self, name: str, *roots: Any, loops: str = "error"):
         if not isinstance(name, str):
             raise WiringError(
                 f'found {name!r} where the name is expected; write Diagram("name", …), the calls after the name.'
             )
         if not roots:
             raise WiringError("a diagram needs at least one call, such as plant(motor_force=u).", block=name)
-        self._set(check_name(name), Collector(roots).structure())
+        if loops not in LOOPS:
+            raise OptionError(
+                f"found loops={loops!r}; expected {' or '.join(map(repr, LOOPS))}.", block=name, port="loops"
+            )
+        self._set(check_name(name), Collector(roots).structure(), loops)
 
     name: str
+    loops: str
     _table: Structure
+    _lowered: Structure
     _checked: Checked
     _flat: dict[Fraction | None, FlatDiagram]
 
-    def _set(self, name: str, table: Structure) -> None:
-        checked = check(table)
+    def _set(self, name: str, table: Structure, loops: str) -> None:
+        runs = lowered(table)
+        checked = check(runs)
         for start in (False, True):
-            evaluation_order(table, checked.traced, start=start)
-        self.__dict__.update(name=name, _table=table, _checked=checked, _flat={})
+            evaluation_order(runs, checked.traced, start=start, solve=loops == "solve")
+        self.__dict__.update(name=name, loops=loops, _table=table, _lowered=runs, _checked=checked, _flat={})
 
     def __setattr__(self, name: str, value: Any) -> None:
         raise AttributeError(f"a diagram is a value: {name!r} can't be set. Use replace(…), or build another one.")
 
     @classmethod
-    def _of(cls, name: str, table: Structure) -> Diagram:
+    def _of(cls, name: str, table: Structure, loops: str = "error") -> Diagram:
         diagram = cls.__new__(cls)
-        diagram._set(name, table)
+        diagram._set(name, table, loops)
         return diagram
 
     def __reduce__(self) -> Any:
-        return Diagram._of, (self.name, self._table)
+        return Diagram._of, (self.name, self._table, self.loops)
 
     def __repr__(self) -> str:
         boxes = [path for path in self._table.frames if path]
@@ -118,7 +136,7 @@ class Diagram:
         ----------
         changes : mapping, optional
             By dotted path, or its unique end: a block (``"plant"``), a parameter
-            (``"controller.admittance_par.stiffness"``), a subsystem's ``sample_time`` or ``method``
+            (``"controller.admittance_par.stiffness"``), a subsystem's ``sample_time``, ``method``, ``offset`` or ``delay``
             (``"controller.sample_time"``; None: that of what surrounds it), a plant's start value
             (``"plant.start.position"``).
         **more
@@ -132,19 +150,75 @@ class Diagram:
         table = Structure(**{k: dict(v) for k, v in vars(self._table).items()})
         for path, value in {**(changes or {}), **more}.items():
             self._change(table, path, value)
-        return Diagram._of(self.name, table)
+        return Diagram._of(self.name, table, self.loops)
+
+    def continuous(self) -> Diagram:
+        """Return the diagram with every sampled subsystem taken as ideal: continuous, without sampling, hold or delay.
+
+        A projection then solves its equation at each evaluation, from the foot point of the last accepted step.
+
+        Raises
+        ------
+        SampleTimeError
+            A block that has a meaning at samples only, such as a `UnitDelay`.
+        """
+        table = Structure(**{k: dict(v) for k, v in vars(self._table).items()})
+        for path, frame in table.frames.items():
+            table.frames[path] = replace_fields(frame, sample_time=None, offset=Fraction(0), delay=0)
+        return Diagram._of(self.name, table, self.loops)
+
+    def sampled(self, sample_time: float | Fraction, method: str = "exact") -> Diagram:
+        """Return the diagram with everything that is continuous sampled.
+
+        Parameters
+        ----------
+        sample_time : float or Fraction
+            Sample time in s. Subsystems that have one of their own keep it.
+        method : {"exact", "forward", "semi_implicit", "trapezoidal"}
+            How the blocks are discretized that were continuous; see `loopwright.blocks.hold`.
+
+        Raises
+        ------
+        SampleTimeError
+            A sample time that is not positive, or an unknown method.
+        """
+        check_method(method)
+        table = Structure(**{k: dict(v) for k, v in vars(self._table).items()})
+        for path, frame in sorted(table.frames.items()):
+            if self._table.clock(path) is None:
+                table.frames[path] = replace_fields(frame, method=method)
+        top = replace_fields(table.frames[""], sample_time=exact_time(sample_time, block=self.name))
+        table.frames[""] = top
+        return Diagram._of(self.name, table, self.loops)
+
+    @property
+    def is_continuous(self) -> bool:
+        """Whether something happens between ticks: continuous states, events, or a transport delay."""
+        table = self._lowered
+        traces = self._checked.traced
+        return (
+            any(t.advance == "derivative" or t.indicators is not None for t in traces.values())
+            or any(table.blocks[p].transport for p in table.blocks if p not in traces)
+            or any(table.is_event(box) for box in table.controls)
+        )
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether a subsystem, or the diagram itself, has a sample time."""
+        return any(frame.sample_time is not None for frame in self._lowered.frames.values())
+
+    @property
+    def has_fmu(self) -> bool:
+        """Whether an FMU is in it."""
+        return any(hasattr(block, "instantiate") for block in self._table.blocks.values())
 
     def _change(self, table: Structure, path: str, value: Any) -> None:
         head, _, last = path.rpartition(".")
         if isinstance(value, Block):
             full = self._find(path)
             table.blocks[full] = value.replace(name=full.rpartition(".")[2])
-        elif last in ("sample_time", "method") and (frame := self._frame(table, head, last)) is not None:
-            new = exact_time(value, block=frame) if last == "sample_time" and value is not None else value
-            if last == "method":
-                check_method(value)
-            changed: dict[str, Any] = {last: new}
-            table.frames[frame] = replace_fields(table.frames[frame], **changed)
+        elif last in _OF_A_BOX and (frame := self._frame(table, head, last)) is not None:
+            table.frames[frame] = _changed_box(table.frames[frame], last, value)
         elif path in table.blocks:
             raise WiringError(
                 f"found {value!r}; expected a block in its place, such as Fmu('other.fmu'), or the name of a parameter "
@@ -194,38 +268,128 @@ class Diagram:
         """
         key = None if step is None else exact_time(step, block=self.name)
         if key not in self._flat:
-            self._flat[key] = flatten(self._table, self._checked, key)
+            solve = self.loops == "solve"
+            self._flat[key] = flatten(self._lowered, self._checked, key, name=self.name, solve=solve)
         return self._flat[key]
 
-    def simulate(self, duration: float, *, step: float | Fraction | None = None, progress: bool | None = None) -> Run:
-        """Run the diagram from t = 0 and return what it recorded.
+    def simulate(
+        self,
+        duration: float,
+        *,
+        step: float | Fraction | None = None,
+        solver: str = "auto",
+        rtol: float = 1e-6,
+        atol: float = 1e-9,
+        max_step: float | None = None,
+        record: Iterable[str] | None = None,
+        every: int = 1,
+        states: bool = True,
+        to: Any = None,
+        overwrite: bool = False,
+        start: RunState | None = None,
+        progress: bool | None = None,
+    ) -> Run:
+        """Run the diagram and return what it recorded: from t = 0, or from a saved state.
+
+        What happens in which order is said in `loopwright.diagrams.Simulation`'s module, in one page.
 
         Parameters
         ----------
         duration : float
             Simulated time in s, a multiple of the step between ticks.
         step : float or Fraction, optional
-            Seconds between two ticks (and communication points of the FMUs). Without one it is the greatest common
-            divisor of all sample times.
+            Seconds between two ticks (samples, steps of a solver of fixed step, communication points of FMUs). Without
+            one it is the greatest common divisor of all sample times, of which those are visited at which a box acts; for
+            a diagram that is continuous only, a thousandth of the duration.
+        solver : str
+            What integrates continuous states: "auto", of fixed step "euler", "heun", "rk4", of variable step "RK23", "RK45",
+            "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams". The default changes from an explicit to an
+            implicit method where the diagram turns out to be stiff.
+        rtol, atol : float
+            Relative and absolute tolerance of a step of a solver of variable step; the absolute one is multiplied with the
+            nominal value of a state that declares one.
+        max_step : float, optional
+            Longest step of a solver of variable step in s.
+        record : list of str, optional
+            Signals, blocks and subsystems to record; everything without it.
+        every : int
+            Record one of so many samples; the first and the last always.
+        states : bool
+            Record the states, too.
+        to : path, optional
+            Folder to which the samples are streamed, with bounded memory; `Run.open` opens it later.
+        overwrite : bool
+            Replace a run that is stored there.
+        start : RunState, optional
+            State to go on from: ``run.final_state``, or that of `Simulation.save`.
         progress : bool, optional
             Show a progress bar; by default on a terminal, and in a notebook where ipywidgets is installed.
 
         Returns
         -------
         Run
-            Every output at every tick.
+            Every output at every sample.
 
         Raises
         ------
         SimulationError
-            `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`; ``error.run`` holds what was
-            recorded until then.
+            `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`, a solver that can't go on, events that
+            pile up, an algebraic loop without a solution; ``error.run`` holds what was recorded until then.
         OptionError
-            A duration that is not positive, or no multiple of the step.
+            A duration that is not positive, or no multiple of the step; an unknown solver, a tolerance out of range.
         """
         from ._simulation import simulate
 
-        return simulate(self, duration, step=step, progress=progress)
+        return simulate(
+            self,
+            duration,
+            step=step,
+            solver=solver,
+            rtol=rtol,
+            atol=atol,
+            max_step=max_step,
+            record=record,
+            every=every,
+            states=states,
+            to=to,
+            overwrite=overwrite,
+            start=start,
+            progress=progress,
+        )
+
+    def simulation(self, **options: Any) -> Simulation:
+        """Return a run in the making, to go on step by step, to save and to restore; see `Simulation`.
+
+        Parameters
+        ----------
+        **options
+            ``step``, ``solver``, ``rtol``, ``atol``, ``max_step``, ``record``, ``every``, ``states``, ``to``,
+            ``overwrite`` and ``start`` of `simulate`.
+        """
+        from ._simulation import Simulation
+
+        return Simulation(self, **options)
+
+
+_OF_A_BOX = ("sample_time", "method", "offset", "delay")
+
+
+def _changed_box(frame: Frame, what: str, value: Any) -> Frame:
+    """Return a box with another sample time, method, offset or delay."""
+    new, path = value, frame.path
+    if what == "sample_time" and value is not None:
+        new = exact_time(value, block=path)
+    elif what == "method":
+        check_method(value)
+    elif what == "offset":
+        new = exact_offset(value, frame.sample_time, block=path)
+    elif what == "delay":
+        new = samples_of_delay(value, frame.sample_time, block=path)
+    changed: dict[str, Any] = {what: new}
+    if what == "sample_time":
+        exact_offset(frame.offset, new, block=path)
+        samples_of_delay(frame.delay, new, block=path)
+    return replace_fields(frame, **changed)
 
 
 def _unique(path: str, known: Mapping[str, Any], kind: str, diagram: str) -> str:

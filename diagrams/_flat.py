@@ -1,17 +1,22 @@
-"""A diagram as one CasADi function: what happens at one tick.
+"""A diagram as CasADi functions: what happens at one tick, and between two.
 
-    (x_next, z, log, ok) = F(t, x, w, p)
+    (x_next, z, log, ok) = F(t, x, w, p)    at a tick, for every pattern of boxes that act in it
+    dx = f(t, x, w, p)                      between ticks: the rates of the continuous states
+    g = h(t, x, w, p)                       between ticks: the indicators of all events
+    x_next = J(t, x, w, p, fired)           at an event
 
-``x`` holds the states of all blocks, ``w`` the outputs of the FMUs, ``z`` their inputs, ``p`` all parameters; ``log``
-is (w, all outputs, x); ``ok`` is 1 while everything is finite and every guard positive. F calls one function per block,
-shared among blocks of equal structure. It is what is evaluated, differentiated and compiled.
+``x`` holds the states of all blocks, then what boxes keep: the outputs that are held, what gates remember, the last
+solution of algebraic loops. ``w`` holds the outputs of the FMUs and of transport delays, ``z`` what they are driven by,
+``p`` all parameters; ``log`` is (w, all outputs, x, residual of the algebraic loops); ``ok`` is 1 while everything is
+finite and every guard positive. All of them are made of the same pass over the blocks, which calls one function per
+block, shared among blocks of equal structure. They are what is evaluated, differentiated and compiled.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cached_property
 from typing import Any
@@ -24,7 +29,7 @@ from ..blocks._errors import SampleTimeError
 from ..blocks._ports import Shape
 from ..blocks._symbols import size
 from ._check import Checked
-from ._order import Step, evaluation_order
+from ._order import Order, evaluation_order
 from ._structure import Structure, Wire, join
 
 LARGEST = float(np.finfo(float).max)
@@ -53,75 +58,181 @@ class Layout:
         return bounds[-1].stop - bounds[0].start if bounds else 0
 
 
+@dataclass(frozen=True)
+class Clock:
+    """The ticks at which a box acts: ``offset``, ``offset + every``, …, on the common base."""
+
+    every: int = 1
+    offset: int = 0
+
+    def acts(self, k: int) -> bool:
+        """Whether it acts at tick ``k``."""
+        return k >= self.offset and (k - self.offset) % self.every == 0
+
+    def after(self, k: int) -> int:
+        """Return the first of its ticks after tick ``k``."""
+        return self.offset if k < self.offset else k + self.every - (k - self.offset) % self.every
+
+
+@dataclass(frozen=True)
+class FlatEvent:
+    """An event of the flattened diagram: of a block, or of a box that is enabled or triggered in continuous time."""
+
+    path: str
+    name: str
+    direction: str
+    hysteresis: float
+    box: bool
+
+
 @dataclass(frozen=True, eq=False)
 class FlatDiagram:
-    """A diagram flattened into one function of a tick.
+    """A diagram flattened into functions of an instant.
 
     Attributes
     ----------
     function : casadi.Function
         ``(t, x, w, p) -> (x_next, z, log, ok)`` for a tick at which every sampled subsystem acts.
+    flow : casadi.Function
+        ``(t, x, w, p) -> dx``, the rates of the entries `continuous` of x.
     base : Fraction
         Seconds between two ticks.
-    states, plant_outputs, plant_inputs, parameters, log : Layout
-        Where things stand in x, w, z, p and log.
+    clocks : dict
+        For every frame that is sampled: at which ticks it acts.
+    states, held, gates, starts, loops : Layout
+        Where the parts of x stand.
+    plant_outputs, plant_inputs, parameters, log : Layout
+        Where things stand in w, z, p and log.
+    continuous : ndarray of int
+        The entries of x that are integrated.
     x0, p : ndarray
-        Start values of the states (before any block computes its own), and parameter values.
+        Start values of x (before any block computes its own), and parameter values.
     """
 
     table: Structure
     checked: Checked
     base: Fraction
-    divisors: dict[str, int]
-    """For every frame: after how many ticks it acts; 1 is every tick."""
+    clocks: dict[str, Clock]
     states: Layout
     held: Layout
+    gates: Layout
+    starts: Layout
+    loops: Layout
     plant_outputs: Layout
     plant_inputs: Layout
     parameters: Layout
     log: Layout
+    continuous: np.ndarray
+    events: tuple[FlatEvent, ...]
     x0: np.ndarray
     p: np.ndarray
-    order: list[Step]
-    start_order: list[Step]
+    order: Order
+    start_order: Order
     ports: dict[str, tuple[str, str]]
     """Block and port behind every dotted path; an FMU's port may have dots of its own."""
-    _functions: dict[frozenset[int], Any]
-    _slices: dict[Any, Any]
+    _functions: dict[Any, Any] = field(default_factory=dict)
+    _slices: dict[Any, Any] = field(default_factory=dict)
+    _parts: dict[str, tuple[Shape, ...]] = field(default_factory=dict)
+
+    @property
+    def width(self) -> int:
+        """Number of entries of x."""
+        return self.x0.size
 
     @property
     def function(self) -> Any:
         """The function of a tick at which every sampled subsystem acts."""
-        return self.at_tick(0)
+        return self.at_tick(frozenset(self.clocks.values()))
 
     @cached_property
-    def rates(self) -> tuple[int, ...]:
-        """The different numbers of ticks after which subsystems act."""
-        return tuple(sorted(set(self.divisors.values())))
+    def distinct(self) -> tuple[Clock, ...]:
+        """The different clocks."""
+        return tuple(sorted(set(self.clocks.values()), key=lambda c: (c.every, c.offset)))
 
-    def acting(self, k: int) -> frozenset[int]:
-        """Return which of `rates` act in tick ``k``."""
-        return frozenset(d for d in self.rates if k % d == 0)
+    @cached_property
+    def hybrid(self) -> bool:
+        """Whether something happens between ticks: continuous states, events, or a transport delay."""
+        delayed = any(self.table.blocks[self.ports[name][0]].transport for name in self.plant_inputs.slices)
+        return bool(self.continuous.size or self.events or delayed)
 
-    def at_tick(self, k: int) -> Any:
-        """Return the function of tick ``k``; equal patterns of acting subsystems share one."""
-        acting = self.acting(k)
+    def acting(self, k: int) -> frozenset[Clock]:
+        """Return the clocks that tick at tick ``k``."""
+        return frozenset(c for c in self.distinct if c.acts(k))
+
+    def ticks(self, last: int, *, every: bool) -> Iterator[int]:
+        """Yield the ticks to visit, from 0 to ``last``: all, or those at which something acts, and both ends."""
+        if every or not self.distinct or any(c == Clock() for c in self.distinct):
+            yield from range(last + 1)
+            return
+        k = 0
+        while k < last:
+            yield k
+            k = min(c.after(k) for c in self.distinct)
+        yield last
+
+    def at_tick(self, acting: frozenset[Clock]) -> Any:
+        """Return the function of a tick at which the given clocks act, and the blocks of continuous frames."""
         if acting not in self._functions:
-            self._functions[acting] = self._build(acting)
+            self._functions[acting] = _tick_function(self, acting)
         return self._functions[acting]
 
-    def evaluator(self, k: int) -> Any:
-        """Return `at_tick` in the form that is evaluated fastest: scalar operations where no block looks up a table.
+    @cached_property
+    def flow(self) -> Any:
+        """The rates of the continuous states between ticks."""
+        from ._between import flow
+
+        return flow(self)
+
+    @cached_property
+    def jacobian(self) -> Any:
+        """The derivative of `flow` by the continuous states, ``(t, x, w, p) -> (n, n)``."""
+        from ._between import flow_jacobian
+
+        return flow_jacobian(self)
+
+    @cached_property
+    def indicators(self) -> Any:
+        """``(t, x, w, p) -> (g, open)``: indicators of `events`, and whether the boxes around them are enabled."""
+        from ._between import indicators
+
+        return indicators(self)
+
+    @cached_property
+    def jump(self) -> Any:
+        """``(t, x, w, p, fired) -> x`` after events."""
+        from ._between import jump
+
+        return jump(self)
+
+    def opening(self) -> Any:
+        """Return the function ``(t, x, w, p) -> held``: what all boxes put out at the start, as if all acted."""
+        from ._between import opening
+
+        return opening(self)
+
+    def loop_equations(self, acting: frozenset[Clock]) -> Any:
+        """Return ``(t, x, w, p) -> (r, J)``: the residual of the algebraic loops at the values in x, and ∂r/∂values.
+
+        None where no torn port acts.
+        """
+        key = ("loops", acting)
+        if key not in self._functions:
+            from ._between import loop_equations
+
+            self._functions[key] = loop_equations(self, acting)
+        return self._functions[key]
+
+    def fast(self, function: Any) -> Any:
+        """Return a function in the form that is evaluated fastest: scalar operations where no block looks up a table.
 
         The results are the same to the last bit.
         """
-        function = self.at_tick(k)
         if id(function) not in self._slices:
             try:
-                self._slices[id(function)] = function.expand()
+                self._slices[id(function)] = (function.expand(), function)  # the key lives as long as its function
             except RuntimeError:
-                self._slices[id(function)] = function
-        return self._slices[id(function)]
+                self._slices[id(function)] = (function, function)
+        return self._slices[id(function)][0]
 
     def is_made(self, path: str, port: str, values: Mapping[tuple[str, str], Any]) -> bool:
         """Whether the signal at an input is among ``values``, or a default."""
@@ -139,6 +250,8 @@ class FlatDiagram:
 
     def part(self, column: Any, wire: Wire) -> Any:
         """Return the part of an output's flat column that a wire takes."""
+        if wire.index is None:
+            return column
         shape = self.checked.shapes[wire.block, wire.port]
         index = np.ravel(np.arange(size(shape)).reshape(shape)[wire.index])
         return column[index.tolist()] if not isinstance(column, np.ndarray) else column[index]
@@ -155,169 +268,232 @@ class FlatDiagram:
             self._slices[key] = f.slice("block", list(range(f.n_in())), [every.index(n) for n in names])
         return self._slices[key]
 
-    def _build(self, acting: frozenset[int]) -> Any:
-        table, traced = self.table, self.checked.traced
-        t, x, w, p = (
-            ca.MX.sym(n, m)
-            for n, m in (
-                ("t", 1),
-                ("x", self.states.total + self.held.total),
-                ("w", self.plant_outputs.total),
-                ("p", self.parameters.total),
-            )
+    def symbols(self) -> tuple[Any, Any, Any, Any]:
+        """Return fresh symbols t, x, w, p."""
+        return (
+            ca.MX.sym("t"),
+            ca.MX.sym("x", self.width),
+            ca.MX.sym("w", self.plant_outputs.total),
+            ca.MX.sym("p", self.parameters.total),
         )
-        values: dict[tuple[str, str], Any] = {}
-        for name, where in self.plant_outputs.slices.items():
-            values[self.ports[name]] = _rows(w, where)
-        new: dict[str, Any] = {}
-        guards: list[Any] = []
-        acts = {path: self.divisors[table.frame_of[path]] in acting for path in traced}
-        for name, where in self.held.slices.items():
-            path, port = self.ports[name]
-            if not acts[path]:
-                values[path, port] = _rows(x, where)
-        for path, names in self.order:
-            if not acts[path]:
-                continue
-            trace = traced[path]
-            arguments = [
-                self.source(path, port, values) if self.is_made(path, port, values) else np.zeros(size(shape))
-                for port, shape in trace.inputs.items()  # what is not made yet is not depended on
-            ]
-            state, numbers = _rows(x, self.states.slices[path]), _rows(p, self.parameters.slices[path])
-            made = self.block_function(path, names).call([t, state, *arguments, numbers])
-            for name, column in zip(names, map(ca.densify, made), strict=True):
-                if name == NEXT:
-                    new[path] = column
-                elif name == GUARDS:
-                    guards += [column] if trace.guards else []
-                else:
-                    values[path, name] = column
-        outputs = [values[path, name] for path in sorted(traced) for name in traced[path].outputs]
-        kept = [values[self.ports[name]] for name in self.held.slices]
-        old = {path: _rows(x, where) for path, where in self.states.slices.items()}
-        x_next = ca.vertcat(*(new.get(path, state) for path, state in old.items()), *kept)
-        z = ca.vertcat(
-            *(
-                ca.MX(ca.densify(ca.DM(column))) if isinstance(column, np.ndarray) else column
-                for column in (self.source(*self.ports[name], values) for name in self.plant_inputs.slices)
-            )
-        )
-        log = ca.vertcat(w, *outputs, x)
-        size_of_all = sum((ca.norm_1(v) for v in (log, x_next, z) if v.numel()), ca.MX(0.0))
-        ok = size_of_all <= LARGEST  # false for any NaN or infinity
-        if guards:
-            ok = ca.logic_and(ok, ca.mmin(ca.vertcat(*guards) > 0))
-        results = [ca.densify(r) for r in (x_next, z, log, ok)]  # a buffer holds every entry, zeros too
-        return ca.Function("tick", [t, x, w, p], results, ["t", "x", "w", "p"], ["x_next", "z", "log", "ok"])
+
+    def next_columns(self, x: Any, done: Any) -> Any:
+        """Return x with the parts that a pass over the blocks has made anew.
+
+        Parameters
+        ----------
+        x : column
+            The vector x before.
+        done : Pass
+            With the new states, held outputs and gates by name.
+        """
+        parts = []
+        for layout, new in (
+            (self.states, done.new),
+            (self.held, done.held),
+            (self.gates, done.gates),
+            (self.starts, {}),
+            (self.loops, {}),
+        ):
+            parts += [new.get(name, rows(x, where)) for name, where in layout.slices.items()]
+        return ca.vertcat(*parts) if parts else ca.MX(0, 1)
 
 
-def flatten(table: Structure, checked: Checked, step: Fraction | None = None) -> FlatDiagram:
+def rows(vector: Any, where: slice) -> Any:
+    """Return a part of a column; an empty one stays a column, which slicing a single entry would not give."""
+    if isinstance(vector, np.ndarray):
+        return vector[where]
+    return vector[where] if where.stop > where.start else ca.MX(0, 1)
+
+
+def _tick_function(flat: FlatDiagram, acting: frozenset[Clock]) -> Any:
+    from ._pass import Pass
+
+    t, x, w, p = flat.symbols()
+    done = Pass(flat, acting, t, x, w, p).run()
+    outputs = [done.values[flat.ports[name]] for name in list(flat.log.slices)[len(flat.plant_outputs.slices) :]]
+    x_next = flat.next_columns(x, done)
+    z = ca.vertcat(
+        *(
+            ca.MX(ca.densify(ca.DM(column))) if isinstance(column, np.ndarray) else column
+            for column in (flat.source(*flat.ports[name], done.values) for name in flat.plant_inputs.slices)
+        )
+    )
+    residual = [done.residual()] if flat.loops.slices else []
+    log = ca.vertcat(w, *outputs, x, *residual)
+    size_of_all = sum((ca.norm_1(v) for v in (log, x_next, z) if v.numel()), ca.MX(0.0))
+    ok = size_of_all <= LARGEST  # false for any NaN or infinity
+    if done.guards:
+        ok = ca.logic_and(ok, ca.mmin(ca.vertcat(*done.guards) > 0))
+    results = [ca.densify(r) for r in (x_next, z, log, ok)]  # a buffer holds every entry, zeros too
+    return ca.Function("tick", [t, x, w, p], results, ["t", "x", "w", "p"], ["x_next", "z", "log", "ok"])
+
+
+def flatten(
+    table: Structure, checked: Checked, step: Fraction | None = None, *, name: str = "", solve: bool = False
+) -> FlatDiagram:
     """Flatten a checked diagram.
 
     Parameters
     ----------
     step : Fraction, optional
-        Seconds between two ticks; required where no subsystem is sampled.
+        Seconds between two ticks; required where there is no other clock.
+    name : str
+        The diagram's name, for errors.
+    solve : bool
+        Whether algebraic loops are to be solved.
 
     Raises
     ------
     AlgebraicLoopError
         Ports that depend on each other within a tick, or at the start.
     SampleTimeError
-        No sample time anywhere, a step that does not divide one, a continuous state outside of sampled subsystems.
+        No sample time anywhere, a step that does not divide one.
     """
-    base, divisors = _clock(table, step)
-    traced = checked.traced
-    for path, trace in traced.items():
-        if trace.advance == "derivative":
-            raise SampleTimeError(
-                "a continuous state stands outside of any sampled subsystem, and there is no solver for it yet. Put "
-                "the block "
-                "into a @subsystem(sample_time=…), which discretizes it.",
-                block=path,
-            )
+    base, clocks = _clocks(table, step, name)
+    traced, blocks = checked.traced, table.blocks
     paths = sorted(traced)
+    order = evaluation_order(table, traced, solve=solve)
+    start_order = evaluation_order(table, traced, start=True, solve=solve)
+    events = tuple(_events(table, checked))
+    between = bool(events) or any(traced[path].advance == "derivative" for path in paths)
+    between = between or any(block.transport and path not in traced for path, block in blocks.items())
+    gated = {path: table.gates(table.frame_of[path]) for path in paths}
+
     states = Layout.of({path: (sum(size(s) for s in traced[path].states.values()),) for path in paths})
-    held = Layout.of(
-        {
-            join(path, port): shape
-            for path in paths
-            if divisors[table.frame_of[path]] > 1
-            for port, shape in traced[path].outputs.items()
-        },
-        states.total,
-    )
-    opaque = sorted(path for path in table.blocks if path not in traced)
-    plant_outputs = Layout.of({join(p, q): checked.shapes[p, q] for p in opaque for q in table.blocks[p].outputs})
+    position = states.total
+
+    def lay(shapes: Mapping[str, Shape]) -> Layout:
+        nonlocal position
+        layout = Layout.of(shapes, position)
+        position += layout.total
+        return layout
+
+    def is_held(path: str) -> bool:
+        clock = clocks.get(table.frame_of[path])
+        return bool(gated[path]) or (clock is not None and (between or clock != Clock()))
+
+    held = lay({join(p, q): s for p in paths if is_held(p) for q, s in traced[p].outputs.items()})
+    gates = lay(dict.fromkeys(sorted(table.controls), ()))
+    resets = [p for p in paths if any(table.frames[g].when == "reset" for g in gated[p]) and states.shapes[p][0]]
+    starts = lay({path: states.shapes[path] for path in resets})
+    torn = dict.fromkeys(sorted({*order.torn, *start_order.torn}))
+    loops = lay({join(*port): traced[port[0]].outputs[port[1]] for port in torn})
+
+    stepped = sorted(path for path in blocks if path not in traced)
+    plant_outputs = Layout.of({join(p, q): checked.shapes[p, q] for p in stepped for q in blocks[p].outputs})
     plant_inputs = Layout.of(
         {
-            join(p, q): port.shape or ()
-            for p in opaque
-            for q, port in table.blocks[p].inputs.items()
+            join(p, q): _input_shape(table, checked, p, q)
+            for p in stepped
+            for q in blocks[p].inputs
             if (p, q) in table.wires
         }
     )
-    packed = {path: traced[path].pack(table.blocks[path], _period(table, path, base)) for path in paths}
-    parameters = Layout.of({path: v.shape for path, v in packed.items()})
+    packed = {path: traced[path].pack(blocks[path], _period(table, path, base)) for path in paths}
     log_shapes = dict(plant_outputs.shapes) | {join(p, q): s for p in paths for q, s in traced[p].outputs.items()}
-    x0 = np.concatenate(
-        [
-            *(
-                np.ravel(port.start_value(table.blocks[path], traced[path].inputs))
-                for path in paths
-                for port in table.blocks[path].states.values()
-            ),
-            np.zeros(held.total),
-        ]
-    )
+    parts = {
+        path: [port.start_value(blocks[path], traced[path].inputs) for port in blocks[path].states.values()]
+        for path in paths
+    }
+    start_values = [np.ravel(v) for values in parts.values() for v in values]
+    ports = {join(*port): port for port in checked.shapes} | {join(*port): port for port in table.wires}
     return FlatDiagram(
         table=table,
         checked=checked,
         base=base,
-        divisors=divisors,
+        clocks=clocks,
         states=states,
         held=held,
+        gates=gates,
+        starts=starts,
+        loops=loops,
         plant_outputs=plant_outputs,
         plant_inputs=plant_inputs,
-        parameters=parameters,
+        parameters=Layout.of({path: v.shape for path, v in packed.items()}),
         log=Layout.of(log_shapes),
-        x0=x0,
+        continuous=_continuous(checked, table, states),
+        events=events,
+        x0=np.concatenate([*start_values, np.zeros(position - states.total)]),
         p=np.concatenate([*packed.values(), np.zeros(0)]),
-        order=evaluation_order(table, traced),
-        start_order=evaluation_order(table, traced, start=True),
-        ports={join(*port): port for port in checked.shapes} | {join(*port): port for port in table.wires},
-        _functions={},
-        _slices={},
+        order=order,
+        start_order=start_order,
+        ports=ports,
     )
 
 
-def _rows(vector: Any, where: slice) -> Any:
-    """Return a part of a column; an empty one stays a column, which slicing a single entry would not give."""
-    return vector[where] if where.stop > where.start else ca.MX(0, 1)
+def _input_shape(table: Structure, checked: Checked, path: str, port: str) -> Shape:
+    declared = table.blocks[path].inputs[port].shape
+    if declared is not None:
+        return declared
+    wire = table.wires[path, port]
+    shape = checked.shapes[wire.block, wire.port]
+    return shape if wire.index is None else np.empty(shape)[wire.index].shape
+
+
+def _continuous(checked: Checked, table: Structure, states: Layout) -> np.ndarray:
+    """Return the entries of x that a solver integrates."""
+    found: list[int] = []
+    for path, where in states.slices.items():
+        trace = checked.traced[path]
+        if trace.advance != "derivative":
+            continue
+        position = where.start
+        for name, shape in trace.states.items():
+            n = size(shape)
+            if not table.blocks[path].states[name].discrete:
+                found += range(position, position + n)
+            position += n
+    return np.array(found, dtype=int)
+
+
+def _events(table: Structure, checked: Checked) -> Iterator[FlatEvent]:
+    """Yield the events of all blocks and boxes in continuous frames, by path."""
+    for path in sorted([*checked.traced, *table.controls]):
+        if path in table.controls:
+            if table.is_event(path):
+                frame = table.frames[path]
+                edge = "both" if frame.control == "enabled" else frame.when
+                yield FlatEvent(path, {"enabled": "enable", "triggered": "trigger"}[frame.control], edge, 0.0, True)
+            continue
+        trace = checked.traced[path]
+        if trace.indicators is not None:
+            for name, event in table.blocks[path].events.items():
+                yield FlatEvent(path, name, event.direction, getattr(event, "hysteresis", 0.0), False)
 
 
 def _period(table: Structure, path: str, base: Fraction) -> float:
-    rate = table.rate(table.frame_of[path])
+    frame = table.frame_of[path]
+    if table.triggered(frame) is not None:
+        return math.nan
+    rate = table.rate(frame)
     return float(rate if rate is not None else base)
 
 
-def _clock(table: Structure, step: Fraction | None) -> tuple[Fraction, dict[str, int]]:
-    rates = {path: rate for path in table.frames if (rate := table.rate(path)) is not None}
-    used: Iterable[Fraction] = list(rates.values())
-    if not rates and step is None:
-        raise SampleTimeError(
-            "no subsystem has a sample time, so there is no clock. Give simulate(…, step=1e-3), or a "
-            "@subsystem(sample_time=1e-3)."
-        )
+def _clocks(table: Structure, step: Fraction | None, name: str) -> tuple[Fraction, dict[str, Clock]]:
+    """Return the seconds between two ticks, and the ticks of every frame that is sampled."""
+    found = {path: clock for path in table.frames if (clock := table.clock(path)) is not None}
+    used = {c.path: c for c in found.values()}
     base = step
     if base is None:
-        base = Fraction(math.gcd(*(r.numerator * (10**9 // r.denominator) for r in used)), 10**9)
-    for path, rate in rates.items():
-        if (rate / base).denominator != 1:
+        if not used:
             raise SampleTimeError(
-                f"its sample time {float(rate):g} s is no multiple of the step {float(base):g} s; choose a step that "
-                f"divides it.",
-                block=path,
+                "no subsystem has a sample time, so there is no clock. Give simulate(…, step=1e-3), or a "
+                "@subsystem(sample_time=1e-3).",
+                block=name or None,
             )
-    return base, {path: int(rates[path] / base) if path in rates else 1 for path in table.frames}
+        times = [t for c in used.values() for t in (c.sample_time, c.offset) if t]
+        base = Fraction(math.gcd(*(r.numerator * (10**9 // r.denominator) for r in times)), 10**9)
+    for frame in used.values():
+        for what, time in (("sample time", frame.sample_time), ("offset", frame.offset)):
+            if time is not None and (time / base).denominator != 1:
+                raise SampleTimeError(
+                    f"its {what} {float(time):g} s is no multiple of the step {float(base):g} s; choose a step that "
+                    f"divides it.",
+                    block=frame.path or name or None,
+                )
+    return base, {
+        path: Clock(int(c.sample_time / base), int(c.offset / base))
+        for path, c in found.items()
+        if c.sample_time is not None
+    }

@@ -3,13 +3,18 @@
 A block's outputs, its next state and its guards are ordered one by one: each waits only for the inputs that it
 depends on. So a cycle in the drawing is no algebraic loop as long as no port waits for itself. Blocks are taken by
 path, so the order never depends on how a diagram was written down.
+
+Where a loop is to be solved, some of its ports are *torn*: they are taken as known, and Newton's method finds the
+values at which what comes round is what was taken.
 """
 
 from __future__ import annotations
 
 import heapq
+import math
 from collections import defaultdict
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from ..blocks._comparison import GUARDS, NEXT
 from ..blocks._errors import AlgebraicLoopError
@@ -30,15 +35,35 @@ def dependencies(table: Structure, traced: Mapping[str, Traced], *, start: bool 
     waits: dict[Port, set[Port]] = {}
     for path, trace in traced.items():
         all_inputs = start and table.blocks[path].starts_from_inputs
+        controls = [table.controls[box] for box in table.gates(table.frame_of[path])]
         for name in (*trace.outputs, NEXT, GUARDS):
             inputs = trace.inputs if all_inputs else trace.depends[name]
             wires = (table.wires.get((path, port)) for port in trace.inputs if port in inputs)
-            waits[path, name] = {(w.block, w.port) for w in wires if w is not None and w.block in traced}
+            waits[path, name] = {(w.block, w.port) for w in [*wires, *controls] if w is not None and w.block in traced}
     return waits
 
 
-def evaluation_order(table: Structure, traced: Mapping[str, Traced], *, start: bool = False) -> list[Step]:
+@dataclass(frozen=True)
+class Order:
+    """What to evaluate, in order, and the output ports that are taken as known."""
+
+    steps: list[Step]
+    torn: tuple[Port, ...] = ()
+    loops: tuple[str, ...] = ()
+    """Every loop, printed port by port."""
+
+
+def evaluation_order(
+    table: Structure, traced: Mapping[str, Traced], *, start: bool = False, solve: bool = False
+) -> Order:
     """Return what to evaluate, in order; a block is evaluated in one go where its inputs allow it.
+
+    Parameters
+    ----------
+    start : bool
+        The order of initialization; see `dependencies`.
+    solve : bool
+        Tear algebraic loops instead of refusing them.
 
     Raises
     ------
@@ -46,6 +71,22 @@ def evaluation_order(table: Structure, traced: Mapping[str, Traced], *, start: b
         With the loop printed port by port.
     """
     waits = dependencies(table, traced, start=start)
+    torn: set[Port] = set()
+    loops: list[str] = []
+    while True:
+        steps, stuck = _sorted(traced, {port: sources - torn for port, sources in waits.items()})
+        if not stuck:
+            return Order(steps, tuple(sorted(torn)), tuple(loops))
+        loop = _a_loop({port: {s for s in waits[port] if s in stuck and s not in torn} for port in stuck})
+        if not solve:
+            raise _loop_error(table, traced, loop, start)
+        sizes = {port: math.prod(traced[port[0]].outputs[port[1]]) for port in loop}
+        torn.add(min(loop, key=lambda port: (sizes[port], port)))
+        loops.append("\n".join(_printed(table, traced, loop)))
+
+
+def _sorted(traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]]) -> tuple[list[Step], set[Port]]:
+    """Return what can be evaluated, in order, and what is left over."""
     missing = {port: len(sources) for port, sources in waits.items()}
     consumers: dict[Port, list[Port]] = defaultdict(list)
     for port in sorted(waits):
@@ -73,24 +114,23 @@ def evaluation_order(table: Structure, traced: Mapping[str, Traced], *, start: b
                 if not missing[consumer, waiting]:
                     ready[consumer].add(waiting)
                     heapq.heappush(whole if ready[consumer] == left[consumer] else part, consumer)
-    stuck = {(path, name) for path, every in left.items() for name in every}
-    if stuck:
-        raise _loop_error(table, traced, waits, stuck, start)
-    return order
+    return order, {(path, name) for path, every in left.items() for name in every}
 
 
-def _loop_error(
-    table: Structure, traced: Mapping[str, Traced], waits: dict[Port, set[Port]], stuck: set[Port], start: bool
-) -> AlgebraicLoopError:
-    """Print the loop port by port."""
-    port = min(p for p in stuck if p[1] not in (NEXT, GUARDS))
-    seen: list[Port] = []
+def _a_loop(waits: Mapping[Port, set[Port]]) -> list[Port]:
+    """Return the ports of one loop among what is left over, each waiting for the next."""
+    port = min(p for p in waits if p[1] not in (NEXT, GUARDS))
+    seen: dict[Port, int] = {}
     while port not in seen:
-        seen.append(port)
-        port = min(s for s in waits[port] if s in stuck)
-    loop = seen[seen.index(port) :]
+        seen[port] = len(seen)
+        port = min(waits[port])
+    loop = list(seen)[seen[port] :]
     first = loop.index(min(loop))
-    loop = loop[first:] + loop[:first]
+    return loop[first:] + loop[:first]
+
+
+def _printed(table: Structure, traced: Mapping[str, Traced], loop: list[Port]) -> list[str]:
+    """Print a loop port by port."""
     lines = []
     for i, (path, name) in enumerate(reversed(loop)):
         source = loop[-i - 2] if i + 2 <= len(loop) else loop[-1]
@@ -100,12 +140,25 @@ def _loop_error(
             for q in traced[consumer_path].inputs
             if (w := table.wires.get((consumer_path, q))) is not None and (w.block, w.port) == (path, name)
         ]
-        inlet = wired[0] if wired else "?"
-        lines.append(f"  {path}.{name} is wired to {consumer_path}.{inlet}")
-        lines.append(f"  {consumer_path}.{inlet} feeds through to {consumer_path}.{source[1]}")
-    what = "initial values depend on each other" if start else "these ports depend on each other within one instant"
+        through = [q for q in wired if q in traced[consumer_path].depends[source[1]]] or wired
+        if through:
+            lines.append(f"  {path}.{name} is wired to {consumer_path}.{through[0]}")
+            lines.append(f"  {consumer_path}.{through[0]} feeds through to {consumer_path}.{source[1]}")
+            continue
+        boxes = table.gates(table.frame_of[consumer_path])
+        box = next((b for b in boxes if (table.controls[b].block, table.controls[b].port) == (path, name)), "?")
+        lines.append(f"  {path}.{name} is wired to what controls {box}")
+        lines.append(f"  {box} acts on {consumer_path}.{source[1]}")
+    return lines
+
+
+def _loop_error(table: Structure, traced: Mapping[str, Traced], loop: list[Port], start: bool) -> AlgebraicLoopError:
+    advice = ", or have it solved at every instant: Diagram(…, loops='solve')"
+    what, delay = "these ports depend on each other within one instant", "UnitDelay"
+    if start:
+        what, delay = "initial values depend on each other", "UnitDelay(initial_value=…)"
     return AlgebraicLoopError(
-        f"{what}:\n" + "\n".join(lines) + "\nBreak the loop where a delay is real: put a UnitDelay"
-        f"{'(initial_value=…)' if start else ''} on one of these wires.",
+        f"{what}:\n" + "\n".join(_printed(table, traced, loop)) + f"\nBreak the loop where a delay is real: put a "
+        f"{delay} on one of these wires{'' if start else advice}.",
         block=min(loop)[0],
     )

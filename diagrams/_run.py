@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
     from xarray import Dataset
 
+    from ._state import RunState
+
 
 @dataclass(frozen=True)
 class Snapshot:
@@ -94,6 +96,8 @@ class Run:
     """Which entries of a sample's vector (outputs as in ``layout``, then states) are in ``data``; None for all."""
     has_states: bool = field(default=True, repr=False)
     diagram_name: str = ""
+    final_state: RunState | None = field(default=None, repr=False)
+    """The complete state at the end, to go on from with ``simulate(…, start=)``; None where an FMU can't save its own."""
 
     def __post_init__(self) -> None:
         if not self.diagram_name:

@@ -1,24 +1,46 @@
-"""The scheduler: integer ticks, in one order.
+"""Simulation: what happens in which order.
 
-At tick k, t = k · base exactly:
+**Time.** Everything sampled happens at integer ticks of one common base, the greatest common divisor of all sample times
+and offsets (and of ``step``, where one is given). Tick k is at k·numerator / denominator seconds, rounded once: time never
+accumulates, and two rates never drift. A box with sample time T and offset d acts at d, d + T, …; between its ticks its
+outputs are held, before its first one they are what it puts out at the start. Visited are the ticks at which a box acts,
+or every tick where there is an FMU, a ``step``, or a solver of fixed step.
+
+**At one instant**, in this order:
 
 1. The outputs of the FMUs are those at the end of their last step: a co-simulation FMU has no feedthrough between
-   communication points (FMI 3.0, Step Mode). At k = 0 they are those of initialization, with the inputs of k = 0.
-2. All blocks are evaluated once, each port after what it depends on: `FlatDiagram`. A sampled subsystem acts in the
-   ticks of its own rate; between them its outputs are held.
-3. Everything is recorded.
-4. The inputs of the FMUs are set and held, and every FMU steps to tick k + 1; the blocks' next states take effect.
+   communication points (FMI 3.0, Step Mode). The continuous states are what the solver arrived at, from the left.
+2. If the instant is a tick: all blocks are evaluated once, each port after what it depends on (`_order`). A box acts if its
+   clock ticks and whatever enables or triggers it says so. The next states of sampled blocks, and what is held, take effect.
+3. Discontinuities of sources in time (a step, an edge of a pulse) are in what was just evaluated: a source's value at t is
+   its value from the right.
+4. Indicators of events are looked at. Those that have changed their domain fire, all together: each jump sees the instant
+   before all of them. Then they are looked at again, until none fires. The same happens between ticks wherever the
+   solver finds a change; such an instant has no step 2. A box that is enabled or triggered in continuous time is such an event.
+5. What is to be recorded is evaluated and recorded: the values from the right, after all events.
+6. A stop condition that is true ends the run; nothing steps beyond.
+7. The continuous states go on to the next tick, with everything sampled and the FMUs' outputs held; then the inputs of the
+   FMUs, held since this tick, are set, and every FMU steps to the next one.
 
-Time never accumulates: tick k is at k·numerator / denominator, rounded once. The last tick is evaluated and recorded,
-and nothing steps beyond it. If a value is not finite or a guard fails, the tick is evaluated again block by block to
-name the first one that is concerned; the run until then is kept in the error.
+**Between ticks** the solver integrates all continuous blocks as one system. It lands on every tick at which something acts,
+on every discontinuity that a source announces (`Block.next_instant`), where it takes values from the left, and on every
+event. Other samples come from its dense output. Memory of blocks (a projection's last foot point) and the last solution of
+an algebraic loop are renewed at accepted steps only.
+
+**At the start** initial states are computed in an order of their own (a block may need its inputs for it), FMUs and blocks
+are evaluated until their values agree, and indicators are taken as they are: nothing fires.
+
+**Order of definition and hashing never matter**: blocks, states, events and boxes are taken by path.
+
+If a value is not finite or a guard fails, the instant is evaluated again block by block to name the first one that is
+concerned; the run until then is kept in the error.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from fractions import Fraction
 from importlib.util import find_spec
@@ -26,330 +48,521 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..blocks._comparison import GUARDS, NEXT
-from ..blocks._equations import initial_state
-from ..blocks._errors import LoopwrightError, NonFiniteError, SimulationError
-from ..blocks._symbols import bundle
+from ..blocks._errors import LoopwrightError, SimulationError
+from ._continuous import Continuous, check_solver
 from ._duration import check_memory, ticks_in
+from ._failures import failure
 from ._flat import FlatDiagram
+from ._machine import Machine
+from ._pass import TRUE
+from ._recorder import Recorder, select
 from ._run import Run
+from ._start import initialize
+from ._state import RunState, check_fits, layout_of
+from ._stored import Stopped, header
 from ._structure import join
 
 if TYPE_CHECKING:
     from ._diagram import Diagram
 
+FIXED_STEP = ("euler", "heun", "rk4")
 _CHUNK = 1000  # ticks between two looks at the progress bar
-_MAX_PASSES = 100  # over inputs and outputs of the FMUs at the start
-_SETTLED = 1e-13  # relative change of an input between two passes, a few hundred ulps
 
 
-def simulate(diagram: Diagram, duration: float, *, step: float | Fraction | None, progress: bool | None) -> Run:
-    """Run a diagram; see `Diagram.simulate`."""
-    flat = diagram.flatten(step)
-    n = ticks_in(duration, flat.base, diagram.name)
-    width = flat.log.total + flat.states.total + flat.held.total
-    check_memory(n + 1, width, flat.base, diagram.name)
-    times = [k * flat.base.numerator / flat.base.denominator for k in range(n + 1)]
-    recorded = _Recorded(diagram, flat, np.array(times), np.empty((n + 1, width)))
-    with ExitStack() as stack:
-        plants = []
-        for path in sorted(diagram.blocks):
-            block: Any = diagram.blocks[path]
-            if not hasattr(block, "instantiate"):
+class Simulation:
+    """A run in the making: made by `Diagram.simulation`, used in a ``with`` statement.
+
+    ``advance`` goes on, ``save`` returns the complete state, ``restore`` goes back to one, ``run`` is what was recorded.
+
+    Examples
+    --------
+    >>> from loopwright.blocks import Constant, Integrator
+    >>> from loopwright.diagrams import Diagram
+    >>> diagram = Diagram("ramp", Integrator()(Constant(value=1.0)).named("y"))
+    >>> with diagram.simulation(step=0.25) as simulation:
+    ...     simulation.advance(0.5)
+    ...     half = simulation.save()
+    ...     simulation.advance(0.5)
+    ...     print(simulation.run()["y"])
+    [0.   0.25 0.5  0.75 1.  ]
+    >>> diagram.simulate(0.5, step=0.25, start=half, progress=False)["y"]
+    array([0.5 , 0.75, 1.  ])
+    """
+
+    def __init__(
+        self,
+        diagram: Diagram,
+        *,
+        step: float | Fraction | None = None,
+        solver: str = "auto",
+        rtol: float = 1e-6,
+        atol: float = 1e-9,
+        max_step: float | None = None,
+        record: Iterable[str] | None = None,
+        every: int = 1,
+        states: bool = True,
+        to: Any = None,
+        overwrite: bool = False,
+        start: RunState | None = None,
+        duration: float | None = None,
+    ):
+        self.diagram = diagram
+        step = default_step(diagram, step, duration, solver)
+        self.flat: FlatDiagram = diagram.flatten(step)
+        self._recording = {"record": record, "every": every, "states": states, "to": to, "overwrite": overwrite}
+        self._stack = ExitStack()
+        self._start_state = start
+        self._machine = Machine(self.flat)
+        self._plants: list[tuple[str, Any]] = []
+        self._every_tick = step is not None or any(not b.transport for b in self._stepped().values())
+        self._last: int | None = None
+        if duration is not None:
+            self._last = ticks_in(duration, self.flat.base, diagram.name)
+            first = 0 if start is None else start.tick
+            self._last += first
+            self._check_memory(self._last - first)
+        self._continuous: Continuous | None = None
+        if self.flat.hybrid:
+            self._continuous = Continuous(
+                self._machine, diagram.name, solver, rtol, atol, max_step, lambda event: self._recorder.event(event)
+            )
+            self._continuous.is_stopped = self._is_stopped  # type: ignore[method-assign]
+            self._every_tick |= self._continuous.fixed
+        elif solver != "auto":
+            from ._solvers import solver_name
+
+            solver_name(solver)  # an unknown one is an error here, too
+        self._stops = self._stop_ports()
+        self._tick, self._count, self._elapsed, self._begun = 0, 0, 0.0, False
+        self._stopped: Stopped | None = None
+        self._recorder = self._new_recorder()
+
+    # --- what belongs to it ------------------------------------------------------------------------------------------
+
+    def _stepped(self) -> dict[str, Any]:
+        table = self.flat.table
+        return {path: table.blocks[path] for path in sorted(table.blocks) if table.stepped(path)}
+
+    def _stop_ports(self) -> list[tuple[int, str]]:
+        """Return the entries of the log that end the run, with the blocks that they belong to."""
+        found = []
+        for path in sorted(self.flat.checked.traced):
+            port = self.flat.table.blocks[path].stops
+            if port is not None:
+                found.append((self.flat.log.slices[join(path, port)].start, path))
+        return found
+
+    def _check_memory(self, ticks: int) -> None:
+        columns = self._columns()
+        width = self.flat.log.total + self.flat.width if columns is None else len(columns)
+        clocks = self.flat.distinct
+        samples = ticks + 1
+        if clocks and not self._every_tick:
+            samples = min(samples, sum(ticks // clock.every + 1 for clock in clocks) + 2)
+        every, to = self._recording["every"], self._recording["to"]
+        check_memory(samples, width, self.flat.base, self.diagram.name, every=every, to=to)
+
+    def _columns(self) -> np.ndarray | None:
+        chosen = self._recording
+        width = self.flat.log.total + self.flat.width
+        return select(chosen["record"], self.flat.log, self.flat.table.names, width, states=chosen["states"])
+
+    def _new_recorder(self) -> Recorder:
+        flat, chosen = self.flat, self._recording
+        columns, width = self._columns(), flat.log.total + flat.width
+        residual = bool(flat.loops.slices)
+        head = None
+        if chosen["to"] is not None:
+            head = header(
+                diagram=self.diagram.name,
+                layout=flat.log,
+                wires=self.flat.table.names,
+                units=self._units(),
+                width=width,
+                columns=columns,
+                has_states=chosen["states"],
+                residual=residual,
+            )
+        rows = None if self._last is None or not (self._every_tick or not flat.distinct) else self._last + 1
+        return Recorder(
+            width,
+            columns,
+            every=chosen["every"],
+            rows=rows,
+            residual=residual,
+            to=chosen["to"],
+            header=head,
+            overwrite=chosen["overwrite"],
+        )
+
+    def _units(self) -> dict[str, Any]:
+        return {join(*port): unit for port, unit in self.flat.checked.units.items()}
+
+    # --- life --------------------------------------------------------------------------------------------------------
+
+    def __enter__(self) -> Simulation:
+        try:
+            self._load()
+            self._begin()
+        except BaseException:
+            self._stack.close()
+            raise
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stack.close()
+
+    def _load(self) -> None:
+        end = math.inf if self._last is None else self.time_of(self._last)
+        for path, block in self._stepped().items():
+            if block.transport:
                 continue
             try:
-                wired = [port for port in block.inputs if (path, port) in diagram.wires]
-                plants.append((path, stack.enter_context(block.instantiate(wired, times[-1]))))
+                wired = [port for port in block.inputs if (path, port) in self.flat.table.wires]
+                self._plants.append((path, self._stack.enter_context(block.instantiate(wired, end))))
             except SimulationError as error:
-                error.run = recorded.until(0, 0.0)
                 error.at(block=path, t=0.0)
+                self._attach(error)
                 raise
             except LoopwrightError as error:
                 error.at(block=path)
                 raise
-        show = stack.enter_context(_progress(diagram.name, times[-1], progress))
-        return _Loop(flat, plants, recorded).run(times, show)
-
-
-class _Recorded:
-    """The samples while they are being made."""
-
-    def __init__(self, diagram: Diagram, flat: FlatDiagram, t: np.ndarray, data: np.ndarray):
-        self.diagram, self.flat, self.t, self.data = diagram, flat, t, data
-
-    def until(self, n: int, elapsed: float, messages: tuple[str, ...] = ()) -> Run:
-        """Return the run of the first ``n`` samples."""
-        units = {join(*port): unit for port, unit in self.flat.checked.units.items()}
-        whole = n == len(self.t)
-        return Run(
-            t=self.t if whole else self.t[:n].copy(),
-            data=self.data if whole else self.data[:n].copy(),
-            layout=self.flat.log,
-            wires=dict(self.diagram.names),
-            units=units,
-            diagram=self.diagram,
-            elapsed=elapsed,
-            messages=messages,
-        )
-
-
-class _Loop:
-    """The state of a run, and its loop."""
-
-    def __init__(self, flat: FlatDiagram, plants: list[tuple[str, Any]], recorded: _Recorded):
-        self.flat, self.plants, self.recorded, self.done = flat, plants, recorded, 0
-        self.t = np.zeros(1)
-        self.x = flat.x0.copy()
-        self.x_next = np.zeros_like(self.x)
-        self.w = np.zeros(flat.plant_outputs.total)
-        self.z = np.zeros(flat.plant_inputs.total)
-        self.log = np.zeros(recorded.data.shape[1])
-        self.ok = np.zeros(1)
-        self._calls: dict[frozenset[int], tuple[Any, Any]] = {}
 
     def _part(self, layout: Any, path: str, vector: np.ndarray) -> np.ndarray:
         mine = [s for name, s in layout.slices.items() if self.flat.ports[name][0] == path]
         return vector[mine[0].start : mine[-1].stop] if mine else vector[:0]
 
-    def run(self, times: list[float], progress: Any) -> Run:
-        started = time.perf_counter()
-        k = 0
+    def _begin(self) -> None:
+        machine = self._machine
         try:
-            self._evaluator(0)
-            self.start()
-            k = self._advance(progress, times)
-        except _Stopped as stop:
-            k = stop.tick
-            error = stop.error
-            error.run = self.recorded.until(k, time.perf_counter() - started)
-            raise error.at(t=times[k]) from stop.__cause__
-        except KeyboardInterrupt as interrupt:
-            interrupt.run = self.recorded.until(self.done, time.perf_counter() - started)  # type: ignore[attr-defined]
+            for path, plant in self._plants:
+                inputs = self._part(self.flat.plant_inputs, path, machine.z)
+                plant.bind(inputs, self._part(self.flat.plant_outputs, path, machine.here.w))
+            delays = None if self._continuous is None else self._continuous.delays
+            initialize(machine, self._plants, delays)
+            for _, plant in self._plants:
+                plant.begin()
+            if self._start_state is not None:
+                self.restore(self._start_state)
+                return
+            if self._continuous is not None:
+                self._continuous.begin()
+            self._begun = True
+            self._at_tick(0)
+        except SimulationError as error:
+            self._attach(self._who(error).at(t=self.t))
             raise
-        elapsed = time.perf_counter() - started
-        messages = tuple(m for _, plant in self.plants for m in plant.messages)
-        return self.recorded.until(k + 1, elapsed, messages)
 
-    def _evaluator(self, k: int) -> Any:
-        """Return the call that evaluates tick ``k``; all calls share the run's vectors."""
-        acting = self.flat.acting(k)
-        if acting not in self._calls:
-            function = self.flat.evaluator(k)
-            buffer, trigger = function.buffer()
-            for i, vector in enumerate((self.t, self.x, self.w, self.flat.p)):
-                buffer.set_arg(i, _view(vector))
-            for i, vector in enumerate((self.x_next, self.z, self.log, self.ok)):
-                buffer.set_res(i, _view(vector))
-            self._calls[acting] = (trigger, buffer)  # the buffer lives as long as its call
-        return self._calls[acting][0]
+    def time_of(self, k: int) -> float:
+        """Return the time of tick ``k`` in s."""
+        return k * self.flat.base.numerator / self.flat.base.denominator
 
-    def _advance(self, progress: Any, times: list[float]) -> int:
-        """Run all ticks and return the last one."""
-        t, ok, x, x_next = _view(self.t), _view(self.ok), _view(self.x), _view(self.x_next)
-        log, data, plants = self.log, self.recorded.data, [plant for _, plant in self.plants]
-        h, last = float(self.flat.base), len(times) - 1
-        single = self._evaluator(0) if self.flat.rates == (1,) else None
+    @property
+    def t(self) -> float:
+        """Time that the run has reached in s."""
+        return self.time_of(self._tick)
+
+    @property
+    def stopped(self) -> Stopped | None:
+        """The stop condition that has ended the run."""
+        return self._stopped
+
+    # --- going on ----------------------------------------------------------------------------------------------------
+
+    def advance(self, duration: float, *, progress: Any = None) -> None:
+        """Go on for a duration in s, a multiple of the step between ticks.
+
+        Raises
+        ------
+        SimulationError
+            See `Diagram.simulate`; ``error.run`` holds what was recorded until then.
+        OptionError
+            A duration that is not positive, or no multiple of the step.
+        """
+        last = self._tick + ticks_in(duration, self.flat.base, self.diagram.name)
+        started = time.perf_counter()
+        try:
+            if self._stopped is None:
+                self._go(last, progress or (lambda t: None))
+        except SimulationError as error:
+            self._elapsed += time.perf_counter() - started
+            self._attach(self._who(error))
+            raise
+        except KeyboardInterrupt as interrupt:
+            self._elapsed += time.perf_counter() - started
+            interrupt.run = self.run(final=False)  # type: ignore[attr-defined]
+            raise
+        self._elapsed += time.perf_counter() - started
+
+    def _go(self, last: int, progress: Any) -> None:
+        if self._continuous is not None:
+            self._go_hybrid(last, progress)
+        else:
+            self._go_sampled(last, progress)
+
+    def _go_sampled(self, last: int, progress: Any) -> None:
+        """Run ticks up to ``last``: nothing happens between them."""
+        flat, machine = self.flat, self._machine
+        t, x, x_next, ok, log = machine.here.t, machine.here.x, machine.x_next, machine.ok, machine.log
+        row, stops, time_of = self._recorder.row, self._stops, self.time_of
+        plants = [plant for _, plant in self._plants]
         only = plants[0].step if len(plants) == 1 else None
-        k = 0
-        while True:
-            end = min(last, k + _CHUNK)
-            for k in range(k, end):  # noqa: B020 - continues where the last chunk ended
-                t[0] = now = times[k]
-                (single or self._evaluator(k))()
-                if not ok[0]:
-                    raise _Stopped(k, self.failure(now, k))
-                data[k] = log
-                try:
-                    if only is not None:
-                        only(now, h)
-                    else:
-                        for plant in plants:
-                            plant.step(now, h)
-                except SimulationError as error:
-                    raise _Stopped(k + 1, self._who(error)) from error
-                x[:] = x_next
-                self.done = k + 1
-            k = end
-            progress(times[k])
-            if k == last:
-                break
-        t[0] = times[k]
-        self._evaluator(k)()
-        if not ok[0]:
-            raise _Stopped(k, self.failure(times[k], k))
-        data[k] = log
-        self.done = k + 1
-        return k
+        h, k = float(flat.base), self._tick
+        always = (
+            machine.tick(flat.acting(0)) if len({flat.acting(i) for i in range(2)}) == 1 and self._constant() else None
+        )
+        n, d = flat.base.numerator, flat.base.denominator
+        count, now = 0, time_of(k)
+        ticks = self._ticks_after(k, last)
+        for k in ticks:
+            try:
+                if only is not None:
+                    only(now, h)
+                else:
+                    for plant in plants:
+                        plant.step(now, h)
+            except SimulationError as error:
+                raise error.at(t=k * n / d) from error.__cause__
+            t[0] = now = k * n / d
+            acting = None
+            if always is None:
+                acting = flat.acting(k)
+                machine.tick(acting)()
+            else:
+                always()
+            if not ok[0]:
+                raise failure(machine, acting if acting is not None else flat.acting(k)).at(t=now)
+            row(now, log)
+            x[:] = x_next
+            self._tick = k
+            if stops and self._ended():
+                return
+            count += 1
+            if count == _CHUNK:
+                progress(now)
+                count = 0
+        progress(now)
+
+    def _constant(self) -> bool:
+        """Whether the same boxes act in every tick that is visited."""
+        clocks = self.flat.distinct
+        return not clocks or (
+            len(clocks) == 1 and clocks[0].offset == 0 and (clocks[0].every == 1 or not self._every_tick)
+        )
+
+    def _ticks_after(self, k: int, last: int) -> Iterator[int]:
+        """Yield the ticks to visit after tick ``k``, up to ``last``."""
+        clocks = self.flat.distinct
+        if self._every_tick or not clocks or any(c.every == 1 and c.offset == 0 for c in clocks):
+            yield from range(k + 1, last + 1)
+            return
+        while (k := min(c.after(k) for c in clocks)) < last:
+            yield k
+        yield last
+
+    def _go_hybrid(self, last: int, progress: Any) -> None:
+        """Run ticks up to ``last`` with a solver between them."""
+        continuous = self._continuous
+        assert continuous is not None
+        clocks, count = self.flat.distinct, 0
+        while self._tick < last:
+            k = self._tick
+            if continuous.fixed or self._plants:
+                following = k + 1
+            else:
+                following = min([c.after(k) for c in clocks] + [last])
+            between = range(k + 1, following) if self._every_tick or not clocks else range(0)
+            now = self.time_of(k)
+
+            def sample(t: float, progress: Any = progress) -> bool:
+                self._recorder.row(t, self._machine.log)
+                self._count += 1
+                if self._count % _CHUNK == 0:
+                    progress(t)
+                return self._is_stopped()
+
+            ended = continuous.advance(now, self.time_of(following), map(self.time_of, between), sample)
+            if ended is not None:
+                self._note_stop(ended)
+                return
+            for _, plant in self._plants:
+                plant.step(now, self.time_of(following) - now)
+            self._at_tick(following)
+            if self._stopped is not None:
+                return
+            count += 1
+            if count % 16 == 0:
+                progress(self.t)
+        progress(self.t)
+
+    def _at_tick(self, k: int) -> None:
+        """Evaluate and record tick ``k``: at the start, and in a hybrid run."""
+        machine, continuous = self._machine, self._continuous
+        machine.here.t[0] = now = self.time_of(k)
+        acting = self.flat.acting(k)
+        if continuous is not None:
+            continuous.at(now)
+        machine.tick(acting)()
+        if not machine.ok[0]:
+            raise failure(machine, acting).at(t=now)
+        machine.here.x[:] = machine.x_next
+        if continuous is not None:
+            continuous.at(now)
+            if acting and continuous.delays is not None:
+                continuous.delays.edge(now)  # what is held has jumped
+            if continuous.settle(now):
+                machine.look()
+        self._recorder.row(now, machine.log)
+        self._tick = k
+        self._ended()
+
+    def _is_stopped(self) -> bool:
+        return any(self._machine.log[i] > TRUE for i, _ in self._stops)
+
+    def _ended(self) -> bool:
+        """Whether a stop condition is true at this tick, which then ends the run."""
+        if self._stopped is None and self._is_stopped():
+            self._note_stop(self.t)
+        return self._stopped is not None
+
+    def _note_stop(self, t: float) -> None:
+        path = next(path for i, path in self._stops if self._machine.log[i] > TRUE)
+        self._stopped = Stopped(t, path)
+
+    # --- what it has made --------------------------------------------------------------------------------------------
 
     def _who(self, error: SimulationError) -> SimulationError:
-        for path, plant in self.plants:
+        for path, plant in self._plants:
             if plant.failed:
                 error.block = path
-        return error
+        return check_solver(error, self._machine)
 
-    # --- the start, and the replay of a failed tick: block by block, with numbers -----------------------------------
+    def _attach(self, error: SimulationError) -> None:
+        if error.run is None:
+            error.run = self.run(final=False)
 
-    def start(self) -> None:
-        """Initialize: inputs and outputs of the FMUs that agree at t = 0, and the blocks' initial states.
+    def run(self, *, final: bool = True) -> Run:
+        """Return what was recorded since the start, or since `restore`; afterwards recording begins anew.
 
-        In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). What they change is given on
-        until it changes no more than by rounding.
+        Parameters
+        ----------
+        final : bool
+            Whether the complete state at the end is kept with it, as ``run.final_state``, where that can be had.
         """
-        try:
-            for path, plant in self.plants:
-                plant.bind(
-                    self._part(self.flat.plant_inputs, path, self.z), self._part(self.flat.plant_outputs, path, self.w)
-                )
-            for _ in range(_MAX_PASSES):
-                self._initial_states()
-                self._evaluator(0)()
-                if not self.ok[0]:
-                    raise _Stopped(0, self.failure(0.0, 0))
-                before = self.z.copy()
-                for _, plant in self.plants:
-                    plant.exchange()
-                self._evaluator(0)()
-                if np.allclose(before, self.z, rtol=_SETTLED, atol=0.0, equal_nan=True):
-                    break
-            else:
-                raise self._unsettled(before)
-            for _, plant in self.plants:
-                plant.begin()
-        except SimulationError as error:
-            raise _Stopped(0, self._who(error)) from error.__cause__
+        recorder, machine = self._recorder, self._machine
+        state = self.save() if final and self.can_save else None
+        if final and self._begun:
+            recorder.last(self.t if self._stopped is None else self._stopped.t, machine.log)
+        messages = tuple(m for _, plant in self._plants for m in plant.messages)
+        t, data = recorder.finish(elapsed=self._elapsed, messages=messages, stopped=self._stopped)
+        run = Run(
+            t=t,
+            data=data,
+            layout=self.flat.log,
+            wires=dict(self.flat.table.names),
+            units=self._units(),
+            diagram=self.diagram,
+            elapsed=self._elapsed,
+            messages=messages,
+            events=recorder.events,
+            stopped=self._stopped,
+            residual=recorder.residual,
+            columns=recorder.columns,
+            has_states=self._recording["states"],
+            final_state=state,
+        )
+        self._recording["to"] = None
+        self._recorder, self._elapsed = self._new_recorder(), 0.0
+        return run
 
-    def _unsettled(self, before: np.ndarray) -> SimulationError:
-        slices = self.flat.plant_inputs.slices
-        name = next(n for n, s in slices.items() if not np.allclose(before[s], self.z[s], rtol=_SETTLED, atol=0.0))
-        path, port = self.flat.ports[name]
-        return SimulationError(
-            f"its value at the start depends on the FMU's own outputs, and is not found: after {_MAX_PASSES} passes it "
-            f"still changes, from {before[slices[name]].tolist()} to {self.z[slices[name]].tolist()}. Put a "
-            "UnitDelay(initial_value=…) on one of the wires between.",
-            block=path,
-            port=port,
+    @property
+    def can_save(self) -> bool:
+        """Whether the complete state can be saved: every FMU can turn its state into bytes."""
+        return self._begun and all(plant.can_serialize and not plant.failed for _, plant in self._plants)
+
+    def save(self) -> RunState:
+        """Return the complete state at this tick, that of the FMUs included.
+
+        Raises
+        ------
+        FmuError
+            If an FMU can't save its state, or can't turn it into bytes.
+        """
+        machine = self._machine
+        return RunState(
+            t=self.t if self._stopped is None else self._stopped.t,
+            tick=self._tick,
+            base=self.flat.base,
+            diagram=self.diagram.name,
+            x=machine.here.x.copy(),
+            w=machine.here.w.copy(),
+            z=machine.z.copy(),
+            log=machine.log.copy(),
+            layout=layout_of(self.flat),
+            continuous=None if self._continuous is None else self._continuous.save(),
+            fmus={path: plant.serialize() for path, plant in self._plants},
+            stopped=self._stopped,
         )
 
-    def _initial_states(self) -> None:
-        """Compute the initial states of the blocks that ask for their inputs first."""
-        table = self.flat.table
-        if not any(table.blocks[path].starts_from_inputs for path in self.flat.checked.traced):
-            return
-        for _ in self._blocks(self.flat.start_order, 0.0, 0, initialize=True):
-            pass
+    def restore(self, state: RunState) -> None:
+        """Go back, or ahead, to a state; what was recorded before is forgotten, and the state is the first sample.
 
-    def failure(self, t: float, k: int) -> SimulationError:
-        """Return the error of the first block that made a value that is not finite or whose guard fails."""
-        for name, where in self.flat.plant_outputs.slices.items():
-            if not np.all(np.isfinite(self.w[where])):
-                path, port = self.flat.ports[name]
-                return _non_finite(path, port, self.w[where], "It comes out of the FMU.")
-        for path, names, inputs, made in self._blocks(self.flat.order, t, k):
-            block = self.flat.table.blocks[path]
-            shapes = self.flat.checked.traced[path].outputs
-            u = bundle("u", inputs)
-            for name in sorted(names, key=lambda n: n != GUARDS):  # a guard says more than the NaN behind it
-                values = made[name]
-                if name == GUARDS:
-                    for guard, value in zip(self.flat.checked.traced[path].guards, values, strict=True):
-                        if not value > 0:
-                            y = bundle("y", {n: made.get(n) for n in shapes})
-                            x = self._states_of(path)
-                            return block.guard_error(guard, float(value), u, y, x).at(block=path)  # type: ignore[return-value]
-                elif not np.all(np.isfinite(values)):
-                    what = "the next state" if name == NEXT else name
-                    return _non_finite(path, what, values, _inputs_text(inputs))
-        layout = self.flat.log
-        sizes = {name: float(np.max(np.abs(self.log[where]), initial=0.0)) for name, where in layout.slices.items()}
-        largest = max(sizes, key=lambda name: sizes[name])
-        path, port = self.flat.ports[largest]
-        return NonFiniteError(
-            f"found {sizes[largest]:g}; the signals of this tick overflow when they are added up, and this "
-            "is the largest. Look at what drives it in the last samples of error.run.",
-            block=path,
-            port=port,
-        )
-
-    def _states_of(self, path: str) -> Any:
-        """Return the states of a block at the failed tick, as its equations see them."""
-        flat, position, parts = self.x[self.flat.states.slices[path]], 0, {}
-        for name, shape in self.flat.checked.traced[path].states.items():
-            n = math.prod(shape)
-            parts[name] = flat[position : position + n].reshape(shape)
-            position += n
-        return bundle("x", parts)
-
-    def _blocks(
-        self, order: list[Any], t: float, k: int, *, initialize: bool = False
-    ) -> Iterator[tuple[str, tuple[str, ...], dict[str, np.ndarray], dict[str, np.ndarray]]]:
-        """Evaluate block by block; yield path, names, inputs and results of each."""
-        flat, table = self.flat, self.flat.table
-        values: dict[tuple[str, str], np.ndarray] = {}
-        for name, where in flat.plant_outputs.slices.items():
-            values[flat.ports[name]] = self.w[where]
-        for name, where in flat.held.slices.items():
-            values[flat.ports[name]] = self.x[where]
-        ready: set[str] = set()
-        for path, names in order:
-            if k % flat.divisors[table.frame_of[path]]:
-                continue
-            trace, block = flat.checked.traced[path], table.blocks[path]
-            known = {p: flat.source(path, p, values) for p in trace.inputs if flat.is_made(path, p, values)}
-            shaped = {p: np.reshape(known[p], trace.inputs[p]) if p in known else None for p in trace.inputs}
-            if initialize and block.starts_from_inputs and path not in ready:
-                ready.add(path)
-                self.x[flat.states.slices[path]] = _initial(path, block, bundle("u", shaped), trace.states)
-            columns = [known.get(p, np.zeros(int(np.prod(s)))) for p, s in trace.inputs.items()]
-            result = flat.block_function(path, names).call(
-                [t, self.x[flat.states.slices[path]], *columns, flat.p[flat.parameters.slices[path]]]
-            )
-            made = {n: np.ravel(np.array(r)) for n, r in zip(names, result, strict=True)}
-            values.update({(path, n): v for n, v in made.items()})
-            shaped_known: Any = dict(shaped)
-            yield path, names, shaped_known, made
+        Raises
+        ------
+        OptionError
+            If it is no state of such a diagram: another base, other blocks or states.
+        """
+        check_fits(state, self.flat, self.diagram.name)
+        machine = self._machine
+        for path, plant in self._plants:
+            plant.restore(plant.deserialize(state.fmus[path]))
+        machine.here.t[0] = state.t
+        machine.here.x[:], machine.here.w[:], machine.z[:], machine.log[:] = state.x, state.w, state.z, state.log
+        if self._continuous is not None and state.continuous is not None:
+            self._continuous.restore(state.continuous)
+        self._tick, self._stopped, self._elapsed, self._begun = state.tick, state.stopped, 0.0, True
+        self._recorder = self._new_recorder()
+        self._recorder.row(self.t, machine.log)
 
 
-def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]]) -> np.ndarray:
-    """Return a block's initial state from its inputs, flat; whatever fails says whose it is."""
+def default_step(diagram: Diagram, step: Any, duration: float | None, solver: str) -> Any:
+    """Return the seconds between two samples of a run that has neither a ``step`` nor a clock.
+
+    A thousandth of the duration, in whole nanoseconds, where the diagram is continuous, has no FMU and the solver
+    chooses its own steps.
+    """
+    if step is not None or duration is None or not diagram.is_continuous or diagram.has_clock:
+        return step
+    from ._solvers import solver_name
+
+    if diagram.has_fmu or solver_name(solver) in FIXED_STEP:
+        return step
     try:
-        return initial_state(block, states, u)
-    except SimulationError as error:
-        raise error.at(block=path, t=0.0) from error.__cause__
-    except Exception as error:
-        expected = ", ".join(f"{name} of shape {shape}" for name, shape in states.items())
-        what = str(error) if isinstance(error, LoopwrightError) else f"{type(error).__name__}: {error}"
-        raise SimulationError(
-            f"its initial(u) failed: {what} {_inputs_text(u._asdict())} Expected {expected}.", block=path, t=0.0
-        ) from error
+        span = Fraction(repr(float(duration)))
+    except (TypeError, ValueError):
+        return step
+    ticks = span / Fraction(1, 10**9)
+    if not span > 0 or ticks.denominator != 1:
+        return span if span > 0 and ticks.denominator == 1 else step
+    return next((span / n for n in (1000, 500, 200, 100, 10, 1) if (ticks / n).denominator == 1), span)
 
 
-def _view(vector: np.ndarray) -> Any:
-    """Return the memory of a vector, as CasADi's buffers take it."""
-    return memoryview(vector)  # type: ignore[arg-type]
-
-
-class _Stopped(Exception):  # noqa: N818 - not an error of its own
-    """Carries an error out of the loop with the tick at which it happened."""
-
-    def __init__(self, tick: int, error: SimulationError):
-        self.tick, self.error = tick, error
-
-
-def _inputs_text(inputs: dict[str, Any]) -> str:
-    shown = ", ".join(f"{n} = {np.asarray(v).tolist()}" for n, v in inputs.items() if v is not None)
-    return f"Its inputs then: {shown}." if shown else "It has no inputs."
-
-
-def _non_finite(path: str, port: str, values: np.ndarray, hint: str) -> NonFiniteError:
-    return NonFiniteError(
-        f"found {values.tolist()}; expected finite numbers. This is the first block that made such a value. {hint}",
-        block=path,
-        port=port,
-    )
+def simulate(
+    diagram: Diagram, duration: float, *, progress: bool | None, start: RunState | None, **options: Any
+) -> Run:
+    """Run a diagram; see `Diagram.simulate`."""
+    if duration is None:
+        ticks_in(duration, Fraction(1), diagram.name)  # refused
+    with Simulation(diagram, duration=duration, start=start, **options) as simulation:
+        first = simulation.t
+        with _progress(diagram.name, first, first + float(duration), progress) as show:
+            if simulation.stopped is None:
+                simulation.advance(duration, progress=show)
+        return simulation.run()
 
 
 @contextmanager
-def _progress(name: str, end: float, show: bool | None) -> Iterator[Any]:
+def _progress(name: str, start: float, end: float, show: bool | None) -> Iterator[Any]:
     """Yield a function that is told the simulated time, and draws it where that is wanted."""
     if show is None:
         import sys
@@ -364,5 +577,5 @@ def _progress(name: str, end: float, show: bool | None) -> Iterator[Any]:
 
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.2f} / {task.total:g} s"))
     with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(name, total=end)
-        yield lambda t: bar.update(task, completed=t)
+        task = bar.add_task(name, total=end - start)
+        yield lambda t: bar.update(task, completed=t - start)

@@ -20,7 +20,19 @@ from ._subsystem import FrameInput, SubsystemCall
 class Frame:
     """A box: the diagram itself (path "") or a subsystem.
 
-    ``sample_time`` is its own; None where it has the rate of what surrounds it.
+    Attributes
+    ----------
+    sample_time : Fraction or None
+        Its own, in s; None where it has the rate of what surrounds it.
+    offset : Fraction
+        Time of its first tick in s, of a box with a sample time.
+    delay : int
+        Computational delay of its outputs in samples.
+    control : str
+        "enabled" or "triggered" for a box that acts on a condition, else "".
+    when : str
+        "held" or "reset" for an enabled box: what its states do when it is enabled again. For a triggered box the edge:
+        "rising", "falling" or "both".
     """
 
     path: str
@@ -28,6 +40,10 @@ class Frame:
     method: str
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
+    offset: Fraction = Fraction(0)
+    delay: int = 0
+    control: str = ""
+    when: str = ""
 
 
 @dataclass(frozen=True)
@@ -53,12 +69,46 @@ class Structure:
     frames: dict[str, Frame] = field(default_factory=dict)
     wires: dict[tuple[str, str], Wire] = field(default_factory=dict)
     names: dict[str, Wire] = field(default_factory=dict)
+    controls: dict[str, Wire] = field(default_factory=dict)
+    """The source of what enables or triggers a subsystem, by the subsystem's path."""
 
-    def rate(self, frame: str) -> Fraction | None:
-        """Return the sample time that holds in a frame: its own, or that of the nearest one around it."""
+    def clock(self, frame: str) -> Frame | None:
+        """Return the frame whose sample time holds in a frame: itself, or the nearest one around it."""
         while frame and self.frames[frame].sample_time is None:
             frame = frame.rpartition(".")[0]
-        return self.frames[frame].sample_time
+        found = self.frames[frame]
+        return None if found.sample_time is None else found
+
+    def rate(self, frame: str) -> Fraction | None:
+        """Return the sample time that holds in a frame, None where it is continuous."""
+        found = self.clock(frame)
+        return None if found is None else found.sample_time
+
+    def around(self, frame: str) -> list[Frame]:
+        """Return the frames around a block in ``frame``, from the outermost one that is not the diagram to it."""
+        parts = frame.split(".") if frame else []
+        return [self.frames[".".join(parts[: i + 1])] for i in range(len(parts))]
+
+    def gates(self, frame: str) -> tuple[str, ...]:
+        """Return the enabled and triggered boxes around a block in ``frame``, from outside in."""
+        return tuple(f.path for f in self.around(frame) if f.control)
+
+    def triggered(self, frame: str) -> str | None:
+        """Return the innermost triggered box around a block in ``frame``."""
+        return next((f.path for f in reversed(self.around(frame)) if f.control == "triggered"), None)
+
+    def is_event(self, box: str) -> bool:
+        """Whether a box is enabled or triggered in continuous time, by an event, and not at ticks."""
+        return box in self.controls and self.rate(box) is None and not self.sampled(box.rpartition(".")[0])
+
+    def stepped(self, path: str) -> bool:
+        """Whether a run steps a block instead of evaluating it: an FMU, or a transport delay in continuous time."""
+        block = self.blocks[path]
+        return hasattr(block, "instantiate") or (block.transport and not self.sampled(self.frame_of[path]))
+
+    def sampled(self, frame: str) -> bool:
+        """Whether blocks in a frame act at instants only: ticks, or those of a trigger."""
+        return self.rate(frame) is not None or self.triggered(frame) is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +228,17 @@ class Collector:
 
         for box in sorted(self.boxes.values(), key=lambda b: (box_path(b).count("."), box_path(b))):
             path, made = box_path(box), box.subsystem
-            table.frames[path] = Frame(path, made.sample_time, made.method, tuple(box.wires), tuple(box.outputs))
+            table.frames[path] = Frame(
+                path,
+                made.sample_time,
+                made.method,
+                tuple(box.wires),
+                tuple(box.outputs),
+                made.offset,
+                made.delay,
+                made.control,
+                made.when,
+            )
         # frames of all blocks, then the given names, then the numbered ones
         frames: dict[int, str] = {}
         for key, block in self.blocks.items():
@@ -210,6 +270,9 @@ class Collector:
         for key, call in self.calls.items():
             for port, signal in call.wires.items():
                 table.wires[paths[key], port] = _resolve(signal, paths)
+        for box in self.boxes.values():
+            if box.subsystem.control:
+                table.controls[box_path(box)] = _resolve(box.wires[box.subsystem.control_input], paths)
         for name, signal, consumer in self.named:
             wire = _resolve(signal, paths)
             frame = frame_of_item(consumer)

@@ -379,12 +379,17 @@ def test_two_rates_hold_between_their_ticks_and_never_drift():
     a = subsystem(sample_time=1e-3)(ticks("a"))(Constant(value=1.0))
     b = subsystem(sample_time=0.7e-3)(ticks("b"))(Constant(value=1.0))
     diagram = Diagram("d", a.named("a"), b.named("b"))
-    run = diagram.simulate(2.1, progress=False)
+    run = diagram.simulate(2.1, step=1e-4, progress=False)
     k = np.arange(len(run.t))
     assert diagram.flatten().base == Fraction(1, 10000)
     assert np.array_equal(run["a"], k // 10)
     assert np.array_equal(run["b"], k // 7)
     assert np.array_equal(run.t, k / 10000)
+    sparse = diagram.simulate(2.1, progress=False)
+    visited = (k % 10 == 0) | (k % 7 == 0)
+    assert np.array_equal(sparse.t, run.t[visited])
+    assert np.array_equal(sparse["a"], run["a"][visited])
+    assert np.array_equal(sparse["b"], run["b"][visited])
 
 
 def test_signals_in_sums_products_and_quotients():

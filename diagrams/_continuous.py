@@ -1,0 +1,378 @@
+"""Between two ticks: the solver, events, discontinuities of sources, transport delays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+from ..blocks._block import Block
+from ..blocks._errors import OptionError, ShapeError, SimulationError
+from ..blocks._instants import left_of
+from ._events import Domains
+from ._failures import failure, opaque_failure, state_values
+from ._flat import FlatDiagram
+from ._machine import Machine
+from ._solvers import Problem, make_solver
+from ._stored import Occurrence
+from ._structure import join
+from ._transport import Delays, step_inputs
+
+NOTHING: frozenset[Any] = frozenset()
+
+
+class Continuous:
+    """The continuous part of a run.
+
+    Parameters
+    ----------
+    machine : Machine
+        The run's numbers and functions.
+    name : str
+        The diagram's name.
+    solver, rtol, atol, max_step
+        See `Diagram.simulate`.
+    on_event : callable
+        Told every event that fires.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        name: str,
+        solver: str,
+        rtol: float,
+        atol: float,
+        max_step: float | None,
+        on_event: Callable[[Occurrence], None],
+    ):
+        flat = machine.flat
+        self.machine, self.flat, self.name, self.on_event = machine, flat, name, on_event
+        self.where = flat.continuous
+        self._edge, self._left = math.inf, math.inf
+        self.delays = _delays(flat)
+        self._flow, self._jacobian = machine.flow(), None
+        problem = Problem(self.where.size, self._rate, self._slope, state_names(flat))
+        longest = max_step
+        if self.delays is not None:
+            longest = min(max_step or math.inf, self.delays.shortest)
+        self.solver = make_solver(
+            solver,
+            problem,
+            rtol=rtol,
+            atol=absolute_tolerances(flat, atol),
+            step=float(flat.base),
+            max_step=longest,
+        )
+        self.fixed = self.solver.fixed
+        if self.fixed and self.delays is not None and float(flat.base) > self.delays.shortest * (1 + 1e-12):
+            raise OptionError(
+                f"the step of {float(flat.base):g} s is longer than a transport delay of {self.delays.shortest:g} s. Take "
+                "a smaller step, or a solver of variable step.",
+                block=name,
+                port="step",
+            )
+        self.domains: Domains | None = None
+        if flat.events:
+            self._indicators, opened = machine.indicators()
+            self.domains = Domains(flat, self._g, opened)
+            self._jump, self._fired = machine.jump()
+        if self.delays is not None:
+            self._driven = np.zeros(flat.plant_inputs.total)
+            self._drive = machine.plain(_driven_function(flat), [self._driven], machine.trial)
+        self.sources = [
+            flat.table.blocks[path]
+            for path in sorted(flat.checked.traced)
+            if not flat.table.sampled(flat.table.frame_of[path])
+            and type(flat.table.blocks[path]).next_instant is not Block.next_instant
+        ]
+
+    # --- functions of a trial: time from the left of the next discontinuity, past inputs of the delays ---------------
+
+    def _time(self, t: float) -> float:
+        t = self._left if t >= self._edge else t
+        if self.delays is not None:
+            self.delays.outputs_at(t, self.machine.trial.w)
+        return t
+
+    def _rate(self, t: float, x: np.ndarray) -> np.ndarray:
+        return self._flow(self._time(t), x)
+
+    def _slope(self, t: float, x: np.ndarray) -> np.ndarray:
+        if self._jacobian is None:
+            self._jacobian = self.machine.jacobian()  # type: ignore[assignment]
+        return self._jacobian(self._time(t), x)  # type: ignore[misc, no-any-return]
+
+    def _g(self, t: float, x: np.ndarray) -> np.ndarray:
+        return self._indicators(self._time(t), x)
+
+    def _inputs_of_delays(self, t: float, x: np.ndarray) -> np.ndarray:
+        trial = self.machine.trial
+        trial.t[0] = self._time(t)
+        trial.x[self.where] = x
+        self._drive()
+        return self._driven
+
+    # --- the instant that is reached ---------------------------------------------------------------------------------
+
+    def at(self, t: float) -> None:
+        """Take an instant from the right: beyond any discontinuity there."""
+        self._edge = self._left = math.inf
+        here = self.machine.here
+        here.t[0] = t
+        if self.delays is not None:
+            self.delays.middle = t + 1.0
+            self.delays.outputs_at(t, here.w)
+        self._synchronize()
+
+    def _put(self, t: float, x: np.ndarray) -> None:
+        here = self.machine.here
+        here.t[0] = self._left if t >= self._edge else t
+        here.x[self.where] = x
+        if self.delays is not None:
+            self.delays.outputs_at(here.t[0], here.w)
+
+    def _synchronize(self) -> None:
+        here, trial = self.machine.here, self.machine.trial
+        trial.x[:] = here.x
+        trial.w[:] = here.w
+
+    def accept(self) -> None:
+        """Evaluate the instant that is reached, and renew what blocks and loops remember."""
+        machine = self.machine
+        machine.look()
+        if not machine.ok[0]:
+            raise failure(machine, NOTHING).at(t=float(machine.here.t[0]))
+        machine.here.x[:] = machine.x_next
+        self._synchronize()
+
+    def begin(self) -> None:
+        """Take the domains of the indicators at the start."""
+        self.at(float(self.machine.here.t[0]))
+        if self.domains is not None:
+            self.domains.begin(float(self.machine.here.t[0]), self.machine.here.x[self.where])
+        if self.delays is not None:
+            self.delays.edge(float(self.machine.here.t[0]))
+
+    def settle(self, t: float) -> bool:
+        """Fire what has changed its domain at an instant; return whether anything did."""
+        if self.domains is None:
+            return False
+        fired = self.domains.changed(t, self.machine.here.x[self.where])
+        if not fired.any():
+            return False
+        self._fire(t, fired)
+        return True
+
+    def _fire(self, t: float, fired: np.ndarray) -> None:
+        assert self.domains is not None
+        machine, domains = self.machine, self.domains
+        for _ in range(domains.most):
+            self._fired[:] = fired
+            before = machine.here.x.copy()
+            self._jump()
+            machine.here.x[:] = machine.x_next
+            for i in np.flatnonzero(fired):
+                self._tell(t, self.flat.events[int(i)], before)
+            domains.count(t, fired, self.name)
+            self._synchronize()
+            fired = domains.changed(t, machine.here.x[self.where])
+            if not fired.any():
+                if self.delays is not None:
+                    self.delays.edge(t)
+                self.accept()
+                return
+        raise domains.too_many(t, fired)
+
+    def _tell(self, t: float, event: Any, before: np.ndarray) -> None:
+        states = [{} if event.box else state_values(self.flat, event.path, x) for x in (before, self.machine.here.x)]
+        self.on_event(Occurrence(t, event.path, event.name, *states))
+
+    # --- from tick to tick -------------------------------------------------------------------------------------------
+
+    def advance(self, t: float, end: float, grid: Iterable[float], sample: Callable[[float], bool]) -> float | None:
+        """Go from ``t`` to ``end``, where the left limit is left in ``here``.
+
+        Parameters
+        ----------
+        grid : iterable of float
+            Times in between at which ``sample(t)`` is called with the instant in ``here``, evaluated.
+        sample : callable
+            Returns whether the run ends there.
+
+        Returns
+        -------
+        float or None
+            Time at which a stop condition has ended the run.
+        """
+        machine, where = self.machine, self.where
+        times = iter(grid)
+        pending = next(times, math.inf)
+        while t < end:
+            edge = min(end, self._next_edge(t))
+            self._edge, self._left = edge, max(t, left_of(edge))
+            if self.delays is not None:
+                self.delays.middle = 0.5 * (t + edge)
+            self._synchronize()
+            self.solver.restart(t, machine.here.x[where], edge)
+            found = None
+            while found is None and t < edge:
+                step = self.solver.step()
+                if self.domains is not None:
+                    found = self.domains.locate(step.t_old, step.t, step.interpolate)
+                t = step.t if found is None else found[0]
+                while pending < t or (pending == t < edge and found is None):
+                    self._put(pending, step.interpolate(pending))
+                    machine.look()
+                    if self._recorded(pending, sample):
+                        return pending
+                    pending = next(times, math.inf)
+                if self.delays is not None and t > step.t_old:
+                    step_inputs(self.delays, step.t_old, t, step.interpolate, self._inputs_of_delays)
+                self._put(t, step.x if found is None else step.interpolate(t))
+                self.accept()
+            happened = found is not None
+            if found is not None:
+                self._fire(t, found[1])
+            if t == edge < end:  # a discontinuity of a source
+                self.at(t)
+                if self.delays is not None:
+                    self.delays.edge(t)
+                happened |= self.settle(t)
+                machine.look()
+            if pending == t < end:
+                if self._recorded(t, sample):
+                    return t
+                pending = next(times, math.inf)
+            elif happened and self._stops_at(t, sample):
+                return t
+        return None
+
+    def _recorded(self, t: float, sample: Callable[[float], bool]) -> bool:
+        if not self.machine.ok[0]:
+            raise failure(self.machine, NOTHING).at(t=t)
+        return sample(t)
+
+    def _stops_at(self, t: float, sample: Callable[[float], bool]) -> bool:
+        return self.is_stopped() and (sample(t) or True)
+
+    is_stopped: Callable[[], bool] = staticmethod(lambda: False)
+    """Whether a stop condition is true in what was evaluated last; set by the run."""
+
+    def _next_edge(self, t: float) -> float:
+        found = math.inf if self.delays is None else self.delays.next_edge(t)
+        for source in self.sources:
+            found = min(found, source.next_instant(t))
+        return found
+
+    # --- saved states ------------------------------------------------------------------------------------------------
+
+    def save(self) -> dict[str, Any]:
+        """Return what is needed to go on from here."""
+        return {
+            "domains": None if self.domains is None else self.domains.save(),
+            "delays": None if self.delays is None else self.delays.save(),
+            "solver": solver_memory(self.solver),
+        }
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Go back to what `save` returned."""
+        if self.domains is not None and saved["domains"] is not None:
+            self.domains.restore(saved["domains"])
+        if self.delays is not None and saved["delays"] is not None:
+            self.delays.restore(saved["delays"])
+        recall(self.solver, saved["solver"])
+
+
+_MEMORY = ("planned", "_hits", "_misses", "_easy")
+
+
+def solver_memory(solver: Any) -> dict[str, Any]:
+    """Return what a solver would do next: its step, and the method that the default has chosen."""
+    kept = {name: getattr(solver, name) for name in _MEMORY if hasattr(solver, name)}
+    if hasattr(solver, "_active"):
+        kept["active"] = solver._active.name
+        kept["methods"] = {m.name: solver_memory(m) for m in (solver._explicit, solver._implicit)}
+    return kept
+
+
+def recall(solver: Any, kept: dict[str, Any]) -> None:
+    """Let a solver go on as the one did whose `solver_memory` it is; another method starts anew."""
+    for name in _MEMORY:
+        if name in kept and hasattr(solver, name):
+            setattr(solver, name, kept[name])
+    if "active" in kept and hasattr(solver, "_active"):
+        for method in (solver._explicit, solver._implicit):
+            if method.name in kept["methods"]:
+                recall(method, kept["methods"][method.name])
+            if method.name == kept["active"]:
+                solver._active = method
+
+
+def state_names(flat: FlatDiagram) -> list[str]:
+    """Return what each continuous state is: ``block.state``, with an index where it has several entries."""
+    found: dict[int, str] = {}
+    for path, where in flat.states.slices.items():
+        position = where.start
+        for name, shape in flat.checked.traced[path].states.items():
+            n = math.prod(shape)
+            for i in range(n):
+                found[position + i] = join(path, name) + (f"[{i}]" if shape else "")
+            position += n
+    return [found[int(i)] for i in flat.continuous]
+
+
+def absolute_tolerances(flat: FlatDiagram, atol: float) -> Any:
+    """Return the absolute tolerance of each continuous state: ``atol`` times its nominal value."""
+    scale = np.ones(flat.width)
+    for path, where in flat.states.slices.items():
+        position = where.start
+        for name, shape in flat.checked.traced[path].states.items():
+            n, nominal = math.prod(shape), flat.table.blocks[path].states[name].nominal
+            scale[position : position + n] = 1.0 if nominal is None else nominal
+            position += n
+    scale = scale[flat.continuous]
+    return atol if np.all(scale == 1.0) or np.ndim(atol) else atol * scale
+
+
+def _delays(flat: FlatDiagram) -> Delays | None:
+    table = flat.table
+    paths = [p for p in sorted(table.blocks) if table.blocks[p].transport and p not in flat.checked.traced]
+    if not paths:
+        return None
+    blocks: list[Any] = [table.blocks[p] for p in paths]
+    inputs = [flat.plant_inputs.slices[join(p, "u")] for p in paths]
+    starts: list[Any] = []
+    for path, block in zip(paths, blocks, strict=True):
+        shape = flat.plant_inputs.shapes[join(path, "u")]
+        try:
+            starts.append(np.ravel(np.broadcast_to(np.asarray(block.initial_value, dtype=float), shape)).copy())
+        except ValueError:
+            raise ShapeError(
+                f"found an initial_value of shape {np.shape(block.initial_value)}; expected {shape}, that of the input, or a "
+                "number.",
+                block=path,
+                port="initial_value",
+            ) from None
+    return Delays([b.delay for b in blocks], inputs, [flat.plant_outputs.slices[join(p, "y")] for p in paths], starts)
+
+
+def _driven_function(flat: FlatDiagram) -> Any:
+    """Return ``(t, x, w, p) -> z`` between ticks."""
+    f = flat.at_tick(frozenset())
+    return f.slice("driven", [0, 1, 2, 3], [1])
+
+
+def check_solver(error: SimulationError, machine: Machine) -> SimulationError:
+    """Return the error behind that of a solver: what an opaque block raised; else say which block its message names."""
+    opaque = opaque_failure(machine)
+    if opaque is not None:
+        return opaque.at(t=error.t)  # type: ignore[return-value]
+    if error.block is None:
+        for name in sorted(state_names(machine.flat), key=len, reverse=True):
+            if f" {name} " in f" {error.message} ":
+                error.block = name.rpartition(".")[0]
+                break
+    return error

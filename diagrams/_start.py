@@ -1,0 +1,114 @@
+"""The start of a run: states, held outputs, and inputs and outputs of FMUs that agree at t = 0."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..blocks._equations import initial_state
+from ..blocks._errors import LoopwrightError, SimulationError
+from ..blocks._symbols import bundle
+from ._failures import failure, inputs_text, shaped_inputs
+from ._machine import Machine
+from ._pass import Pass, above
+
+_MAX_PASSES = 100  # over inputs and outputs of the FMUs at the start
+_SETTLED = 1e-13  # relative change of an input between two passes, a few hundred ulps
+
+
+def initialize(machine: Machine, plants: list[tuple[str, Any]], delays: Any) -> None:
+    """Find values of everything at t = 0.
+
+    In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). What they change is given on
+    until it changes no more than by rounding.
+    """
+    flat = machine.flat
+    acting = flat.acting(0)
+    machine.here.t[0] = 0.0
+    if delays is not None:
+        delays.outputs_at(0.0, machine.here.w)
+    passes = 0
+    while True:
+        _states(machine)
+        _boxes(machine)
+        machine.tick(acting)()
+        if not machine.ok[0]:
+            raise failure(machine, acting)
+        before = machine.z.copy()
+        for _, plant in plants:
+            plant.exchange()
+        machine.tick(acting)()
+        passes += 1
+        if np.allclose(before, machine.z, rtol=_SETTLED, atol=0.0, equal_nan=True) and (
+            passes > 1 or not machine.looped
+        ):
+            break
+        if passes == _MAX_PASSES:
+            raise _unsettled(machine, before)
+
+
+def _states(machine: Machine) -> None:
+    """Compute the initial states of the blocks that ask for their inputs first."""
+    flat, x = machine.flat, machine.here.x
+    blocks = flat.table.blocks
+    if any(blocks[path].starts_from_inputs for path in flat.checked.traced):
+        ready: set[str] = set()
+
+        def before(path: str, inputs: dict[str, Any]) -> None:
+            block, trace = blocks[path], flat.checked.traced[path]
+            if block.starts_from_inputs and path not in ready:
+                ready.add(path)
+                u = bundle("u", shaped_inputs(trace, inputs))
+                x[flat.states.slices[path]] = _initial(path, block, u, trace.states)
+
+        Pass(
+            flat, frozenset(), 0.0, x, machine.here.w, flat.p, opened=True, order=flat.start_order.steps, before=before
+        ).run()
+    for path, where in flat.starts.slices.items():
+        x[where] = x[flat.states.slices[path]]
+
+
+def _boxes(machine: Machine) -> None:
+    """Let every box put out once what it would at the start, and remember what controls it."""
+    flat, x = machine.flat, machine.here.x
+    if not flat.held.slices and not flat.gates.slices:
+        return
+    done = Pass(flat, frozenset(), 0.0, x, machine.here.w, flat.p, opened=True).run()
+    for name, column in done.held.items():
+        where = flat.held.slices[name]
+        x[where] = np.ravel(np.array(column))
+    events = {(e.path, e.name) for e in flat.events}
+    for box, where in flat.gates.slices.items():
+        now = float(above(done.control(box)))
+        discrete_enable = flat.table.frames[box].control == "enabled" and (box, "enable") not in events
+        x[where] = 1.0 if discrete_enable else now  # at its first tick an enabled box has its start values anyway
+
+
+def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]]) -> np.ndarray:
+    """Return a block's initial state from its inputs, flat; whatever fails says whose it is."""
+    try:
+        return initial_state(block, states, u)
+    except SimulationError as error:
+        raise error.at(block=path, t=0.0) from error.__cause__
+    except Exception as error:
+        expected = ", ".join(f"{name} of shape {shape}" for name, shape in states.items())
+        what = str(error) if isinstance(error, LoopwrightError) else f"{type(error).__name__}: {error}"
+        raise SimulationError(
+            f"its initial(u) failed: {what} {inputs_text(u._asdict())} Expected {expected}.", block=path, t=0.0
+        ) from error
+
+
+def _unsettled(machine: Machine, before: np.ndarray) -> SimulationError:
+    flat, z = machine.flat, machine.z
+    slices = flat.plant_inputs.slices
+    name = next(n for n, s in slices.items() if not np.allclose(before[s], z[s], rtol=_SETTLED, atol=0.0))
+    path, port = flat.ports[name]
+    return SimulationError(
+        f"its value at the start depends on the FMU's own outputs, and is not found: after {_MAX_PASSES} passes it "
+        f"still changes, from {before[slices[name]].tolist()} to {z[slices[name]].tolist()}. Put a "
+        "UnitDelay(initial_value=…) on one of the wires between.",
+        block=path,
+        port=port,
+    )
