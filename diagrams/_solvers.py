@@ -41,7 +41,7 @@ from ..blocks._errors import NonFiniteError, OptionError, SimulationError, near
 Dense = Callable[[float], np.ndarray]
 
 _STRETCH = 2_000  # steps between two looks at the progress
-_HOPELESS = 1e8  # steps to go, at which a run is given up: hours
+_HOPELESS = 1e7  # steps to go, at which a run is given up
 
 
 @dataclass(frozen=True)
@@ -129,9 +129,10 @@ class Solver(ABC):
         """Raise if an entry is not finite; ``what`` is "state" or "rate"."""
         if not np.isfinite(values).all():
             i = int(np.flatnonzero(~np.isfinite(values))[0])
+            growth = "a step too long for a fast mode (try a tenth of it)" if self.fixed else "unbounded growth"
             raise NonFiniteError(
                 f"The {what} of {self.problem.names[i]} is {values[i]:g} with solver={self.name!r}; expected a finite "
-                "number. Look for a division by zero, a root or a logarithm of a negative number, or unbounded growth.",
+                f"number. Look for a division by zero, a root or a logarithm of a negative number, or {growth}.",
                 t=t,
             )
 
@@ -233,9 +234,9 @@ class FixedStep(Solver):
         last = self._done >= self._count
         t_new = self.stop if last else self._start + self._done * ((self.stop - self._start) / self._count)
         if self.problem.size:
-            f = self.rate(t, x)
-            self.finite(t, f, "rate")
             with np.errstate(all="ignore"):
+                f = self.rate(t, x)
+                self.finite(t, f, "rate")
                 x_new = self._formula(self.rate, t, x, f, t_new)
             self.finite(t_new, x_new, "state")
         else:
@@ -256,7 +257,8 @@ def _euler(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarr
 def _heun(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray, t_new: float) -> np.ndarray:
     """Heun's method, order 2, two stages: the mean of the rates at both ends. Stable for h < 2/|λ| for a real pole."""
     h = t_new - t
-    return x + (0.5 * h) * (f + rate(t_new, x + h * f))
+    x_new: np.ndarray = x + (0.5 * h) * (f + rate(t_new, x + h * f))
+    return x_new
 
 
 def _rk4(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray, t_new: float) -> np.ndarray:
@@ -266,7 +268,8 @@ def _rk4(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray
     k2 = rate(middle, x + (0.5 * h) * f)
     k3 = rate(middle, x + (0.5 * h) * k2)
     k4 = rate(t_new, x + h * k3)
-    return x + (h / 6) * (f + 2 * (k2 + k3) + k4)
+    x_new: np.ndarray = x + (h / 6) * (f + 2 * (k2 + k3) + k4)
+    return x_new
 
 
 _FIXED = {"euler": _euler, "heun": _heun, "rk4": _rk4}

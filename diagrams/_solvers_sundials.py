@@ -123,7 +123,7 @@ class _Calls:
     def view(self, address: int, size: int) -> np.ndarray:
         """Return the memory at this address as an array."""
         if address not in self._views:
-            self._views[address] = np.frombuffer((c_double * size).from_address(address))
+            self._views[address] = np.frombuffer(memoryview((c_double * size).from_address(address)).cast("B"))
         return self._views[address]
 
     def vector(self, handle: int) -> np.ndarray:
