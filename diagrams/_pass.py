@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import casadi as ca
@@ -36,6 +36,8 @@ class Pass:
         Another order than that of a tick.
     before, visit : callable, optional
         ``before(path, inputs)`` is called ahead of each block, ``visit(path, names, inputs, made)`` after it.
+    taps : mapping, optional
+        By port: what its consumers get instead of what is put out there, a function of that.
     """
 
     def __init__(
@@ -52,11 +54,14 @@ class Pass:
         order: Any = None,
         before: Callable[..., None] | None = None,
         visit: Callable[..., None] | None = None,
+        taps: Mapping[tuple[str, str], Callable[[Any], Any]] | None = None,
     ):
         self.flat, self.acting, self.opened = flat, acting, opened
         self.t, self.x, self.w, self.p, self.fired = t, x, w, p, fired
         self.order = flat.order.steps if order is None else order
-        self.before, self.visit = before, visit
+        self.before, self.visit, self.taps = before, visit, taps or {}
+        self.returned: dict[tuple[str, str], Any] = {}
+        """What the blocks put out at ports that are tapped."""
         self.values: dict[tuple[str, str], Any] = {}
         self.new: dict[str, Any] = {}
         """Next states of the blocks that act, by path."""
@@ -75,12 +80,12 @@ class Pass:
         """Evaluate all blocks."""
         flat, table, traced = self.flat, self.flat.table, self.flat.checked.traced
         for name, where in flat.plant_outputs.slices.items():
-            self.values[flat.ports[name]] = rows(self.w, where)
+            self._put(flat.ports[name], rows(self.w, where))
         acts = {path: self._acts(table.frame_of[path]) for path in traced}
         for name, where in flat.held.slices.items():
             path, port = flat.ports[name]
             if not acts[path]:
-                self.values[path, port] = rows(self.x, where)
+                self._put((path, port), rows(self.x, where))
         torn = {}
         for name, where in flat.loops.slices.items():
             path, port = flat.ports[name]
@@ -145,7 +150,13 @@ class Pass:
         if (path, name) in torn:
             self.mismatch.append((column, torn[path, name]))
         else:
-            self.values[path, name] = column
+            self._put((path, name), column)
+
+    def _put(self, port: tuple[str, str], column: Any) -> None:
+        if port in self.taps:
+            self.returned[port] = column
+            column = self.taps[port](column)
+        self.values[port] = column
 
     def residual(self) -> Any:
         """Return the largest mismatch of the torn ports, relative to 1 + their size."""
