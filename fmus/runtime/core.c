@@ -361,17 +361,56 @@ static void lw_destroy(lw_instance *self) {
     free(self);
 }
 
+/* ---- saved states ---- */
+
+/* Serialized: the token, then the state as it is in memory (same machine type). */
+#define LW_SERIALIZED (sizeof LW_TOKEN + sizeof(lw_state))
+
+static bool lw_between_steps(lw_instance *self, const char *function) {
+    if (self->s.mode != LW_INTERMEDIATE) return true;
+    return lw_fail(self, "%s was called in Intermediate Update Mode. Call it when the step has ended.", function);
+}
+
+/* Copy `from` to *state, which is allocated where there is none. */
+static bool lw_copy_state(lw_instance *self, const char *function, const void *from, void **state) {
+    lw_state *copy = *state ? *state : malloc(sizeof *copy);
+    if (!copy) return lw_fail(self, "%s: out of memory.", function);
+    memcpy(copy, from, sizeof *copy);
+    *state = copy;
+    return true;
+}
+
+static bool lw_get_state(lw_instance *self, const char *function, void **state) {
+    return lw_between_steps(self, function) && lw_copy_state(self, function, &self->s, state);
+}
+
 /* A state from outside: is it one of this very FMU, and of this interface type? */
 static bool lw_accept_state(lw_instance *self, const char *function, const lw_state *state) {
+    if (!state) return lw_fail(self, "%s: the state is NULL. Get one first.", function);
     if (state->magic != LW_MAGIC || state->mode < LW_INSTANTIATED || state->mode > LW_TERMINATED)
         return lw_fail(self, "%s: this is no state of this FMU. Give one that it has made itself.", function);
-    if (self->s.mode == LW_INTERMEDIATE)
-        return lw_fail(self, "%s was called in Intermediate Update Mode. Call it when the step has ended.", function);
+    if (!lw_between_steps(self, function)) return false;
     if (state->model_exchange != self->s.model_exchange)
         return lw_fail(self, "%s: this is the state of a %s instance. Give one of the same interface type.", function,
                        state->model_exchange ? "Model Exchange" : "Co-Simulation");
     self->s = *state;
     return true;
+}
+
+static bool lw_serialize_state(lw_instance *self, const char *function, const lw_state *state, void *bytes, size_t size) {
+    if (!state || size < LW_SERIALIZED)
+        return lw_fail(self, "%s: %s. Ask for the size of the serialized state first.", function,
+                       state ? "too few bytes" : "the state is NULL");
+    memcpy(bytes, LW_TOKEN, sizeof LW_TOKEN);
+    memcpy((char *)bytes + sizeof LW_TOKEN, state, sizeof *state);
+    return true;
+}
+
+static bool lw_deserialize_state(lw_instance *self, const char *function, const void *bytes, size_t size, void **state) {
+    if (size != LW_SERIALIZED || memcmp(bytes, LW_TOKEN, sizeof LW_TOKEN))
+        return lw_fail(self, "%s: these %zu bytes are no state of this FMU (%zu bytes that begin with its "
+                       "token). Give what it has serialized itself.", function, size, LW_SERIALIZED);
+    return lw_copy_state(self, function, (const char *)bytes + sizeof LW_TOKEN, state);
 }
 
 /* ---- initialization ---- */

@@ -284,16 +284,11 @@ fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real x_nominal
 
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *FMUstate) {
     LW_SELF;
-    lw_state *copy = *FMUstate ? *FMUstate : malloc(sizeof *copy);
-    if (!copy) return LW_OK(lw_fail(self, "fmi2GetFMUstate: out of memory."));
-    *copy = self->s;
-    *FMUstate = copy;
-    return fmi2OK;
+    return LW_OK(lw_get_state(self, "fmi2GetFMUstate", FMUstate));
 }
 
 fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate FMUstate) {
     LW_SELF;
-    if (!FMUstate) return LW_OK(lw_fail(self, "fmi2SetFMUstate: the state is NULL. Get one first."));
     return LW_OK(lw_accept_state(self, "fmi2SetFMUstate", FMUstate));
 }
 
@@ -306,9 +301,6 @@ fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *FMUstate) {
     return fmi2OK;
 }
 
-/* Serialized: the token, then the state as it is in memory (same machine type). */
-#define LW_SERIALIZED (sizeof LW_TOKEN + sizeof(lw_state))
-
 fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate FMUstate, size_t *size) {
     LW_SELF;
     (void)FMUstate;
@@ -318,24 +310,12 @@ fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate FMUstate, si
 
 fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate FMUstate, fmi2Byte serializedState[], size_t size) {
     LW_SELF;
-    if (!FMUstate || size < LW_SERIALIZED)
-        return LW_OK(lw_fail(self, "fmi2SerializeFMUstate: %s. Ask fmi2SerializedFMUstateSize for the size.",
-                             FMUstate ? "too few bytes" : "the state is NULL"));
-    memcpy(serializedState, LW_TOKEN, sizeof LW_TOKEN);
-    memcpy(serializedState + sizeof LW_TOKEN, FMUstate, sizeof(lw_state));
-    return fmi2OK;
+    return LW_OK(lw_serialize_state(self, "fmi2SerializeFMUstate", FMUstate, serializedState, size));
 }
 
 fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte serializedState[], size_t size, fmi2FMUstate *FMUstate) {
     LW_SELF;
-    if (size != LW_SERIALIZED || memcmp(serializedState, LW_TOKEN, sizeof LW_TOKEN))
-        return LW_OK(lw_fail(self, "fmi2DeSerializeFMUstate: these %zu bytes are no state of this FMU (%zu bytes that begin "
-                             "with its GUID). Give what fmi2SerializeFMUstate wrote.", size, LW_SERIALIZED));
-    lw_state *copy = *FMUstate ? *FMUstate : malloc(sizeof *copy);
-    if (!copy) return LW_OK(lw_fail(self, "fmi2DeSerializeFMUstate: out of memory."));
-    memcpy(copy, serializedState + sizeof LW_TOKEN, sizeof *copy);
-    *FMUstate = copy;
-    return fmi2OK;
+    return LW_OK(lw_deserialize_state(self, "fmi2DeSerializeFMUstate", serializedState, size, FMUstate));
 }
 
 /* ---- partial derivatives (FMI 2.0, 2.1.9) ---- */

@@ -197,18 +197,11 @@ fmi3Status fmi3DoStep(fmi3Instance instance, fmi3Float64 currentCommunicationPoi
 
 fmi3Status fmi3GetFMUState(fmi3Instance instance, fmi3FMUState *FMUState) {
     LW_SELF;
-    if (self->s.mode == LW_INTERMEDIATE) return LW_OK(lw_fail(self, "fmi3GetFMUState was called in Intermediate Update Mode. "
-                                                              "Call it when the step has ended."));
-    lw_state *copy = *FMUState ? *FMUState : malloc(sizeof *copy);
-    if (!copy) return LW_OK(lw_fail(self, "fmi3GetFMUState: out of memory."));
-    *copy = self->s;
-    *FMUState = copy;
-    return fmi3OK;
+    return LW_OK(lw_get_state(self, "fmi3GetFMUState", FMUState));
 }
 
 fmi3Status fmi3SetFMUState(fmi3Instance instance, fmi3FMUState FMUState) {
     LW_SELF;
-    if (!FMUState) return LW_OK(lw_fail(self, "fmi3SetFMUState: the state is NULL. Get one first."));
     return LW_OK(lw_accept_state(self, "fmi3SetFMUState", FMUState));
 }
 
@@ -221,9 +214,6 @@ fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *FMUState) {
     return fmi3OK;
 }
 
-/* Serialized: the token, then the state as it is in memory (same machine type). */
-#define LW_SERIALIZED (sizeof LW_TOKEN + sizeof(lw_state))
-
 fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState FMUState, size_t *size) {
     LW_SELF;
     (void)FMUState;
@@ -233,24 +223,12 @@ fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState FMUSta
 
 fmi3Status fmi3SerializeFMUState(fmi3Instance instance, fmi3FMUState FMUState, fmi3Byte serializedState[], size_t size) {
     LW_SELF;
-    if (!FMUState || size < LW_SERIALIZED)
-        return LW_OK(lw_fail(self, "fmi3SerializeFMUState: %s. Ask fmi3SerializedFMUStateSize for the size.",
-                             FMUState ? "too few bytes" : "the state is NULL"));
-    memcpy(serializedState, LW_TOKEN, sizeof LW_TOKEN);
-    memcpy(serializedState + sizeof LW_TOKEN, FMUState, sizeof(lw_state));
-    return fmi3OK;
+    return LW_OK(lw_serialize_state(self, "fmi3SerializeFMUState", FMUState, serializedState, size));
 }
 
 fmi3Status fmi3DeserializeFMUState(fmi3Instance instance, const fmi3Byte serializedState[], size_t size, fmi3FMUState *FMUState) {
     LW_SELF;
-    if (size != LW_SERIALIZED || memcmp(serializedState, LW_TOKEN, sizeof LW_TOKEN))
-        return LW_OK(lw_fail(self, "fmi3DeserializeFMUState: these %zu bytes are no state of this FMU (%zu bytes that begin "
-                             "with its instantiation token). Give what fmi3SerializeFMUState wrote.", size, LW_SERIALIZED));
-    lw_state *copy = *FMUState ? *FMUState : malloc(sizeof *copy);
-    if (!copy) return LW_OK(lw_fail(self, "fmi3DeserializeFMUState: out of memory."));
-    memcpy(copy, serializedState + sizeof LW_TOKEN, sizeof *copy);
-    *FMUState = copy;
-    return fmi3OK;
+    return LW_OK(lw_deserialize_state(self, "fmi3DeserializeFMUState", serializedState, size, FMUState));
 }
 
 /* ---- partial derivatives (FMI 3.0, 2.2.11) ---- */
