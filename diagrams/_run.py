@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -35,6 +35,8 @@ class Snapshot:
     """The state vector x of the flattened diagram."""
     names: dict[str, Wire]
     """The named wires: two of one short name are told apart by what they carry."""
+    run: Any = field(default=None, repr=False, compare=False)
+    """The run that it comes from."""
 
     def __getitem__(self, name: str) -> Any:
         return self.values[resolve(name, self.names, self.values)]
@@ -98,6 +100,9 @@ class Run:
     diagram_name: str = ""
     final_state: RunState | None = field(default=None, repr=False)
     """The complete state at the end, to go on from with ``simulate(…, start=)``; None where an FMU can't save its own."""
+
+    recipe: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    """How it was run (step, solver, tolerances, start), so that an instant of it can be found again."""
 
     def __post_init__(self) -> None:
         if not self.diagram_name:
@@ -266,7 +271,7 @@ class Run:
         found = ((name, self._where(name)) for name in (*self.layout.slices, *self.wires))
         values = {name: row[where] for name, where in found if where is not None}
         first = self.layout.total if self.columns is None else int(np.searchsorted(self.columns, self.layout.total))
-        return Snapshot(float(self.t[k]), k, values, row[first:].copy(), dict(self.wires))
+        return Snapshot(float(self.t[k]), k, values, row[first:].copy(), dict(self.wires), self)
 
     def plot(self, *names: str, axes: Any = None) -> Figure:
         """Draw signals over time, one below the other, and return the figure.

@@ -108,6 +108,8 @@ class Simulation:
     ):
         self.diagram = diagram
         step = default_step(diagram, step, duration, solver)
+        options = {"step": step, "solver": solver, "rtol": rtol, "atol": atol, "max_step": max_step, "start": start}
+        self.recipe = {name: value for name, value in options.items() if value is not None}
         self.flat: FlatDiagram = diagram.flatten(step)
         self._recording = {"record": record, "every": every, "states": states, "to": to, "overwrite": overwrite}
         self._stack = ExitStack()
@@ -213,13 +215,12 @@ class Simulation:
         self._stack.close()
 
     def _load(self) -> None:
-        end = math.inf if self._last is None else self.time_of(self._last)
         for path, block in self._stepped().items():
             if block.transport:
                 continue
             try:
                 wired = [port for port in block.inputs if (path, port) in self.flat.table.wires]
-                self._plants.append((path, self._stack.enter_context(block.instantiate(wired, end))))
+                self._plants.append((path, self._stack.enter_context(block.instantiate(wired, None))))
             except SimulationError as error:
                 error.at(block=path, t=0.0)
                 self._attach(error)
@@ -470,6 +471,7 @@ class Simulation:
             columns=recorder.columns,
             has_states=self._recording["states"],
             final_state=state,
+            recipe=self.recipe,
         )
         self._recording["to"] = None
         self._recorder, self._elapsed = self._new_recorder(), 0.0
