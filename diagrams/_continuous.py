@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -69,8 +69,8 @@ class Continuous:
         self.fixed = self.solver.fixed
         if self.fixed and self.delays is not None and float(flat.base) > self.delays.shortest * (1 + 1e-12):
             raise OptionError(
-                f"the step of {float(flat.base):g} s is longer than a transport delay of {self.delays.shortest:g} s. Take "
-                "a smaller step, or a solver of variable step.",
+                f"the step of {float(flat.base):g} s is longer than a transport delay of {self.delays.shortest:g} s. "
+                "Take a smaller step, or a solver of variable step.",
                 block=name,
                 port="step",
             )
@@ -277,7 +277,7 @@ class Continuous:
             "solver": solver_memory(self.solver),
         }
 
-    def restore(self, saved: dict[str, Any]) -> None:
+    def restore(self, saved: Mapping[str, Any]) -> None:
         """Go back to what `save` returned."""
         if self.domains is not None and saved["domains"] is not None:
             self.domains.restore(saved["domains"])
@@ -351,8 +351,8 @@ def _delays(flat: FlatDiagram) -> Delays | None:
             starts.append(np.ravel(np.broadcast_to(np.asarray(block.initial_value, dtype=float), shape)).copy())
         except ValueError:
             raise ShapeError(
-                f"found an initial_value of shape {np.shape(block.initial_value)}; expected {shape}, that of the input, or a "
-                "number.",
+                f"found an initial_value of shape {np.shape(block.initial_value)}; expected {shape}, that of the "
+                "input, or a number.",
                 block=path,
                 port="initial_value",
             ) from None

@@ -136,8 +136,8 @@ class Diagram:
         ----------
         changes : mapping, optional
             By dotted path, or its unique end: a block (``"plant"``), a parameter
-            (``"controller.admittance_par.stiffness"``), a subsystem's ``sample_time``, ``method``, ``offset`` or ``delay``
-            (``"controller.sample_time"``; None: that of what surrounds it), a plant's start value
+            (``"controller.admittance_par.stiffness"``), a subsystem's ``sample_time``, ``method``, ``offset`` or
+            ``delay`` (``"controller.sample_time"``; None: that of what surrounds it), a plant's start value
             (``"plant.start.position"``).
         **more
             The same, for paths that are identifiers: ``replace(plant=Fmu("other.fmu"))``.
@@ -299,15 +299,15 @@ class Diagram:
             Simulated time in s, a multiple of the step between ticks.
         step : float or Fraction, optional
             Seconds between two ticks (samples, steps of a solver of fixed step, communication points of FMUs). Without
-            one it is the greatest common divisor of all sample times, of which those are visited at which a box acts; for
-            a diagram that is continuous only, a thousandth of the duration.
+            one it is the greatest common divisor of all sample times, of which those are visited at which a box acts;
+            for a diagram that is continuous only, a thousandth of the duration.
         solver : str
-            What integrates continuous states: "auto", of fixed step "euler", "heun", "rk4", of variable step "RK23", "RK45",
-            "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams". The default changes from an explicit to an
-            implicit method where the diagram turns out to be stiff.
+            What integrates continuous states: "auto", of fixed step "euler", "heun", "rk4", of variable step "RK23",
+            "RK45", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams". The default changes from an explicit
+            to an implicit method where the diagram turns out to be stiff.
         rtol, atol : float
-            Relative and absolute tolerance of a step of a solver of variable step; the absolute one is multiplied with the
-            nominal value of a state that declares one.
+            Relative and absolute tolerance of a step of a solver of variable step; the absolute one is multiplied with
+            the nominal value of a state that declares one.
         max_step : float, optional
             Longest step of a solver of variable step in s.
         record : list of str, optional
@@ -333,8 +333,8 @@ class Diagram:
         Raises
         ------
         SimulationError
-            `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`, a solver that can't go on, events that
-            pile up, an algebraic loop without a solution; ``error.run`` holds what was recorded until then.
+            `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`, a solver that can't go on, events
+            that pile up, an algebraic loop without a solution; ``error.run`` holds what was recorded until then.
         OptionError
             A duration that is not positive, or no multiple of the step; an unknown solver, a tolerance out of range.
         """

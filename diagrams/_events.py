@@ -2,8 +2,9 @@
 
 An indicator is in one of two domains, z > 0 or z ≤ 0 (with a hysteresis δ it leaves the first at z ≤ −δ, the second at
 z > δ). A change in the declared direction fires. Changes are looked for at a few instants inside each step of the
-solver, no further apart than two ticks, and, after an event, at instants that come geometrically closer to it; each is then located on the step's dense
-output with Brent's method, to the resolution of floating point, on the side where the domain has changed.
+solver, no further apart than two ticks, and, after an event, at instants that come geometrically closer to it; each is
+then located on the step's dense output with Brent's method, to the resolution of floating point, on the side where the
+domain has changed.
 """
 
 from __future__ import annotations
@@ -147,8 +148,8 @@ class Domains:
             counts = np.bincount([i for _, i in self._recent])
             event = self.events[int(np.argmax(counts))]
             raise SimulationError(
-                f"the event {event.name!r} chatters: {_CHATTER} events fired within {t - self._recent[0][0]:.2g} s, so the "
-                "run would not go on. What it switches drives the indicator back across zero at once. Declare "
+                f"the event {event.name!r} chatters: {_CHATTER} events fired within {t - self._recent[0][0]:.2g} s, so "
+                "the run would not go on. What it switches drives the indicator back across zero at once. Declare "
                 "a hysteresis, Event(hysteresis=…), or take a block that has one, such as Relay.",
                 block=event.path,
                 t=t,
@@ -167,9 +168,10 @@ class Domains:
             event, t = self.events[i], times[-1]
             limit = t + intervals[-1] * r / (1.0 - r)
             raise SimulationError(
-                f"the event {event.name!r} shows Zeno behaviour: it fires at intervals that shrink by {r:.4g} each time, the "
-                f"last one {intervals[-1]:.2g} s, and would fire infinitely often before t = {limit:.9g} s. Give the model a "
-                "state of rest: let its jump stop the motion below a small speed, or end the run before.",
+                f"the event {event.name!r} shows Zeno behaviour: it fires at intervals that shrink by {r:.4g} each "
+                f"time, the last one {intervals[-1]:.2g} s, and would fire infinitely often before t = {limit:.9g} s. "
+                "Give the model a state of rest: let its jump stop the motion below a small speed, or end the run "
+                "before.",
                 block=event.path,
                 t=t,
             )
@@ -179,8 +181,9 @@ class Domains:
         names = ", ".join(f"{self.events[i].path}.{self.events[i].name}" for i in np.flatnonzero(fired))
         event = self.events[int(np.flatnonzero(fired)[0])]
         return SimulationError(
-            f"events fire each other without end at one instant: after {_SAME_INSTANT} rounds {names} still fires. Let a "
-            "jump change what the other's indicator looks at only once, or declare a hysteresis, Event(hysteresis=…).",
+            f"events fire each other without end at one instant: after {_SAME_INSTANT} rounds {names} still fires. "
+            "Let a jump change what the other's indicator looks at only once, or declare a hysteresis, "
+            "Event(hysteresis=…).",
             block=event.path,
             t=t,
         )

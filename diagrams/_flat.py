@@ -288,13 +288,14 @@ class FlatDiagram:
             With the new states, held outputs and gates by name.
         """
         parts = []
-        for layout, new in (
+        made: list[tuple[Layout, Mapping[str, Any]]] = [
             (self.states, done.new),
             (self.held, done.held),
             (self.gates, done.gates),
             (self.starts, {}),
             (self.loops, {}),
-        ):
+        ]
+        for layout, new in made:
             parts += [new.get(name, rows(x, where)) for name, where in layout.slices.items()]
         return ca.vertcat(*parts) if parts else ca.MX(0, 1)
 

@@ -97,7 +97,7 @@ class Run:
     has_states: bool = field(default=True, repr=False)
     diagram_name: str = ""
     final_state: RunState | None = field(default=None, repr=False)
-    """The complete state at the end, to go on from with ``simulate(…, start=)``; None where an FMU can't save its own."""
+    """The complete state at the end, to go on from with ``simulate(…, start=)``; None where an FMU can't save its."""
 
     def __post_init__(self) -> None:
         if not self.diagram_name:
