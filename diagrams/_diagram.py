@@ -13,7 +13,8 @@ from ..blocks._errors import OptionError, UnknownNameError, WiringError, near
 from ..blocks._signals import check_name
 from ..blocks._values import Value
 from ._check import Checked, check
-from ._flat import FlatDiagram, flatten
+from ._flat import FlatDiagram
+from ._flatten import flatten
 from ._lowering import lowered
 from ._order import evaluation_order
 from ._run import Run

@@ -9,7 +9,8 @@ import numpy as np
 
 from ..blocks._errors import SimulationError
 from ._between import NONE, active_loops
-from ._flat import Clock, FlatDiagram
+from ._flat import FlatDiagram
+from ._layout import Clock
 
 TOLERANCE = 1e-9
 """Largest residual of an algebraic loop that counts as solved, relative to 1 + the size of its values."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..blocks._errors import OptionError, UnknownNameError, near
-from ._flat import Layout
+from ._layout import Layout
 from ._stored import Occurrence, Stopped, read, write
 from ._structure import Wire
 

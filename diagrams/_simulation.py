@@ -316,8 +316,7 @@ class Simulation:
         )
         n, d = flat.base.numerator, flat.base.denominator
         count, now = 0, time_of(k)
-        ticks = self._ticks_after(k, last)
-        for k in ticks:
+        for k in flat.ticks(self._tick, last, every=self._every_tick):
             try:
                 if only is not None:
                     only(now, h)
@@ -352,16 +351,6 @@ class Simulation:
         return not clocks or (
             len(clocks) == 1 and clocks[0].offset == 0 and (clocks[0].every == 1 or not self._every_tick)
         )
-
-    def _ticks_after(self, k: int, last: int) -> Iterator[int]:
-        """Yield the ticks to visit after tick ``k``, up to ``last``."""
-        clocks = self.flat.distinct
-        if self._every_tick or not clocks or any(c.every == 1 and c.offset == 0 for c in clocks):
-            yield from range(k + 1, last + 1)
-            return
-        while (k := min(c.after(k) for c in clocks)) < last:
-            yield k
-        yield last
 
     def _go_hybrid(self, last: int, progress: Any) -> None:
         """Run ticks up to ``last`` with a solver between them."""
