@@ -333,6 +333,13 @@ def test_a_trial_beyond_the_domain_of_the_rates_shortens_the_step(name):
     assert states[-1][0] == pytest.approx((1 - 1.95 / 2) ** 2, rel=1e-2 if name in {"BDF", "LSODA"} else 2e-3)
 
 
+@pytest.mark.parametrize("name", VARIABLE)
+def test_a_first_step_may_be_tried_beyond_the_domain_of_the_rates(name):
+    solver = make_solver(name, problem(tank, tank_jacobian, 1))
+    states, _ = run(solver, [1e-14], [1.9e-7])  # Euler's step to there is below zero; empty at 2e-7
+    assert 0 <= states[-1][0] < 1e-14
+
+
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_rate_that_is_not_finite_at_the_start_is_named(name):
     of = problem(lambda t, x: [1.0, math.nan], lambda t, x: np.zeros((2, 2)), 2)
