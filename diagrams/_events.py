@@ -36,17 +36,24 @@ class Domains:
         self.falling = np.array([e.direction != "rising" for e in flat.events])
         self._hysteresis = np.array([e.hysteresis for e in flat.events])
         self.above = np.zeros(len(flat.events), dtype=bool)
+        self._first = self.above
         self.fresh = True
         self._times = [deque[float](maxlen=_ZENO + 1) for _ in flat.events]
         self._largest = np.zeros(len(flat.events))
         self._recent = deque[tuple[float, int]](maxlen=_CHATTER)
 
     def _domains(self, t: float, x: np.ndarray, before: np.ndarray) -> np.ndarray:
-        return np.array(self._g(t, x) > np.where(before, -self._hysteresis, self._hysteresis))
+        now = self._g(t, x) > np.where(before, -self._hysteresis, self._hysteresis)
+        return np.where(self._open > 0.5, now, before)  # what a closed box holds, this too
 
     def begin(self, t: float, x: np.ndarray) -> None:
         """Take the domains as they are; nothing fires."""
-        self.above = np.array(self._g(t, x) > 0.0)
+        self.above = self._first = np.array(self._g(t, x) > 0.0)
+
+    def reset(self, box: str) -> None:
+        """Go back to the domains of the start for the blocks in a box, whose states have done so."""
+        inside = np.array([e.path.startswith(f"{box}.") and not e.box for e in self.events])
+        self.above = np.where(inside, self._first, self.above)
 
     def changed(self, t: float, x: np.ndarray) -> np.ndarray:
         """Take over the domains at one instant, and return which events their changes fire."""
@@ -57,7 +64,7 @@ class Domains:
 
     def _fires(self, before: np.ndarray, now: np.ndarray) -> np.ndarray:
         up, down = now & ~before & self.rising, before & ~now & self.falling
-        return np.array((up | down) & (self._open > 0.5))
+        return np.array(up | down)
 
     def locate(
         self, t_old: float, t_new: float, state: Callable[[float], np.ndarray]
@@ -195,11 +202,12 @@ class Domains:
 
     def save(self) -> Any:
         """Return what is needed to go on from here."""
-        return self.above.copy(), self.fresh, [list(d) for d in self._times], self._largest.copy(), list(self._recent)
+        times = [list(d) for d in self._times]
+        return self.above.copy(), self.fresh, times, self._largest.copy(), list(self._recent), self._first.copy()
 
     def restore(self, saved: Any) -> None:
         """Go back to what `save` returned."""
-        above, self.fresh, times, largest, recent = saved
-        self.above, self._largest = above.copy(), largest.copy()
+        above, self.fresh, times, largest, recent, first = saved
+        self.above, self._largest, self._first = above.copy(), largest.copy(), first.copy()
         self._times = [deque(d, maxlen=_ZENO + 1) for d in times]
         self._recent = deque(recent, maxlen=_CHATTER)

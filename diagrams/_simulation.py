@@ -263,7 +263,7 @@ class Simulation:
     @property
     def t(self) -> float:
         """Time that the run has reached in s."""
-        return self.time_of(self._tick)
+        return self.time_of(self._tick) if self._stopped is None else self._stopped.t
 
     @property
     def stopped(self) -> Stopped | None:
@@ -398,7 +398,7 @@ class Simulation:
         machine.here.x[:] = machine.x_next
         if continuous is not None:
             continuous.at(now)
-            if acting and continuous.delays is not None:
+            if (acting or self._plants) and continuous.delays is not None:
                 continuous.delays.edge(now)  # what is held has jumped
             if continuous.settle(now):
                 machine.look()
@@ -515,7 +515,7 @@ class Simulation:
             self._continuous.restore(state.continuous)
         self._tick, self._stopped, self._elapsed, self._begun = state.tick, state.stopped, 0.0, True
         self._recorder = self._new_recorder()
-        self._recorder.row(self.t, machine.log)
+        self._recorder.row(state.t, machine.log)
 
 
 def default_step(diagram: Diagram, step: Any, duration: float | None, solver: str) -> Any:
