@@ -79,7 +79,7 @@ def flatten(
             if (p, q) in table.wires
         }
     )
-    packed = {path: traced[path].pack(blocks[path], _period(table, path, base)) for path in paths}
+    packed = {path: traced[path].pack(blocks[path], _period(table, path)) for path in paths}
     log_shapes = dict(plant_outputs.shapes) | {join(p, q): s for p in paths for q, s in traced[p].outputs.items()}
     start_values = [
         np.ravel(port.start_value(blocks[path], traced[path].inputs))
@@ -151,12 +151,12 @@ def _events(table: Structure, checked: Checked) -> Iterator[FlatEvent]:
                 yield FlatEvent(path, name, event.direction, getattr(event, "hysteresis", 0.0), False)
 
 
-def _period(table: Structure, path: str, base: Fraction) -> float:
+def _period(table: Structure, path: str) -> float:
     frame = table.frame_of[path]
     if table.triggered(frame) is not None:
         return math.nan
     rate = table.rate(frame)
-    return float(rate if rate is not None else base)
+    return math.nan if rate is None else float(rate)
 
 
 def _clocks(table: Structure, step: Fraction | None, name: str) -> tuple[Fraction, dict[str, Clock]]:
