@@ -280,8 +280,11 @@ class TransferFunction(_TransferFunction):
         b, a = self.coefficients()
         last: int = self.__dict__["_last"]  # known by which coefficients are zero, so the same in every equal trace
         w = np.abs(a[last] / a[0]) ** (1.0 / last) if last else 1.0 + 0.0 * a[0]
-        powers = np.stack([1.0 / (a[0] * w**k) for k in range(self.order + 1)])
-        return w, b * powers, a * powers
+        factors = [1.0 / a[0]]
+        for _ in range(self.order):
+            factors.append(factors[-1] / w)
+        scale = np.stack(factors)
+        return w, b * scale, a * scale
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the output."""

@@ -40,11 +40,13 @@ class Quantizer(Block):
     def nearest(self, u: Any) -> Array:
         """Return the number of the level nearest to u."""
         check_shapes(interval=self.interval, u=u.u)
-        return np.floor(u.u / self.interval + 0.5)
+        ratio = u.u / self.interval
+        level = np.floor(ratio + 0.5)
+        return np.where(level - 0.5 > ratio, level - 1.0, level)  # just below a middle the sum is rounded up
 
     def initial(self, u: Any) -> Array:
         """Return the level at the start."""
-        return np.floor(np.asarray(u.u) / self.interval + 0.5)
+        return np.asarray(self.nearest(u))
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> Array:
         """Return the quantized signal."""
@@ -60,11 +62,8 @@ class Quantizer(Block):
         return off - 0.5, -0.5 - off
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> Array:
-        """Return the next level, or the nearest one where the signal has jumped further."""
-        near = self.nearest(u)
-        above = np.where(near > x.level, near, x.level + 1.0)  # rounding may put the middle on either side
-        below = np.where(near < x.level, near, x.level - 1.0)
-        return np.where(fired.up > 0.5, above, np.where(fired.down > 0.5, below, x.level))
+        """Return the nearest level."""
+        return self.nearest(u)
 
 
 class Relay(Block):

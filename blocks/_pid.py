@@ -70,7 +70,7 @@ class PID(Block):
     actual = Input(description="what the actuator does, in the unit of u; with tracking only")
     u = Output(description="control signal")
     excess = Output(secondary=True, description="what the limits cut off, v − u")
-    integral = State(start="start_of_integral", description="I")
+    integral = State(start=lambda block: block.initial_output or 0.0, description="I")
     filtered = State(description="x_f; with filter_time")
     clamped = State(discrete=True, description="1 while the integral is held; with clamping")
     clamp = Event("rising", "v is beyond a limit and the integral drives it further; with clamping")
@@ -158,11 +158,6 @@ class PID(Block):
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]
         """Those of the clamp, where there is one."""
         return {"clamp": type(self).clamp, "release": type(self).release} if self.clamps else {}
-
-    @property
-    def start_of_integral(self) -> float:
-        """The integral at the start, where no input is looked at."""
-        return 0.0 if self.initial_output is None else self.initial_output
 
     @property
     def starts_from_inputs(self) -> bool:

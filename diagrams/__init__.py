@@ -2,7 +2,8 @@
 
 from . import experiments
 from ._diagram import Diagram
-from ._flat import FlatDiagram, Layout
+from ._flat import FlatDiagram
+from ._layout import Layout
 from ._run import Run, Snapshot
 from ._simulation import Simulation
 from ._state import RunState

@@ -6,7 +6,8 @@ from typing import Any
 
 import casadi as ca
 
-from ._flat import Clock, FlatDiagram, rows
+from ._flat import FlatDiagram
+from ._layout import Clock, rows
 from ._pass import Pass, above, both, choose, negated
 
 NONE: frozenset[Clock] = frozenset()

@@ -189,22 +189,22 @@ def _check_boxes(table: Structure, traced: dict[str, Traced], shapes: dict[Port,
                 "time whatever the box does. Put it outside, and wire its outputs in.",
                 block=path,
             )
-        box = table.triggered(table.frame_of[path])
-        if box is None:
+        triggered = table.triggered(table.frame_of[path])
+        if triggered is None:
             continue
         trace = traced[path]
         if trace.advance not in ("none", "update") or _reads_sample_time(table.blocks[path], trace):
             raise SampleTimeError(
-                f"it needs a sample time, and the triggered box {box} has none: it acts whenever it is triggered. Put "
-                f"it outside the box, or take a block that counts samples.",
+                f"it needs a sample time, and the triggered box {triggered} has none: it acts whenever it is "
+                "triggered. Put it outside the box, or take a block that counts samples.",
                 block=path,
             )
         inner = table.clock(table.frame_of[path])
-        outer = table.clock(box)
+        outer = table.clock(triggered)
         if inner is not outer:
             raise SampleTimeError(
                 f"the box {inner.path if inner else ''} has a sample time of its own inside of the triggered box "
-                f"{box}; it acts whenever {box} is triggered. Leave the sample time out.",
+                f"{triggered}; it acts whenever {triggered} is triggered. Leave the sample time out.",
                 block=path,
             )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -69,8 +69,8 @@ class Continuous:
         self.fixed = self.solver.fixed
         if self.fixed and self.delays is not None and float(flat.base) > self.delays.shortest * (1 + 1e-12):
             raise OptionError(
-                f"the step of {float(flat.base):g} s is longer than a transport delay of {self.delays.shortest:g} s. Take "
-                "a smaller step, or a solver of variable step.",
+                f"the step of {float(flat.base):g} s is longer than a transport delay of {self.delays.shortest:g} s. "
+                "Take a smaller step, or a solver of variable step.",
                 block=name,
                 port="step",
             )
@@ -176,6 +176,7 @@ class Continuous:
             machine.here.x[:] = machine.x_next
             for i in np.flatnonzero(fired):
                 self._tell(t, self.flat.events[int(i)], before)
+                self._reset_domains(self.flat.events[int(i)])
             domains.count(t, fired, self.name)
             self._synchronize()
             fired = domains.changed(t, machine.here.x[self.where])
@@ -185,6 +186,14 @@ class Continuous:
                 self.accept()
                 return
         raise domains.too_many(t, fired)
+
+    def _reset_domains(self, event: Any) -> None:
+        """Where a box has just been enabled and its states start anew, so do the domains of its events."""
+        if not event.box or self.flat.table.frames[event.path].when != "reset":
+            return
+        if self.machine.here.x[self.flat.gates.slices[event.path]][0] > 0.5:
+            assert self.domains is not None
+            self.domains.reset(event.path)
 
     def _tell(self, t: float, event: Any, before: np.ndarray) -> None:
         states = [{} if event.box else state_values(self.flat, event.path, x) for x in (before, self.machine.here.x)]
@@ -277,7 +286,7 @@ class Continuous:
             "solver": solver_memory(self.solver),
         }
 
-    def restore(self, saved: dict[str, Any]) -> None:
+    def restore(self, saved: Mapping[str, Any]) -> None:
         """Go back to what `save` returned."""
         if self.domains is not None and saved["domains"] is not None:
             self.domains.restore(saved["domains"])
@@ -347,12 +356,15 @@ def _delays(flat: FlatDiagram) -> Delays | None:
     starts: list[Any] = []
     for path, block in zip(paths, blocks, strict=True):
         shape = flat.plant_inputs.shapes[join(path, "u")]
+        if block.initial_value is None:
+            starts.append(None)  # the first input; see `Delays.begin`
+            continue
         try:
             starts.append(np.ravel(np.broadcast_to(np.asarray(block.initial_value, dtype=float), shape)).copy())
         except ValueError:
             raise ShapeError(
-                f"found an initial_value of shape {np.shape(block.initial_value)}; expected {shape}, that of the input, or a "
-                "number.",
+                f"found an initial_value of shape {np.shape(block.initial_value)}; expected {shape}, that of the "
+                "input, or a number.",
                 block=path,
                 port="initial_value",
             ) from None

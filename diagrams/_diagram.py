@@ -9,16 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 from ..blocks._block import Block
 from ..blocks._discretization import check_method
-from ..blocks._errors import OptionError, UnknownNameError, WiringError, near
+from ..blocks._errors import OptionError, WiringError
 from ..blocks._signals import check_name
-from ..blocks._values import Value
 from ._check import Checked, check
-from ._flat import FlatDiagram, flatten
+from ._flat import FlatDiagram
+from ._flatten import flatten
 from ._lowering import lowered
 from ._order import evaluation_order
+from ._replace import replaced, unique
 from ._run import Run
 from ._structure import Collector, Frame, Structure, Wire
-from ._subsystem import exact_offset, exact_time, samples_of_delay
+from ._subsystem import exact_time
 
 if TYPE_CHECKING:
     from ._linearize import Linearization
@@ -126,10 +127,7 @@ class Diagram:
 
     def __getitem__(self, path: str) -> Block:
         """Return the block at a path, or at the unique end of one."""
-        return self._table.blocks[self._find(path)]
-
-    def _find(self, path: str) -> str:
-        return _unique(path, self._table.blocks, "block", self.name)
+        return self._table.blocks[unique(path, self._table.blocks, "block", self.name)]
 
     def replace(self, changes: Mapping[str, Any] | None = None, /, **more: Any) -> Diagram:
         """Return a variant: other blocks, parameters or sample times.
@@ -138,8 +136,8 @@ class Diagram:
         ----------
         changes : mapping, optional
             By dotted path, or its unique end: a block (``"plant"``), a parameter
-            (``"controller.admittance_par.stiffness"``), a subsystem's ``sample_time``, ``method``, ``offset`` or ``delay``
-            (``"controller.sample_time"``; None: that of what surrounds it), a plant's start value
+            (``"controller.admittance_par.stiffness"``), a subsystem's ``sample_time``, ``method``, ``offset`` or
+            ``delay`` (``"controller.sample_time"``; None: that of what surrounds it), a plant's start value
             (``"plant.start.position"``).
         **more
             The same, for paths that are identifiers: ``replace(plant=Fmu("other.fmu"))``.
@@ -149,9 +147,7 @@ class Diagram:
         UnknownNameError, ParameterError, WiringError
             A name that isn't there, a value out of bounds, a block that doesn't fit the wires.
         """
-        table = Structure(**{k: dict(v) for k, v in vars(self._table).items()})
-        for path, value in {**(changes or {}), **more}.items():
-            self._change(table, path, value)
+        table = replaced(self._table, {**(changes or {}), **more}, self.name)
         return Diagram._of(self.name, table, self.loops)
 
     def continuous(self) -> Diagram:
@@ -214,52 +210,6 @@ class Diagram:
         """Whether an FMU is in it."""
         return any(hasattr(block, "instantiate") for block in self._table.blocks.values())
 
-    def _change(self, table: Structure, path: str, value: Any) -> None:
-        head, _, last = path.rpartition(".")
-        if isinstance(value, Block):
-            full = self._find(path)
-            table.blocks[full] = value.replace(name=full.rpartition(".")[2])
-        elif last in _OF_A_BOX and (frame := self._frame(table, head, last)) is not None:
-            table.frames[frame] = _changed_box(table.frames[frame], last, value)
-        elif path in table.blocks:
-            raise WiringError(
-                f"found {value!r}; expected a block in its place, such as Fmu('other.fmu'), or the name of a parameter "
-                f"({path}.…).",
-                block=path,
-            )
-        else:
-            full, keys = self._split(table, path)
-            table.blocks[full] = _changed(table.blocks[full], keys, value)
-
-    def _frame(self, table: Structure, path: str, what: str) -> str | None:
-        """Return the subsystem that a path means; None where it means none, but perhaps a block."""
-        boxes = {frame: None for frame in table.frames if frame}
-        if path:
-            found = [f for f in boxes if f == path or f.endswith("." + path)]
-            return _unique(path, boxes, "subsystem", self.name) if found else None
-        offered = ", ".join(f"{frame}.{what}" for frame in boxes) or "none: this diagram has no subsystem"
-        raise UnknownNameError(f"a diagram has no {what!r} of its own; its subsystems have: {offered}.")
-
-    def _split(self, table: Structure, path: str) -> tuple[str, list[str]]:
-        """Return the block and the parameter path that a dotted path means."""
-        parts = path.split(".")
-        for cut in range(len(parts) - 1, 0, -1):
-            try:
-                return self._find(".".join(parts[:cut])), parts[cut:]
-            except UnknownNameError:
-                continue
-        owners = [p for p, block in sorted(table.blocks.items()) if path in type(block).parameter_specs]
-        if len(owners) == 1:
-            return owners[0], [path]
-        if owners:
-            raise UnknownNameError(
-                f"{path!r} is a parameter of {', '.join(owners)}; write the path, such as '{owners[0]}.{path}'."
-            )
-        known = {f"{p}.{q}" for p, block in table.blocks.items() for q in type(block).parameter_specs} | set(
-            table.blocks
-        )
-        raise UnknownNameError(f"nothing is called {path!r} in diagram {self.name!r}. {near(path, known)}")
-
     def flatten(self, step: float | Fraction | None = None) -> FlatDiagram:
         """Return the diagram as one CasADi function of a tick.
 
@@ -301,15 +251,15 @@ class Diagram:
             Simulated time in s, a multiple of the step between ticks.
         step : float or Fraction, optional
             Seconds between two ticks (samples, steps of a solver of fixed step, communication points of FMUs). Without
-            one it is the greatest common divisor of all sample times, of which those are visited at which a box acts; for
-            a diagram that is continuous only, a thousandth of the duration.
+            one it is the greatest common divisor of all sample times, of which those are visited at which a box acts;
+            for a diagram that is continuous only, a thousandth of the duration.
         solver : str
-            What integrates continuous states: "auto", of fixed step "euler", "heun", "rk4", of variable step "RK23", "RK45",
-            "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams". The default changes from an explicit to an
-            implicit method where the diagram turns out to be stiff.
+            What integrates continuous states: "auto", of fixed step "euler", "heun", "rk4", of variable step "RK23",
+            "RK45", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams". The default changes from an explicit
+            to an implicit method where the diagram turns out to be stiff.
         rtol, atol : float
-            Relative and absolute tolerance of a step of a solver of variable step; the absolute one is multiplied with the
-            nominal value of a state that declares one.
+            Relative and absolute tolerance of a step of a solver of variable step; the absolute one is multiplied with
+            the nominal value of a state that declares one.
         max_step : float, optional
             Longest step of a solver of variable step in s.
         record : list of str, optional
@@ -335,8 +285,8 @@ class Diagram:
         Raises
         ------
         SimulationError
-            `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`, a solver that can't go on, events that
-            pile up, an algebraic loop without a solution; ``error.run`` holds what was recorded until then.
+            `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`, a solver that can't go on, events
+            that pile up, an algebraic loop without a solution; ``error.run`` holds what was recorded until then.
         OptionError
             A duration that is not positive, or no multiple of the step; an unknown solver, a tolerance out of range.
         """
@@ -438,51 +388,3 @@ class Diagram:
         from ._simulation import Simulation
 
         return Simulation(self, **options)
-
-
-_OF_A_BOX = ("sample_time", "method", "offset", "delay")
-
-
-def _changed_box(frame: Frame, what: str, value: Any) -> Frame:
-    """Return a box with another sample time, method, offset or delay."""
-    new, path = value, frame.path
-    if what == "sample_time" and value is not None:
-        new = exact_time(value, block=path)
-    elif what == "method":
-        check_method(value)
-    elif what == "offset":
-        new = exact_offset(value, frame.sample_time, block=path)
-    elif what == "delay":
-        new = samples_of_delay(value, frame.sample_time, block=path)
-    changed: dict[str, Any] = {what: new}
-    if what == "sample_time":
-        exact_offset(frame.offset, new, block=path)
-        samples_of_delay(frame.delay, new, block=path)
-    return replace_fields(frame, **changed)
-
-
-def _unique(path: str, known: Mapping[str, Any], kind: str, diagram: str) -> str:
-    """Return the full path that ``path`` is, or is the unique end of."""
-    if not isinstance(path, str):
-        raise UnknownNameError(f"found {path!r}; expected the path of a {kind}, such as {next(iter(known), '')!r}.")
-    if path in known:
-        return path
-    found = sorted(p for p in known if p.endswith("." + path))
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise UnknownNameError(f"{path!r} stands for several {kind}s: {', '.join(found)}. Write more of the path.")
-    raise UnknownNameError(f"no {kind} {path!r} in diagram {diagram!r}. {near(path, known)}")
-
-
-def _changed(block: Value, keys: list[str], value: Any) -> Any:
-    """Return ``block`` with the parameter at a path of attribute names or mapping keys changed."""
-    name = keys[0]
-    if len(keys) == 1:
-        return block.replace(**{name: value})
-    inner = block.__dict__.get(name)
-    if isinstance(inner, Value):
-        return block.replace(**{name: _changed(inner, keys[1:], value)})
-    if isinstance(inner, Mapping):
-        return block.replace(**{name: {**inner, ".".join(keys[1:]): value}})
-    raise UnknownNameError(f"it has no parameter {'.'.join(keys)!r}. {near(name, type(block).parameter_specs)}")

@@ -12,7 +12,7 @@ from typing import Any
 from ..blocks._errors import OptionError
 
 
-def ticks_in(duration: float, base: Fraction, name: str) -> int:
+def ticks_in(duration: Any, base: Fraction, name: str) -> int:
     """Return the number of ticks in a duration; rounding of a few ulps, as in 0.1 + 0.2, is forgiven."""
     try:
         span = float(duration)

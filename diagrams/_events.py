@@ -2,8 +2,9 @@
 
 An indicator is in one of two domains, z > 0 or z ≤ 0 (with a hysteresis δ it leaves the first at z ≤ −δ, the second at
 z > δ). A change in the declared direction fires. Changes are looked for at a few instants inside each step of the
-solver, no further apart than two ticks, and, after an event, at instants that come geometrically closer to it; each is then located on the step's dense
-output with Brent's method, to the resolution of floating point, on the side where the domain has changed.
+solver, no further apart than two ticks, and, after an event, at instants that come geometrically closer to it; each is
+then located on the step's dense output with Brent's method, to the resolution of floating point, on the side where the
+domain has changed.
 """
 
 from __future__ import annotations
@@ -35,17 +36,24 @@ class Domains:
         self.falling = np.array([e.direction != "rising" for e in flat.events])
         self._hysteresis = np.array([e.hysteresis for e in flat.events])
         self.above = np.zeros(len(flat.events), dtype=bool)
+        self._first = self.above
         self.fresh = True
         self._times = [deque[float](maxlen=_ZENO + 1) for _ in flat.events]
         self._largest = np.zeros(len(flat.events))
         self._recent = deque[tuple[float, int]](maxlen=_CHATTER)
 
     def _domains(self, t: float, x: np.ndarray, before: np.ndarray) -> np.ndarray:
-        return np.array(self._g(t, x) > np.where(before, -self._hysteresis, self._hysteresis))
+        now = self._g(t, x) > np.where(before, -self._hysteresis, self._hysteresis)
+        return np.where(self._open > 0.5, now, before)  # what a closed box holds, this too
 
     def begin(self, t: float, x: np.ndarray) -> None:
         """Take the domains as they are; nothing fires."""
-        self.above = np.array(self._g(t, x) > 0.0)
+        self.above = self._first = np.array(self._g(t, x) > 0.0)
+
+    def reset(self, box: str) -> None:
+        """Go back to the domains of the start for the blocks in a box, whose states have done so."""
+        inside = np.array([e.path.startswith(f"{box}.") and not e.box for e in self.events])
+        self.above = np.where(inside, self._first, self.above)
 
     def changed(self, t: float, x: np.ndarray) -> np.ndarray:
         """Take over the domains at one instant, and return which events their changes fire."""
@@ -56,7 +64,7 @@ class Domains:
 
     def _fires(self, before: np.ndarray, now: np.ndarray) -> np.ndarray:
         up, down = now & ~before & self.rising, before & ~now & self.falling
-        return np.array((up | down) & (self._open > 0.5))
+        return np.array(up | down)
 
     def locate(
         self, t_old: float, t_new: float, state: Callable[[float], np.ndarray]
@@ -147,8 +155,8 @@ class Domains:
             counts = np.bincount([i for _, i in self._recent])
             event = self.events[int(np.argmax(counts))]
             raise SimulationError(
-                f"the event {event.name!r} chatters: {_CHATTER} events fired within {t - self._recent[0][0]:.2g} s, so the "
-                "run would not go on. What it switches drives the indicator back across zero at once. Declare "
+                f"the event {event.name!r} chatters: {_CHATTER} events fired within {t - self._recent[0][0]:.2g} s, so "
+                "the run would not go on. What it switches drives the indicator back across zero at once. Declare "
                 "a hysteresis, Event(hysteresis=…), or take a block that has one, such as Relay.",
                 block=event.path,
                 t=t,
@@ -167,9 +175,10 @@ class Domains:
             event, t = self.events[i], times[-1]
             limit = t + intervals[-1] * r / (1.0 - r)
             raise SimulationError(
-                f"the event {event.name!r} shows Zeno behaviour: it fires at intervals that shrink by {r:.4g} each time, the "
-                f"last one {intervals[-1]:.2g} s, and would fire infinitely often before t = {limit:.9g} s. Give the model a "
-                "state of rest: let its jump stop the motion below a small speed, or end the run before.",
+                f"the event {event.name!r} shows Zeno behaviour: it fires at intervals that shrink by {r:.4g} each "
+                f"time, the last one {intervals[-1]:.2g} s, and would fire infinitely often before t = {limit:.9g} s. "
+                "Give the model a state of rest: let its jump stop the motion below a small speed, or end the run "
+                "before.",
                 block=event.path,
                 t=t,
             )
@@ -179,8 +188,9 @@ class Domains:
         names = ", ".join(f"{self.events[i].path}.{self.events[i].name}" for i in np.flatnonzero(fired))
         event = self.events[int(np.flatnonzero(fired)[0])]
         return SimulationError(
-            f"events fire each other without end at one instant: after {_SAME_INSTANT} rounds {names} still fires. Let a "
-            "jump change what the other's indicator looks at only once, or declare a hysteresis, Event(hysteresis=…).",
+            f"events fire each other without end at one instant: after {_SAME_INSTANT} rounds {names} still fires. "
+            "Let a jump change what the other's indicator looks at only once, or declare a hysteresis, "
+            "Event(hysteresis=…).",
             block=event.path,
             t=t,
         )
@@ -192,11 +202,12 @@ class Domains:
 
     def save(self) -> Any:
         """Return what is needed to go on from here."""
-        return self.above.copy(), self.fresh, [list(d) for d in self._times], self._largest.copy(), list(self._recent)
+        times = [list(d) for d in self._times]
+        return self.above.copy(), self.fresh, times, self._largest.copy(), list(self._recent), self._first.copy()
 
     def restore(self, saved: Any) -> None:
         """Go back to what `save` returned."""
-        above, self.fresh, times, largest, recent = saved
-        self.above, self._largest = above.copy(), largest.copy()
+        above, self.fresh, times, largest, recent, first = saved
+        self.above, self._largest, self._first = above.copy(), largest.copy(), first.copy()
         self._times = [deque(d, maxlen=_ZENO + 1) for d in times]
         self._recent = deque(recent, maxlen=_CHATTER)

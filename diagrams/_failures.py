@@ -11,7 +11,8 @@ from ..blocks._callbacks import raise_failure
 from ..blocks._comparison import GUARDS, NEXT
 from ..blocks._errors import NonFiniteError, SimulationError
 from ..blocks._symbols import bundle
-from ._flat import Clock, FlatDiagram
+from ._flat import FlatDiagram
+from ._layout import Clock
 from ._machine import Machine
 from ._pass import Pass
 

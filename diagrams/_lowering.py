@@ -23,7 +23,7 @@ def lowered(table: Structure) -> Structure:
         rate = table.rate(table.frame_of[path])
         if block.transport and rate is not None:
             try:
-                sampled[path] = block.sampled(rate)  # type: ignore[attr-defined]
+                sampled[path] = block.sampled(rate)
             except LoopwrightError as error:
                 error.block = path
                 raise

@@ -9,7 +9,8 @@ import numpy as np
 
 from ..blocks._errors import SimulationError
 from ._between import NONE, active_loops
-from ._flat import Clock, FlatDiagram
+from ._flat import FlatDiagram
+from ._layout import Clock
 
 TOLERANCE = 1e-9
 """Largest residual of an algebraic loop that counts as solved, relative to 1 + the size of its values."""
@@ -143,7 +144,8 @@ class Machine:
 
     def plain(self, function: Any, outputs: list[np.ndarray], vectors: Vectors) -> Callable[[], None]:
         """Return the call of another function of (t, x, w, p)."""
-        return self._bind(function, vectors, outputs).call
+        call: Callable[[], None] = self._bind(function, vectors, outputs).call
+        return call
 
     # --- algebraic loops ---------------------------------------------------------------------------------------------
 
@@ -206,8 +208,9 @@ class Machine:
         loops = "\n".join(self.flat.order.loops)
         path, port = self.flat.order.torn[0]
         return SimulationError(
-            f"the algebraic loop was not solved: its residual is {residual:.3g}, expected at most {TOLERANCE:g}. Newton's "
-            f"method, started from the last solution, got no closer; the loop may have none, or several.\n{loops}\n"
+            f"the algebraic loop was not solved: its residual is {residual:.3g}, expected at most {TOLERANCE:g}. "
+            "Newton's method, started from the last solution, got no closer; the loop may have none, or "
+            f"several.\n{loops}\n"
             "Break it with a UnitDelay where a delay is real, or solve the equations for the signal by hand.",
             block=path,
             port=port,

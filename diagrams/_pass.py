@@ -10,7 +10,8 @@ import numpy as np
 
 from ..blocks._comparison import GUARDS, NEXT
 from ..blocks._symbols import size
-from ._flat import Clock, FlatDiagram, rows
+from ._flat import FlatDiagram
+from ._layout import Clock, rows
 from ._structure import join
 
 TRUE = 0.5

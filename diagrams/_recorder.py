@@ -12,8 +12,8 @@ import numpy as np
 
 from ..blocks._errors import OptionError, SimulationError, UnknownNameError
 from ._duration import memory
-from ._flat import Layout
-from ._run import entries, resolve
+from ._layout import Layout
+from ._names import entries, resolve
 from ._stored import END, Occurrence, create, line, prepare, read, split, write_json
 from ._structure import Wire
 

@@ -1,34 +1,36 @@
 """Simulation: what happens in which order.
 
-**Time.** Everything sampled happens at integer ticks of one common base, the greatest common divisor of all sample times
-and offsets (and of ``step``, where one is given). Tick k is at k·numerator / denominator seconds, rounded once: time never
-accumulates, and two rates never drift. A box with sample time T and offset d acts at d, d + T, …; between its ticks its
-outputs are held, before its first one they are what it puts out at the start. Visited are the ticks at which a box acts,
-or every tick where there is an FMU, a ``step``, or a solver of fixed step.
+**Time.** Everything sampled happens at integer ticks of one common base, the greatest common divisor of all sample
+times and offsets (and of ``step``, where one is given). Tick k is at k·numerator / denominator seconds, rounded once:
+time never accumulates, and two rates never drift. A box with sample time T and offset d acts at d, d + T, …; between
+its ticks its outputs are held, before its first one they are what it puts out at the start. Visited are the ticks at
+which a box acts, or every tick where there is an FMU, a ``step``, or a solver of fixed step.
 
 **At one instant**, in this order:
 
 1. The outputs of the FMUs are those at the end of their last step: a co-simulation FMU has no feedthrough between
    communication points (FMI 3.0, Step Mode). The continuous states are what the solver arrived at, from the left.
-2. If the instant is a tick: all blocks are evaluated once, each port after what it depends on (`_order`). A box acts if its
-   clock ticks and whatever enables or triggers it says so. The next states of sampled blocks, and what is held, take effect.
-3. Discontinuities of sources in time (a step, an edge of a pulse) are in what was just evaluated: a source's value at t is
-   its value from the right.
-4. Indicators of events are looked at. Those that have changed their domain fire, all together: each jump sees the instant
-   before all of them. Then they are looked at again, until none fires. The same happens between ticks wherever the
-   solver finds a change; such an instant has no step 2. A box that is enabled or triggered in continuous time is such an event.
+2. If the instant is a tick: all blocks are evaluated once, each port after what it depends on (`_order`). A box acts if
+   its clock ticks and whatever enables or triggers it says so. The next states of sampled blocks, and what is held,
+   take effect.
+3. Discontinuities of sources in time (a step, an edge of a pulse) are in what was just evaluated: a source's value at t
+   is its value from the right.
+4. Indicators of events are looked at. Those that have changed their domain fire, all together: each jump sees the
+   instant before all of them. Then they are looked at again, until none fires. The same happens between ticks wherever
+   the solver finds a change; such an instant has no step 2. A box that is enabled or triggered in continuous time is
+   such an event.
 5. What is to be recorded is evaluated and recorded: the values from the right, after all events.
 6. A stop condition that is true ends the run; nothing steps beyond.
-7. The continuous states go on to the next tick, with everything sampled and the FMUs' outputs held; then the inputs of the
-   FMUs, held since this tick, are set, and every FMU steps to the next one.
+7. The continuous states go on to the next tick, with everything sampled and the FMUs' outputs held; then the inputs of
+   the FMUs, held since this tick, are set, and every FMU steps to the next one.
 
-**Between ticks** the solver integrates all continuous blocks as one system. It lands on every tick at which something acts,
-on every discontinuity that a source announces (`Block.next_instant`), where it takes values from the left, and on every
-event. Other samples come from its dense output. Memory of blocks (a projection's last foot point) and the last solution of
-an algebraic loop are renewed at accepted steps only.
+**Between ticks** the solver integrates all continuous blocks as one system. It lands on every tick at which something
+acts, on every discontinuity that a source announces (`Block.next_instant`), where it takes values from the left, and on
+every event. Other samples come from its dense output. Memory of blocks (a projection's last foot point) and the last
+solution of an algebraic loop are renewed at accepted steps only.
 
-**At the start** initial states are computed in an order of their own (a block may need its inputs for it), FMUs and blocks
-are evaluated until their values agree, and indicators are taken as they are: nothing fires.
+**At the start** initial states are computed in an order of their own (a block may need its inputs for it), FMUs and
+blocks are evaluated until their values agree, and indicators are taken as they are: nothing fires.
 
 **Order of definition and hashing never matter**: blocks, states, events and boxes are taken by path.
 
@@ -59,7 +61,7 @@ from ._recorder import Recorder, select
 from ._run import Run
 from ._start import initialize
 from ._state import RunState, check_fits, layout_of
-from ._stored import Stopped, header
+from ._stored import Occurrence, Stopped, header
 from ._structure import join
 
 if TYPE_CHECKING:
@@ -72,7 +74,8 @@ _CHUNK = 1000  # ticks between two looks at the progress bar
 class Simulation:
     """A run in the making: made by `Diagram.simulation`, used in a ``with`` statement.
 
-    ``advance`` goes on, ``save`` returns the complete state, ``restore`` goes back to one, ``run`` is what was recorded.
+    ``advance`` goes on, ``save`` returns the complete state, ``restore`` goes back to one, ``run`` is what was
+    recorded.
 
     Examples
     --------
@@ -125,10 +128,8 @@ class Simulation:
             self._check_memory(self._last - first)
         self._continuous: Continuous | None = None
         if self.flat.hybrid:
-            self._continuous = Continuous(
-                self._machine, diagram.name, solver, rtol, atol, max_step, lambda event: self._recorder.event(event)
-            )
-            self._continuous.is_stopped = self._is_stopped  # type: ignore[method-assign]
+            self._continuous = Continuous(self._machine, diagram.name, solver, rtol, atol, max_step, self._on_event)
+            self._continuous.is_stopped = self._is_stopped
             self._every_tick |= self._continuous.fixed
         elif solver != "auto":
             from ._solvers import solver_name
@@ -251,7 +252,9 @@ class Simulation:
             self._begun = True
             self._at_tick(0)
         except SimulationError as error:
-            self._attach(self._who(error).at(t=self.t))
+            error = self._who(error)
+            error.at(t=self.t)
+            self._attach(error)
             raise
 
     def time_of(self, k: int) -> float:
@@ -261,7 +264,7 @@ class Simulation:
     @property
     def t(self) -> float:
         """Time that the run has reached in s."""
-        return self.time_of(self._tick)
+        return self.time_of(self._tick) if self._stopped is None else self._stopped.t
 
     @property
     def stopped(self) -> Stopped | None:
@@ -314,8 +317,7 @@ class Simulation:
         )
         n, d = flat.base.numerator, flat.base.denominator
         count, now = 0, time_of(k)
-        ticks = self._ticks_after(k, last)
-        for k in ticks:
+        for k in flat.ticks(self._tick, last, every=self._every_tick):
             try:
                 if only is not None:
                     only(now, h)
@@ -351,16 +353,6 @@ class Simulation:
             len(clocks) == 1 and clocks[0].offset == 0 and (clocks[0].every == 1 or not self._every_tick)
         )
 
-    def _ticks_after(self, k: int, last: int) -> Iterator[int]:
-        """Yield the ticks to visit after tick ``k``, up to ``last``."""
-        clocks = self.flat.distinct
-        if self._every_tick or not clocks or any(c.every == 1 and c.offset == 0 for c in clocks):
-            yield from range(k + 1, last + 1)
-            return
-        while (k := min(c.after(k) for c in clocks)) < last:
-            yield k
-        yield last
-
     def _go_hybrid(self, last: int, progress: Any) -> None:
         """Run ticks up to ``last`` with a solver between them."""
         continuous = self._continuous
@@ -368,10 +360,8 @@ class Simulation:
         clocks, count = self.flat.distinct, 0
         while self._tick < last:
             k = self._tick
-            if continuous.fixed or self._plants:
-                following = k + 1
-            else:
-                following = min([c.after(k) for c in clocks] + [last])
+            every = continuous.fixed or self._plants
+            following = k + 1 if every else min([*(c.after(k) for c in clocks), last])
             between = range(k + 1, following) if self._every_tick or not clocks else range(0)
             now = self.time_of(k)
 
@@ -409,13 +399,16 @@ class Simulation:
         machine.here.x[:] = machine.x_next
         if continuous is not None:
             continuous.at(now)
-            if acting and continuous.delays is not None:
+            if (acting or self._plants) and continuous.delays is not None:
                 continuous.delays.edge(now)  # what is held has jumped
             if continuous.settle(now):
                 machine.look()
         self._recorder.row(now, machine.log)
         self._tick = k
         self._ended()
+
+    def _on_event(self, event: Occurrence) -> None:
+        self._recorder.event(event)
 
     def _is_stopped(self) -> bool:
         return any(self._machine.log[i] > TRUE for i, _ in self._stops)
@@ -524,7 +517,7 @@ class Simulation:
             self._continuous.restore(state.continuous)
         self._tick, self._stopped, self._elapsed, self._begun = state.tick, state.stopped, 0.0, True
         self._recorder = self._new_recorder()
-        self._recorder.row(self.t, machine.log)
+        self._recorder.row(state.t, machine.log)
 
 
 def default_step(diagram: Diagram, step: Any, duration: float | None, solver: str) -> Any:
@@ -549,9 +542,7 @@ def default_step(diagram: Diagram, step: Any, duration: float | None, solver: st
     return next((span / n for n in (1000, 500, 200, 100, 10, 1) if (ticks / n).denominator == 1), span)
 
 
-def simulate(
-    diagram: Diagram, duration: float, *, progress: bool | None, start: RunState | None, **options: Any
-) -> Run:
+def simulate(diagram: Diagram, duration: Any, *, progress: bool | None, start: RunState | None, **options: Any) -> Run:
     """Run a diagram; see `Diagram.simulate`."""
     if duration is None:
         ticks_in(duration, Fraction(1), diagram.name)  # refused

@@ -78,14 +78,8 @@ class SciPySolver(VariableStep):
         self._strange = False
         if self._attempt and self._inner is not None and first is not None:  # a new object would cost a third of a step
             inner = self._inner
-            inner.t, inner.y, inner.t_bound, inner.h_abs, inner.t_old, inner.status = (
-                t,
-                x,
-                self.stop,
-                first,
-                None,
-                "running",
-            )
+            inner.t, inner.y, inner.t_bound, inner.t_old = t, x, self.stop, None
+            inner.h_abs, inner.status = first, "running"
             inner.f = self.rate(t, x)
         else:
             self._create(t, x, first)
@@ -93,9 +87,7 @@ class SciPySolver(VariableStep):
     def _create(self, t: float, x: np.ndarray, first: float | None) -> None:
         with np.errstate(all="ignore"):
             self._inner = self._method(self.rate, t, x, self.stop, first_step=first, **self._options)
-            if self.name != "LSODA" and not math.isfinite(
-                self._inner.h_abs
-            ):  # the trial for the first step went astray
+            if self.name != "LSODA" and not math.isfinite(self._inner.h_abs):  # the trial of a first step went astray
                 first = 1e-6 * (self.stop - t)
                 self._inner = self._method(self.rate, t, x, self.stop, first_step=first, **self._options)
 
@@ -130,7 +122,7 @@ class SciPySolver(VariableStep):
                     inner.step()
             if inner.status == "failed":
                 break
-            if not self._strange or (self.name != "LSODA" and self._sound(inner)):
+            if self._sound(inner):
                 self._retried = max(0, self._retried - 1) if inner is first else self._retried + 3
                 return
             h = 0.25 * (inner.t - t)
@@ -145,7 +137,12 @@ class SciPySolver(VariableStep):
 
     def _sound(self, inner: Any) -> bool:
         """Tell whether an accepted step is: a method may have met a NaN and shortened its step, which is well."""
-        return bool(np.isfinite(inner.y).all() and np.isfinite(getattr(inner, "f", 0.0)).all())
+        if self.name == "LSODA":  # which accepts a NaN
+            return not self._strange
+        if self._attempt and not self._strange:
+            return True
+        finite = np.isfinite(inner.y).all() and np.isfinite(getattr(inner, "f", 0.0)).all()
+        return bool(finite and not math.isnan(inner.h_abs))
 
     def _dense(self) -> Dense:
         return self._inner.dense_output()  # type: ignore[no-any-return]

@@ -99,13 +99,13 @@ def _library() -> _Library:
     except (ImportError, OSError, AttributeError) as error:
         raise OptionError(
             f"SUNDIALS can't be loaded: {error}. Expected version 7, as FMPy brings it for Linux and Windows (x86_64) "
-            "and macOS (arm64); upgrade it (pip install -U fmpy), or take solver='BDF', the same kind of method."
+            "and macOS (arm64) from 0.3.28 on: pip install -U fmpy, or take solver='BDF', the same kind of method."
         ) from error
     major = c_int()
     library.SUNDIALSGetVersionNumber(byref(major), byref(c_int()), byref(c_int()), ctypes.create_string_buffer(8), 8)
     if major.value != 7:
         raise OptionError(
-            f"FMPy brings SUNDIALS {major.value}; expected 7. Take solver='BDF' or another version of FMPy."
+            f"FMPy brings SUNDIALS {major.value}; expected 7. Install another version of FMPy, or take solver='BDF'."
         )
     return library
 

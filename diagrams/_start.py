@@ -39,6 +39,8 @@ def initialize(machine: Machine, plants: list[tuple[str, Any]], delays: Any) -> 
         before = machine.z.copy()
         for _, plant in plants:
             plant.exchange()
+        if delays is not None:
+            delays.begin(machine.z, machine.here.w)
         machine.tick(acting)()
         passes += 1
         if np.allclose(before, machine.z, rtol=_SETTLED, atol=0.0, equal_nan=True) and (
@@ -105,10 +107,15 @@ def _unsettled(machine: Machine, before: np.ndarray) -> SimulationError:
     slices = flat.plant_inputs.slices
     name = next(n for n, s in slices.items() if not np.allclose(before[s], z[s], rtol=_SETTLED, atol=0.0))
     path, port = flat.ports[name]
+    delay = flat.table.blocks[path].transport
+    own, step = (
+        ("its own output", "Give it an initial_value.")
+        if delay
+        else ("the FMU's own outputs", "Put a UnitDelay(initial_value=…) on one of the wires between.")
+    )
     return SimulationError(
-        f"its value at the start depends on the FMU's own outputs, and is not found: after {_MAX_PASSES} passes it "
-        f"still changes, from {before[slices[name]].tolist()} to {z[slices[name]].tolist()}. Put a "
-        "UnitDelay(initial_value=…) on one of the wires between.",
+        f"its value at the start depends on {own}, and is not found: after {_MAX_PASSES} passes it "
+        f"still changes, from {before[slices[name]].tolist()} to {z[slices[name]].tolist()}. {step}",
         block=path,
         port=port,
     )

@@ -18,8 +18,8 @@ from ._stored import Stopped
 class RunState:
     """The complete state of a run at a tick: states of all blocks, what boxes hold, the solver's memory, the FMUs.
 
-    It can be pickled. `Diagram.simulate` goes on from it with ``start=``: the diagram that it comes from, or a variant with
-    other parameters (a branch), but the same blocks and states.
+    It can be pickled. `Diagram.simulate` goes on from it with ``start=``: the diagram that it comes from, or a variant
+    with other parameters (a branch), but the same blocks and states.
 
     Attributes
     ----------
@@ -82,8 +82,8 @@ def check_fits(state: RunState, flat: FlatDiagram, name: str) -> None:
             if missing:
                 first = min(map(str, (m[0] for m in missing)))
                 raise OptionError(
-                    f"it is the state of a run of {state.diagram!r} with other blocks: {whose} the {kind} of {first!r}. A "
-                    "branch may change parameters, not blocks or wires.",
+                    f"it is the state of a run of {state.diagram!r} with other blocks: {whose} the {kind} of "
+                    f"{first!r}. A branch may change parameters, not blocks or wires.",
                     block=name,
                     port="start",
                 )

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from ..blocks._errors import OptionError
-from ._flat import Layout
+from ._layout import Layout
 from ._structure import Wire
 
 FORMAT, VERSION = "loopwright run", 1

@@ -34,6 +34,7 @@ class Delays:
 
     def __init__(self, taus: list[float], inputs: list[slice], outputs: list[slice], starts: list[np.ndarray | None]):
         self.taus, self.inputs, self.outputs, self.starts = taus, inputs, outputs, starts
+        self._from_input = [start is None for start in starts]
         self.shortest = min(taus, default=math.inf)
         angles = np.pi * np.arange(_NODES) / (_NODES - 1)
         self.nodes = 0.5 * (1.0 - np.cos(angles))
@@ -46,12 +47,12 @@ class Delays:
         self.middle = 0.0
         """An instant within the segment that is being solved: tells which side of a discontinuity is meant."""
 
-    def begin(self, t: float, z: np.ndarray) -> None:
-        """Take the inputs at the start where there is no initial value; the start is a discontinuity."""
+    def begin(self, z: np.ndarray, w: np.ndarray) -> None:
+        """Take the inputs at the start where there is no initial value, and put them out."""
         for i, where in enumerate(self.inputs):
-            if self.starts[i] is None:
+            if self._from_input[i]:
                 self.starts[i] = z[where].copy()
-        self.edge(t)
+        self.outputs_at(0.0, w)
 
     def times(self, t_old: float, t: float) -> np.ndarray:
         """Return the instants of a step at which `keep` wants the inputs."""

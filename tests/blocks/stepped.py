@@ -70,6 +70,7 @@ class Alone:
                 if step.status != 1:
                     break
                 hit = [i for i, found in enumerate(step.t_events) if len(found)]
+                assert len(self.occurred) < 500, "the events never end"
                 x, above = self._settle(t, x, u(t), above, set(hit))
             if events:
                 x, above = self._settle(t, x, u(t), above, set())

@@ -82,6 +82,8 @@ def in_time(block, end, grid=1e-2, **inputs):
             else:
                 raise AssertionError(f"endless events {names} at t = {t}")
             history.append((t, run.x.copy()))
+            if len(history) > 1000:
+                raise AssertionError(f"too many events {names} until t = {t}")
         t = stop
 
     def outputs(t):

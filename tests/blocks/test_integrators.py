@@ -155,6 +155,11 @@ def test_at_ticks_it_is_reset_to_the_input_that_it_is_told():
     assert got.tolist() == [[0.0, 0.0], [1.0, 1.0], [5.0, -1.0], [5.0, 0.0]]
 
 
+def test_at_ticks_a_signal_that_is_true_at_the_start_is_no_edge():
+    alone = Alone(ResettableIntegrator(initial_value=1.0, reset_to_input=True), T=1.0)
+    assert alone.ticks(u=np.ones(3), reset=np.ones(3), value=np.full(3, 9.0))["y"].tolist() == [1.0, 2.0, 3.0]
+
+
 def test_only_the_output_after_a_reset_feeds_it_through():
     block = ResettableIntegrator()
     shapes = {"u": (), "reset": ()}

@@ -53,6 +53,8 @@ def test_an_edge_resets_in_its_own_tick():
     alone = Alone(DiscreteIntegrator(method="backward", reset_to_input=True), T=1.0, u=(2,), value=(2,))
     got = alone.ticks(u=np.ones((3, 2)), reset=[0, 0, 1], value=np.full((3, 2), [10.0, 20.0]))["y"]
     assert got.tolist() == [[1.0, 1.0], [2.0, 2.0], [11.0, 21.0]]
+    got = alone.ticks(u=np.ones((2, 2)), reset=[1, 1], value=np.full((2, 2), 9.0))["y"]
+    assert got.tolist() == [[1.0, 1.0], [2.0, 2.0]]  # true at the start is no edge
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from loopwright.blocks._errors import NonFiniteError, OptionError, SimulationError
+from loopwright.diagrams import _solvers_sundials
 from loopwright.diagrams._solvers import SOLVERS, Problem, make_solver
 
 FIXED = {"euler": 1, "heun": 2, "rk4": 4}
@@ -249,6 +250,21 @@ def test_a_solver_lands_on_its_stops_and_never_looks_beyond(name):
     assert x[0] == pytest.approx(math.exp(-2), rel={"euler": 0.05, "heun": 2e-3}.get(name, 2e-4))
 
 
+@pytest.mark.parametrize("name", VARIABLE)
+def test_rounding_does_not_carry_a_stage_beyond_the_stop(name):
+    rng, stop = np.random.default_rng(3), 0.0
+
+    def rate(t, x):
+        assert t <= stop  # t + (stop - t), which is one ulp above it for these pairs
+        return np.zeros(1)
+
+    solver = make_solver(name, problem(rate, lambda t, x: np.zeros((1, 1)), 1), rtol=1e-3)
+    pairs = [(t, stop) for t, stop in rng.uniform((0, 0.3), (0.1, 1), (20_000, 2)) if t + (stop - t) > stop]
+    assert len(pairs) > 20
+    for t, stop in pairs[:50]:
+        run(solver, [1.0], [stop], t)
+
+
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_jump_between_restarts_is_met_with_a_step_that_shrinks(name):
     # at rest, steps grow without bound; then the input jumps
@@ -315,6 +331,13 @@ def test_a_trial_beyond_the_domain_of_the_rates_shortens_the_step(name):
     solver = make_solver(name, problem(tank, tank_jacobian, 1))
     states, _ = run(solver, [1.0], [1.0, 1.95])  # empty at t = 2
     assert states[-1][0] == pytest.approx((1 - 1.95 / 2) ** 2, rel=1e-2 if name in {"BDF", "LSODA"} else 2e-3)
+
+
+@pytest.mark.parametrize("name", VARIABLE)
+def test_a_first_step_may_be_tried_beyond_the_domain_of_the_rates(name):
+    solver = make_solver(name, problem(tank, tank_jacobian, 1))
+    states, _ = run(solver, [1e-14], [1.9e-7])  # Euler's step to there is below zero; empty at 2e-7
+    assert 0 <= states[-1][0] < 1e-14
 
 
 @pytest.mark.parametrize("name", SOLVERS)
@@ -425,6 +448,13 @@ def test_names_ignore_capitals_and_an_unknown_one_is_answered_with_near_ones():
 def test_options_out_of_range_are_refused(options, message):
     with pytest.raises(OptionError, match=message):
         make_solver(options.pop("name", "auto"), PENDULUM, **options)
+
+
+def test_without_sundials_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(_solvers_sundials._FUNCTIONS, "sundials_of_another_version", {"f": (None,)})
+    monkeypatch.setattr(_solvers_sundials, "_library", _solvers_sundials._library.__wrapped__)
+    with pytest.raises(OptionError, match=r"SUNDIALS can't be loaded: .*pip install -U fmpy, or take solver='BDF'"):
+        make_solver("cvode", PENDULUM)
 
 
 def test_cvode_frees_its_memory():
