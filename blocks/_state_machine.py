@@ -31,11 +31,12 @@ class StateMachine(Block):
     names. Each mode is an output as well, a logic signal by its name: 1 while the machine is in it.
 
     A transition is taken while its condition is true, not only when it becomes so: one that is already true when its
-    mode is entered is acted on at once. Of several, the first in the order of ``transitions`` is taken.
+    mode is entered is acted on as well. Of several, the first in the order of ``transitions`` is taken.
 
     In a sampled frame the conditions of tick k decide the mode of tick k + 1, one transition a tick (a Moore machine):
     the outputs depend on the mode alone, and no loop through the machine is algebraic. In a continuous frame a
-    transition is an event at the instant at which its condition becomes true; several may follow each other there.
+    transition is an event at the instant at which its condition becomes true. What its own outputs change at that
+    instant is waited for: a condition that is true when its mode is entered acts right after, not at the same instant.
 
     Raises
     ------
@@ -119,12 +120,13 @@ class StateMachine(Block):
     def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, ...] | Array:
         """Return, for each transition, how far its condition is above 0.5, as long as it counts.
 
-        It is never above t: no event fires at the start itself, and so a condition that is true then acts right after.
+        It is never above the time in the mode: at the instant at which a mode is entered the conditions may still be
+        those of the last one, and at the start no event fires. One that is true then acts right after.
         """
-        values = []
+        values, elapsed = [], t - x.since
         for source, _, condition in self.transitions:
             above = self._holds(x.active, source, u, condition) - 0.5
-            values.append(np.where(above > t, t, above))
+            values.append(np.where(above > elapsed, elapsed, above))
         return tuple(values) if len(values) > 1 else values[0]
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[Array, Array]:

@@ -24,9 +24,18 @@ def replaced(table: Structure, changes: Mapping[str, Any], diagram: str) -> Stru
     return table
 
 
+def _owner(table: Structure, path: str) -> str:
+    """Return the block that a path is, or is the unique end of; "" if there is none."""
+    if path in table.blocks:
+        return path
+    found = [p for p in table.blocks if p.endswith("." + path)]
+    return found[0] if len(found) == 1 else ""
+
+
 def _change(table: Structure, path: str, value: Any, diagram: str) -> None:
     head, _, last = path.rpartition(".")
-    if isinstance(value, Block):
+    owner = table.blocks.get(_owner(table, head)) if head else None
+    if isinstance(value, Block) and not (owner is not None and last in type(owner).parameter_specs):
         full = unique(path, table.blocks, "block", diagram)
         table.blocks[full] = value.replace(name=full.rpartition(".")[2])
     elif last in _OF_A_BOX and (frame := _frame(table, head, last, diagram)) is not None:
@@ -48,6 +57,8 @@ def _frame(table: Structure, path: str, what: str, diagram: str) -> str | None:
     if path:
         found = [f for f in boxes if f == path or f.endswith("." + path)]
         return unique(path, boxes, "subsystem", diagram) if found else None
+    if any(what in type(block).parameter_specs for block in table.blocks.values()):
+        return None  # a block's parameter of that name
     offered = ", ".join(f"{frame}.{what}" for frame in boxes) or "none: this diagram has no subsystem"
     raise UnknownNameError(f"a diagram has no {what!r} of its own; its subsystems have: {offered}.")
 

@@ -24,6 +24,7 @@ from loopwright.blocks import (
     Step,
     Sum,
     TraceError,
+    TransportDelay,
     UnitDelay,
     UnitError,
     UnknownNameError,
@@ -31,7 +32,8 @@ from loopwright.blocks import (
     WiringError,
     parameter,
 )
-from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams import Diagram, experiments, subsystem
+from loopwright.fmus import gantry
 
 
 class Lag(Block):
@@ -577,3 +579,16 @@ def test_a_name_given_outside_a_box_belongs_to_where_it_is_given():
 def test_a_part_that_is_not_there_is_refused_on_a_named_wire():
     with pytest.raises(ShapeError, match=r"constant\.y\[5\] is out of range: the port has shape \(2,\)"):
         Diagram("d", Constant(value=(1.0, 2.0)).y[5].named("a"))
+
+
+def test_a_parameter_that_is_a_block_itself_is_replaced_by_its_path():
+    diagram = experiments.path_following().diagram
+    light = gantry.nominal.replace(coulomb_scale=0.0)
+    changed = diagram.replace({"feedback_linearization.model": light})
+    assert changed["feedback_linearization"].model == light
+    assert list(changed.blocks) == list(diagram.blocks)
+
+
+def test_the_delay_of_a_block_is_found_by_its_short_name():
+    diagram = Diagram("d", TransportDelay(delay=0.5, name="late")(Constant(value=1.0)))
+    assert diagram.replace(delay=0.25)["late"].delay == 0.25
