@@ -13,6 +13,7 @@ from ._environment import HandForce, PathSpring
 from ._errors import (
     AlgebraicLoopError,
     CompilerError,
+    ConfirmationError,
     DefinitionError,
     DoubleDriveError,
     DuplicateNameError,
@@ -51,6 +52,7 @@ __all__ = [
     "Call",
     "Circle",
     "CompilerError",
+    "ConfirmationError",
     "Constant",
     "CubicSpline",
     "DefinitionError",
