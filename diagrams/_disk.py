@@ -204,8 +204,8 @@ def _disk(r: Realization, skew: float) -> DiskMargin:
         raise ParameterError(f"found a loop of shape {r.D.shape}; expected a square one.", block="disk_margin")
     if not r.order or not r.stable():
         raise ParameterError(
-            f"found a closed loop with {r.unstable()} poles that are not stable among {r.order}; expected a stable one: "
-            "it has no margin.",
+            f"found a closed loop with {r.unstable()} poles of {r.order} that are not stable; expected a stable one: "
+            "this one has no margin.",
             block="disk_margin",
         )
 

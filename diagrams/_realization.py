@@ -95,7 +95,7 @@ class Realization:
         with np.errstate(divide="ignore", invalid="ignore"):
             # log|1 + p| without cancellation near p = 0
             real = 0.5 * np.log1p(np.maximum(2 * p.real + np.abs(p) ** 2, -1.0))
-            return (real + 1j * np.angle(1 + p)) / self.dt
+            return np.asarray((real + 1j * np.angle(1 + p)) / self.dt)
 
     def matrix(self, s: Any) -> np.ndarray:
         """Return the transfer matrix at the points s, shape (..., outputs, inputs)."""

@@ -106,7 +106,7 @@ def delayed_hold(plant: Any, sample_time: float, delay: float = 0.0) -> Any:
         )
     if not (sample_time > 0 and delay >= 0):
         raise ParameterError(
-            f"found a sample time of {sample_time} s and a delay of {delay} s; expected one above 0, the other not below.",
+            f"found a sample time of {sample_time} s and a delay of {delay} s; expected T > 0 and a delay ≥ 0.",
             block="delayed_hold",
         )
     n, m = P.nstates, P.ninputs
