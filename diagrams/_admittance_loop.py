@@ -33,8 +33,9 @@ implementations are told apart:
 Where M, C, M̂ and Ĉ are diagonal in the frame of the path, at rest on a path along an axis, say, one direction stands
 alone. Elsewhere unequal axes couple the two; both are then in the model, and the environment acts in one.
 
-The reduction is exact for small motions where no static force acts. One that does turns with the path: F₀ adds κ F₀ to
-the stiffness between the directions, which is not modelled.
+The reduction is exact for small motions where no static force acts, or the path is straight. On a curved path the frame
+turns under a static force F₀: for each metre along it F∥ changes by κ F₀⊥ and F⊥ by −κ F₀∥, which is not modelled. Nor
+are the limits of an `AdmittanceFilter`, which small motions don't reach.
 """
 
 from __future__ import annotations
@@ -169,9 +170,20 @@ class AdmittanceLoop(Value):
                 block=who,
                 port="xi",
             )
+        if np.any(self.velocity) and float(self._at.curvature) != 0.0:
+            raise ParameterError(
+                f"found {self.velocity.tolist()} m/s where the path is curved; expected zero there: it is a model "
+                "at rest. Choose a straight path, or linearize the diagram along a run.",
+                block=who,
+                port="velocity",
+            )
         for model in (self.model, self.true_plant):
             expect_model(cast(Any, self), model)
         _ = self.motions
+
+    @property
+    def _at(self) -> Any:
+        return self.path.frame(self.path.parameter_at(self.eta))
 
     @property
     def true_plant(self) -> PlanarModel:
@@ -191,7 +203,7 @@ class AdmittanceLoop(Value):
     @property
     def q(self) -> float:
         """1 − κ ξ₁."""
-        return 1.0 - float(self.path.frame(self.path.parameter_at(self.eta)).curvature) * self.xi
+        return 1.0 - float(self._at.curvature) * self.xi
 
     @property
     def scale(self) -> float:
@@ -206,8 +218,7 @@ class AdmittanceLoop(Value):
     @property
     def frame(self) -> np.ndarray:
         """E = [t n] at the point on the path."""
-        f = self.path.frame(self.path.parameter_at(self.eta))
-        return np.stack([f.tangent, f.normal], axis=-1)
+        return np.stack([self._at.tangent, self._at.normal], axis=-1)
 
     @cached_property
     def motions(self) -> tuple[Motion, Motion]:

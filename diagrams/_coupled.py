@@ -132,6 +132,8 @@ def growth_rate_by_control(loop: AdmittanceLoop, **environment: float) -> float:
     n = len(loop.directions)
     P, K = loop.plant_matrices(**environment), loop.controller_matrices
     if loop.implementation == "continuous":
+        if np.linalg.det(np.eye(n) - K.D @ P.D[:, :n]) <= 0.0:
+            return float("inf")
         plant = control.ss(P.A, P.B[:, :n], P.C, P.D[:, :n])
         values = control.feedback(plant, control.ss(*K), sign=1).poles()
     else:

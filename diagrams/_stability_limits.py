@@ -7,7 +7,7 @@ that become stable again beyond it follow, and are listed: bisection between two
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -188,6 +188,30 @@ def stability_limit(
         confirmed_by=confirmed,
         **common,
     )
+
+
+def stiffness_limits(loop: AdmittanceLoop, dampings: Sequence[float] = (0.0, 10.0, 100.0)) -> dict[str, StabilityLimit]:
+    """Return the limits of the environment's stiffness side by side: continuous, and sampled without and with a delay.
+
+    Parameters
+    ----------
+    loop : AdmittanceLoop
+        Robot and controller; its own implementation and delay are replaced.
+    dampings : sequence of float, optional
+        Dampings b_e of the environment, N s/m.
+
+    Returns
+    -------
+    dict
+        By the names that they have in a report, such as ``admittance.perp.ke_limit.sampled_d0.be_10``.
+    """
+    variants = {"continuous": loop.replace(implementation="continuous", delay=0)}
+    variants |= {f"sampled_d{n}": loop.replace(implementation="sampled", delay=n) for n in (0, 1)}
+    return {
+        f"admittance.{loop.side}.ke_limit.{name}.be_{b:g}": stability_limit(variant, damping=b)
+        for name, variant in variants.items()
+        for b in dampings
+    }
 
 
 def stability_map(

@@ -31,6 +31,7 @@ from loopwright.diagrams._stability_limits import (
     rule_of_thumb,
     stability_limit,
     stability_map,
+    stiffness_limits,
 )
 from loopwright.fmus import gantry_contact
 from loopwright.fmus.scara import nominal as scara
@@ -334,6 +335,23 @@ def test_a_loop_that_is_unstable_from_the_start_has_the_limit_zero():
     assert limit.confirmed_by.startswith("unstable from the start of the scan, σ = ")
 
 
+def test_limits_stand_side_by_side_by_the_names_of_a_report():
+    found = stiffness_limits(loop(delay=7), (0.0, 10.0))
+    assert list(found)[::3] == ["admittance.perp.ke_limit.continuous.be_0", "admittance.perp.ke_limit.sampled_d0.be_10"]
+    assert found["admittance.perp.ke_limit.continuous.be_10"].value == math.inf
+    assert found["admittance.perp.ke_limit.sampled_d1.be_10"] == stability_limit(loop(delay=1), damping=10.0)
+    assert len(found) == 6
+
+
+def test_acceleration_that_is_fed_back_with_the_wrong_sign_has_no_continuous_solution():
+    # half of the force too much is cancelled: (M + m) p̈ = … + 1.5 m p̈ has one up to m = 2 M
+    model = loop(feed_forward=0.0, cancelled=1.5, **CONTINUOUS)
+    mass = 2.0 * SMOOTH.mass[1]
+    assert math.isfinite(growth_rate(model, mass=0.99 * mass))
+    assert growth_rate(model, mass=1.01 * mass) == math.inf
+    assert growth_rate_by_control(model, mass=1.01 * mass) == math.inf
+
+
 def test_a_map_holds_growth_and_limits():
     k, b = np.geomspace(100.0, 1e6, 30), np.array([0.0, 10.0, 100.0])
     found = stability_map(loop(delay=1), k, b)
@@ -370,6 +388,10 @@ def test_the_loop_of_a_diagram_has_its_parameters():
         ({"path": ELLIPSE, "eta": 0.0, "xi": 0.08}, "xi: found 0.08 m; expected an offset within the reach"),
         ({"model": scara}, "Scara, which is not Cartesian; expected"),
         ({"pid_par": AdmittanceFilter(mass=1, stiffness=0, damping=1)}, "pid_par: found "),
+        (
+            {"path": ELLIPSE, "eta": 0.0, "velocity": (0.0, 0.1)},
+            "velocity: found [0.0, 0.1] m/s where the path is curved",
+        ),
         ({"delay": -1}, "delay: found -1; expected a value at least 0"),
     ],
 )
