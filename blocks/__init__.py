@@ -15,6 +15,7 @@ from ._environment import HandForce, PathSpring
 from ._errors import (
     AlgebraicLoopError,
     CompilerError,
+    ConfirmationError,
     DefinitionError,
     DoubleDriveError,
     DuplicateNameError,
@@ -71,6 +72,7 @@ __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "Clock",
     "Compare",
     "CompilerError",
+    "ConfirmationError",
     "Constant",
     "Counter",
     "CubicSpline",

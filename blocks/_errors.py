@@ -21,9 +21,10 @@
     │   ├── GuardError
     │   │   └── PathDomainError           a position outside the domain of a path's coordinates
     │   └── FmuRuntimeError               an FMU's function returned an error
-    └── FmuError (RuntimeError)           an FMU that can't be read, built or loaded
-        ├── FmuFileError
-        └── CompilerError
+    ├── FmuError (RuntimeError)           an FMU that can't be read, built or loaded
+    │   ├── FmuFileError
+    │   └── CompilerError
+    └── ConfirmationError (RuntimeError)  two independent computations of one number disagree
 
 Each says who (block path, port), when (t), what was found, what was expected, and one next step.
 """
@@ -178,6 +179,10 @@ class FmuFileError(FmuError):
 
 class CompilerError(FmuError):
     """No C compiler was found, or it failed; its own message is quoted."""
+
+
+class ConfirmationError(LoopwrightError, RuntimeError):
+    """A number and its independent confirmation (eigenvalues, encirclements, another algorithm) disagree."""
 
 
 def near(name: str, known: Iterable[str]) -> str:

@@ -1,10 +1,26 @@
-"""Diagrams: wiring, scheduling, simulation; the diagram of Fig. 3 and its experiments; the command line."""
+"""Diagrams: wiring, scheduling, simulation; margins of its loops; Fig. 3 and its experiments; the command line."""
 
 from . import experiments
+from ._control_values import Comparison, compare_with_control
 from ._diagram import Diagram
+from ._disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
 from ._flat import FlatDiagram
 from ._layout import Layout
+from ._linearize import Linearization
+from ._margins import GainCrossover, Margins, PhaseCrossover, margins
+from ._number import Number
+from ._nyquist import NyquistCount, nyquist_count
+from ._operating_point import OperatingPoint
+from ._placement import SampledDesign, place, sampled_gains, sampled_poles
 from ._run import Run, Snapshot
+from ._sensitivities import (
+    GangOfFour,
+    complementary,
+    delayed_hold,
+    delayed_hold_margin,
+    gang_of_four,
+    sensitivity,
+)
 from ._simulation import Simulation
 from ._state import RunState
 from ._stored import Occurrence, Stopped
@@ -13,19 +29,44 @@ from ._subsystem import Subsystem, subsystem
 from .fig3 import fig3
 
 __all__ = [
+    "Comparison",
     "Diagram",
+    "DiskMargin",
     "FlatDiagram",
     "Frame",
+    "GainCrossover",
+    "GangOfFour",
     "Layout",
+    "Linearization",
+    "Margins",
+    "Number",
+    "NyquistCount",
     "Occurrence",
+    "OperatingPoint",
+    "PhaseCrossover",
     "Run",
     "RunState",
+    "SampledDesign",
     "Simulation",
     "Snapshot",
     "Stopped",
     "Subsystem",
     "Wire",
+    "compare_with_control",
+    "complementary",
+    "delayed_hold",
+    "delayed_hold_margin",
+    "disk_margin",
     "experiments",
     "fig3",
+    "gang_of_four",
+    "loop_at",
+    "margins",
+    "mimo_disk_margin",
+    "nyquist_count",
+    "place",
+    "sampled_gains",
+    "sampled_poles",
+    "sensitivity",
     "subsystem",
 ]

@@ -1,0 +1,46 @@
+"""A number of a report, with what can be said for it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number that a control engineer can trust: value, unit, tolerance, and how it was confirmed.
+
+    Parameters
+    ----------
+    value : float
+        The value; infinite where there is no limit, NaN where the quantity does not exist.
+    unit : str
+        Its unit, "1" where it has none.
+    tolerance : float
+        Absolute bound of the numerical error of the value, in its unit.
+    confirmed_by : str
+        The independent computation that agreed.
+
+    Examples
+    --------
+    >>> float(Number(71.25, "deg", 1e-9, "closed-loop eigenvalues"))
+    71.25
+    """
+
+    value: float
+    unit: str
+    tolerance: float
+    confirmed_by: str
+
+    def __post_init__(self) -> None:
+        for name in ("value", "tolerance"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+
+    def __float__(self) -> float:
+        return self.value
+
+    def __str__(self) -> str:
+        return f"{self.value:.6g}" + ("" if self.unit == "1" else f" {self.unit}")
+
+    def as_dict(self) -> dict[str, float | str]:
+        """Return the four entries by name, as they stand in a report's JSON."""
+        return asdict(self)
