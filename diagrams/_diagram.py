@@ -11,6 +11,7 @@ from ..blocks._block import Block
 from ..blocks._discretization import check_method
 from ..blocks._errors import OptionError, WiringError
 from ..blocks._signals import check_name
+from ._analysis import Analysis
 from ._check import Checked, check
 from ._flat import FlatDiagram
 from ._flatten import flatten
@@ -22,15 +23,13 @@ from ._structure import Collector, Frame, Structure, Wire
 from ._subsystem import exact_time
 
 if TYPE_CHECKING:
-    from ._linearize import Linearization
-    from ._operating_point import OperatingPoint
     from ._simulation import Simulation
     from ._state import RunState
 
 LOOPS = ("error", "solve")
 
 
-class Diagram:
+class Diagram(Analysis):
     """A diagram: what its last calls need, found by walking the wires backwards.
 
     Building it checks everything: unwired inputs, double drives, shapes, units, names, algebraic loops.
@@ -307,73 +306,6 @@ class Diagram:
             overwrite=overwrite,
             start=start,
             progress=progress,
-        )
-
-    def operating_point(self, t: float = 0.0, **options: Any) -> OperatingPoint:
-        """Run to a time, and return everything that a linear model at that instant depends on.
-
-        Parameters
-        ----------
-        t : float
-            Time in s, a tick.
-        **options
-            How to run: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step`` and ``start`` of `simulate`.
-        """
-        from ._operating_point import at_time
-
-        return at_time(self, t, options)
-
-    def linearize(
-        self,
-        point: Any = None,
-        *,
-        inputs: str | Iterable[str] = (),
-        outputs: str | Iterable[str] = (),
-        openings: str | Iterable[str] = (),
-        plants: str | None = None,
-        **options: Any,
-    ) -> Linearization:
-        """Return the linear model of this very diagram at an operating point.
-
-        It is continuous where everything is continuous. With sampled subsystems it is discrete, over one base period or,
-        with several rates, their least common one; hold, delay and the time between ticks are exact.
-
-        Parameters
-        ----------
-        point : OperatingPoint, Snapshot or float, optional
-            Where: ``run.at(t)``, a time in s, `operating_point`, `trim`; the start without it.
-        inputs : str or list of str
-            Wires or ports at which a signal is injected: added to what the consumers get; over a period it is held.
-        outputs : str or list of str
-            Wires or ports that are measured: what the block puts out, ahead of an injection there.
-        openings : str or list of str
-            Wires that are cut behind the port, for all its consumers, which get its value at the operating point: that
-            stays what it is.
-        plants : {"equations", "step"}, optional
-            How an FMU's step is linearized: by its equations' Jacobian and a matrix exponential, right at an equilibrium, or
-            by differences of the step itself. Without it the first at an equilibrium, else the second.
-        **options
-            How to run to the operating point, where it is a time: see `operating_point`. With ``step`` a diagram that is
-            continuous but for an FMU is linearized over its communication step.
-
-        Returns
-        -------
-        Linearization
-            With `Linearization.system`, a `control.StateSpace` with names, and the loops: ``.loop("v_perp")``.
-
-        Raises
-        ------
-        UnknownNameError
-            A signal that isn't there.
-        WiringError
-            An opening at which nothing is wired, or a transport delay in continuous time.
-        FmuError
-            An FMU that can't be linearized; the error says what it lacks.
-        """
-        from ._linearize import linearize
-
-        return linearize(
-            self, point, inputs=inputs, outputs=outputs, openings=openings, plants=plants, **options
         )
 
     def simulation(self, **options: Any) -> Simulation:
