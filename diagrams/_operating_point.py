@@ -9,13 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..blocks._errors import OptionError
+from ..blocks._errors import OptionError, UnknownNameError, near
 from ._flat import FlatDiagram
 from ._run import Snapshot
+from ._state import layout_of
 from ._structure import join
 
 if TYPE_CHECKING:
     from ._diagram import Diagram
+
+OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start")
+"""How to run to an operating point."""
+MORE = {"linearize": ("inputs", "outputs", "openings", "plants"), "operating_point": ("t",)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,8 +42,8 @@ class OperatingPoint:
     plants : mapping
         Time, states and inputs of each FMU by path, as `Fmu.linear_model` takes them.
     residual : float
-        How far it is from an equilibrium: the largest change of a state over the next tick, and of a continuous state in
-        one second, relative to 1 + its size.
+        How far it is from an equilibrium: the largest change of a state over the next tick, and of a continuous state
+        in one second, relative to 1 + its size.
     largest : str
         The state with that residual.
     how : str
@@ -57,6 +62,32 @@ class OperatingPoint:
     how: str = "run"
     values: Mapping[str, Any] = field(default_factory=dict, repr=False)
     """Every signal by its path, then."""
+    layout: tuple[Any, ...] = field(default=(), repr=False)
+    """What its vectors mean: two diagrams with one of these can exchange operating points."""
+
+    def check_fits(self, flat: FlatDiagram, name: str) -> None:
+        """Refuse the operating point of a diagram with other blocks, states or ports.
+
+        Raises
+        ------
+        OptionError
+            If it is one.
+        """
+        sizes = (self.x.size, self.w.size, self.z.size)
+        needed = (flat.width, flat.plant_outputs.total, flat.plant_inputs.total)
+        if sizes == needed and (not self.layout or self.layout == layout_of(flat)):
+            return
+        raise OptionError(
+            "it is the operating point of a diagram with other blocks or wires. Make one of this diagram: "
+            "diagram.operating_point(t), or linearize(t).",
+            block=name,
+            port="operating point",
+        )
+
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters that belong to it, where a trim has found them, by path, as `Diagram.replace` takes them."""
+    residuals: Mapping[str, float] = field(default_factory=dict, repr=False)
+    """What a trim has left of each of its equations, by name, largest first."""
 
 
 def capture(simulation: Any, how: str = "run") -> OperatingPoint:
@@ -81,10 +112,13 @@ def capture(simulation: Any, how: str = "run") -> OperatingPoint:
         largest,
         how,
         values,
+        layout_of(flat),
     )
 
 
-def from_equilibrium(flat: FlatDiagram, t: float, x: np.ndarray, w: np.ndarray, x_next: np.ndarray) -> tuple[float, str]:
+def from_equilibrium(
+    flat: FlatDiagram, t: float, x: np.ndarray, w: np.ndarray, x_next: np.ndarray
+) -> tuple[float, str]:
     """Return the largest relative change of a state, and whose it is."""
     found, who = 0.0, ""
     rates = np.zeros(flat.width)
@@ -95,6 +129,21 @@ def from_equilibrium(flat: FlatDiagram, t: float, x: np.ndarray, w: np.ndarray, 
         if change.size and change.max() > found:
             found, who = float(change.max()), path
     return found, who
+
+
+def check_options(diagram: Diagram, options: Mapping[str, Any], what: str) -> None:
+    """Refuse what is no option of how to run to an operating point.
+
+    Raises
+    ------
+    UnknownNameError
+        If something else is given.
+    """
+    for name in options:
+        if name not in OPTIONS:
+            raise UnknownNameError(
+                f"{what} takes no {name!r}. {near(name, (*OPTIONS, *MORE.get(what, ())))}", block=diagram.name
+            )
 
 
 def operating_point(diagram: Diagram, point: Any, options: Mapping[str, Any]) -> OperatingPoint:
@@ -108,13 +157,12 @@ def operating_point(diagram: Diagram, point: Any, options: Mapping[str, Any]) ->
     if isinstance(point, OperatingPoint):
         return point
     if isinstance(point, Snapshot):
-        run = getattr(point, "run", None)
-        recipe = dict(getattr(run, "recipe", {}) or {})
-        recipe.update(options)
-        return at_time(diagram, point.t, recipe)
+        recipe = dict(getattr(point.run, "recipe", {}) or {})
+        return at_time(diagram, point.t, {**recipe, **options})
     if point is None:
-        return at_time(diagram, 0.0, options)
-    if isinstance(point, int | float) and not isinstance(point, bool):
+        start = options.get("start")
+        return at_time(diagram, 0.0 if start is None else start.t, options)
+    if isinstance(point, int | float | np.floating | np.integer) and not isinstance(point, bool):
         return at_time(diagram, float(point), options)
     raise OptionError(
         f"found {point!r}; expected an operating point: run.at(t), a time in s, diagram.operating_point(…), "
@@ -128,15 +176,64 @@ def at_time(diagram: Diagram, t: float, options: Mapping[str, Any]) -> Operating
     """Run a diagram to a time, and return the operating point there."""
     from ._simulation import Simulation
 
+    check_options(diagram, options, "operating_point")
     options = dict(options)
     start = options.get("start")
-    if options.get("step") is None and diagram.is_continuous and not diagram.has_clock and not diagram.has_fmu:
-        options["step"] = Fraction(repr(float(t))) if t > 0 else Fraction(1, 1000)
+    first = 0.0 if start is None else float(start.t)
+    if not first <= t < np.inf:
+        raise OptionError(
+            f"found an operating point at t = {t!r} s; expected a time from {first:g} s on, where the run begins.",
+            block=diagram.name,
+            port="operating point",
+        )
+    if not diagram.has_clock and start is None and (options.get("step") is None or not diagram.has_fmu):
+        options["step"] = _any_step(diagram, t)
+        t = 0.0 if t == 0 else float(options["step"])
     with Simulation(diagram, **options) as simulation:
-        span = t - (0.0 if start is None else start.t)
-        if span > 0:
-            simulation.advance(span)
+        if t > first:
+            _check_tick(diagram, simulation.flat.base, t)
+            simulation.advance(t - first)
+        if simulation.stopped is not None and simulation.t < t:
+            raise OptionError(
+                f"the run is stopped at t = {simulation.t:.9g} s by {simulation.stopped.block!r}, before the operating "
+                f"point at t = {t:g} s. Choose an earlier one.",
+                block=diagram.name,
+                port="operating point",
+            )
+        events = [e for e in simulation._recorder.events if e.t == simulation.t]
+        if events:
+            raise OptionError(
+                f"at t = {t:g} s the event {events[-1].event!r} of {events[-1].block!r} fires, so there is no linear "
+                "model at that instant. Choose a time before or after it.",
+                block=diagram.name,
+                port="operating point",
+            )
         return capture(simulation)
+
+
+def _check_tick(diagram: Diagram, base: Fraction, t: float) -> None:
+    n = round(Fraction(t) / base)
+    if abs(Fraction(t) - n * base) > Fraction(t) * Fraction(1, 10**12):
+        raise OptionError(
+            f"t = {t!r} s is between two ticks, {float(base):g} s apart. Take {float(n * base)!r} s, or a step=… of "
+            "which both this time and all sample times are multiples.",
+            block=diagram.name,
+            port="operating point",
+        )
+
+
+def _any_step(diagram: Diagram, t: float) -> Fraction:
+    """Return a step on which a time is a tick, where nothing else asks for one."""
+    if not t > 0:
+        return Fraction(1, 1000)
+    if diagram.has_fmu:
+        raise OptionError(
+            f"to run to t = {t:g} s the FMU needs a communication step. Give one, operating_point({t:g}, step=1e-3), "
+            "and linearize there.",
+            block=diagram.name,
+            port="step",
+        )
+    return Fraction(max(1, round(t * 10**9)), 10**9)
 
 
 def names_of_states(flat: FlatDiagram) -> list[str]:

@@ -91,7 +91,8 @@ class Pass:
         for name, where in flat.loops.slices.items():
             path, port = flat.ports[name]
             if acts[path]:
-                torn[path, port] = self.values[path, port] = rows(self.x, where)
+                torn[path, port] = rows(self.x, where)
+                self._put((path, port), torn[path, port])
         for path, names in self.order:
             if not acts[path]:
                 continue
