@@ -12,6 +12,7 @@ from ..blocks._errors import ParameterError
 
 Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 HIDDEN = 1e-11  # relative size of a coupling that counts as none when hidden modes are split off
+STRUCTURE = 1e-14  # relative size, all scaled, below which an entry is what rounding has left of a zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +70,9 @@ class Realization:
             raise ParameterError("found NaN or infinity in A, B, C or D; look at the operating point.", block=who)
         if dt:
             A = A - np.eye(len(A))
+        if len(A):  # a feedthrough that rounding has left would be crossings near infinity
+            size = max(float(np.abs(M).max(initial=0.0)) for M in _scaled(A, B, C))
+            D = np.where(np.abs(D) <= STRUCTURE * size, 0.0, D)
         for _ in range(int(delay)):
             A, B, C, D = _delayed(A, B, C, D)
         return cls(*_balanced(A, B, C), D, float(dt), np.zeros(0)).minimal()
@@ -156,14 +160,16 @@ class Realization:
 
     def minimal(self) -> Realization:
         """Return the part that is controllable and observable; what was split off is kept in ``hidden``."""
-        hidden, part = [self.hidden], self
-        for _ in range(2):
-            part, rest = _split(part)
-            part = _dual(part)
-            hidden.append(rest)
+        whole = self._without(*_connected(self))
+        part, first = _split(whole)
+        part, second = _split(_dual(part))
+        return whole._without(_dual(part), np.concatenate([first, second]))
+
+    def _without(self, part: Realization, hidden: np.ndarray) -> Realization:
+        """Return a part of this system whose response is the same, with the poles of the rest; else this system."""
         if part.order == self.order:
             return self
-        part = Realization(*_balanced(part.A, part.B, part.C), self.D, self.dt, np.concatenate(hidden))
+        part = Realization(*_scaled(part.A, part.B, part.C), self.D, self.dt, np.concatenate([self.hidden, hidden]))
         poles = self.logarithm(np.linalg.eigvals(self.A))
         size = np.abs(poles[np.isfinite(poles)])
         top = min(10 * size.max(initial=1.0), self.nyquist)
@@ -203,6 +209,39 @@ def _balanced(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, 
         return A, B, C
     _, (d, _) = matrix_balance(A, permute=False, separate=True)
     return A * d / d[:, None], B / d[:, None], C * d
+
+
+def _scaled(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scale the states so that input, states and output are of one size.
+
+    A chain of integrators has no loop that fixes its scale: balanced alone, it is scaled by what rounding has left.
+    """
+    from scipy.linalg import matrix_balance
+
+    n = len(A)
+    if not n:
+        return A, B, C
+    whole = np.block([[A, np.linalg.norm(B, axis=1)[:, None]], [np.linalg.norm(C, axis=0)[None, :], np.zeros((1, 1))]])
+    _, (d, _) = matrix_balance(whole, permute=False, separate=True)
+    d = d[:n] / d[n]
+    return A * d / d[:, None], B / d[:, None], C * d
+
+
+def _connected(r: Realization) -> tuple[Realization, np.ndarray]:
+    """Return what the input reaches and the output sees along couplings above rounding, and the poles of the rest."""
+    A, B, C = _scaled(r.A, r.B, r.C)
+    n = len(A)
+    whole = np.block([[A, B], [C, np.zeros((len(C), B.shape[1]))]])
+    size = np.abs(whole).max(initial=0.0)
+    A, B, C = (np.abs(M) > STRUCTURE * size for M in (A, B, C))
+    reached, seen = B.any(axis=1), C.any(axis=0)
+    for _ in range(n):
+        reached, seen = reached | A[:, reached].any(axis=1), seen | A[seen].any(axis=0)
+    keep = reached & seen
+    if keep.all():
+        return r, np.zeros(0)
+    part = Realization(r.A[np.ix_(keep, keep)], r.B[keep], r.C[:, keep], r.D, r.dt, r.hidden)
+    return part, np.linalg.eigvals(r.A[np.ix_(~keep, ~keep)])
 
 
 def _split(r: Realization) -> tuple[Realization, np.ndarray]:
