@@ -13,19 +13,98 @@ if TYPE_CHECKING:
 class Analysis:
     """The methods of `Diagram` that analyse it."""
 
-    def operating_point(self: Any, t: float = 0.0, **options: Any) -> OperatingPoint:
+    def operating_point(
+        self: Any, t: float = 0.0, *, states: Mapping[str, Any] | None = None, **options: Any
+    ) -> OperatingPoint:
         """Run to a time, and return everything that a linear model at that instant depends on.
 
         Parameters
         ----------
         t : float
             Time in s, a tick.
+        states : mapping, optional
+            Values of states of blocks and FMUs that are given, by path: ``{"plant.position": 0.2}``. Signals, and the
+            FMUs' outputs, are then what follows from them.
         **options
             How to run: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step`` and ``start`` of `simulate`.
+
+        Raises
+        ------
+        UnknownNameError
+            A state that isn't there.
         """
+        if states:
+            from ._trim import given
+
+            return given(self, t, states, options)
         from ._operating_point import at_time
 
         return at_time(self, t, options)
+
+    def trim(
+        self: Any,
+        free: Mapping[str, Any] | Iterable[str] | None = None,
+        targets: Mapping[str, Any] | None = None,
+        *,
+        rates: Mapping[str, Any] | None = None,
+        fixed: Iterable[str] = (),
+        at: Any = None,
+        tolerance: float = 1e-9,
+        **options: Any,
+    ) -> OperatingPoint:
+        """Find an operating point: the states and parameters at which signals have given values, and all is at rest.
+
+        Every state of a block or an FMU is unknown, unless it is fixed, and is asked to stay: rates are zero, sampled
+        states repeat. The equations are solved by least squares within bounds, with the exact derivatives of the
+        diagram and the linear models of its FMUs. A state that nothing determines stays near where the search begins.
+
+        Parameters
+        ----------
+        free : mapping of str to (low, high), or list of str, optional
+            Parameters that may change, by the paths of `replace`, with their bounds in their units, or None:
+            ``{"force.value": (-10, 10)}``. An FMU's are ``"plant.start.mass"``. A state that is named here gets bounds.
+        targets : mapping, optional
+            Values that signals are to have, by the names of wires or ports: ``{"position": 0.2}``.
+        rates : mapping, optional
+            Rates of states in their unit per second that are not zero, by path; None where any rate will do.
+        fixed : list of str, optional
+            States that keep the value with which the search begins.
+        at : OperatingPoint, Snapshot or float, optional
+            Where the search begins, as in `linearize`; also the time at which sources are taken, and what discrete
+            states and enabled boxes are. Without it, the start.
+        tolerance : float
+            Largest residual of an equation, relative to 1 + the size of what it belongs to.
+        **options
+            How to run to where the search begins, as in `operating_point`; ``step`` is needed where only an FMU steps.
+
+        Returns
+        -------
+        OperatingPoint
+            With ``parameters``, the values found, and ``residuals``, what is left of each equation by name. `linearize`
+            takes it with its parameters, ``simulate(…, start=point)`` runs from it.
+
+        Raises
+        ------
+        SimulationError
+            If no such point is found; the message has the largest residuals, and the parameters at a bound.
+        UnknownNameError, OptionError, ParameterError
+            A name that isn't there, bounds or values that don't fit, a parameter that can't change.
+        FmuError
+            An FMU without a linear model.
+
+        Examples
+        --------
+        >>> from loopwright.blocks import Constant, Integrator
+        >>> from loopwright.diagrams import Diagram
+        >>> level, inflow = Integrator(name="level"), Constant(value=1.0, name="inflow")
+        >>> tank = Diagram("tank", level(inflow - 0.5 * level.y))
+        >>> point = tank.trim(free={"inflow.value": (0, 10)}, targets={"level.y": 3.0})
+        >>> round(point.parameters["inflow.value"], 12)
+        1.5
+        """
+        from ._trim import trim
+
+        return trim(self, free, targets, rates=rates, fixed=fixed, at=at, tolerance=tolerance, **options)
 
     def linearize(
         self: Any,

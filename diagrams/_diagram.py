@@ -23,6 +23,7 @@ from ._structure import Collector, Frame, Structure, Wire
 from ._subsystem import exact_time
 
 if TYPE_CHECKING:
+    from ._operating_point import OperatingPoint
     from ._simulation import Simulation
     from ._state import RunState
 
@@ -237,7 +238,7 @@ class Diagram(Analysis):
         states: bool = True,
         to: Any = None,
         overwrite: bool = False,
-        start: RunState | None = None,
+        start: RunState | OperatingPoint | None = None,
         progress: bool | None = None,
     ) -> Run:
         """Run the diagram and return what it recorded: from t = 0, or from a saved state.
@@ -271,8 +272,9 @@ class Diagram(Analysis):
             Folder to which the samples are streamed, with bounded memory; `Run.open` opens it later.
         overwrite : bool
             Replace a run that is stored there.
-        start : RunState, optional
-            State to go on from: ``run.final_state``, or that of `Simulation.save`.
+        start : RunState or OperatingPoint, optional
+            State to go on from: ``run.final_state``, that of `Simulation.save`, or an operating point, such as
+            `trim` finds one, with the parameters that belong to it.
         progress : bool, optional
             Show a progress bar; by default on a terminal, and in a notebook where ipywidgets is installed.
 

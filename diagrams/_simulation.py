@@ -40,7 +40,6 @@ concerned; the run until then is kept in the error.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -55,7 +54,9 @@ from ._continuous import Continuous, check_solver
 from ._duration import check_memory, ticks_in
 from ._failures import failure
 from ._flat import FlatDiagram
+from ._from_point import place, placed
 from ._machine import Machine
+from ._operating_point import OperatingPoint
 from ._pass import TRUE
 from ._recorder import Recorder, select
 from ._run import Run
@@ -106,9 +107,14 @@ class Simulation:
         states: bool = True,
         to: Any = None,
         overwrite: bool = False,
-        start: RunState | None = None,
+        start: RunState | OperatingPoint | None = None,
         duration: float | None = None,
     ):
+        self._point = start if isinstance(start, OperatingPoint) else None
+        if self._point is not None:
+            diagram = placed(diagram, self._point)
+            if not diagram.is_continuous and not diagram.has_clock:
+                step = step or self._point.base
         self.diagram = diagram
         step = default_step(diagram, step, duration, solver)
         options = {"step": step, "solver": solver, "rtol": rtol, "atol": atol, "max_step": max_step, "start": start}
@@ -116,7 +122,7 @@ class Simulation:
         self.flat: FlatDiagram = diagram.flatten(step)
         self._recording = {"record": record, "every": every, "states": states, "to": to, "overwrite": overwrite}
         self._stack = ExitStack()
-        self._start_state = start
+        self._start_state = None if isinstance(start, OperatingPoint) else start
         self._machine = Machine(self.flat)
         self._plants: list[tuple[str, Any]] = []
         self._every_tick = step is not None or any(not b.transport for b in self._stepped().values())
@@ -221,7 +227,9 @@ class Simulation:
                 continue
             try:
                 wired = [port for port in block.inputs if (path, port) in self.flat.table.wires]
-                self._plants.append((path, self._stack.enter_context(block.instantiate(wired, None))))
+                since = 0.0 if self._point is None else self._point.t
+                instance = block.instantiate(wired, None, start_time=since)
+                self._plants.append((path, self._stack.enter_context(instance)))
             except SimulationError as error:
                 error.at(block=path, t=0.0)
                 self._attach(error)
@@ -247,10 +255,11 @@ class Simulation:
             if self._start_state is not None:
                 self.restore(self._start_state)
                 return
+            first = 0 if self._point is None else place(self, self._point)
             if self._continuous is not None:
                 self._continuous.begin()
             self._begun = True
-            self._at_tick(0)
+            self._at_tick(first)
         except SimulationError as error:
             error = self._who(error)
             error.at(t=self.t)
@@ -542,7 +551,9 @@ def default_step(diagram: Diagram, step: Any, duration: float | None, solver: st
     return next((span / n for n in (1000, 500, 200, 100, 10, 1) if (ticks / n).denominator == 1), span)
 
 
-def simulate(diagram: Diagram, duration: Any, *, progress: bool | None, start: RunState | None, **options: Any) -> Run:
+def simulate(
+    diagram: Diagram, duration: Any, *, progress: bool | None, start: RunState | OperatingPoint | None, **options: Any
+) -> Run:
     """Run a diagram; see `Diagram.simulate`."""
     if duration is None:
         ticks_in(duration, Fraction(1), diagram.name)  # refused
