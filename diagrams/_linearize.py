@@ -100,7 +100,9 @@ class Linearization:
             key: [e.replace(".", "_") for e in labels]
             for key, labels in (("inputs", self.inputs), ("outputs", self.outputs), ("states", self.states))
         }
-        return StateSpace(self.A, self.B, C, D, self.dt, name=name, remove_useless_states=False, **names)
+        return StateSpace(
+            self.A, self.B, C, D, self.dt, name=name.replace(".", "_"), remove_useless_states=False, **names
+        )
 
     @property
     def poles(self) -> np.ndarray:
