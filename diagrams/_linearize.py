@@ -319,13 +319,14 @@ def batch(
     diagram: Diagram, points: Iterable[Any] = (None,), variants: Iterable[Mapping[str, Any]] = ({},), **options: Any
 ) -> list[Linearization]:
     """Linearize at several operating points, and with several parameters; see `Diagram.linearize_batch`."""
-    made = []
+    made, points = [], list(points)
     for changes in variants:
-        variant = diagram.replace(changes) if changes else diagram
-        for point in points:
-            try:
+        point: Any = None
+        try:
+            variant = diagram.replace(changes) if changes else diagram
+            for point in points:
                 made.append(linearize(variant, point, **options))
-            except LoopwrightError as error:
-                error.message = f"{error.message} (with {dict(changes)}, at {point!r})"
-                raise
+        except LoopwrightError as error:
+            error.message = f"{error.message} (with {dict(changes)}, at {point!r})"
+            raise
     return made
