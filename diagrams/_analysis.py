@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ._drawing import Drawing
+    from ._frequency_response import FrequencyResponse
     from ._linearize import Linearization
     from ._operating_point import OperatingPoint
+    from ._report_model import Report
 
 
 class Analysis:
@@ -189,3 +193,162 @@ class Analysis:
         from ._linearize import batch
 
         return batch(self, points, variants, **options)
+
+    def report(
+        self: Any,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        pdf: bool = False,
+        json: bool = False,
+        **options: Any,
+    ) -> Report:
+        """Analyse the diagram for design, and write the report; see docs/reports.md.
+
+        Parameters
+        ----------
+        path : path, optional
+            File to write, ``.html``; without it nothing is written. A notebook shows what is returned.
+        pdf, json : bool
+            Write ``.pdf`` (which needs ``pip install 'loopwright[pdf]'``) and ``.json`` beside it, too.
+        **options
+            What `loopwright.diagrams._report_analysis.analyse` takes, such as ``point`` and ``loops``.
+
+        Returns
+        -------
+        Report
+            Its sections, and ``.numbers()`` by dotted path.
+
+        Raises
+        ------
+        OptionError
+            A path that does not end in ``.html``, or a PDF without the library that makes it.
+        ConfirmationError
+            A number that its independent confirmation does not bear out.
+        """
+        from ._report_analysis import analyse
+        from ._report_figures import with_drawing
+        from ._report_files import check_files, write_report
+
+        check_files(path, pdf=pdf, json=json)
+        made = with_drawing(analyse(self, **options), self)
+        write_report(made, path, pdf=pdf, json=json)
+        return made
+
+    def draw(
+        self: Any,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        box: str = "",
+        closed: bool | Iterable[str] | None = None,
+    ) -> Drawing:
+        """Draw the diagram itself: blocks, boxes with their rates, wires with their names, FMUs marked.
+
+        Signals run from left to right; what closes a loop runs back below. Nothing but Python is needed.
+
+        Parameters
+        ----------
+        path : path, optional
+            File to write, ``.svg``.
+        box : str
+            Path of the subsystem whose inside is drawn; the whole diagram without it.
+        closed : bool or list of str, optional
+            Subsystems that are drawn closed: all of them, or those of the list. Without it all are open, in a diagram
+            of more than 40 blocks closed.
+
+        Returns
+        -------
+        Drawing
+            A notebook shows it; ``.svg`` is its text.
+
+        Raises
+        ------
+        OptionError
+            No such subsystem, or a file that is no ``.svg``.
+
+        Examples
+        --------
+        >>> from loopwright.blocks import Gain, Sine
+        >>> from loopwright.diagrams import Diagram
+        >>> Diagram("demo", Gain(gain=2)(Sine(frequency=1))).draw().svg[:4]
+        '<svg'
+        """
+        from ._drawing import Drawing, draw
+
+        drawing = Drawing(draw(self, box=box, closed=closed))
+        if path is not None:
+            drawing.save(path)
+        return drawing
+
+    def _repr_svg_(self: Any) -> str:
+        return str(self.draw().svg)
+
+    def frequency_response(
+        self: Any,
+        wire: str,
+        frequencies: Any,
+        *,
+        amplitude: float,
+        kind: str = "sine",
+        at: Any = 0.0,
+        outputs: str | Iterable[str] = (),
+        windows: int = 40,
+        agreement: float = 1e-6,
+        **options: Any,
+    ) -> FrequencyResponse:
+        """Measure a frequency response on the running diagram: a test signal d is added at a wire.
+
+        With v what the wire's port puts out, and u = v + d what all its consumers get, S = u/d, T = −v/d and L = −v/u,
+        which is what `Linearization.sensitivity`, `complementary` and `loop` say of the same wire. All are sampled where
+        the linear model is, at the ticks of the least common period of what is sampled, and d is held between them; in a
+        diagram that is continuous throughout, d is continuous. So the phasors are those of what is sampled: a plant's
+        velocity, read at 1 kHz, holds the aliased ripple of the controller's hold, and its fundamental in continuous
+        time is another by 1e-4 to 1e-3.
+
+        The signal is ramped in; then windows of whole periods follow until two agree. Sources go on meanwhile: take a
+        diagram whose references stand still, or a time from which on they do, and look at ``moved``.
+
+        Parameters
+        ----------
+        wire : str
+            A wire or port, or an entry of it, ``"motor_force[0]"``. Of one with several entries, each is excited in a
+            run of its own, and the responses are matrices.
+        frequencies : array_like
+            In rad/s. They are moved by less than half a sample in a window, so that whole periods fit into it.
+        amplitude : float
+            Largest value of the test signal, in the wire's unit: small enough that nothing saturates.
+        kind : {"sine", "multisine", "chirp"}
+            One sine after the other; all at once, with Schroeder's phases; a linear sweep over their range, repeated.
+        at : OperatingPoint, Snapshot or float
+            Where: `trim`, ``run.at(t)``, or a time in s that is run to first.
+        outputs : str or list of str
+            Further signals to be measured: `FrequencyResponse.response`, from the test signal to them.
+        windows : int
+            Most windows that are waited for.
+        agreement : float
+            Relative difference of two windows at which a frequency is done.
+        **options
+            How to run, as in `operating_point`. A continuous diagram is run with rtol = 1e-9, atol = 1e-12, and sampled
+            16 times in a period of the highest frequency, if nothing else is said.
+
+        Returns
+        -------
+        FrequencyResponse
+            ``S``, ``T``, ``L`` and ``response`` as `control.FrequencyResponseData`, with the estimate's own
+            ``uncertainty`` and ``distortion``; ``compare(linearization)`` is the largest relative deviation from a
+            linear model.
+
+        Raises
+        ------
+        UnknownNameError
+            A signal that isn't there.
+        WiringError
+            A port that nothing is wired to.
+        OptionError
+            Frequencies that are not positive or too high for the samples, no amplitude, an unknown kind.
+        """
+        from ._frequency_response import frequency_response
+
+        return frequency_response(
+            self, wire, frequencies, amplitude=amplitude, kind=kind, at=at, outputs=outputs, windows=windows,
+            agreement=agreement, **options,
+        )  # fmt: skip

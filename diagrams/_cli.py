@@ -23,6 +23,7 @@ from typing import Any
 from ..blocks._errors import FmuError, FmuFileError, LoopwrightError, OptionError, near
 from ..fmus import gantry
 from ._cli_fmu import COMMANDS, add_commands
+from ._cli_report import add_report, report_command
 from ._cli_text import fit as _fit
 from ._cli_text import say as _say
 from ._keynumbers import DEFINITIONS, key_numbers
@@ -69,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.print_help(sys.stderr)
         return 2
     try:
-        return COMMANDS.get(arguments.command, _run)(arguments)
+        return {**COMMANDS, "report": report_command}.get(arguments.command, _run)(arguments)
     except OptionError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
         return 2
@@ -113,6 +114,7 @@ def _parser() -> argparse.ArgumentParser:
         dest="options",
         help="an option of the experiments; repeat it for several",
     )
+    add_report(commands)
     add_commands(commands)
     return parser
 

@@ -51,15 +51,36 @@ def user_model(text: str) -> Iterator[UserModel]:
         yield UserModel(block, tuple(place for place in places if place.exists() and place != path))
 
 
-def _parts(text: str) -> tuple[Path, str]:
+@contextlib.contextmanager
+def user_file(text: str, *, port: str) -> Iterator[tuple[ModuleType, Path, str]]:
+    """Load a file from ``FILE.py:NAME``, or ``FILE.py``; yield its module, its path, and the name or "".
+
+    Parameters
+    ----------
+    port : str
+        The argument of the command that gave it.
+
+    Raises
+    ------
+    OptionError
+        No such file.
+    DefinitionError
+        The file can't be imported.
+    """
+    path, name = _parts(text, port, "loop.py:diagram")
+    with _loaded(path) as module:
+        yield module, path, name
+
+
+def _parts(text: str, port: str = "MODEL", example: str = "model.py:Motor") -> tuple[Path, str]:
     head, colon, name = text.rpartition(":")
     if not colon or not head.endswith(".py"):  # a drive's colon is none of ours
         head, name = text, ""
     path = Path(head).expanduser()
     if path.suffix != ".py":
-        raise OptionError(f"found {text!r}; expected FILE.py:Name, such as model.py:Motor.", port="MODEL")
+        raise OptionError(f"found {text!r}; expected FILE.py:Name, such as {example}.", port=port)
     if not path.is_file():
-        raise OptionError(f"there is no file {str(path)!r}. Check the path.", port="MODEL")
+        raise OptionError(f"there is no file {str(path)!r}. Check the path.", port=port)
     return path.resolve(), name
 
 

@@ -1,0 +1,253 @@
+"""Order for a drawing: which wires close loops, who stands above whom in a layer, and at what height."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+
+@dataclass(eq=False)
+class Node:
+    """A block, a box, a pin on a box's border, or a wire on its way through a layer.
+
+    Attributes
+    ----------
+    ins, outs : dict
+        Height of every pin below the upper edge.
+    side : int
+        -1 for an input pin of the box that is laid out, 1 for an output pin, else 0.
+    plant : bool
+        Whether loops are closed behind it.
+    lane, loose : bool
+        A wire on its way through a layer; what nothing drives, and a wire that comes from there.
+    """
+
+    key: str
+    width: float
+    height: float
+    ins: dict[str, float] = field(default_factory=dict)
+    outs: dict[str, float] = field(default_factory=dict)
+    side: int = 0
+    plant: bool = False
+    lane: bool = False
+    loose: bool = False
+    layer: int = 0
+    x: float = 0.0
+    y: float = 0.0
+
+
+Link = tuple[Node, float, Node, float]
+"""A wire between neighbouring layers: node, height of its pin, node, height of its pin."""
+
+# --- loops ----------------------------------------------------------------------------------------------------------
+
+
+def cut_loops(keys: Sequence[str], pairs: Iterable[tuple[str, str]], plants: set[str]) -> list[tuple[str, str]]:
+    """Return the wires without those that close loops.
+
+    Parameters
+    ----------
+    keys : list of str
+        The nodes.
+    pairs : list of pairs
+        The wires.
+    plants : set of str
+        Nodes behind which loops are closed; other loops are closed ahead of the node where they are entered.
+    """
+    left = [pair for pair in dict.fromkeys(pairs) if pair[0] != pair[1]]
+    place = {key: i for i, key in enumerate(keys)}
+    while True:
+        knots = [knot for knot in _knots(keys, left) if len(knot) > 1]
+        if not knots:
+            return left
+        gone: set[tuple[str, str]] = set()
+        for knot in knots:
+            plant = min(knot & plants, key=place.__getitem__, default=None)
+            if plant is not None and not plants >= knot:
+                gone |= {(a, b) for a, b in left if a == plant and b in knot}
+            else:
+                entered = {b for a, b in left if b in knot and a not in knot}
+                door = min(entered or knot, key=place.__getitem__)
+                gone |= {(a, b) for a, b in left if b == door and a in knot}
+        left = [pair for pair in left if pair not in gone]
+
+
+def _knots(keys: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[set[str]]:
+    """Return the strongly connected parts of a graph (Tarjan's algorithm, without recursion)."""
+    after: dict[str, list[str]] = {key: [] for key in keys}
+    for a, b in pairs:
+        after[a].append(b)
+    number: dict[str, int] = {}
+    low: dict[str, int] = {}
+    open_: list[str] = []
+    found: list[set[str]] = []
+    for root in keys:
+        work = [(root, 0)] if root not in number else []
+        while work:
+            key, i = work.pop()
+            if key not in number:
+                number[key] = low[key] = len(number)
+                open_.append(key)
+            descended = False
+            for j in range(i, len(after[key])):
+                other = after[key][j]
+                if other not in number:
+                    work += [(key, j), (other, 0)]
+                    descended = True
+                    break
+                if other in open_:
+                    low[key] = min(low[key], low[other])
+            if descended:
+                continue
+            if low[key] == number[key]:
+                at = open_.index(key)
+                found.append(set(open_[at:]))
+                del open_[at:]
+    return found
+
+
+# --- who stands above whom ------------------------------------------------------------------------------------------
+
+
+def order_layers(layers: list[list[Node]], links: Sequence[Link]) -> list[list[Node]]:
+    """Sort every layer so that few wires cross: sweeps to the barycentres of the neighbours, the best one is kept."""
+    left, right = _neighbours(links)
+    best, least = layers, _crossings(layers, links)
+    now = [list(layer) for layer in layers]
+    for sweep in range(24):
+        if not least:
+            break
+        forth = sweep % 2 == 0
+        sides = left if forth else right
+        spot = _spots(now)
+        for layer in now if forth else reversed(now):
+            centre = {}
+            for i, node in enumerate(layer):
+                around = [spot[id(other)] + dy / (other.height + 1) for other, dy, _ in sides.get(id(node), [])]
+                centre[id(node)] = sum(around) / len(around) if around else float(i)
+            layer.sort(key=lambda node: centre[id(node)])
+            spot.update({id(node): float(i) for i, node in enumerate(layer)})
+        crossings = _crossings(now, links)
+        if crossings < least:
+            best, least = [list(layer) for layer in now], crossings
+    return _swapped(best, links, least)
+
+
+def _swapped(layers: list[list[Node]], links: Sequence[Link], least: int) -> list[list[Node]]:
+    """Exchange neighbours in a layer as long as that removes crossings."""
+    layers = [list(layer) for layer in layers]
+    if sum(map(len, layers)) > 150:
+        return layers
+    for _ in range(4):
+        start = least
+        for layer in layers:
+            near = [k for k in links if k[0] in layer or k[2] in layer]
+            here = _crossings(layers, near)
+            for i in range(len(layer) - 1):
+                layer[i], layer[i + 1] = layer[i + 1], layer[i]
+                crossings = _crossings(layers, near)
+                if crossings < here:
+                    least, here = least - (here - crossings), crossings
+                else:
+                    layer[i], layer[i + 1] = layer[i + 1], layer[i]
+        if least == start:
+            break
+    return layers
+
+
+def _spots(layers: list[list[Node]]) -> dict[int, float]:
+    return {id(node): float(i) for layer in layers for i, node in enumerate(layer)}
+
+
+def _neighbours(links: Sequence[Link]) -> tuple[dict[int, list[tuple[Node, float, float]]], ...]:
+    """Return, for every node, its neighbours on the left and on the right with both pins' heights."""
+    left: dict[int, list[tuple[Node, float, float]]] = {}
+    right: dict[int, list[tuple[Node, float, float]]] = {}
+    for a, da, b, db in links:
+        left.setdefault(id(b), []).append((a, da, db))
+        right.setdefault(id(a), []).append((b, db, da))
+    return left, right
+
+
+def _crossings(layers: list[list[Node]], links: Sequence[Link]) -> int:
+    spot = _spots(layers)
+    channels: dict[int, list[tuple[tuple[float, float], tuple[float, float]]]] = {}
+    for a, da, b, db in links:
+        channels.setdefault(a.layer, []).append(((spot[id(a)], da), (spot[id(b)], db)))
+    return sum(
+        (first[0] < second[0] and first[1] > second[1]) or (first[0] > second[0] and first[1] < second[1])
+        for wires in channels.values()
+        for i, first in enumerate(wires)
+        for second in wires[i + 1 :]
+    )
+
+
+# --- heights --------------------------------------------------------------------------------------------------------
+
+
+def place_layers(layers: list[list[Node]], links: Sequence[Link], *, gap: Callable[[Node, Node], float]) -> None:
+    """Set ``y`` of all nodes so that wires are straight where they can be.
+
+    Parameters
+    ----------
+    gap : callable
+        Room between two nodes, the upper one first.
+    """
+    left, right = _neighbours(links)
+    for layer in layers:
+        y = 0.0
+        for i, node in enumerate(layer):
+            y += gap(layer[i - 1], node) if i else 0.0
+            node.y, y = y, y + node.height
+    sweeps = [(layers, left), (layers[::-1], right)] * 4 + [(layers, left), (layers, None)]
+    for row, sides in sweeps:
+        for layer in row:
+            wanted = []
+            for node in layer:
+                sets = [sides] if sides is not None else [left, right]
+                pulls = [
+                    (other.y + there - here, _stiffness(node, other))
+                    for side in sets
+                    for other, there, here in side.get(id(node), [])
+                ]
+                wanted.append((_median(pulls), sum(w for _, w in pulls)) if pulls else (node.y, 0.1))
+            _settle(layer, wanted, gap)
+    top = min((node.y for layer in layers for node in layer), default=0.0)
+    for layer in layers:
+        for node in layer:
+            node.y = round(node.y - top)
+
+
+def _stiffness(a: Node, b: Node) -> float:
+    """Return how much it matters that a wire between two nodes is straight."""
+    if a.lane and b.lane:
+        return 4.0
+    if a.loose or b.loose:  # a source can stand anywhere
+        return 0.5
+    return 2.0 if a.lane or b.lane else 1.5
+
+
+def _median(values: Sequence[tuple[float, float]]) -> float:
+    """Return the weighted median; of two in the middle the first."""
+    half, total = sum(w for _, w in values) / 2, 0.0
+    for value, weight in sorted(values):
+        total += weight
+        if total >= half:
+            return value
+    return values[-1][0]
+
+
+def _settle(layer: list[Node], wanted: list[tuple[float, float]], gap: Callable[[Node, Node], float]) -> None:
+    """Move the nodes of a layer as near as they can come to where they are wanted, in order and apart."""
+    offsets, total = [], 0.0
+    for i, node in enumerate(layer):
+        total += layer[i - 1].height + gap(layer[i - 1], node) if i else 0.0
+        offsets.append(total)
+    groups: list[list[tuple[float, float]]] = []
+    for (value, weight), offset in zip(wanted, offsets, strict=True):
+        groups.append([(value - offset, weight)])
+        while len(groups) > 1 and _median(groups[-2]) > _median(groups[-1]):
+            groups[-2:] = [groups[-2] + groups[-1]]
+    heights = [_median(group) for group in groups for _ in group]
+    for node, height, offset in zip(layer, heights, offsets, strict=True):
+        node.y = height + offset
