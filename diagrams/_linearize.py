@@ -54,6 +54,8 @@ class Linearization:
     notes : tuple of str
         What the model does not follow: outputs that move in steps only, events within the period, a start that is
         unlike every later tick.
+    plants, step
+        How it was asked for; its loops are made in the same way.
     """
 
     diagram: Diagram

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start")
 """How to run to an operating point."""
+AGAIN = 1e-3
+"""How far a run may be from where it was the first time, as its solver takes other steps; relative to 1 + its size."""
 MORE = {"linearize": ("inputs", "outputs", "openings", "plants"), "operating_point": ("t",)}
 
 
@@ -158,7 +160,9 @@ def operating_point(diagram: Diagram, point: Any, options: Mapping[str, Any]) ->
         return point
     if isinstance(point, Snapshot):
         recipe = dict(getattr(point.run, "recipe", {}) or {})
-        return at_time(diagram, point.t, {**recipe, **options})
+        found = at_time(diagram, point.t, {**recipe, **options})
+        _check_found_again(diagram, point, found)
+        return found
     if point is None:
         start = options.get("start")
         return at_time(diagram, 0.0 if start is None else start.t, options)
@@ -170,6 +174,21 @@ def operating_point(diagram: Diagram, point: Any, options: Mapping[str, Any]) ->
         block=diagram.name,
         port="operating point",
     )
+
+
+def _check_found_again(diagram: Diagram, given: Snapshot, found: OperatingPoint) -> None:
+    """Refuse an instant of a run that does not come again: one that was restored from a state on the way."""
+    if getattr(given.run, "diagram", None) is not diagram or given.state.shape != found.x.shape:
+        return
+    off = float(np.max(np.abs(found.x - given.state) / (1.0 + np.abs(found.x)), initial=0.0))
+    if not off <= AGAIN:
+        raise OptionError(
+            f"run again to t = {given.t:g} s, the diagram is not where it was in this run: a state is off by "
+            f"{off:.3g}. The run was restored from a state on its way, or an FMU does not repeat itself. Give the state that it "
+            "began with: linearize(t, start=…).",
+            block=diagram.name,
+            port="operating point",
+        )
 
 
 def at_time(diagram: Diagram, t: float, options: Mapping[str, Any]) -> OperatingPoint:
@@ -186,9 +205,12 @@ def at_time(diagram: Diagram, t: float, options: Mapping[str, Any]) -> Operating
             block=diagram.name,
             port="operating point",
         )
-    if not diagram.has_clock and start is None and (options.get("step") is None or not diagram.has_fmu):
-        options["step"] = _any_step(diagram, t)
-        t = 0.0 if t == 0 else float(options["step"])
+    if not diagram.has_clock:
+        if start is not None:
+            options.setdefault("step", start.base)
+        elif not _is_tick(options, t, diagram.has_fmu):
+            options["step"] = _any_step(diagram, t)
+            t = 0.0 if t == 0 else float(options["step"])
     with Simulation(diagram, **options) as simulation:
         if t > first:
             _check_tick(diagram, simulation.flat.base, t)
@@ -209,6 +231,14 @@ def at_time(diagram: Diagram, t: float, options: Mapping[str, Any]) -> Operating
                 port="operating point",
             )
         return capture(simulation)
+
+
+def _is_tick(options: Mapping[str, Any], t: float, has_fmu: bool) -> bool:
+    """Whether the step that was given is kept: it is one of communication, or of the solver, or meets the time."""
+    if options.get("step") is None:
+        return False
+    steps = t / float(options["step"])
+    return has_fmu or options.get("solver") in ("euler", "heun", "rk4") or abs(steps - round(steps)) <= 1e-12 * steps
 
 
 def _check_tick(diagram: Diagram, base: Fraction, t: float) -> None:

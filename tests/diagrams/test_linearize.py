@@ -7,6 +7,7 @@ from dataclasses import replace
 import control
 import numpy as np
 import pytest
+from linear import by_simulation, differences
 from scipy.integrate import solve_ivp
 
 from loopwright.blocks import (
@@ -41,38 +42,9 @@ from loopwright.diagrams import Diagram, Linearization, OperatingPoint, subsyste
 T = 0.05
 
 
-def differences(f, x, d=1e-4):
-    """The Jacobian by central differences of fourth order."""
-    columns = []
-    for i in range(len(x)):
-        e = np.zeros(len(x))
-        e[i] = d
-        columns.append((8 * (f(x + e) - f(x - e)) - (f(x + 2 * e) - f(x - 2 * e))) / (12 * d))
-    return np.array(columns).T
-
-
 def close(got, want, bound):
     assert np.shape(got) == np.shape(want)
     assert np.max(np.abs(got - want), initial=0.0) <= bound * max(np.max(np.abs(want), initial=0.0), 1e-3)
-
-
-def by_simulation(diagram, t, period, **options):
-    """The derivative of the way from just before one tick to just before another, by differences of the simulation."""
-    options = {"rtol": 1e-11, "atol": 1e-13, **options}
-    point = diagram.operating_point(t, **options)
-    with diagram.simulation(**options) as run:
-        if t > 0:
-            run.advance(t)
-        state, flat = run.save(), run.flat
-
-        def go(x):
-            after = np.ravel(np.array(flat.at_tick(flat.acting(point.tick))(point.t, x, point.w, flat.p)[0]))
-            run.restore(replace(state, x=after))
-            run.advance(period)
-            n = flat.log.total
-            return run._machine.log[n : n + flat.width].copy()
-
-        return differences(go, point.x), point, go(point.x) - point.x
 
 
 # --- motion --------------------------------------------------------------------------------------------------------------
@@ -173,7 +145,7 @@ def test_several_rates_that_move_against_differences_of_the_simulation(t):
     u = slow(angle.y).named("u")
     f = Function(lambda a, v, u, w: -5 * np.sin(a) + u * w)(angle.y, rate.y, u, slower(rate.y, u).named("w"))
     diagram = Diagram("d", angle(rate(f)))
-    A, _, moved = by_simulation(diagram, t, 6 * T)
+    A, moved = by_simulation(diagram, t, 6 * T)
     lin = diagram.linearize(t, rtol=1e-11, atol=1e-13)
     keep = [names(lin).index(n) for n in lin.states]
     close(lin.A, A[np.ix_(keep, keep)], 1e-7)
@@ -450,6 +422,34 @@ def test_every_sample_of_a_continuous_run_is_an_operating_point():
         exact = 1 / np.sqrt(1 + 2 * t)
         assert pytest.approx(np.array([[-3 * exact**2]]), rel=1e-8) == lin.A
         assert lin.affine == pytest.approx([-(exact**3)], rel=1e-8)
+
+
+def test_a_run_that_was_restored_on_its_way_is_not_found_again_without_its_start():
+    diagram = pendulum()
+    first = diagram.simulate(1.0, progress=False)
+    with diagram.simulation() as simulation:
+        simulation.restore(first.final_state)
+        simulation.advance(0.2)
+        run = simulation.run()
+    assert diagram.linearize(run.at(1.2)).point.t == 1.2  # the same run, as it happens
+    with diagram.simulation() as simulation:
+        simulation.restore(replace(first.final_state, x=0.5 * first.final_state.x))
+        simulation.advance(0.2)
+        run = simulation.run()
+    with pytest.raises(OptionError, match=r"run again to t = 1\.2 s, the diagram is not where it was in this run"):
+        diagram.linearize(run.at(1.2))
+
+
+def test_a_solver_of_fixed_step_keeps_its_step_on_the_way():
+    x = Integrator(initial_value=1.0)
+    diagram = Diagram("d", x(Function(lambda x: -(x**3))(x.y)))
+    run = diagram.simulate(1.0, step=0.25, solver="euler", progress=False)
+    assert diagram.linearize(run.at(1.0)).point.x.tolist() == run.at(1.0).state.tolist()
+    half = diagram.simulate(0.5, step=0.25, solver="euler", progress=False)
+    again = diagram.simulate(0.5, step=0.25, solver="euler", progress=False, start=half.final_state)
+    assert diagram.linearize(again.at(1.0)).point.x.tolist() == run.at(1.0).state.tolist()
+    with pytest.raises(OptionError, match=r"t = 0\.3 s is between two ticks"):
+        diagram.linearize(0.3, step=0.25, solver="euler")
 
 
 def test_points_between_the_ticks_of_slow_boxes_are_operating_points():

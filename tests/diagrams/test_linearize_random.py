@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from linear import by_simulation
 from scipy.linalg import block_diag, expm
 
 from loopwright.blocks import Constant, DiscreteStateSpace, Function, Gain, StateSpace
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams._operating_point import names_of_states
 
 NEAR = 1e-10
 few = settings(max_examples=10, deadline=None)
@@ -165,14 +167,18 @@ class Loop:
                 Node(0.5 * r.normal(size=(k, k)), r.normal(size=(k, 1)), r.normal(size=(1, k)), r.normal(size=(1, 1)))
             )
 
-    def diagram(self, deep=False):
-        plant = StateSpace(A=self.A, B=self.B, C=self.C, name="plant")
+    def diagram(self, deep=False, bend=None):
+        """Return the diagram; with a function ``bend`` its forces go through it, and it does not begin at rest."""
+        start = 0.0 if bend is None else np.linspace(0.5, 1.5, len(self.A))
+        plant = StateSpace(A=self.A, B=self.B, C=self.C, initial_state=start, name="plant")
         forces = []
         for i, ((every, offset), v) in enumerate(zip(self.clocks, self.boxes, strict=True)):
             block = DiscreteStateSpace(A=v.A, B=v.B, C=v.C, D=v.D, name="c")
 
             @subsystem(sample_time=round(every * self.base, 9), offset=round(offset * self.base, 9), name=f"box{i}")
             def box(y, block=block):
+                if bend is not None:
+                    return Function(bend, name="bend")(block(y))
                 if not deep:
                     return block(y)
 
@@ -183,7 +189,8 @@ class Loop:
                 return inner(y)
 
             forces.append(box(plant.y[i : i + 1]).named(f"u{i}"))
-        call = plant(mixer([np.eye(self.m)[:, [i]] for i in range(self.m)], "all")(*forces))
+        total = mixer([np.eye(self.m)[:, [i]] for i in range(self.m)], "all")(*forces)
+        call = plant(total if bend is None else Function(lambda f: f + 0.1 * f**2, name="curve")(total))
         return Diagram("loop", call)
 
     def model(self, cut=()):
@@ -273,6 +280,23 @@ def test_the_poles_do_not_depend_on_the_tick_at_which_the_period_begins(seed):
     for A in found[1:]:
         size = min(len(A), len(found[0])) + 1
         close(np.poly(A)[:size], want[:size], 1e-9)
+
+
+@settings(max_examples=4, deadline=None)
+@given(seeds, RATES, st.integers(0, 3))
+def test_bent_ones_on_the_move_against_differences_of_the_simulation(seed, clocks, k):
+    diagram = Loop(seed, clocks).diagram(bend=np.sin)
+    t = k * float(diagram.flatten().base)
+    period = float(lcm(*(every for every, _ in clocks))) * 1e-2
+    A, moved = by_simulation(diagram, t, period)
+    lin = diagram.linearize(t, rtol=1e-11, atol=1e-13)
+    everything = names_of_states(diagram.flatten())
+    keep = [everything.index(name) for name in lin.states]
+    gone = [i for i in range(len(A)) if i not in keep]
+    close(lin.A, A[np.ix_(keep, keep)], 1e-7)
+    close(lin.affine, moved[keep], 1e-7)
+    assert np.abs(A[np.ix_(keep, gone)]).max(initial=0.0) < 1e-9
+    assert not lin.is_equilibrium
 
 
 # --- boxes that are enabled ----------------------------------------------------------------------------------------------
