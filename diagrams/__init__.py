@@ -5,6 +5,7 @@ from ._control_values import Comparison, compare_with_control
 from ._diagram import Diagram
 from ._disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
 from ._flat import FlatDiagram
+from ._frequency_response import FrequencyResponse
 from ._layout import Layout
 from ._linearize import Linearization
 from ._margins import GainCrossover, Margins, PhaseCrossover, margins
@@ -34,6 +35,7 @@ __all__ = [
     "DiskMargin",
     "FlatDiagram",
     "Frame",
+    "FrequencyResponse",
     "GainCrossover",
     "GangOfFour",
     "Layout",

@@ -298,11 +298,11 @@ class Analysis:
         """Measure a frequency response on the running diagram: a test signal d is added at a wire.
 
         With v what the wire's port puts out, and u = v + d what all its consumers get, S = u/d, T = −v/d and L = −v/u,
-        which is what `Linearization.sensitivity`, `complementary` and `loop` say of the same wire. All are sampled where
-        the linear model is, at the ticks of the least common period of what is sampled, and d is held between them; in a
-        diagram that is continuous throughout, d is continuous. So the phasors are those of what is sampled: a plant's
-        velocity, read at 1 kHz, holds the aliased ripple of the controller's hold, and its fundamental in continuous
-        time is another by 1e-4 to 1e-3.
+        which is what `Linearization.sensitivity`, `complementary` and `loop` say of the same wire. All are sampled
+        where the linear model is, at the ticks of the least common period of what is sampled, and d is held between
+        them; in a diagram that is continuous throughout, d is continuous. So the phasors are those of what is sampled:
+        a plant's velocity, read at 1 kHz, holds the aliased ripple of the controller's hold, and its fundamental in
+        continuous time is another by 1e-4 to 1e-3.
 
         The signal is ramped in; then windows of whole periods follow until two agree. Sources go on meanwhile: take a
         diagram whose references stand still, or a time from which on they do, and look at ``moved``.
