@@ -7,9 +7,14 @@ import os
 import shutil
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..blocks._errors import OptionError
+
+if TYPE_CHECKING:
+    from ._diagram import Diagram
+
+FIXED_STEP = ("euler", "heun", "rk4")
 
 
 def ticks_in(duration: Any, base: Fraction, name: str) -> int:
@@ -29,6 +34,28 @@ def ticks_in(duration: Any, base: Fraction, name: str) -> int:
             port="duration",
         )
     return n
+
+
+def default_step(diagram: Diagram, step: Any, duration: float | None, solver: str) -> Any:
+    """Return the seconds between two samples of a run that has neither a ``step`` nor a clock.
+
+    A thousandth of the duration, in whole nanoseconds, where the diagram is continuous, has no FMU and the solver
+    chooses its own steps.
+    """
+    if step is not None or duration is None or not diagram.is_continuous or diagram.has_clock:
+        return step
+    from ._solvers import solver_name
+
+    if diagram.has_fmu or solver_name(solver) in FIXED_STEP:
+        return step
+    try:
+        span = Fraction(repr(float(duration)))
+    except (TypeError, ValueError):
+        return step
+    ticks = span / Fraction(1, 10**9)
+    if not span > 0 or ticks.denominator != 1:
+        return span if span > 0 and ticks.denominator == 1 else step
+    return next((span / n for n in (1000, 500, 200, 100, 10, 1) if (ticks / n).denominator == 1), span)
 
 
 def memory() -> int:

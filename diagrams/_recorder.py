@@ -178,6 +178,11 @@ class Recorder:
             self._due = monotonic() + _LATEST
         return self._files
 
+    @property
+    def is_open(self) -> bool:
+        """Whether files on disk are open: samples were written, and `finish` was not called."""
+        return self._files is not None
+
     def flush(self) -> None:
         """Write what is held to disk; in memory, nothing is to be done."""
         if self._files is None:
@@ -246,6 +251,7 @@ class Recorder:
         finally:
             for file in files:
                 file.close()
+            self._files = None
         stored = read(self.to)
         self.events, self.residual = stored.events, stored.residual
         return stored.t, stored.data
