@@ -12,7 +12,7 @@ from ..blocks._block import Block
 from ..blocks._errors import OptionError, ShapeError, SimulationError
 from ..blocks._instants import left_of
 from ._events import Domains
-from ._failures import failure, opaque_failure, state_values
+from ._failures import failure, forget_trials, opaque_failure, state_values
 from ._flat import FlatDiagram
 from ._machine import Machine
 from ._solvers import Problem, make_solver
@@ -52,6 +52,7 @@ class Continuous:
         self.machine, self.flat, self.name, self.on_event = machine, flat, name, on_event
         self.where = flat.continuous
         self._edge, self._left = math.inf, math.inf
+        self._opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
         self.delays = _delays(flat)
         self._flow, self._jacobian = machine.flow(), None
         problem = Problem(self.where.size, self._rate, self._slope, state_names(flat))
@@ -145,6 +146,8 @@ class Continuous:
         machine.look()
         if not machine.ok[0]:
             raise failure(machine, NOTHING).at(t=float(machine.here.t[0]))
+        if self._opaque:
+            forget_trials(machine)
         machine.here.x[:] = machine.x_next
         self._synchronize()
 
