@@ -40,7 +40,6 @@ concerned; the run until then is kept in the error.
 
 from __future__ import annotations
 
-import math
 import sys
 import time
 from collections.abc import Iterable
@@ -60,6 +59,7 @@ from ._progress import progress_bar
 from ._recorder import Recorder
 from ._recording import Recording
 from ._run import Run
+from ._sampled import CHUNK, run_ticks
 from ._start import initialize
 from ._state import RunState, check_fits, layout_of
 from ._stored import Occurrence, Stopped
@@ -67,8 +67,6 @@ from ._structure import join
 
 if TYPE_CHECKING:
     from ._diagram import Diagram
-
-_CHUNK = 1000  # ticks between two looks at the progress bar
 
 
 class Simulation:
@@ -255,59 +253,19 @@ class Simulation:
             if self._continuous is not None:
                 self._go_hybrid(last, progress)
             else:
-                self._go_sampled(last, progress)
+                run_ticks(
+                    self._machine,
+                    [plant for _, plant in self._plants],
+                    self._tick,
+                    last,
+                    every=self._every_tick,
+                    row=self._recorder.row,
+                    arrived=self._arrived,
+                    progress=progress,
+                )
         except SimulationError as error:
             culprit = self._who(error)
             raise culprit from culprit.__cause__
-
-    def _go_sampled(self, last: int, progress: Any) -> None:
-        """Run ticks up to ``last``: nothing happens between them."""
-        flat, machine = self.flat, self._machine
-        t, x, x_next, ok, log = machine.here.t, machine.here.x, machine.x_next, machine.ok, machine.log
-        row, stops, time_of = self._recorder.row, self._stops, self.time_of
-        plants = [plant for _, plant in self._plants]
-        only = plants[0].step if len(plants) == 1 else None
-        h, k = float(flat.base), self._tick
-        always = (
-            machine.tick(flat.acting(0)) if len({flat.acting(i) for i in range(2)}) == 1 and self._constant() else None
-        )
-        n, d = flat.base.numerator, flat.base.denominator
-        count, now = 0, time_of(k)
-        for k in flat.ticks(self._tick, last, every=self._every_tick):
-            try:
-                if only is not None:
-                    only(now, h)
-                else:
-                    for plant in plants:
-                        plant.step(now, h)
-            except SimulationError as error:
-                raise error.at(t=k * n / d) from error.__cause__
-            t[0] = now = k * n / d
-            acting = None
-            if always is None:
-                acting = flat.acting(k)
-                machine.tick(acting)()
-            else:
-                always()
-            if not ok[0]:
-                raise failure(machine, acting if acting is not None else flat.acting(k)).at(t=now)
-            row(now, log)
-            x[:] = x_next
-            self._tick = k
-            if stops and self._ended():
-                return
-            count += 1
-            if count == _CHUNK:
-                progress(now)
-                count = 0
-        progress(now)
-
-    def _constant(self) -> bool:
-        """Whether the same boxes act in every tick that is visited."""
-        clocks = self.flat.distinct
-        return not clocks or (
-            len(clocks) == 1 and clocks[0].offset == 0 and (clocks[0].every == 1 or not self._every_tick)
-        )
 
     def _go_hybrid(self, last: int, progress: Any) -> None:
         """Run ticks up to ``last`` with a solver between them."""
@@ -324,7 +282,7 @@ class Simulation:
             def sample(t: float, progress: Any = progress) -> bool:
                 self._recorder.row(t, self._machine.log)
                 self._count += 1
-                if self._count % _CHUNK == 0:
+                if self._count % CHUNK == 0:
                     progress(t)
                 return self._is_stopped()
 
@@ -365,6 +323,11 @@ class Simulation:
 
     def _on_event(self, event: Occurrence) -> None:
         self._recorder.event(event)
+
+    def _arrived(self, k: int) -> bool:
+        """Take note of a tick that has been recorded; return whether it ends the run."""
+        self._tick = k
+        return bool(self._stops) and self._ended()
 
     def _is_stopped(self) -> bool:
         return any(self._machine.log[i] > TRUE for i, _ in self._stops)
