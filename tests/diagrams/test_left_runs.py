@@ -11,9 +11,13 @@ CLOCK = Diagram("clock", Clock().named("t"))
 
 
 def test_an_error_between_two_advances_ends_the_run_with_what_was_recorded(tmp_path):
-    with pytest.raises(KeyError), CLOCK.simulation(step=0.25, to=tmp_path / "run") as simulation:
-        simulation.advance(1.0)
-        raise KeyError("mine")
+    def leave():
+        with CLOCK.simulation(step=0.25, to=tmp_path / "run") as simulation:
+            simulation.advance(1.0)
+            raise KeyError("mine")
+
+    with pytest.raises(KeyError):
+        leave()
     run = Run.open(tmp_path / "run")
     np.testing.assert_array_equal(run["t"], [0.0, 0.25, 0.5, 0.75, 1.0])
     assert run.messages == ("This run was cut off at t = 1 s: KeyError: 'mine'",)
