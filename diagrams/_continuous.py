@@ -11,6 +11,7 @@ import numpy as np
 from ..blocks._block import Block
 from ..blocks._errors import OptionError, ShapeError, SimulationError
 from ..blocks._instants import left_of
+from ._between import active_loops
 from ._events import Domains
 from ._failures import failure, forget_trials, opaque_failure, state_values
 from ._flat import FlatDiagram
@@ -52,6 +53,7 @@ class Continuous:
         self.machine, self.flat, self.name, self.on_event = machine, flat, name, on_event
         self.where = flat.continuous
         self._edge, self._left = math.inf, math.inf
+        self._loops = active_loops(flat, NOTHING)
         self._opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
         self.delays = _delays(flat)
         self._flow, self._jacobian = machine.flow(), None
@@ -234,6 +236,7 @@ class Continuous:
                 step = self.solver.step()
                 if self.domains is not None:
                     found = self.domains.locate(step.t_old, step.t, step.interpolate)
+                    solved = machine.trial.x[self._loops]
                 t = step.t if found is None else found[0]
                 while pending < t or (pending == t < edge and found is None):
                     self._put(pending, step.interpolate(pending))
@@ -244,6 +247,8 @@ class Continuous:
                 if self.delays is not None and t > step.t_old:
                     step_inputs(self.delays, step.t_old, t, step.interpolate, self._inputs_of_delays)
                 self._put(t, step.x if found is None else step.interpolate(t))
+                if found is not None:  # the loops as the indicators saw them, to the last bit
+                    machine.here.x[self._loops] = solved
                 self.accept()
             happened = found is not None
             if found is not None:
