@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..blocks._block import Block
-from ..blocks._errors import OptionError, ShapeError, SimulationError
-from ..blocks._instants import left_of
+from ..blocks._errors import OptionError, SimulationError
+from ..blocks._instants import is_before, left_of
 from ._between import active_loops
 from ._events import Domains
 from ._failures import failure, forget_trials, opaque_failure, state_values
@@ -19,7 +19,7 @@ from ._machine import Machine
 from ._solvers import Problem, make_solver
 from ._stored import Occurrence
 from ._structure import join
-from ._transport import Delays, step_inputs
+from ._transport import delays_of, driven_function, step_inputs
 
 NOTHING: frozenset[Any] = frozenset()
 
@@ -52,10 +52,11 @@ class Continuous:
         flat = machine.flat
         self.machine, self.flat, self.name, self.on_event = machine, flat, name, on_event
         self.where = flat.continuous
-        self._edge, self._left = math.inf, math.inf
+        self._edge, self._left, self._sources_edge = math.inf, math.inf, math.inf
+        self._resolution = rtol, atol
         self._loops = active_loops(flat, NOTHING)
         self._opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
-        self.delays = _delays(flat)
+        self.delays = delays_of(flat)
         self._flow, self._jacobian = machine.flow(), None
         problem = Problem(self.where.size, self._rate, self._slope, state_names(flat))
         longest = max_step
@@ -84,7 +85,7 @@ class Continuous:
             self._jump, self._fired = machine.jump()
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
-            self._drive = machine.plain(_driven_function(flat), [self._driven], machine.trial)
+            self._drive = machine.plain(driven_function(flat), [self._driven], machine.trial)
         self.sources = [
             flat.table.blocks[path]
             for path in sorted(flat.checked.traced)
@@ -225,7 +226,8 @@ class Continuous:
         times = iter(grid)
         pending = next(times, math.inf)
         while t < end:
-            edge = min(end, self._next_edge(t))
+            jump = self._next_edge(t)
+            edge = jump if is_before(jump, end) else end
             self._edge, self._left = edge, max(t, left_of(edge))
             if self.delays is not None:
                 self.delays.middle = 0.5 * (t + edge)
@@ -245,7 +247,7 @@ class Continuous:
                         return pending
                     pending = next(times, math.inf)
                 if self.delays is not None and t > step.t_old:
-                    step_inputs(self.delays, step.t_old, t, step.interpolate, self._inputs_of_delays)
+                    step_inputs(self.delays, step.t_old, t, step.interpolate, self._inputs_of_delays, self._resolution)
                 self._put(t, step.x if found is None else step.interpolate(t))
                 if found is not None:  # the loops as the indicators saw them, to the last bit
                     machine.here.x[self._loops] = solved
@@ -253,10 +255,10 @@ class Continuous:
             happened = found is not None
             if found is not None:
                 self._fire(t, found[1])
-            if t == edge < end:  # a discontinuity of a source
+            if t == edge and self.delays is not None:
+                self.delays.reached(t, from_source=not is_before(t, self._sources_edge))
+            if t == edge < end:  # a discontinuity of a source, or one that comes out of a delay
                 self.at(t)
-                if self.delays is not None:
-                    self.delays.edge(t)
                 happened |= self.settle(t)
                 machine.look()
             if pending == t < end:
@@ -279,10 +281,8 @@ class Continuous:
     """Whether a stop condition is true in what was evaluated last; set by the run."""
 
     def _next_edge(self, t: float) -> float:
-        found = math.inf if self.delays is None else self.delays.next_edge(t)
-        for source in self.sources:
-            found = min(found, source.next_instant(t))
-        return found
+        self._sources_edge = min((source.next_instant(t) for source in self.sources), default=math.inf)
+        return min(self._sources_edge, math.inf if self.delays is None else self.delays.next_edge(t))
 
     # --- saved states ------------------------------------------------------------------------------------------------
 
@@ -352,37 +352,6 @@ def absolute_tolerances(flat: FlatDiagram, atol: float) -> Any:
             position += n
     scale = scale[flat.continuous]
     return atol if np.all(scale == 1.0) or np.ndim(atol) else atol * scale
-
-
-def _delays(flat: FlatDiagram) -> Delays | None:
-    table = flat.table
-    paths = [p for p in sorted(table.blocks) if table.blocks[p].transport and p not in flat.checked.traced]
-    if not paths:
-        return None
-    blocks: list[Any] = [table.blocks[p] for p in paths]
-    inputs = [flat.plant_inputs.slices[join(p, "u")] for p in paths]
-    starts: list[Any] = []
-    for path, block in zip(paths, blocks, strict=True):
-        shape = flat.plant_inputs.shapes[join(path, "u")]
-        if block.initial_value is None:
-            starts.append(None)  # the first input; see `Delays.begin`
-            continue
-        try:
-            starts.append(np.ravel(np.broadcast_to(np.asarray(block.initial_value, dtype=float), shape)).copy())
-        except ValueError:
-            raise ShapeError(
-                f"found an initial_value of shape {np.shape(block.initial_value)}; expected {shape}, that of the "
-                "input, or a number.",
-                block=path,
-                port="initial_value",
-            ) from None
-    return Delays([b.delay for b in blocks], inputs, [flat.plant_outputs.slices[join(p, "y")] for p in paths], starts)
-
-
-def _driven_function(flat: FlatDiagram) -> Any:
-    """Return ``(t, x, w, p) -> z`` between ticks."""
-    f = flat.at_tick(frozenset())
-    return f.slice("driven", [0, 1, 2, 3], [1])
 
 
 def check_solver(error: SimulationError, machine: Machine) -> SimulationError:
