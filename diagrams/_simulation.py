@@ -110,6 +110,8 @@ class Simulation:
         self.diagram = diagram
         step = default_step(diagram, step, duration, solver)
         self.flat: FlatDiagram = diagram.flatten(step)
+        if start is not None:
+            check_fits(start, self.flat, diagram.name)
         self._recording = Recording(self.flat, diagram.name, record, every, states, to, overwrite)
         self._stack = ExitStack()
         self._start_state = start
