@@ -1,6 +1,7 @@
 """Diagrams: wiring, scheduling, simulation; the diagram of Fig. 3 and its experiments; the command line."""
 
 from . import experiments
+from ._contract import BlockReport, check_block
 from ._diagram import Diagram
 from ._flat import FlatDiagram
 from ._layout import Layout
@@ -13,6 +14,7 @@ from ._subsystem import Subsystem, subsystem
 from .fig3 import fig3
 
 __all__ = [
+    "BlockReport",
     "Diagram",
     "FlatDiagram",
     "Frame",
@@ -25,6 +27,7 @@ __all__ = [
     "Stopped",
     "Subsystem",
     "Wire",
+    "check_block",
     "experiments",
     "fig3",
     "subsystem",
