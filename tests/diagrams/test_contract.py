@@ -1,8 +1,12 @@
 """The contract of a block: every block of the library keeps it, and each way of breaking it is found."""
 
+import inspect
 import math
 import pickle
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,9 +40,16 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import check_block
 
+PAGE = (Path(__file__).parents[2] / "docs" / "blocks.md").read_text(encoding="utf-8")
+
 
 def named(case):
     return type(case[0]).__name__
+
+
+def public_blocks():
+    public = {v for v in vars(loopwright.blocks).values() if isinstance(v, type) and issubclass(v, Block)}
+    return [cls for cls in public if not is_base(cls)]
 
 
 # --- the library ----------------------------------------------------------------------------------------------------------
@@ -54,9 +65,29 @@ def test_the_library_keeps_the_contract(block, options, frames):
 
 
 def test_every_public_block_is_among_them():
-    public = {v for v in vars(loopwright.blocks).values() if isinstance(v, type) and issubclass(v, Block)}
-    missing = {v.__name__ for v in public if not is_base(v)} - set(map(named, CASES))
+    missing = {cls.__name__ for cls in public_blocks()} - set(map(named, CASES))
     assert not missing, f"give {missing} a line in tests/diagrams/library.py"
+
+
+def test_the_page_of_the_library_has_a_line_for_each_block_as_it_is():
+    frames = {}
+    for block, _, found in CASES:
+        frames.setdefault(type(block), set()).update(found)
+    rows = re.findall(r"(?m)^\| `(\w+)` \| (\w+) \| (.*) \|$", PAGE)
+    expected = []
+    for name in (row[0] for row in rows):
+        cls = getattr(loopwright.blocks, name)
+        where = "both" if len(frames[cls]) == 2 else next(iter(frames[cls]))
+        expected.append((name, where, inspect.getdoc(cls).splitlines()[0].replace("``", "`")))
+    assert rows == expected
+    assert sorted(row[0] for row in rows) == sorted(cls.__name__ for cls in public_blocks())
+
+
+def test_the_code_of_the_page_of_the_library_runs():
+    (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("lag keeps the contract of a block.")
 
 
 @pytest.mark.xfail(raises=DefinitionError, strict=True, reason="a speed limit cuts the acceleration without an event")
