@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..blocks._block import Block
-from ..blocks._errors import OptionError, SimulationError
+from ..blocks._errors import NonFiniteError, OptionError, SimulationError
 from ..blocks._instants import is_before, left_of
 from ._between import active_loops
 from ._events import Domains
@@ -80,8 +80,8 @@ class Continuous:
             )
         self.domains: Domains | None = None
         if flat.events:
-            self._indicators, opened = machine.indicators()
-            self.domains = Domains(flat, self._g, opened)
+            self._indicators, self._opened = machine.indicators()
+            self.domains = Domains(flat, self._g, self._opened)
             self._jump, self._fired = machine.jump()
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
@@ -110,7 +110,23 @@ class Continuous:
         return self._jacobian(self._time(t), x)  # type: ignore[misc, no-any-return]
 
     def _g(self, t: float, x: np.ndarray) -> np.ndarray:
-        return self._indicators(self._time(t), x)
+        g = self._indicators(self._time(t), x)
+        if not np.all(np.isfinite(g[self._opened > 0.5])):
+            raise self._not_finite(t, x, g)
+        return g
+
+    def _not_finite(self, t: float, x: np.ndarray, g: np.ndarray) -> SimulationError:
+        """Return the error of an indicator that is not finite: that of the block which made the first such value."""
+        event = self.flat.events[int(np.flatnonzero(~np.isfinite(g) & (self._opened > 0.5))[0])]
+        self._put(t, x)
+        self.machine.look()
+        if not self.machine.ok[0]:
+            return failure(self.machine, NOTHING).at(t=t)  # type: ignore[return-value]
+        return NonFiniteError(
+            f"its indicator {event.name!r} is not a finite number; expected one. Look at roots and quotients in it.",
+            block=event.path,
+            t=t,
+        )
 
     def _inputs_of_delays(self, t: float, x: np.ndarray) -> np.ndarray:
         trial = self.machine.trial

@@ -51,10 +51,12 @@ def default_step(diagram: Diagram, step: Any, duration: float | None, solver: st
     try:
         span = Fraction(repr(float(duration)))
     except (TypeError, ValueError):
-        return step
+        span = Fraction(0)
+    if not span > 0:
+        ticks_in(duration, Fraction(1), diagram.name)  # refused
     ticks = span / Fraction(1, 10**9)
-    if not span > 0 or ticks.denominator != 1:
-        return span if span > 0 and ticks.denominator == 1 else step
+    if ticks.denominator != 1:
+        return step
     return next((span / n for n in (1000, 500, 200, 100, 10, 1) if (ticks / n).denominator == 1), span)
 
 

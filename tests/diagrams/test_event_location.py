@@ -14,9 +14,11 @@ from loopwright.blocks import (
     Compare,
     Constant,
     Event,
+    Function,
     Gain,
     Input,
     Integrator,
+    NonFiniteError,
     PiecewiseLinear,
     Relay,
     SimulationError,
@@ -308,3 +310,31 @@ def test_an_event_far_from_the_start_is_found_as_exactly():
     take = Takes(name="take")(Clock(), Compare(">", name="c")(Clock(), 1e5 + 0.125))
     run = Diagram("d", take).simulate(1e5 + 1.0, step=1e5 + 1.0, progress=False)
     assert run.events[-1].t == pytest.approx(1e5 + 0.125, abs=3e-11)
+
+
+def test_many_events_at_one_instant_are_no_chattering():
+    crossings = [Crossings(name=f"c{i}")(Clock() - 0.5) for i in range(600)]
+    run = Diagram("d", *crossings).simulate(1.0, step=0.5, progress=False)
+    assert len(run.events) == 600
+
+
+def test_an_indicator_that_is_not_finite_ends_the_run_and_fires_nothing():
+    class Rooted(Block):
+        u = Input()
+        count = State(discrete=True, output=True)
+        cross = Event("both")
+
+        def indicators(self, t, x, u):
+            return np.sqrt(u.u) + 1.0
+
+        def jump(self, t, x, u, fired):
+            return x.count + 1.0
+
+    told = r"rooted, t = 0\.\d+ s: its indicator 'cross' is not a finite number"
+    with pytest.raises(NonFiniteError, match=told) as caught:
+        Diagram("d", Rooted(name="rooted")(0.55 - Clock())).simulate(1.0, step=0.1, progress=False)
+    assert caught.value.run.events == ()
+    assert 0.5 <= caught.value.t <= 0.65
+    root = Function(np.sqrt, name="root")
+    with pytest.raises(NonFiniteError, match=r"root\.y, t = 0\.\d+ s: found \[nan\].*first block"):
+        Diagram("d", Crossings(name="c")(root(0.55 - Clock()))).simulate(1.0, step=0.1, progress=False)

@@ -23,6 +23,7 @@ from loopwright.blocks import (
     Input,
     Integrator,
     NonFiniteError,
+    OptionError,
     Output,
     PathProjection,
     PulseTrain,
@@ -557,3 +558,29 @@ def test_of_two_opaque_blocks_with_one_function_the_one_that_failed_is_named():
 
     with pytest.raises(SimulationError, match=r"box\.second, t = 0\.4 s"):
         Diagram("d", *box(Clock())).simulate(1.0, progress=False)
+
+
+@pytest.mark.parametrize("duration", [0, -1.0, float("nan"), float("inf"), "1 s"])
+def test_a_duration_that_is_none_is_refused_for_a_continuous_diagram_too(duration):
+    with pytest.raises(OptionError, match=r"d\.duration: found a duration of .*; expected seconds, positive"):
+        Diagram("d", Falls(name="f")).simulate(duration, progress=False)
+
+
+def test_an_unknown_solver_is_refused_with_near_names_whether_or_not_it_is_needed():
+    for diagram in (Diagram("d", Falls(name="f")), Diagram("d", counting(0.1)())):
+        with pytest.raises(OptionError, match=r"no solver 'RK54'; expected one of auto, .*Did you mean .*'RK45'"):
+            diagram.simulate(1.0, solver="RK54", progress=False)
+
+
+def test_recording_goes_on_where_it_was_asked_for():
+    with Diagram("d", Falls(name="f"), counting(0.1)().named("n")).simulation() as simulation:
+        simulation.advance(0.3)
+        assert simulation.run().t.tolist() == [0.0, 0.1, 0.2, 0.3]
+        simulation.advance(0.2)
+        assert simulation.run()["n"].tolist() == [5, 6]
+
+
+def test_an_event_at_the_very_end_is_in_the_last_sample():
+    run = Diagram("d", Crossings(name="c")(1.0 - Clock())).simulate(1.0, step=0.25, progress=False)
+    assert [e.t for e in run.events] == [1.0]
+    assert run["c.count"].tolist() == [0, 0, 0, 0, 1]
