@@ -39,6 +39,7 @@ from loopwright.blocks import (
     parameter,
 )
 from loopwright.diagrams import check_block
+from loopwright.fmus import Fmu, mass_spring_damper
 
 PAGE = (Path(__file__).parents[2] / "docs" / "blocks.md").read_text(encoding="utf-8")
 
@@ -164,6 +165,13 @@ def test_inputs_are_ranges_or_signals():
 def test_a_function_without_a_name_in_a_module_is_not_pickled_and_no_error():
     report = check_block(PythonFunction(lambda u: 2.0 * u))
     assert report.checks["values"].startswith("not pickled, since its function can't be")
+
+
+def test_an_fmu_is_run_saved_and_restored():
+    report = check_block(Fmu(mass_spring_damper.build(), name="plant"))
+    assert report.frames == {"sampled": "checked", "continuous": "checked"}
+    assert report.checks["sampled: run"].endswith("restored, it is the same")
+    assert "sampled: trace" not in report.checks
 
 
 def test_wrong_arguments_are_errors():
