@@ -74,6 +74,7 @@ def part_shape(shape: Shape, wire: Wire, who: str, port: str) -> Shape:
 
 
 def _check_ports(table: Structure) -> None:
+    inputs = {path: block.inputs for path, block in table.blocks.items()}  # made anew each time they are asked for
     for (consumer, port), wire in table.wires.items():
         outputs = table.blocks[wire.block].outputs
         if wire.port not in outputs:
@@ -81,14 +82,14 @@ def _check_ports(table: Structure) -> None:
                 f"it has no output {wire.port!r}, which {consumer}.{port} is wired to. {near(wire.port, outputs)}",
                 block=wire.block,
             )
-    for path, block in sorted(table.blocks.items()):
-        for port, spec in block.inputs.items():
+    for path in sorted(table.blocks):
+        for port, spec in inputs[path].items():
             if (path, port) not in table.wires and spec.default is None:
                 raise UnwiredInputError("nothing is wired to it; wire it in the block's call.", block=path, port=port)
     for (consumer, port), wire in table.wires.items():
-        if port not in table.blocks[consumer].inputs:
+        if port not in inputs[consumer]:
             raise UnknownNameError(
-                f"it has no input {port!r}, which {wire} is wired to. {near(port, table.blocks[consumer].inputs)}",
+                f"it has no input {port!r}, which {wire} is wired to. {near(port, inputs[consumer])}",
                 block=consumer,
             )
 
@@ -107,10 +108,11 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[Port, Shape
     consumers: dict[Port, list[Port]] = {}
     fed: dict[Port, list[str]] = {}
     unknown: dict[str, set[str]] = {path: set() for path in table.blocks}
+    inputs = {path: block.inputs for path, block in table.blocks.items()}
     for (path, port), wire in table.wires.items():
         source = (wire.block, wire.port)
         fed.setdefault(source, []).append(path)
-        if table.blocks[path].inputs[port].shape is None and source not in shapes:
+        if inputs[path][port].shape is None and source not in shapes:
             unknown[path].add(port)
             consumers.setdefault(source, []).append((path, port))
     ready = [path for path, ports in unknown.items() if not ports]
