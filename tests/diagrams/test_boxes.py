@@ -371,3 +371,35 @@ def test_offsets_and_delays_without_a_sample_time_or_out_of_range_are_refused():
         counting(0.1, delay=0.5)
     with pytest.raises(SampleTimeError, match=r"its offset 0\.03 s is no multiple of the step 0\.02 s"):
         Diagram("d", counting(0.1, offset=0.03)()).simulate(1.0, step=0.02, progress=False)
+
+
+def test_a_box_that_is_reset_keeps_its_states_until_it_opens_again():
+    @subsystem(enabled="reset")
+    def box(u):
+        return Lag(name="lag", start=2.0)(u)
+
+    enable = Step(times=(0.5, 0.8), values=(0.0, 1.0), initial_value=1.0)
+    run = Diagram("d", box(Constant(value=0.0), enable=enable)).simulate(1.0, step=0.1, **TIGHT)
+    states = np.array([run.at(t).state[0] for t in (0.4, 0.5, 0.7, 0.8)])
+    assert states == pytest.approx([2 * np.exp(-0.4), 2 * np.exp(-0.5), 2 * np.exp(-0.5), 2.0], abs=1e-11)
+
+
+def test_an_edge_that_came_while_the_box_around_was_closed_acts_when_that_opens():
+    """At ticks as in continuous time: what a closed box remembers is what was when it closed."""
+
+    @subsystem(triggered="rising")
+    def inner(t):
+        return Gain(gain=1.0, name="g")(t)
+
+    trigger = Step(times=(0.2, 0.45, 0.5, 0.8), values=(1.0, 0.0, 1.0, 0.0))
+    enable = Step(times=(0.1, 0.3, 0.4, 0.9), values=(0.0, 1.0, 0.0, 1.0), initial_value=1.0)
+    # closed over [0.1, 0.3) and [0.4, 0.9): the edge at 0.2 acts at 0.3, that at 0.5 is over by 0.9
+    for options in ({"sample_time": 0.05}, {}):
+
+        @subsystem(enabled="held", **options)
+        def outer(t, trigger):
+            return inner(t, trigger=trigger)
+
+        wired = outer(Clock(), trigger, enable=enable).named("y")
+        run = Diagram("d", counting(0.05, "beside")(), wired).simulate(1.0, progress=False)
+        assert np.array_equal(run["y"], np.where(run.t < 0.3, 0.0, 0.3))

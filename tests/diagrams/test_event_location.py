@@ -338,3 +338,22 @@ def test_an_indicator_that_is_not_finite_ends_the_run_and_fires_nothing():
     root = Function(np.sqrt, name="root")
     with pytest.raises(NonFiniteError, match=r"root\.y, t = 0\.\d+ s: found \[nan\].*first block"):
         Diagram("d", Crossings(name="c")(root(0.55 - Clock()))).simulate(1.0, step=0.1, progress=False)
+
+
+def test_a_jump_is_told_which_of_its_events_fired():
+    class Two(Block):
+        u = Input()
+        code = State(discrete=True, output=True)
+        one = Event("rising")
+        two = Event("rising")
+
+        def indicators(self, t, x, u):
+            return u.u - 0.25, u.u - 0.5
+
+        def jump(self, t, x, u, fired):
+            return 10.0 * x.code + fired.one + 2.0 * fired.two
+
+    u = Step(times=(0.1, 0.3, 0.5, 0.7), values=(0.3, 0.6, 0.0, 1.0))
+    run = Diagram("d", Two(name="two")(u)).simulate(1.0, step=0.5, progress=False)
+    assert run["two.code"][-1] == 123.0  # the first, the second, both
+    assert [e.event for e in run.events] == ["one", "two", "one", "two"]
