@@ -51,17 +51,17 @@ def instants(block: Block, end: float) -> list[float]:
 
 def check_smooth(bench: Bench, announced: list[float]) -> int:
     """Look for jumps that nothing announces, in a continuous frame, and return how many intervals were searched."""
-    if bench.sampled or not bench.traced.outputs or bench.block.memory:
+    if bench.sampled or not (bench.traced.outputs or bench.traced.states) or bench.block.memory:
         return 0
     searched = 0
     edges = np.unique([0.0, *announced[:24], bench.exercise.duration])
     function = bench.traced.function
     symbols = function.mx_in()
-    results = function.call(symbols)[: len(bench.traced.outputs)]
-    all_outputs = ca.vertcat(*results)
-    slope = ca.jacobian(all_outputs, symbols[0])
-    rows = ca.densify(all_outputs if bench.block.opaque else ca.vertcat(all_outputs, slope))
-    in_time = ca.Function("in_time", symbols, [rows])
+    *outputs, rates, _ = function.call(symbols)
+    rows = [*outputs, *([rates] if bench.traced.advance == "derivative" else [])]
+    if not bench.block.opaque:
+        rows.append(ca.jacobian(ca.vertcat(*outputs), symbols[0]))
+    in_time = ca.Function("in_time", symbols, [ca.densify(ca.vertcat(*rows))])
     rest = bench.points[1].columns()[1:]
     for left, right in pairwise(edges):
         margin = 1e-6 * (right - left)

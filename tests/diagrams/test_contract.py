@@ -387,6 +387,15 @@ class Bent(Block):
         return np.where(t >= 0.37, t - 0.37, 0.0)
 
 
+class Pushed(Block):
+    """A rate that jumps, of which nobody is told."""
+
+    y = State(output=True)
+
+    def derivative(self, t, x, u):
+        return np.where(t >= 0.37, 1.0, 0.0) - x.y
+
+
 class Standing(Sudden):
     """Announces the same instant again and again."""
 
@@ -476,6 +485,7 @@ BROKEN = {
     Dragging: (DefinitionError, r"dragging: events: in a continuous frame its outputs or derivatives jump"),
     Sudden: (DefinitionError, r"sudden: next_instant: its outputs, or their rates, jump at t = 0\.37 s"),
     Bent: (DefinitionError, r"bent: next_instant: its outputs, or their rates, jump at t = 0\.37 s"),
+    Pushed: (DefinitionError, r"pushed: next_instant: its outputs, or their rates, jump at t = 0\.37 s"),
     Standing: (DefinitionError, r"standing: next_instant: next_instant\(0\.37\) gave 0\.37; expected a later time"),
     Skipping: (DefinitionError, r"skipping: next_instant: next_instant\(0\.0\) gave 0\.37, but next_instant\(0\.185\)"),
     Flapping: (DefinitionError, r"flapping: events: at t = .* its events go on firing \(up\), 100 times"),
