@@ -53,6 +53,8 @@ class Continuous:
         self.machine, self.flat, self.name, self.on_event = machine, flat, name, on_event
         self.where = flat.continuous
         self._edge, self._left, self._sources_edge = math.inf, math.inf, math.inf
+        self.beyond: tuple[float, np.ndarray] | None = None
+        """The last trial of the solver at which a rate was not finite."""
         self._resolution = rtol, atol
         self._loops = active_loops(flat, NOTHING)
         self._opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
@@ -102,7 +104,10 @@ class Continuous:
         return t
 
     def _rate(self, t: float, x: np.ndarray) -> np.ndarray:
-        return self._flow(self._time(t), x)
+        rates = self._flow(self._time(t), x)
+        if not np.isfinite(rates).all():
+            self.beyond = (t, x.copy())
+        return rates
 
     def _slope(self, t: float, x: np.ndarray) -> np.ndarray:
         if self._jacobian is None:
@@ -127,6 +132,18 @@ class Continuous:
             block=event.path,
             t=t,
         )
+
+    def made_by(self) -> SimulationError | None:
+        """Return the error of the block that made the last trial's rates not finite; the instant is lost with it."""
+        if self.beyond is None:
+            return None
+        t, x = self.beyond
+        self._put(t, x)
+        try:
+            self.machine.look()
+        except SimulationError:
+            return None
+        return None if self.machine.ok[0] else failure(self.machine, NOTHING).at(t=t)  # type: ignore[return-value]
 
     def _inputs_of_delays(self, t: float, x: np.ndarray) -> np.ndarray:
         trial = self.machine.trial
@@ -370,14 +387,22 @@ def absolute_tolerances(flat: FlatDiagram, atol: float) -> Any:
     return atol if np.all(scale == 1.0) or np.ndim(atol) else atol * scale
 
 
-def check_solver(error: SimulationError, machine: Machine) -> SimulationError:
-    """Return the error behind that of a solver: what an opaque block raised; else say which block its message names."""
+def check_solver(error: SimulationError, machine: Machine, continuous: Continuous | None = None) -> SimulationError:
+    """Return the error behind that of a solver: what an opaque block raised, or the block that made a trial not finite.
+
+    Else say which block its message names.
+    """
     opaque = opaque_failure(machine)
     if opaque is not None:
         return opaque.at(t=error.t)  # type: ignore[return-value]
-    if error.block is None:
-        for name in sorted(state_names(machine.flat), key=len, reverse=True):
-            if f" {name} " in f" {error.message} ":
-                error.block = name.rpartition(".")[0]
-                break
-    return error
+    if error.block is not None:
+        return error
+    for name in sorted(state_names(machine.flat), key=len, reverse=True):
+        if f" {name} " in f" {error.message} ":
+            error.block = name.rpartition(".")[0]
+            break
+    made = continuous.made_by() if continuous is not None and error.block is not None else None
+    if made is None or made.block == error.block:
+        return error
+    made.message = f"{made.message} The solver could not go on without it: {error.message}"
+    return made

@@ -36,13 +36,17 @@ def ticks_in(duration: Any, base: Fraction, name: str) -> int:
     return n
 
 
-def default_step(diagram: Diagram, step: Any, duration: float | None, solver: str) -> Any:
+def default_step(diagram: Diagram, step: Any, duration: float | None, solver: str, start: Any = None) -> Any:
     """Return the seconds between two samples of a run that has neither a ``step`` nor a clock.
 
-    A thousandth of the duration, in whole nanoseconds, where the diagram is continuous, has no FMU and the solver
-    chooses its own steps.
+    That of the run that is gone on from; else a thousandth of the duration, in whole nanoseconds where it has them,
+    where the diagram is continuous, has no FMU and the solver chooses its own steps.
     """
-    if step is not None or duration is None or not diagram.is_continuous or diagram.has_clock:
+    if step is not None or not diagram.is_continuous or diagram.has_clock:
+        return step
+    if start is not None and hasattr(start, "base"):
+        return start.base
+    if duration is None:
         return step
     from ._solvers import solver_name
 
@@ -56,7 +60,7 @@ def default_step(diagram: Diagram, step: Any, duration: float | None, solver: st
         ticks_in(duration, Fraction(1), diagram.name)  # refused
     ticks = span / Fraction(1, 10**9)
     if ticks.denominator != 1:
-        return step
+        return span / 1000
     return next((span / n for n in (1000, 500, 200, 100, 10, 1) if (ticks / n).denominator == 1), span)
 
 

@@ -76,8 +76,7 @@ class Recorder:
         header: Mapping[str, Any] | None = None,
         overwrite: bool = False,
     ):
-        if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
-            raise OptionError(f"found every={every!r}; expected a positive integer: one of so many samples is kept.")
+        check_every(every)
         self.every, self.has_residual = int(every), residual
         self.columns = None if columns is None else np.array([*columns], dtype=int)
         self._pick = self.columns
@@ -255,6 +254,18 @@ class Recorder:
         stored = read(self.to)
         self.events, self.residual = stored.events, stored.residual
         return stored.t, stored.data
+
+
+def check_every(every: Any) -> None:
+    """Refuse an ``every`` that is no positive integer.
+
+    Raises
+    ------
+    OptionError
+        If it is none.
+    """
+    if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
+        raise OptionError(f"found every={every!r}; expected a positive integer: one of so many samples is kept.")
 
 
 def select(

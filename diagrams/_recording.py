@@ -11,7 +11,7 @@ import numpy as np
 
 from ._duration import check_memory
 from ._flat import FlatDiagram
-from ._recorder import Recorder, select
+from ._recorder import Recorder, check_every, select
 from ._stored import header
 from ._structure import join
 
@@ -27,6 +27,9 @@ class Recording:
     states: bool
     to: Any
     overwrite: bool
+
+    def __post_init__(self) -> None:
+        check_every(self.every)
 
     @property
     def width(self) -> int:

@@ -108,8 +108,8 @@ class Simulation:
         duration: float | None = None,
     ):
         self.diagram = diagram
-        step = default_step(diagram, step, duration, solver)
-        self.flat: FlatDiagram = diagram.flatten(step)
+        given, step = step, default_step(diagram, step, duration, solver, start)
+        self.flat: FlatDiagram = diagram.flatten(step) if step is given else diagram._flattened(step)
         if start is not None:
             check_fits(start, self.flat, diagram.name)
         self._recording = Recording(self.flat, diagram.name, record, every, states, to, overwrite)
@@ -350,7 +350,7 @@ class Simulation:
         for path, plant in self._plants:
             if plant.failed:
                 error.block = path
-        return check_solver(error, self._machine)
+        return check_solver(error, self._machine, self._continuous)
 
     def _attach(self, error: SimulationError) -> None:
         if error.run is None:

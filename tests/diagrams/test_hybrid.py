@@ -584,3 +584,42 @@ def test_an_event_at_the_very_end_is_in_the_last_sample():
     run = Diagram("d", Crossings(name="c")(1.0 - Clock())).simulate(1.0, step=0.25, progress=False)
     assert [e.t for e in run.events] == [1.0]
     assert run["c.count"].tolist() == [0, 0, 0, 0, 1]
+
+
+# --- what a run is asked for, and who is to blame ---------------------------------------------------------------------
+
+
+def test_a_continuous_run_takes_any_duration():
+    run = Diagram("d", Integrator()(Constant(value=1.0)).named("y")).simulate(np.pi, progress=False)
+    assert (len(run.t), run.t[-1]) == (1001, np.pi)
+    assert abs(run["y"][-1] - np.pi) < 1e-14
+
+
+def test_a_continuous_run_goes_on_for_another_duration_on_the_same_samples():
+    diagram = Diagram("d", Integrator()(Constant(value=1.0)).named("y"))
+    run = diagram.simulate(2.5, start=diagram.simulate(1.0, progress=False).final_state, progress=False)
+    assert (run.t[1] - run.t[0], run.t[-1]) == (pytest.approx(1e-3), 3.5)
+    assert abs(run["y"][-1] - 3.5) < 1e-13
+
+
+def test_a_rate_that_is_not_finite_names_the_block_that_made_it_so():
+    bad = Function(lambda u: 1.0 / (1.0 - np.where(u > 0.5, 1.0, 0.0)), name="bad")
+    diagram = Diagram("d", Integrator(name="i")(bad(Integrator(name="ramp")(Constant(value=1.0)))))
+    with pytest.raises(NonFiniteError, match=r"^bad\.y, t = 0\.5.* s: found \[inf\].* The solver could not go on") as e:
+        diagram.simulate(1.0, progress=False)
+    assert (e.value.block, e.value.port) == ("bad", "y")
+    assert 0.49 < e.value.run.t[-1] <= 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"every": 0}, "found every=0; expected a positive integer"),
+        ({"atol": "x"}, "atol is 'x'; expected a number"),
+        ({"rtol": "x"}, "rtol is 'x'; expected"),
+        ({"max_step": "x"}, "max_step is 'x'; expected a positive number"),
+    ],
+)
+def test_options_that_are_none_are_refused(options, words):
+    with pytest.raises(OptionError, match=words):
+        Diagram("d", Integrator()(Constant(value=1.0))).simulate(1.0, **options)
