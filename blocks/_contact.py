@@ -72,7 +72,7 @@ class Wall(Block):
         F = n max(k δ + d δ̇, 0) in the wall, δ > 0;    F = 0 outside.
 
     n points out of the wall. A damped wall's force jumps where the body comes in, and is gone before it leaves. In a
-    continuous frame that jump is an event; without damping the force has a kink only, and there are no events.
+    continuous frame that jump is an event; without damping the force has a kink only, and the event is for ``contact``.
 
     Raises
     ------
@@ -112,8 +112,8 @@ class Wall(Block):
 
     @property
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """Contact that is made and lost, where the force jumps."""
-        return {"touch": Wall.touch, "press": Wall.press} if self.damping else {}
+        """Contact that is made and lost, where the force jumps; undamped, it follows the depth alone."""
+        return {"touch": Wall.touch} | ({"press": Wall.press} if self.damping else {})
 
     def _seen(self, u: Any) -> tuple[Array, Array, Array]:
         """Return n, the depth δ, and k δ + d δ̇."""
@@ -154,13 +154,14 @@ class Wall(Block):
         """Keep whether it pushes."""
         return self._pushes(u)
 
-    def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+    def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, Array] | Array:
         """Return δ and k δ + d δ̇."""
-        return self._seen(u)[1:]
+        _, depth, push = self._seen(u)
+        return (depth, push) if x else depth
 
-    def jump(self, t: Array, x: Any, u: Any, fired: Any) -> Array:
-        """Return whether it pushes now."""
-        return self._pushes(u)
+    def jump(self, t: Array, x: Any, u: Any, fired: Any) -> Array | tuple[()]:
+        """Return whether it pushes now, where that is a state."""
+        return self._pushes(u) if x else ()
 
 
 class HandProfile(Block):

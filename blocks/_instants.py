@@ -20,6 +20,11 @@ def left_of(t: float) -> float:
     return t - 4.0 * _TOLERANCE * abs(t)
 
 
+def is_before(a: float, b: float) -> bool:
+    """Whether a comes before b by more than the rounding of both: what is as near as that is one instant."""
+    return a < b - 2.0 * _TOLERANCE * abs(b) if b < math.inf else a < b
+
+
 def period_of(t: Array, period: Array, delay: Array) -> tuple[Array, Array, Array]:
     """Return the number of the period at t, the time since it began in periods, and the rounding of it."""
     passed = (t - delay) / period

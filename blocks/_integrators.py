@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ._block import Block
+from ._branches import truth
 from ._errors import ParameterError, ShapeError
 from ._ports import Event, Input, Output, State
 from ._values import Array, parameter
@@ -227,9 +228,9 @@ class ResettableIntegrator(_Limits, Block):
         return limited(0.0 * x.integral + target, self.lower, self.upper)
 
     def now(self, x: Any, u: Any) -> Array:
-        """Return y at a tick."""
-        edge = np.logical_and(u.reset > 0.5, x.last <= 0.5)
-        return np.where(edge, self.reset_value(x, u), x.integral)
+        """Return y at a tick; NaN passes through."""
+        edge = truth(u.reset) * (1.0 - truth(x.last))
+        return np.where(edge > 0.5, self.reset_value(x, u), np.where(edge <= 0.5, x.integral, edge))
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> tuple[Array, Array]:
         """Return the integral after and before a reset."""

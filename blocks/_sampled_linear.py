@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from ._block import Block
+from ._branches import truth
 from ._delays import History, pushed
 from ._errors import ParameterError
 from ._integrators import check_limits, limited
@@ -69,8 +70,8 @@ class DiscreteIntegrator(Block):
     def sums(self, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
         """Return y and the sum that the next tick starts from."""
         target = u.value if self.reset_to_input else self.initial_value
-        edge = np.logical_and(u.reset > 0.5, x.last <= 0.5)
-        total = np.where(edge, 0.0 * x.total + target, x.total)
+        edge = truth(u.reset) * (1.0 - truth(x.last))
+        total = np.where(edge > 0.5, 0.0 * x.total + target, np.where(edge <= 0.5, x.total, edge))
         now, then = _WEIGHTS[self.method]
         area = self.gain * T * u.u
         y = limited(total + now * area if now else total, self.lower, self.upper)

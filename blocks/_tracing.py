@@ -384,10 +384,10 @@ class _Tracer:
             new, self.solved = trapezoidal(rates, arguments, self.T, np.concatenate(nominals))
             return "trapezoidal", None, new, unused
         if self.method == "semi_implicit":
-            new = x
+            new = [x[i] for i in range(n)]
             for i in reversed(range(n)):
-                new = ca.vertcat(new[:i], x[i] + self.T * states_from("derivative", new)[i], new[i + 1 :])
-            return "semi_implicit", None, new, unused
+                new[i] = x[i] + self.T * states_from("derivative", ca.vertcat(*new))[i]
+            return "semi_implicit", None, ca.vertcat(*new), unused
         return "forward", None, x + self.T * dx, unused
 
     def _rates(self, discrete: set[str]) -> Any:

@@ -1,6 +1,7 @@
-"""Diagrams: wiring, scheduling, simulation; margins of its loops; Fig. 3 and its experiments; the command line."""
+"""Diagrams: wiring, scheduling, simulation; linearization and margins; Fig. 3 and its experiments; the command line."""
 
 from . import experiments
+from ._contract import BlockReport, check_block
 from ._control_values import Comparison, compare_with_control
 from ._diagram import Diagram
 from ._disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
@@ -30,6 +31,7 @@ from ._subsystem import Subsystem, subsystem
 from .fig3 import fig3
 
 __all__ = [
+    "BlockReport",
     "Comparison",
     "Diagram",
     "DiskMargin",
@@ -54,6 +56,7 @@ __all__ = [
     "Stopped",
     "Subsystem",
     "Wire",
+    "check_block",
     "compare_with_control",
     "complementary",
     "delayed_hold",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,6 +74,7 @@ def part_shape(shape: Shape, wire: Wire, who: str, port: str) -> Shape:
 
 
 def _check_ports(table: Structure) -> None:
+    inputs = {path: block.inputs for path, block in table.blocks.items()}  # made anew each time they are asked for
     for (consumer, port), wire in table.wires.items():
         outputs = table.blocks[wire.block].outputs
         if wire.port not in outputs:
@@ -82,14 +82,14 @@ def _check_ports(table: Structure) -> None:
                 f"it has no output {wire.port!r}, which {consumer}.{port} is wired to. {near(wire.port, outputs)}",
                 block=wire.block,
             )
-    for path, block in sorted(table.blocks.items()):
-        for port, spec in block.inputs.items():
+    for path in sorted(table.blocks):
+        for port, spec in inputs[path].items():
             if (path, port) not in table.wires and spec.default is None:
                 raise UnwiredInputError("nothing is wired to it; wire it in the block's call.", block=path, port=port)
     for (consumer, port), wire in table.wires.items():
-        if port not in table.blocks[consumer].inputs:
+        if port not in inputs[consumer]:
             raise UnknownNameError(
-                f"it has no input {port!r}, which {wire} is wired to. {near(port, table.blocks[consumer].inputs)}",
+                f"it has no input {port!r}, which {wire} is wired to. {near(port, inputs[consumer])}",
                 block=consumer,
             )
 
@@ -106,20 +106,27 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[Port, Shape
     assumed: dict[Port, Shape] = {}
     shared: dict[Any, Traced] = {}  # traces of users' classes: what they close over may change between two builds
     consumers: dict[Port, list[Port]] = {}
+    fed: dict[Port, list[str]] = {}
     unknown: dict[str, set[str]] = {path: set() for path in table.blocks}
+    inputs = {path: block.inputs for path, block in table.blocks.items()}
     for (path, port), wire in table.wires.items():
         source = (wire.block, wire.port)
-        if table.blocks[path].inputs[port].shape is None and source not in shapes:
+        fed.setdefault(source, []).append(path)
+        if inputs[path][port].shape is None and source not in shapes:
             unknown[path].add(port)
             consumers.setdefault(source, []).append((path, port))
     ready = [path for path, ports in unknown.items() if not ports]
     heapq.heapify(ready)
     waiting = set(table.blocks) - set(ready)
+    stuck: list[tuple[bool, bool, str]] | None = None  # from the first assumption on: who is best to make the next one
     while ready or waiting:
         if not ready:
-            guess = _assume(table, shapes, waiting)
-            assumed.update(guess)
-            path = next(iter(guess))[0]
+            if stuck is None:
+                stuck = [(not _known(table, shapes, p), not table.blocks[p].states, p) for p in waiting]
+                heapq.heapify(stuck)
+            while (path := heapq.heappop(stuck)[2]) not in waiting:
+                pass
+            assumed.update(_assume(table, shapes, path))
             unknown[path].clear()
             waiting.discard(path)
             heapq.heappush(ready, path)
@@ -135,6 +142,9 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[Port, Shape
         for name, shape in found.items():
             if (path, name) not in shapes:
                 shapes[path, name] = shape
+                for consumer in fed.get((path, name), ()):
+                    if stuck is not None and consumer in waiting:
+                        heapq.heappush(stuck, (False, not table.blocks[consumer].states, consumer))
                 for consumer, port in consumers.get((path, name), ()):
                     unknown[consumer].discard(port)
                     if not unknown[consumer] and consumer in waiting:
@@ -227,23 +237,23 @@ def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, 
         raise
 
 
-def _assume(table: Structure, shapes: dict[Port, Shape], stuck: Iterable[str]) -> dict[Port, Shape]:
+def _known(table: Structure, shapes: dict[Port, Shape], path: str) -> list[Shape]:
+    """Return the shapes that are known of what is wired to a block."""
+    wires = ((port, table.wires.get((path, port))) for port in table.blocks[path].inputs)
+    return [
+        part_shape(shapes[w.block, w.port], w, path, port)
+        for port, w in wires
+        if w is not None and (w.block, w.port) in shapes
+    ]
+
+
+def _assume(table: Structure, shapes: dict[Port, Shape], path: str) -> dict[Port, Shape]:
     """Return an assumption that lets a loop of unknown shapes go on; it is checked once the shapes are known.
 
     A block's unknown inputs are assumed to have the shape of a known one beside them, else of its first state.
     """
-
-    def known(path: str) -> list[Shape]:
-        wires = ((port, table.wires.get((path, port))) for port in table.blocks[path].inputs)
-        return [
-            part_shape(shapes[w.block, w.port], w, path, port)
-            for port, w in wires
-            if w is not None and (w.block, w.port) in shapes
-        ]
-
-    path = min(stuck, key=lambda p: (not known(p), not table.blocks[p].states, p))
     block = table.blocks[path]
-    shape = next(iter([*known(path), *start_shapes(block)]), ())
+    shape = next(iter([*_known(table, shapes, path), *start_shapes(block)]), ())
     return {
         (path, port): shape
         for port, spec in block.inputs.items()
@@ -275,18 +285,20 @@ def _check_units(table: Structure, shapes: dict[Port, Shape]) -> dict[Port, Unit
         for name, port in block.outputs.items():
             if port.unit is not None:
                 units[path, name] = port.unit
-    changed = True
-    while changed:  # outputs that take over an input's unit
-        changed = False
-        for path, block in sorted(table.blocks.items()):
-            for name, port in block.outputs.items():
-                like = getattr(port, "like", None)
-                wire = table.wires.get((path, like)) if like and not hasattr(port, "start") else None
-                if wire is not None and (path, name) not in units:
-                    unit = _part_unit(units, wire)
-                    if unit is not None:
-                        units[path, name] = unit
-                        changed = True
+    followers: dict[Port, list[tuple[Port, Wire]]] = {}  # outputs that take over an input's unit
+    for path, block in table.blocks.items():
+        for name, port in block.outputs.items():
+            like = getattr(port, "like", None)
+            wire = table.wires.get((path, like)) if like and not hasattr(port, "start") else None
+            if wire is not None and (path, name) not in units:
+                followers.setdefault((wire.block, wire.port), []).append(((path, name), wire))
+    told = list(units)
+    while told:
+        for output, wire in followers.get(told.pop(), ()):
+            unit = _part_unit(units, wire)
+            if unit is not None:
+                units[output] = unit
+                told.append(output)
     for path, block in sorted(table.blocks.items()):
         seen: tuple[Wire, Unit] | None = None
         for name, spec in block.inputs.items():

@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 
 from ..blocks._block import Block
-from ..blocks._errors import OptionError, ShapeError, SimulationError
-from ..blocks._instants import left_of
+from ..blocks._errors import NonFiniteError, OptionError, SimulationError
+from ..blocks._instants import is_before, left_of
+from ._between import active_loops
 from ._events import Domains
-from ._failures import failure, opaque_failure, state_values
+from ._failures import failure, forget_trials, opaque_failure, state_values
 from ._flat import FlatDiagram
 from ._machine import Machine
 from ._solvers import Problem, make_solver
 from ._stored import Occurrence
 from ._structure import join
-from ._transport import Delays, step_inputs
+from ._transport import delays_of, driven_function, step_inputs
 
 NOTHING: frozenset[Any] = frozenset()
 
@@ -51,8 +52,13 @@ class Continuous:
         flat = machine.flat
         self.machine, self.flat, self.name, self.on_event = machine, flat, name, on_event
         self.where = flat.continuous
-        self._edge, self._left = math.inf, math.inf
-        self.delays = _delays(flat)
+        self._edge, self._left, self._sources_edge = math.inf, math.inf, math.inf
+        self.beyond: tuple[float, np.ndarray] | None = None
+        """The last trial of the solver at which a rate was not finite."""
+        self._resolution = rtol, atol
+        self._loops = active_loops(flat, NOTHING)
+        self._opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
+        self.delays = delays_of(flat)
         self._flow, self._jacobian = machine.flow(), None
         problem = Problem(self.where.size, self._rate, self._slope, state_names(flat))
         longest = max_step
@@ -76,12 +82,12 @@ class Continuous:
             )
         self.domains: Domains | None = None
         if flat.events:
-            self._indicators, opened = machine.indicators()
-            self.domains = Domains(flat, self._g, opened)
+            self._indicators, self._opened = machine.indicators()
+            self.domains = Domains(flat, self._g, self._opened)
             self._jump, self._fired = machine.jump()
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
-            self._drive = machine.plain(_driven_function(flat), [self._driven], machine.trial)
+            self._drive = machine.plain(driven_function(flat), [self._driven], machine.trial)
         self.sources = [
             flat.table.blocks[path]
             for path in sorted(flat.checked.traced)
@@ -98,7 +104,10 @@ class Continuous:
         return t
 
     def _rate(self, t: float, x: np.ndarray) -> np.ndarray:
-        return self._flow(self._time(t), x)
+        rates = self._flow(self._time(t), x)
+        if not np.isfinite(rates).all():
+            self.beyond = (t, x.copy())
+        return rates
 
     def _slope(self, t: float, x: np.ndarray) -> np.ndarray:
         if self._jacobian is None:
@@ -106,7 +115,35 @@ class Continuous:
         return self._jacobian(self._time(t), x)  # type: ignore[misc, no-any-return]
 
     def _g(self, t: float, x: np.ndarray) -> np.ndarray:
-        return self._indicators(self._time(t), x)
+        g = self._indicators(self._time(t), x)
+        if not np.all(np.isfinite(g[self._opened > 0.5])):
+            raise self._not_finite(t, x, g)
+        return g
+
+    def _not_finite(self, t: float, x: np.ndarray, g: np.ndarray) -> SimulationError:
+        """Return the error of an indicator that is not finite: that of the block which made the first such value."""
+        event = self.flat.events[int(np.flatnonzero(~np.isfinite(g) & (self._opened > 0.5))[0])]
+        self._put(t, x)
+        self.machine.look()
+        if not self.machine.ok[0]:
+            return failure(self.machine, NOTHING).at(t=t)  # type: ignore[return-value]
+        return NonFiniteError(
+            f"its indicator {event.name!r} is not a finite number; expected one. Look at roots and quotients in it.",
+            block=event.path,
+            t=t,
+        )
+
+    def made_by(self) -> SimulationError | None:
+        """Return the error of the block that made the last trial's rates not finite; the instant is lost with it."""
+        if self.beyond is None:
+            return None
+        t, x = self.beyond
+        self._put(t, x)
+        try:
+            self.machine.look()
+        except SimulationError:
+            return None
+        return None if self.machine.ok[0] else failure(self.machine, NOTHING).at(t=t)  # type: ignore[return-value]
 
     def _inputs_of_delays(self, t: float, x: np.ndarray) -> np.ndarray:
         trial = self.machine.trial
@@ -145,6 +182,8 @@ class Continuous:
         machine.look()
         if not machine.ok[0]:
             raise failure(machine, NOTHING).at(t=float(machine.here.t[0]))
+        if self._opaque:
+            forget_trials(machine)
         machine.here.x[:] = machine.x_next
         self._synchronize()
 
@@ -220,7 +259,8 @@ class Continuous:
         times = iter(grid)
         pending = next(times, math.inf)
         while t < end:
-            edge = min(end, self._next_edge(t))
+            jump = self._next_edge(t)
+            edge = jump if is_before(jump, end) else end
             self._edge, self._left = edge, max(t, left_of(edge))
             if self.delays is not None:
                 self.delays.middle = 0.5 * (t + edge)
@@ -231,6 +271,7 @@ class Continuous:
                 step = self.solver.step()
                 if self.domains is not None:
                     found = self.domains.locate(step.t_old, step.t, step.interpolate)
+                    solved = machine.trial.x[self._loops]
                 t = step.t if found is None else found[0]
                 while pending < t or (pending == t < edge and found is None):
                     self._put(pending, step.interpolate(pending))
@@ -239,16 +280,18 @@ class Continuous:
                         return pending
                     pending = next(times, math.inf)
                 if self.delays is not None and t > step.t_old:
-                    step_inputs(self.delays, step.t_old, t, step.interpolate, self._inputs_of_delays)
+                    step_inputs(self.delays, step.t_old, t, step.interpolate, self._inputs_of_delays, self._resolution)
                 self._put(t, step.x if found is None else step.interpolate(t))
+                if found is not None:  # the loops as the indicators saw them, to the last bit
+                    machine.here.x[self._loops] = solved
                 self.accept()
             happened = found is not None
             if found is not None:
                 self._fire(t, found[1])
-            if t == edge < end:  # a discontinuity of a source
+            if t == edge and self.delays is not None:
+                self.delays.reached(t, from_source=not is_before(t, self._sources_edge))
+            if t == edge < end:  # a discontinuity of a source, or one that comes out of a delay
                 self.at(t)
-                if self.delays is not None:
-                    self.delays.edge(t)
                 happened |= self.settle(t)
                 machine.look()
             if pending == t < end:
@@ -271,10 +314,8 @@ class Continuous:
     """Whether a stop condition is true in what was evaluated last; set by the run."""
 
     def _next_edge(self, t: float) -> float:
-        found = math.inf if self.delays is None else self.delays.next_edge(t)
-        for source in self.sources:
-            found = min(found, source.next_instant(t))
-        return found
+        self._sources_edge = min((source.next_instant(t) for source in self.sources), default=math.inf)
+        return min(self._sources_edge, math.inf if self.delays is None else self.delays.next_edge(t))
 
     # --- saved states ------------------------------------------------------------------------------------------------
 
@@ -346,45 +387,22 @@ def absolute_tolerances(flat: FlatDiagram, atol: float) -> Any:
     return atol if np.all(scale == 1.0) or np.ndim(atol) else atol * scale
 
 
-def _delays(flat: FlatDiagram) -> Delays | None:
-    table = flat.table
-    paths = [p for p in sorted(table.blocks) if table.blocks[p].transport and p not in flat.checked.traced]
-    if not paths:
-        return None
-    blocks: list[Any] = [table.blocks[p] for p in paths]
-    inputs = [flat.plant_inputs.slices[join(p, "u")] for p in paths]
-    starts: list[Any] = []
-    for path, block in zip(paths, blocks, strict=True):
-        shape = flat.plant_inputs.shapes[join(path, "u")]
-        if block.initial_value is None:
-            starts.append(None)  # the first input; see `Delays.begin`
-            continue
-        try:
-            starts.append(np.ravel(np.broadcast_to(np.asarray(block.initial_value, dtype=float), shape)).copy())
-        except ValueError:
-            raise ShapeError(
-                f"found an initial_value of shape {np.shape(block.initial_value)}; expected {shape}, that of the "
-                "input, or a number.",
-                block=path,
-                port="initial_value",
-            ) from None
-    return Delays([b.delay for b in blocks], inputs, [flat.plant_outputs.slices[join(p, "y")] for p in paths], starts)
+def check_solver(error: SimulationError, machine: Machine, continuous: Continuous | None = None) -> SimulationError:
+    """Return the error behind that of a solver: what an opaque block raised, or the block that made a trial not finite.
 
-
-def _driven_function(flat: FlatDiagram) -> Any:
-    """Return ``(t, x, w, p) -> z`` between ticks."""
-    f = flat.at_tick(frozenset())
-    return f.slice("driven", [0, 1, 2, 3], [1])
-
-
-def check_solver(error: SimulationError, machine: Machine) -> SimulationError:
-    """Return the error behind that of a solver: what an opaque block raised; else say which block its message names."""
+    Else say which block its message names.
+    """
     opaque = opaque_failure(machine)
     if opaque is not None:
         return opaque.at(t=error.t)  # type: ignore[return-value]
-    if error.block is None:
-        for name in sorted(state_names(machine.flat), key=len, reverse=True):
-            if f" {name} " in f" {error.message} ":
-                error.block = name.rpartition(".")[0]
-                break
-    return error
+    if error.block is not None:
+        return error
+    for name in sorted(state_names(machine.flat), key=len, reverse=True):
+        if f" {name} " in f" {error.message} ":
+            error.block = name.rpartition(".")[0]
+            break
+    made = continuous.made_by() if continuous is not None and error.block is not None else None
+    if made is None or made.block == error.block:
+        return error
+    made.message = f"{made.message} The solver could not go on without it: {error.message}"
+    return made

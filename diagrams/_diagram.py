@@ -218,7 +218,9 @@ class Diagram(Analysis):
         step : float or Fraction, optional
             Seconds between two ticks, where no subsystem has a sample time (or to look between samples).
         """
-        key = None if step is None else exact_time(step, block=self.name)
+        return self._flattened(None if step is None else exact_time(step, block=self.name))
+
+    def _flattened(self, key: Fraction | None) -> FlatDiagram:
         if key not in self._flat:
             solve = self.loops == "solve"
             self._flat[key] = flatten(self._lowered, self._checked, key, name=self.name, solve=solve)

@@ -7,9 +7,14 @@ import os
 import shutil
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..blocks._errors import OptionError
+
+if TYPE_CHECKING:
+    from ._diagram import Diagram
+
+FIXED_STEP = ("euler", "heun", "rk4")
 
 
 def ticks_in(duration: Any, base: Fraction, name: str) -> int:
@@ -29,6 +34,34 @@ def ticks_in(duration: Any, base: Fraction, name: str) -> int:
             port="duration",
         )
     return n
+
+
+def default_step(diagram: Diagram, step: Any, duration: float | None, solver: str, start: Any = None) -> Any:
+    """Return the seconds between two samples of a run that has neither a ``step`` nor a clock.
+
+    That of the run that is gone on from; else a thousandth of the duration, in whole nanoseconds where it has them,
+    where the diagram is continuous, has no FMU and the solver chooses its own steps.
+    """
+    if step is not None or not diagram.is_continuous or diagram.has_clock:
+        return step
+    if start is not None and hasattr(start, "base"):
+        return start.base
+    if duration is None:
+        return step
+    from ._solvers import solver_name
+
+    if diagram.has_fmu or solver_name(solver) in FIXED_STEP:
+        return step
+    try:
+        span = Fraction(repr(float(duration)))
+    except (TypeError, ValueError):
+        span = Fraction(0)
+    if not span > 0:
+        ticks_in(duration, Fraction(1), diagram.name)  # refused
+    ticks = span / Fraction(1, 10**9)
+    if ticks.denominator != 1:
+        return span / 1000
+    return next((span / n for n in (1000, 500, 200, 100, 10, 1) if (ticks / n).denominator == 1), span)
 
 
 def memory() -> int:

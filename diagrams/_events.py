@@ -40,7 +40,7 @@ class Domains:
         self.fresh = True
         self._times = [deque[float](maxlen=_ZENO + 1) for _ in flat.events]
         self._largest = np.zeros(len(flat.events))
-        self._recent = deque[tuple[float, int]](maxlen=_CHATTER)
+        self._recent = deque[tuple[float, tuple[int, ...]]](maxlen=_CHATTER)
 
     def _domains(self, t: float, x: np.ndarray, before: np.ndarray) -> np.ndarray:
         now = self._g(t, x) > np.where(before, -self._hysteresis, self._hysteresis)
@@ -149,14 +149,15 @@ class Domains:
             if times:
                 self._largest[i] = max(self._largest[i], t - times[-1])
             times.append(t)
-            self._recent.append((t, int(i)))
             self._look_for_zeno(int(i))
+        self._recent.append((t, tuple(np.flatnonzero(fired).tolist())))
         if len(self._recent) == _CHATTER and t - self._recent[0][0] < _SPAN * (1.0 + abs(t)):
-            counts = np.bincount([i for _, i in self._recent])
+            counts = np.bincount([i for _, together in self._recent for i in together])
             event = self.events[int(np.argmax(counts))]
             raise SimulationError(
-                f"the event {event.name!r} chatters: {_CHATTER} events fired within {t - self._recent[0][0]:.2g} s, so "
-                "the run would not go on. What it switches drives the indicator back across zero at once. Declare "
+                f"the event {event.name!r} chatters: {_CHATTER} times events fired within "
+                f"{t - self._recent[0][0]:.2g} s, so the run would not go on. "
+                "What it switches drives the indicator back across zero at once. Declare "
                 "a hysteresis, Event(hysteresis=…), or take a block that has one, such as Relay.",
                 block=event.path,
                 t=t,

@@ -20,8 +20,7 @@ from ._pass import Pass
 def failure(machine: Machine, acting: frozenset[Clock]) -> SimulationError:
     """Return the error of the first block that made a value that is not finite, or whose guard fails, at ``here``."""
     flat, here = machine.flat, machine.here
-    for trace in flat.checked.traced.values():
-        trace.failures.clear()  # some may be of trials that the solver got over
+    forget_trials(machine)
     for name, where in flat.plant_outputs.slices.items():
         if not np.all(np.isfinite(here.w[where])):
             path, port = flat.ports[name]
@@ -37,6 +36,15 @@ def failure(machine: Machine, acting: frozenset[Clock]) -> SimulationError:
     done = Pass(flat, acting, float(here.t[0]), here.x, here.w, flat.p, visit=visit)
     done.run()
     return opaque_failure(machine) or (found[0] if found else _overflow(machine))
+
+
+def forget_trials(machine: Machine) -> None:
+    """Forget what opaque blocks have raised in trials that the solver got over; an interrupt is raised."""
+    for trace in machine.flat.checked.traced.values():
+        if trace.failures:
+            last = trace.failures.pop()
+            if not isinstance(last, Exception):
+                raise last
 
 
 def opaque_failure(machine: Machine) -> SimulationError | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -143,9 +144,10 @@ class Machine:
         return (call if solve is None else _one_after_the_other(solve, call)), fired
 
     def plain(self, function: Any, outputs: list[np.ndarray], vectors: Vectors) -> Callable[[], None]:
-        """Return the call of another function of (t, x, w, p)."""
+        """Return the call of another function of (t, x, w, p) between ticks."""
         call: Callable[[], None] = self._bind(function, vectors, outputs).call
-        return call
+        solve = self.loop_solver(NONE, vectors)
+        return call if solve is None else _one_after_the_other(solve, call)
 
     # --- algebraic loops ---------------------------------------------------------------------------------------------
 
@@ -197,7 +199,7 @@ class Machine:
                     call()
                     break
                 v, found = x[where], better
-            if not found <= TOLERANCE:
+            if not found <= TOLERANCE and math.isfinite(found):  # a NaN that comes in is told by who made it
                 raise self.unsolved(found, float(vectors.t[0]))
 
         self._solved[key] = solve

@@ -13,7 +13,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from ..blocks._comparison import GUARDS, NEXT
@@ -71,18 +71,46 @@ def evaluation_order(
         With the loop printed port by port.
     """
     waits = dependencies(table, traced, start=start)
+    steps, stuck = _sorted(traced, waits)
+    if not stuck:
+        return Order(steps)
+    if not solve:
+        within = {port: {s for s in waits[port] if s in stuck} for port in stuck}
+        raise _loop_error(table, traced, _a_loop(within, _first(stuck)), start)
     torn: set[Port] = set()
     loops: list[str] = []
-    while True:
-        steps, stuck = _sorted(traced, {port: sources - torn for port, sources in waits.items()})
-        if not stuck:
-            return Order(steps, tuple(sorted(torn)), tuple(loops))
-        loop = _a_loop({port: {s for s in waits[port] if s in stuck and s not in torn} for port in stuck})
-        if not solve:
-            raise _loop_error(table, traced, loop, start)
-        sizes = {port: math.prod(traced[port[0]].outputs[port[1]]) for port in loop}
-        torn.add(min(loop, key=lambda port: (sizes[port], port)))
+    for loop, port in _tear(traced, waits, stuck):
+        torn.add(port)
         loops.append("\n".join(_printed(table, traced, loop)))
+    steps, _ = _sorted(traced, {port: sources - torn for port, sources in waits.items()})
+    return Order(steps, tuple(sorted(torn)), tuple(loops))
+
+
+def _tear(
+    traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]], stuck: set[Port]
+) -> Iterator[tuple[list[Port], Port]]:
+    """Yield loop after loop among the ports that are stuck, and its port that is to be taken as known."""
+    waits = {port: {s for s in waits[port] if s in stuck} for port in stuck}
+    consumers: dict[Port, list[Port]] = defaultdict(list)
+    for port, sources in waits.items():
+        for source in sources:
+            consumers[source].append(port)
+    candidates = sorted((p for p in stuck if p[1] not in (NEXT, GUARDS)), reverse=True)
+    while candidates:
+        if not waits[candidates[-1]]:
+            candidates.pop()
+            continue
+        loop = _a_loop(waits, candidates[-1])
+        sizes = {port: math.prod(traced[port[0]].outputs[port[1]]) for port in loop}
+        torn = min(loop, key=lambda port: (sizes[port], port))
+        yield loop, torn
+        known = [torn]
+        while known:
+            source = known.pop()
+            for port in consumers.pop(source, ()):
+                waits[port].discard(source)
+                if not waits[port]:
+                    known.append(port)
 
 
 def _sorted(traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]]) -> tuple[list[Step], set[Port]]:
@@ -117,9 +145,13 @@ def _sorted(traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]]) -> tu
     return order, {(path, name) for path, every in left.items() for name in every}
 
 
-def _a_loop(waits: Mapping[Port, set[Port]]) -> list[Port]:
-    """Return the ports of one loop among what is left over, each waiting for the next."""
-    port = min(p for p in waits if p[1] not in (NEXT, GUARDS))
+def _first(ports: Iterable[Port]) -> Port:
+    """Return the first one that is an output."""
+    return min(p for p in ports if p[1] not in (NEXT, GUARDS))
+
+
+def _a_loop(waits: Mapping[Port, set[Port]], port: Port) -> list[Port]:
+    """Return the ports of one loop, found from a port that is stuck, each waiting for the next."""
     seen: dict[Port, int] = {}
     while port not in seen:
         seen[port] = len(seen)

@@ -76,8 +76,7 @@ class Recorder:
         header: Mapping[str, Any] | None = None,
         overwrite: bool = False,
     ):
-        if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
-            raise OptionError(f"found every={every!r}; expected a positive integer: one of so many samples is kept.")
+        check_every(every)
         self.every, self.has_residual = int(every), residual
         self.columns = None if columns is None else np.array([*columns], dtype=int)
         self._pick = self.columns
@@ -178,6 +177,11 @@ class Recorder:
             self._due = monotonic() + _LATEST
         return self._files
 
+    @property
+    def is_open(self) -> bool:
+        """Whether files on disk are open: samples were written, and `finish` was not called."""
+        return self._files is not None
+
     def flush(self) -> None:
         """Write what is held to disk; in memory, nothing is to be done."""
         if self._files is None:
@@ -246,9 +250,22 @@ class Recorder:
         finally:
             for file in files:
                 file.close()
+            self._files = None
         stored = read(self.to)
         self.events, self.residual = stored.events, stored.residual
         return stored.t, stored.data
+
+
+def check_every(every: Any) -> None:
+    """Refuse an ``every`` that is no positive integer.
+
+    Raises
+    ------
+    OptionError
+        If it is none.
+    """
+    if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
+        raise OptionError(f"found every={every!r}; expected a positive integer: one of so many samples is kept.")
 
 
 def select(

@@ -40,36 +40,35 @@ concerned; the run until then is kept in the error.
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable
+from contextlib import ExitStack
 from fractions import Fraction
-from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from ..blocks._errors import LoopwrightError, SimulationError
+from ..blocks._errors import SimulationError
 from ._continuous import Continuous, check_solver
-from ._duration import check_memory, ticks_in
+from ._duration import default_step, ticks_in
 from ._failures import failure
 from ._flat import FlatDiagram
 from ._from_point import place, placed
 from ._machine import Machine
 from ._operating_point import OperatingPoint
 from ._pass import TRUE
-from ._recorder import Recorder, select
+from ._plants import bind, has_plants, loaded
+from ._progress import progress_bar
+from ._recorder import Recorder
+from ._recording import Recording
 from ._run import Run
+from ._sampled import CHUNK, run_ticks
 from ._start import initialize
 from ._state import RunState, check_fits, layout_of
-from ._stored import Occurrence, Stopped, header
+from ._stored import Occurrence, Stopped
 from ._structure import join
 
 if TYPE_CHECKING:
     from ._diagram import Diagram
-
-FIXED_STEP = ("euler", "heun", "rk4")
-_CHUNK = 1000  # ticks between two looks at the progress bar
 
 
 class Simulation:
@@ -116,22 +115,25 @@ class Simulation:
             if not diagram.is_continuous and not diagram.has_clock:
                 step = step or self._point.base
         self.diagram = diagram
-        step = default_step(diagram, step, duration, solver)
+        saved = None if isinstance(start, OperatingPoint) else start
+        given, step = step, default_step(diagram, step, duration, solver, saved)
         options = {"step": step, "solver": solver, "rtol": rtol, "atol": atol, "max_step": max_step, "start": start}
         self.recipe = {name: value for name, value in options.items() if value is not None}
-        self.flat: FlatDiagram = diagram.flatten(step)
-        self._recording = {"record": record, "every": every, "states": states, "to": to, "overwrite": overwrite}
+        self.flat: FlatDiagram = diagram.flatten(step) if step is given else diagram._flattened(step)
+        if saved is not None:
+            check_fits(saved, self.flat, diagram.name)
+        self._recording = Recording(self.flat, diagram.name, record, every, states, to, overwrite)
         self._stack = ExitStack()
-        self._start_state = None if isinstance(start, OperatingPoint) else start
+        self._start_state = saved
         self._machine = Machine(self.flat)
         self._plants: list[tuple[str, Any]] = []
-        self._every_tick = step is not None or any(not b.transport for b in self._stepped().values())
+        self._every_tick = step is not None or has_plants(self.flat)
         self._last: int | None = None
         if duration is not None:
             self._last = ticks_in(duration, self.flat.base, diagram.name)
             first = 0 if start is None else start.tick
             self._last += first
-            self._check_memory(self._last - first)
+            self._recording.check_memory(self._last - first, every_tick=self._every_tick)
         self._continuous: Continuous | None = None
         if self.flat.hybrid:
             self._continuous = Continuous(self._machine, diagram.name, solver, rtol, atol, max_step, self._on_event)
@@ -148,9 +150,9 @@ class Simulation:
 
     # --- what belongs to it ------------------------------------------------------------------------------------------
 
-    def _stepped(self) -> dict[str, Any]:
-        table = self.flat.table
-        return {path: table.blocks[path] for path in sorted(table.blocks) if table.stepped(path)}
+    def _new_recorder(self) -> Recorder:
+        every_tick = self._every_tick or not self.flat.distinct
+        return self._recording.begin(None if self._last is None or not every_tick else self._last + 1)
 
     def _stop_ports(self) -> list[tuple[int, str]]:
         """Return the entries of the log that end the run, with the blocks that they belong to."""
@@ -161,93 +163,40 @@ class Simulation:
                 found.append((self.flat.log.slices[join(path, port)].start, path))
         return found
 
-    def _check_memory(self, ticks: int) -> None:
-        columns = self._columns()
-        width = self.flat.log.total + self.flat.width if columns is None else len(columns)
-        clocks = self.flat.distinct
-        samples = ticks + 1
-        if clocks and not self._every_tick:
-            samples = min(samples, sum(ticks // clock.every + 1 for clock in clocks) + 2)
-        every, to = self._recording["every"], self._recording["to"]
-        check_memory(samples, width, self.flat.base, self.diagram.name, every=every, to=to)
-
-    def _columns(self) -> np.ndarray | None:
-        chosen = self._recording
-        width = self.flat.log.total + self.flat.width
-        return select(chosen["record"], self.flat.log, self.flat.table.names, width, states=chosen["states"])
-
-    def _new_recorder(self) -> Recorder:
-        flat, chosen = self.flat, self._recording
-        columns, width = self._columns(), flat.log.total + flat.width
-        residual = bool(flat.loops.slices)
-        head = None
-        if chosen["to"] is not None:
-            head = header(
-                diagram=self.diagram.name,
-                layout=flat.log,
-                wires=self.flat.table.names,
-                units=self._units(),
-                width=width,
-                columns=columns,
-                has_states=chosen["states"],
-                residual=residual,
-            )
-        rows = None if self._last is None or not (self._every_tick or not flat.distinct) else self._last + 1
-        return Recorder(
-            width,
-            columns,
-            every=chosen["every"],
-            rows=rows,
-            residual=residual,
-            to=chosen["to"],
-            header=head,
-            overwrite=chosen["overwrite"],
-        )
-
-    def _units(self) -> dict[str, Any]:
-        return {join(*port): unit for port, unit in self.flat.checked.units.items()}
-
     # --- life --------------------------------------------------------------------------------------------------------
 
     def __enter__(self) -> Simulation:
         try:
             self._load()
+            self._stack.push(self._finish)
             self._begin()
         except BaseException:
-            self._stack.close()
+            self._stack.__exit__(*sys.exc_info())
             raise
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        self._stack.close()
+    def __exit__(self, *error: Any) -> None:
+        self._stack.__exit__(*error)
 
     def _load(self) -> None:
-        for path, block in self._stepped().items():
-            if block.transport:
-                continue
-            try:
-                wired = [port for port in block.inputs if (path, port) in self.flat.table.wires]
-                since = 0.0 if self._point is None else self._point.t
-                instance = block.instantiate(wired, None, start_time=since)
-                self._plants.append((path, self._stack.enter_context(instance)))
-            except SimulationError as error:
-                error.at(block=path, t=0.0)
-                self._attach(error)
-                raise
-            except LoopwrightError as error:
-                error.at(block=path)
-                raise
+        since = 0.0 if self._point is None else self._point.t
+        try:
+            for path, plant in loaded(self.flat, self._stack, since):
+                self._plants.append((path, plant))
+        except SimulationError as error:
+            self._attach(error)
+            raise
 
-    def _part(self, layout: Any, path: str, vector: np.ndarray) -> np.ndarray:
-        mine = [s for name, s in layout.slices.items() if self.flat.ports[name][0] == path]
-        return vector[mine[0].start : mine[-1].stop] if mine else vector[:0]
+    def _finish(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        """End a run on disk that `run` was not asked for."""
+        if self._recorder.is_open:
+            cut = [] if error is None else [f"This run was cut off at t = {self.t:g} s: {kind.__name__}: {error}"]
+            self._recorder.finish(elapsed=self._elapsed, messages=(*self._messages, *cut), stopped=self._stopped)
 
     def _begin(self) -> None:
         machine = self._machine
         try:
-            for path, plant in self._plants:
-                inputs = self._part(self.flat.plant_inputs, path, machine.z)
-                plant.bind(inputs, self._part(self.flat.plant_outputs, path, machine.here.w))
+            bind(machine, self._plants)
             delays = None if self._continuous is None else self._continuous.delays
             initialize(machine, self._plants, delays)
             for _, plant in self._plants:
@@ -261,10 +210,10 @@ class Simulation:
             self._begun = True
             self._at_tick(first)
         except SimulationError as error:
-            error = self._who(error)
-            error.at(t=self.t)
-            self._attach(error)
-            raise
+            culprit = self._who(error)
+            culprit.at(t=self.t)
+            self._attach(culprit)
+            raise culprit from culprit.__cause__
 
     def time_of(self, k: int) -> float:
         """Return the time of tick ``k`` in s."""
@@ -294,12 +243,18 @@ class Simulation:
         """
         last = self._tick + ticks_in(duration, self.flat.base, self.diagram.name)
         started = time.perf_counter()
+
+        def tell(t: float) -> None:
+            self._recorder.flush()
+            if progress is not None:
+                progress(t)
+
         try:
             if self._stopped is None:
-                self._go(last, progress or (lambda t: None))
+                self._go(last, tell)
         except SimulationError as error:
             self._elapsed += time.perf_counter() - started
-            self._attach(self._who(error))
+            self._attach(error)
             raise
         except KeyboardInterrupt as interrupt:
             self._elapsed += time.perf_counter() - started
@@ -308,59 +263,23 @@ class Simulation:
         self._elapsed += time.perf_counter() - started
 
     def _go(self, last: int, progress: Any) -> None:
-        if self._continuous is not None:
-            self._go_hybrid(last, progress)
-        else:
-            self._go_sampled(last, progress)
-
-    def _go_sampled(self, last: int, progress: Any) -> None:
-        """Run ticks up to ``last``: nothing happens between them."""
-        flat, machine = self.flat, self._machine
-        t, x, x_next, ok, log = machine.here.t, machine.here.x, machine.x_next, machine.ok, machine.log
-        row, stops, time_of = self._recorder.row, self._stops, self.time_of
-        plants = [plant for _, plant in self._plants]
-        only = plants[0].step if len(plants) == 1 else None
-        h, k = float(flat.base), self._tick
-        always = (
-            machine.tick(flat.acting(0)) if len({flat.acting(i) for i in range(2)}) == 1 and self._constant() else None
-        )
-        n, d = flat.base.numerator, flat.base.denominator
-        count, now = 0, time_of(k)
-        for k in flat.ticks(self._tick, last, every=self._every_tick):
-            try:
-                if only is not None:
-                    only(now, h)
-                else:
-                    for plant in plants:
-                        plant.step(now, h)
-            except SimulationError as error:
-                raise error.at(t=k * n / d) from error.__cause__
-            t[0] = now = k * n / d
-            acting = None
-            if always is None:
-                acting = flat.acting(k)
-                machine.tick(acting)()
+        try:
+            if self._continuous is not None:
+                self._go_hybrid(last, progress)
             else:
-                always()
-            if not ok[0]:
-                raise failure(machine, acting if acting is not None else flat.acting(k)).at(t=now)
-            row(now, log)
-            x[:] = x_next
-            self._tick = k
-            if stops and self._ended():
-                return
-            count += 1
-            if count == _CHUNK:
-                progress(now)
-                count = 0
-        progress(now)
-
-    def _constant(self) -> bool:
-        """Whether the same boxes act in every tick that is visited."""
-        clocks = self.flat.distinct
-        return not clocks or (
-            len(clocks) == 1 and clocks[0].offset == 0 and (clocks[0].every == 1 or not self._every_tick)
-        )
+                run_ticks(
+                    self._machine,
+                    [plant for _, plant in self._plants],
+                    self._tick,
+                    last,
+                    every=self._every_tick,
+                    row=self._recorder.row,
+                    arrived=self._arrived,
+                    progress=progress,
+                )
+        except SimulationError as error:
+            culprit = self._who(error)
+            raise culprit from culprit.__cause__
 
     def _go_hybrid(self, last: int, progress: Any) -> None:
         """Run ticks up to ``last`` with a solver between them."""
@@ -377,7 +296,7 @@ class Simulation:
             def sample(t: float, progress: Any = progress) -> bool:
                 self._recorder.row(t, self._machine.log)
                 self._count += 1
-                if self._count % _CHUNK == 0:
+                if self._count % CHUNK == 0:
                     progress(t)
                 return self._is_stopped()
 
@@ -419,6 +338,11 @@ class Simulation:
     def _on_event(self, event: Occurrence) -> None:
         self._recorder.event(event)
 
+    def _arrived(self, k: int) -> bool:
+        """Take note of a tick that has been recorded; return whether it ends the run."""
+        self._tick = k
+        return bool(self._stops) and self._ended()
+
     def _is_stopped(self) -> bool:
         return any(self._machine.log[i] > TRUE for i, _ in self._stops)
 
@@ -438,7 +362,7 @@ class Simulation:
         for path, plant in self._plants:
             if plant.failed:
                 error.block = path
-        return check_solver(error, self._machine)
+        return check_solver(error, self._machine, self._continuous)
 
     def _attach(self, error: SimulationError) -> None:
         if error.run is None:
@@ -456,14 +380,14 @@ class Simulation:
         state = self.save() if final and self.can_save else None
         if final and self._begun:
             recorder.last(self.t if self._stopped is None else self._stopped.t, machine.log)
-        messages = tuple(m for _, plant in self._plants for m in plant.messages)
+        messages = self._messages
         t, data = recorder.finish(elapsed=self._elapsed, messages=messages, stopped=self._stopped)
         run = Run(
             t=t,
             data=data,
             layout=self.flat.log,
             wires=dict(self.flat.table.names),
-            units=self._units(),
+            units=self._recording.units,
             diagram=self.diagram,
             elapsed=self._elapsed,
             messages=messages,
@@ -471,13 +395,17 @@ class Simulation:
             stopped=self._stopped,
             residual=recorder.residual,
             columns=recorder.columns,
-            has_states=self._recording["states"],
+            has_states=self._recording.states,
             final_state=state,
             recipe=self.recipe,
         )
-        self._recording["to"] = None
+        self._recording.to = None  # what comes now does not replace it
         self._recorder, self._elapsed = self._new_recorder(), 0.0
         return run
+
+    @property
+    def _messages(self) -> tuple[str, ...]:
+        return tuple(m for _, plant in self._plants for m in plant.messages)
 
     @property
     def can_save(self) -> bool:
@@ -525,30 +453,11 @@ class Simulation:
         if self._continuous is not None and state.continuous is not None:
             self._continuous.restore(state.continuous)
         self._tick, self._stopped, self._elapsed, self._begun = state.tick, state.stopped, 0.0, True
+        if self._recorder.is_open:
+            self._recorder.finish()
+            self._recording.overwrite = True
         self._recorder = self._new_recorder()
         self._recorder.row(state.t, machine.log)
-
-
-def default_step(diagram: Diagram, step: Any, duration: float | None, solver: str) -> Any:
-    """Return the seconds between two samples of a run that has neither a ``step`` nor a clock.
-
-    A thousandth of the duration, in whole nanoseconds, where the diagram is continuous, has no FMU and the solver
-    chooses its own steps.
-    """
-    if step is not None or duration is None or not diagram.is_continuous or diagram.has_clock:
-        return step
-    from ._solvers import solver_name
-
-    if diagram.has_fmu or solver_name(solver) in FIXED_STEP:
-        return step
-    try:
-        span = Fraction(repr(float(duration)))
-    except (TypeError, ValueError):
-        return step
-    ticks = span / Fraction(1, 10**9)
-    if not span > 0 or ticks.denominator != 1:
-        return span if span > 0 and ticks.denominator == 1 else step
-    return next((span / n for n in (1000, 500, 200, 100, 10, 1) if (ticks / n).denominator == 1), span)
 
 
 def simulate(
@@ -559,27 +468,7 @@ def simulate(
         ticks_in(duration, Fraction(1), diagram.name)  # refused
     with Simulation(diagram, duration=duration, start=start, **options) as simulation:
         first = simulation.t
-        with _progress(diagram.name, first, first + float(duration), progress) as show:
+        with progress_bar(diagram.name, first, first + float(duration), progress) as show:
             if simulation.stopped is None:
                 simulation.advance(duration, progress=show)
         return simulation.run()
-
-
-@contextmanager
-def _progress(name: str, start: float, end: float, show: bool | None) -> Iterator[Any]:
-    """Yield a function that is told the simulated time, and draws it where that is wanted."""
-    if show is None:
-        import sys
-
-        widgets = "ipykernel" in sys.modules and find_spec("ipywidgets") is not None
-        show = sys.stderr.isatty() or widgets
-    if not show:
-        yield lambda t: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.2f} / {task.total:g} s"))
-    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(name, total=end - start)
-        yield lambda t: bar.update(task, completed=t - start)

@@ -328,16 +328,19 @@ def make_solver(
     name = solver_name(name)
     size = problem.size
     for option, value in (("step", step), ("max_step", max_step)):
-        if value is not None and not value > 0:
+        if value is not None and not (isinstance(value, int | float | np.number) and value > 0):
             raise OptionError(f"{option} is {value!r}; expected a positive number of seconds.")
     if name in _FIXED:
         if step is None:
             raise OptionError(f"solver={name!r} has a fixed step and step is None; give step=1e-3 or so, in s.")
         return FixedStep(name, problem, step, _FIXED[name])
     bound = math.inf if max_step is None else float(max_step)
-    if not 3e-14 <= rtol < 1:
+    if isinstance(rtol, bool) or not isinstance(rtol, int | float | np.number) or not 3e-14 <= rtol < 1:
         raise OptionError(f"rtol is {rtol!r}; expected 3e-14 <= rtol < 1. 1e-6 serves most diagrams.")
-    absolute = np.asarray(atol, dtype=float)
+    try:
+        absolute = np.asarray(atol, dtype=float)
+    except (TypeError, ValueError):
+        absolute = np.full((), -1.0)
     if absolute.shape not in ((), (size,)) or not (absolute >= 0).all():
         raise OptionError(f"atol is {atol!r}; expected a number or an array of shape ({size},), not negative.")
     if not size:

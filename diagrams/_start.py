@@ -29,7 +29,8 @@ def initialize(machine: Machine, plants: list[tuple[str, Any]], delays: Any) -> 
     machine.here.t[0] = 0.0
     if delays is not None:
         delays.outputs_at(0.0, machine.here.w)
-    passes = 0
+    passes, last = 0, np.full(flat.width, np.nan)
+    most = _MAX_PASSES * (10 if machine.looped else 1)
     while True:
         _states(machine)
         _boxes(machine)
@@ -43,12 +44,12 @@ def initialize(machine: Machine, plants: list[tuple[str, Any]], delays: Any) -> 
             delays.begin(machine.z, machine.here.w)
         machine.tick(acting)()
         passes += 1
-        if np.allclose(before, machine.z, rtol=_SETTLED, atol=0.0, equal_nan=True) and (
-            passes > 1 or not machine.looped
-        ):
+        found = not machine.looped or np.allclose(last, machine.here.x, rtol=_SETTLED, atol=_SETTLED)
+        if found and np.allclose(before, machine.z, rtol=_SETTLED, atol=0.0, equal_nan=True):
             break
-        if passes == _MAX_PASSES:
-            raise _unsettled(machine, before)
+        if passes == most:
+            raise _unsettled(machine, before) if found else _unsolved_start(machine, last)
+        last = machine.here.x.copy()
 
 
 def _states(machine: Machine) -> None:
@@ -100,6 +101,19 @@ def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]
         raise SimulationError(
             f"its initial(u) failed: {what} {inputs_text(u._asdict())} Expected {expected}.", block=path, t=0.0
         ) from error
+
+
+def _unsolved_start(machine: Machine, last: np.ndarray) -> SimulationError:
+    flat, x = machine.flat, machine.here.x
+    path = next(
+        (p for p, s in flat.states.slices.items() if not np.allclose(last[s], x[s], rtol=_SETTLED, atol=_SETTLED)), ""
+    )
+    loops = "\n".join(flat.start_order.loops)
+    return SimulationError(
+        f"its initial state depends on itself, and is not found: after {_MAX_PASSES * 10} passes it still changes.\n"
+        f"{loops}\nGive it an initial_value, or one to another block of this loop.",
+        block=path or flat.start_order.torn[0][0],
+    )
 
 
 def _unsettled(machine: Machine, before: np.ndarray) -> SimulationError:

@@ -101,7 +101,8 @@ class Subsystem:
     ):
         check_method(method)
         self.function, self.method = function, method
-        own = function.__name__ if function.__name__.isidentifier() else "subsystem"
+        own = getattr(function, "__name__", "")  # a functools.partial has none, a lambda no identifier
+        own = own if own.isidentifier() else "subsystem"
         self.name = check_name(name or own)
         self.sample_time = None if sample_time is None else exact_time(sample_time, block=self.name)
         self.offset = exact_offset(offset, self.sample_time, block=self.name)

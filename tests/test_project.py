@@ -177,6 +177,13 @@ def test_the_readme_opens_with_a_closed_loop_in_ten_lines_that_runs(tmp_path):
     run_commands((ROOT / "README.md").read_text(encoding="utf-8"), tmp_path)
 
 
+def test_the_page_on_diagrams_runs(tmp_path):
+    scope = {}
+    with chdir(tmp_path):
+        for snippet in blocks_of_code((ROOT / "docs" / "diagrams.md").read_text(encoding="utf-8")):
+            exec(snippet, scope)
+
+
 def test_the_page_on_export_runs(tmp_path):
     text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
     model, *more = blocks_of_code(text)

@@ -80,10 +80,19 @@ def test_a_wall_for_a_scalar():
     assert force(wall, position=1.9, velocity=1.0) == 0.0
 
 
-def test_only_a_damped_wall_has_events():
-    assert not Wall(**WALL).events
+def test_an_undamped_wall_has_the_event_of_contact_and_no_state():
+    assert list(Wall(**WALL).events) == ["touch"]
     assert not Wall(**WALL).states
     assert list(Wall(damping=1.0, **WALL).events) == ["touch", "press"]
+
+
+def test_contact_with_an_undamped_wall_lasts_while_the_body_is_in_it():
+    # its output contact jumps although the force does not: in from arcsin 0.8, out at π − arcsin 0.8
+    wall = Wall(stiffness=50.0, point=0.8, normal=-1.0)
+    outputs, log = in_time(wall, 6.0, position=np.sin, velocity=np.cos)
+    into = np.arcsin(0.8)
+    assert [t for t, _ in log] == pytest.approx([into, np.pi - into], abs=1e-12)
+    assert [float(outputs(t)["contact"]) for t in (0.5 * into, 0.5 * np.pi, 3.0)] == [0.0, 1.0, 0.0]
 
 
 def test_contact_is_made_at_the_surface_and_lost_where_the_push_ends():

@@ -125,7 +125,7 @@ def test_both_are_of_first_order(method):
 
 
 def test_the_sample_time_is_that_of_the_frame():
-    # two rates: a tick every 10 ms, one pendulum's every 20 ms, the other's every 50 ms, held between
+    # two rates: looked at every 10 ms, one pendulum's every 20 ms, the other's every 50 ms, held between
     @subsystem(sample_time=0.05)
     def slow(u):
         return Pendulum(name="slow")(u)
@@ -135,7 +135,7 @@ def test_the_sample_time_is_that_of_the_frame():
         return Pendulum(name="fast")(u)
 
     signal = Wave()().y[0]
-    run = Diagram("rates", *slow(signal), *fast.replace(name="f")(signal)).simulate(2.0, progress=False)
+    run = Diagram("rates", *slow(signal), *fast.replace(name="f")(signal)).simulate(2.0, step=0.01, progress=False)
     assert np.diff(run.t) == pytest.approx(0.01)
     for name, every, ticks in (("slow", 5, 40), ("fast", 2, 100)):
         h = 0.01 * every

@@ -1,0 +1,28 @@
+"""The progress of a run, drawn on a terminal or in a notebook."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from typing import Any
+
+
+@contextmanager
+def progress_bar(name: str, start: float, end: float, show: bool | None) -> Iterator[Any]:
+    """Yield a function that is told the simulated time, and draws it where that is wanted."""
+    if show is None:
+        import sys
+
+        widgets = "ipykernel" in sys.modules and find_spec("ipywidgets") is not None
+        show = sys.stderr.isatty() or widgets
+    if not show:
+        yield lambda t: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.2f} / {task.total:g} s"))
+    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(name, total=end - start)
+        yield lambda t: bar.update(task, completed=t - start)

@@ -1,0 +1,96 @@
+"""What a run records, and where to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ._duration import check_memory
+from ._flat import FlatDiagram
+from ._recorder import Recorder, check_every, select
+from ._stored import header
+from ._structure import join
+
+
+@dataclass
+class Recording:
+    """What a run records, and where to: the choices of `Diagram.simulate`."""
+
+    flat: FlatDiagram
+    name: str
+    record: Iterable[str] | None
+    every: int
+    states: bool
+    to: Any
+    overwrite: bool
+
+    def __post_init__(self) -> None:
+        check_every(self.every)
+
+    @property
+    def width(self) -> int:
+        """Entries of the vector of a sample, without the residual."""
+        return self.flat.log.total + self.flat.width
+
+    @cached_property
+    def columns(self) -> np.ndarray | None:
+        """The entries that are kept; None for all."""
+        return select(self.record, self.flat.log, self.flat.table.names, self.width, states=self.states)
+
+    @cached_property
+    def units(self) -> dict[str, Any]:
+        """The units of the ports by path."""
+        return {join(*port): unit for port, unit in self.flat.checked.units.items()}
+
+    def check_memory(self, ticks: int, *, every_tick: bool) -> None:
+        """Refuse a run whose samples can't fit; see `_duration.check_memory`.
+
+        Parameters
+        ----------
+        ticks : int
+            Ticks of the run.
+        every_tick : bool
+            Whether each is visited, not only those at which a box acts.
+        """
+        width = self.width if self.columns is None else len(self.columns)
+        clocks = self.flat.distinct
+        samples = ticks + 1
+        if clocks and not every_tick:
+            samples = min(samples, sum(ticks // clock.every + 1 for clock in clocks) + 2)
+        check_memory(samples, width, self.flat.base, self.name, every=self.every, to=self.to)
+
+    def begin(self, rows: int | None = None) -> Recorder:
+        """Return a recorder that has no sample yet.
+
+        Parameters
+        ----------
+        rows : int, optional
+            Samples that are to come, if that is known.
+        """
+        flat, head = self.flat, None
+        residual = bool(flat.loops.slices)
+        if self.to is not None:
+            head = header(
+                diagram=self.name,
+                layout=flat.log,
+                wires=flat.table.names,
+                units=self.units,
+                width=self.width,
+                columns=self.columns,
+                has_states=self.states,
+                residual=residual,
+            )
+        return Recorder(
+            self.width,
+            self.columns,
+            every=self.every,
+            rows=rows,
+            residual=residual,
+            to=self.to,
+            header=head,
+            overwrite=self.overwrite,
+        )
