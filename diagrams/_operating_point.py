@@ -184,8 +184,8 @@ def _check_found_again(diagram: Diagram, given: Snapshot, found: OperatingPoint)
     if not off <= AGAIN:
         raise OptionError(
             f"run again to t = {given.t:g} s, the diagram is not where it was in this run: a state is off by "
-            f"{off:.3g}. The run was restored from a state on its way, or an FMU does not repeat itself. Give the state that it "
-            "began with: linearize(t, start=…).",
+            f"{off:.3g}. The run was restored from a state on its way, or an FMU does not repeat itself. Give "
+            "the state that it began with: linearize(t, start=…).",
             block=diagram.name,
             port="operating point",
         )

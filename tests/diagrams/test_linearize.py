@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from linear import by_simulation, differences
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 from loopwright.blocks import (
     Clock,
@@ -112,6 +113,32 @@ def test_a_source_that_jumps_within_the_period_is_followed():
         return x
 
     close(lin.A, differences(go, np.array([0.5]), 1e-3), 1e-9)
+
+
+def test_a_bent_algebraic_loop_is_solved_all_along_the_period():
+    """ẋ = −2 v + u, v = 0.5 sin v + x², u held."""
+    x = Integrator(initial_value=1.2)
+    a, b = Function(lambda v: 0.5 * np.sin(v), name="a"), Sum(signs="++", name="b")
+    loop = b(a.y, Function(lambda x: x**2)(x.y)).named("v")
+
+    @subsystem(sample_time=T)
+    def box(v):
+        return Function(lambda v: v * v)(v)
+
+    f = Function(lambda v, u: -2 * v + u)(loop, box(loop))
+    lin = Diagram("d", a(loop), x(f), loops="solve").linearize(0.1, rtol=1e-11, atol=1e-13)
+
+    def go(x):
+        def v(x):
+            return brentq(lambda v: 0.5 * np.sin(v) + x**2 - v, -5, 5, xtol=1e-15)
+
+        u = v(x[0]) ** 2
+        return solve_ivp(lambda t, s: [-2 * v(s[0]) + u], (0, T), x, method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1]
+
+    x0 = lin.point.x[[list(names(lin)).index("integrator.y")]]
+    i = lin.states.index("integrator.y")
+    close(lin.A[[[i]], [[i]]], differences(go, x0, 1e-3), 1e-9)
+    assert lin.affine[i] == pytest.approx((go(x0) - x0)[0], rel=1e-9)
 
 
 def test_time_in_the_flow_counts_even_where_nothing_moves():
