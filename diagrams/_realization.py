@@ -203,12 +203,18 @@ def _delayed(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Matr
 
 def _balanced(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scale the states by powers of two, so that A's rows and columns are of one size."""
-    from scipy.linalg import matrix_balance
-
     if not len(A):
         return A, B, C
-    _, (d, _) = matrix_balance(A, permute=False, separate=True)
+    d = _scales(A)
     return A * d / d[:, None], B / d[:, None], C * d
+
+
+def _scales(M: np.ndarray) -> np.ndarray:
+    from scipy.linalg import matrix_balance
+
+    with np.errstate(invalid="ignore"):  # SciPy reads a permutation out of the factors, which may be too large for one
+        _, (d, _) = matrix_balance(M, permute=False, separate=True)
+    return np.asarray(d)
 
 
 def _scaled(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -216,13 +222,11 @@ def _scaled(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np
 
     A chain of integrators has no loop that fixes its scale: balanced alone, it is scaled by what rounding has left.
     """
-    from scipy.linalg import matrix_balance
-
     n = len(A)
     if not n:
         return A, B, C
     whole = np.block([[A, np.linalg.norm(B, axis=1)[:, None]], [np.linalg.norm(C, axis=0)[None, :], np.zeros((1, 1))]])
-    _, (d, _) = matrix_balance(whole, permute=False, separate=True)
+    d = _scales(whole)
     d = d[:n] / d[n]
     return A * d / d[:, None], B / d[:, None], C * d
 
