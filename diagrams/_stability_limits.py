@@ -24,6 +24,7 @@ SCANNED = {"stiffness": (1e-2, 1e8), "damping": (1e-3, 1e6), "mass": (1e-4, 1e4)
 UNITS = {"stiffness": "N/m", "damping": "N.s/m", "mass": "kg", "tool_mass": "kg"}
 _SIDES = 0.01  # a limit is confirmed at 0.99 and 1.01 of it
 _GROWTH = 0.03  # its growth rate is told at 0.97 and 1.03
+_FLAT = 20.0  # an extremum that is so many times its own depth away from zero does not reach it
 _ROUNDING = 1e-12  # relative, of Brent's method
 
 
@@ -275,7 +276,7 @@ def _brackets(at: Any, grid: np.ndarray, sigma: np.ndarray) -> Iterator[tuple[fl
         elif 0 < i + 1 < len(grid) - 1 and positive[i + 1] == positive[i + 2] and np.isfinite(sigma[i : i + 3]).all():
             towards = 1.0 if positive[i] else -1.0  # the sign of σ that a touching extremum would leave
             here = towards * sigma[i : i + 3]
-            if here[1] > min(here[0], here[2]):
+            if here[1] > min(here[0], here[2]) or here[1] > _FLAT * float(np.ptp(here)):
                 continue
             found = minimize_scalar(
                 lambda y, towards=towards: towards * at(math.exp(y)),
