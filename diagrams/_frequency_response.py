@@ -282,7 +282,7 @@ def _beginning(
 def _moves(flat: FlatDiagram, port: tuple[str, str]) -> bool:
     """Whether a signal follows continuous states, or time, between two ticks."""
     t, x, w, p = flat.symbols()
-    column = Pass(flat, NONE, t, x, w, p).run().values[port]
+    column = Pass(flat, NONE, t, x, w, p).run().values.get(port)  # none: it is held, and nothing asks for it
     if not isinstance(column, ca.MX):
         return False
     by_x = ca.jacobian(column, x)[:, flat.continuous.tolist()] if flat.continuous.size else ca.MX(0, 1)

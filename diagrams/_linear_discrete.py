@@ -299,7 +299,7 @@ def _moves(flat: FlatDiagram, signal: Signal) -> bool:
     from ._pass import Pass
 
     t, x, w, p = flat.symbols()
-    column = Pass(flat, NONE, t, x, w, p).run().values[signal.port]
+    column = Pass(flat, NONE, t, x, w, p).run().values.get(signal.port)  # none: it is held, and nothing asks for it
     return bool(isinstance(column, ca.MX) and ca.jacobian(column, x)[:, flat.continuous.tolist()].nnz())
 
 
