@@ -137,9 +137,10 @@ class Analysis:
         openings : str or list of str
             Wires that are cut behind the port, for all its consumers, which get its value at the operating point: that
             stays what it is.
-        plants : {"equations", "step"}, optional
+        plants : {"equations", "step", "identified"}, optional
             How an FMU's step is linearized: by its equations' Jacobian and a matrix exponential, right at an
-            equilibrium, or by differences of the step itself. Without it the first at an equilibrium, else the second.
+            equilibrium; by differences of the step itself; or from its pulse responses from rest, without its states.
+            Without it the first at an equilibrium, else the second, and the third where the FMU allows neither.
         **options
             How to run to the operating point, where it is a time: see `operating_point`. With ``step`` a diagram that
             is continuous but for an FMU is linearized over its communication step.

@@ -197,6 +197,9 @@ class _Chain:
 def _plant_states(flat: FlatDiagram, point: OperatingPoint, models: Sequence[PlantModel]) -> np.ndarray:
     parts = [np.zeros(0)]
     for m in models:
+        if m.identified:  # its states are made up, and zero at rest
+            parts.append(np.zeros(len(m.A)))
+            continue
         block: Any = flat.table.blocks[m.path]
         parts += [np.ravel(point.plants[m.path]["state"][name]) for name in block.description.states]
     return np.concatenate(parts)

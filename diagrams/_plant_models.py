@@ -10,10 +10,11 @@ import numpy as np
 
 from ..blocks._errors import FmuError, OptionError
 from ._flat import FlatDiagram
+from ._identification import identified
 from ._operating_point import OperatingPoint
 from ._structure import join
 
-WAYS = ("equations", "step")
+WAYS = ("equations", "step", "identified")
 EQUILIBRIUM = 1e-9
 """An FMU is at rest where no state changes faster than that in a second, relative to 1 + its size."""
 
@@ -42,6 +43,8 @@ class PlantModel:
     """Its outputs after the step."""
     next: Mapping[str, Any] = field(default_factory=dict)
     """Its operating point after the step."""
+    identified: bool = False
+    """Whether its states are made up, and only its outputs mean something."""
 
 
 def plants(flat: FlatDiagram) -> list[str]:
@@ -128,9 +131,10 @@ def step_models(flat: FlatDiagram, at: OperatingPoint, z: np.ndarray, h: float, 
     ----------
     z : ndarray
         Inputs of all FMUs over the step.
-    way : {None, "equations", "step"}
+    way : {None, "equations", "step", "identified"}
         "equations" takes the zero-order hold of the equations' Jacobians, by a matrix exponential, which is right at an
-        equilibrium; "step" differences the step itself. None takes the first at an equilibrium, else the second.
+        equilibrium; "step" differences the step itself; "identified" takes pulse responses from rest. None takes the
+        first at an equilibrium, else the second, and the third where the FMU allows neither.
 
     Raises
     ------
@@ -159,13 +163,23 @@ def _step_model(
         if way == "equations":
             raise
         equations = None
-    if equations is not None and way != "step" and (way == "equations" or _rests(equations)):
+    if equations is not None and (way == "equations" or (way is None and _rests(equations))):
         m, how = _held(equations, h), f"{equations.how}, held over a step by a matrix exponential"
         C, D = equations.C, equations.D
+    elif way == "identified" or not block.description.states:  # it may have states that it doesn't show
+        return _identified_model(flat, at, path, z, h)
     else:
-        m = block.step_difference(
-            h, t=at.plants[path]["t"], state=at.plants[path]["state"], inputs=_inputs(flat, at, path, z)
-        )
+        try:
+            m = block.step_difference(
+                h, t=at.plants[path]["t"], state=at.plants[path]["state"], inputs=_inputs(flat, at, path, z)
+            )
+        except FmuError as error:
+            if way == "step":
+                raise
+            try:
+                return _identified_model(flat, at, path, z, h)
+            except FmuError as last:
+                raise last from error
         how = m.how
         C, D = _outputs_before(flat, at, path, equations, m, z)
     names = _named(path, m.states)
@@ -177,6 +191,18 @@ def _step_model(
     return PlantModel(
         path, m.A, m.B[:, wired], C, D[:, wired], m.x0, m.f, names, mine, w, how, _error(m), m.y0, following
     )
+
+
+def _identified_model(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float) -> PlantModel:
+    mine, w, wired = entries(flat, path)
+    now = {**at.plants[path], "inputs": _inputs(flat, at, path, z)}
+    m = identified(flat.table.blocks[path], now, h, at.w[w])
+    n, rest = len(m.A), {**now, "t": now["t"] + h}
+    D = np.zeros((len(w), len(wired)))
+    return PlantModel(
+        path, m.A, m.B[:, wired], m.C, D, np.zeros(n), np.zeros(n), _named(path, m.states), mine, w, m.how,
+        m.uncertainty, m.y0, rest, True,
+    )  # fmt: skip
 
 
 def _rests(m: Any) -> bool:
