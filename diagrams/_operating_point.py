@@ -159,6 +159,7 @@ def operating_point(diagram: Diagram, point: Any, options: Mapping[str, Any]) ->
     if isinstance(point, OperatingPoint):
         return point
     if isinstance(point, Snapshot):
+        _check_whose(diagram, point)
         recipe = dict(getattr(point.run, "recipe", {}) or {})
         found = at_time(diagram, point.t, {**recipe, **options})
         _check_found_again(diagram, point, found)
@@ -174,6 +175,22 @@ def operating_point(diagram: Diagram, point: Any, options: Mapping[str, Any]) ->
         block=diagram.name,
         port="operating point",
     )
+
+
+def _check_whose(diagram: Diagram, given: Snapshot) -> None:
+    """Refuse an instant of a run of a diagram that has nothing to do with this one."""
+    whose = getattr(given.run, "diagram_name", diagram.name)
+    if whose != diagram.name and not {path.partition(".")[0] for path in given.values} <= _tops(diagram):
+        raise OptionError(
+            f"found an instant of a run of the diagram {whose!r}, which has other blocks. Take one of a run of this "
+            "diagram, or a time in s.",
+            block=diagram.name,
+            port="operating point",
+        )
+
+
+def _tops(diagram: Diagram) -> set[str]:
+    return {path.partition(".")[0] for path in diagram.blocks}
 
 
 def _check_found_again(diagram: Diagram, given: Snapshot, found: OperatingPoint) -> None:

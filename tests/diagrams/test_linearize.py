@@ -502,7 +502,7 @@ def test_a_batch_goes_through_points_and_parameters():
         (UnknownNameError, r"there is no signal 'forse' in this diagram\. Did you mean 'force'", {"inputs": "forse"}),
         (UnknownNameError, r"'y' has the shape \(2,\), and no entry \[2\]", {"inputs": "y[2]"}),
         (UnknownNameError, r"linearize takes no 'ouputs'\. Did you mean 'outputs'", {"ouputs": "y"}),
-        (OptionError, r"found plants='magic'; expected one of 'equations', 'step', or None", {"plants": "magic"}),
+        (OptionError, r"found plants='magic'; expected one of 'equations', 'step'", {"plants": "magic"}),
         (
             OptionError,
             r"operating point: t = 0\.07 s is between two ticks, 0\.05 s apart\. Take 0\.05 s",
@@ -536,6 +536,8 @@ def test_the_point_of_another_diagram_is_refused():
     point = hybrid().operating_point()
     with pytest.raises(OptionError, match="it is the operating point of a diagram with other blocks or wires"):
         pendulum().linearize(point)
+    with pytest.raises(OptionError, match=r"found an instant of a run of the diagram 'hybrid', which has other blocks"):
+        pendulum().linearize(hybrid().simulate(T, progress=False).at(T))
     with pytest.raises(OptionError, match=r"found step=0\.01, but the operating point stands on ticks of 0\.05 s"):
         hybrid().linearize(point, step=0.01)
 
