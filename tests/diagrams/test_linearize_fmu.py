@@ -141,6 +141,26 @@ def test_a_continuous_diagram_with_a_feedthrough_back_to_its_own_fmu(monkeypatch
     close(lin.D, np.array([[-0.5 / (M + 0.5)]]), bound)
 
 
+@pytest.mark.parametrize("h", [1e-3, 0.02])
+def test_continuous_blocks_see_an_fmu_by_steps(h):
+    """ẋ = −4 x + s with s held, F = −0.5 a − 3 x, by what the acceleration was at the end of the last step."""
+    plant, lag = mass(position=0.0), Integrator(name="lag")
+    total = Function(lambda a, i: -0.5 * a - 3 * i, name="total")(plant.acceleration, lag.y).named("u")
+    rate = Function(lambda x, s: s - 4 * x, name="rate")(lag.y, plant.position)
+    lin = Diagram("d", plant(force=total), lag(rate)).linearize(step=h, inputs="u", outputs="u")
+    assert lin.states == ("lag.y", "mass.position", "mass.velocity", "held(mass.force)")
+    Phi, Gam = held(A_MSD, B_MSD, h)
+    u = np.array([[-3, 0.5 * K / M, 0.5 * D / M, -0.5 / M]])
+    A = np.zeros((4, 4))
+    A[0, :2] = np.exp(-4 * h), (1 - np.exp(-4 * h)) / 4
+    A[1:3, 1:3] = Phi
+    A[1:3] += Gam @ u
+    A[3] = u
+    close(lin.A, A, 1e-10)
+    close(lin.B, np.vstack([[[0]], Gam, [[1]]]), 1e-10)
+    close(lin.C, u, 1e-10)
+
+
 def test_an_ideal_controller_around_an_fmu_is_continuous():
     plant = mass(position=0.0)
 
