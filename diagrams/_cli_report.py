@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from ..blocks._errors import DefinitionError, FmuError, FmuFileError, LoopwrightError, OptionError, near
@@ -61,8 +61,8 @@ def report_command(arguments: argparse.Namespace) -> int:
         check_files(out, pdf=arguments.pdf, json=arguments.json)
         began = time.perf_counter()
         try:
-            with _progress(f"{diagram.name}: analysing …"):
-                report = _analysed(diagram, experiment)
+            with _progress(diagram.name) as tell:
+                report = _analysed(diagram, experiment, tell)
         except LoopwrightError as error:
             say(f"loopwright: error: {error}", sys.stderr)
             return 1
@@ -79,27 +79,26 @@ def report_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _analysed(diagram: Diagram, experiment: Experiment | None) -> Any:
+def _analysed(diagram: Diagram, experiment: Experiment | None, tell: Callable[[str], None]) -> Any:
     from ._report_analysis import analyse
     from ._report_figures import with_drawing
 
-    more = {} if experiment is None else {"experiment": experiment}
-    return with_drawing(analyse(diagram, **more), diagram)
+    return with_drawing(analyse(diagram, experiment=experiment, progress=tell), diagram)
 
 
 @contextlib.contextmanager
-def _progress(text: str) -> Iterator[None]:
-    """Show that something goes on, on a terminal."""
+def _progress(name: str) -> Iterator[Callable[[str], None]]:
+    """Show on a terminal which section is being made, and since when."""
     if not sys.stderr.isatty():
-        yield
+        yield lambda key: None
         return
     from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        progress.add_task(text, total=None)
-        yield
+        task = progress.add_task(f"{name}: analysing", total=None)
+        yield lambda key: progress.update(task, description=f"{name}: {key.replace('_', ' ')}")
 
 
 # --- what is analysed -----------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ p, ul { margin: .5rem 0 .75rem; max-width: 46rem; }
 .no { color: var(--soft); font-weight: 400; margin-right: .35em; font-variant-numeric: tabular-nums; }
 code, .path { font-family: ui-monospace, "SF Mono", Consolas, "Liberation Mono", "DejaVu Sans Mono", monospace;
   font-size: .88em; }
+p code { white-space: nowrap; }
 a { color: var(--link); text-decoration: none; }
 a:hover { text-decoration: underline; }
 a.n { color: inherit; text-decoration: underline dotted var(--line); text-underline-offset: .2em; }
@@ -63,7 +64,7 @@ tr:target, li:target { background: #fff6d6; }
 figure { margin: 1.5rem 0; }
 figure .scroll { overflow-x: auto; }
 figure svg { max-width: 100%; height: auto; display: block; }
-figure .wide svg { max-width: none; }
+figure .wide svg { width: 100%; min-width: 56rem; }
 figure .paper { display: none; }
 figcaption { font-size: .9rem; margin-top: .5rem; max-width: 52rem; }
 ol.why { font-size: .87rem; padding-left: 2rem; }
@@ -86,6 +87,10 @@ table.definitions td { max-width: 46rem; }
   h4 { font-size: 10pt; margin: 9pt 0 3pt; }
   section.level2:first-child h2 { margin-top: 18pt; }
   h2, h3, h4, caption { break-after: avoid; }
+  h2, h3, h4 { break-inside: avoid; }
+  /* room for what follows, taken back: where break-after is not known, neither a heading nor a table's head stays alone */
+  h3::after, h4::after { content: ""; display: block; height: 60pt; margin-bottom: -60pt; }
+  main h2::after, .long::before { content: ""; display: block; height: 90pt; margin-bottom: -90pt; break-inside: avoid; }
   nav { position: static; max-height: none; overflow: visible; }
   nav li { margin: 1.5pt 0; }
   nav a, a, a.n { color: inherit; text-decoration: none; }
