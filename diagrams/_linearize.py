@@ -174,6 +174,7 @@ def linearize(
     """Linearize a diagram; see `Diagram.linearize`."""
     check_options(diagram, options, "linearize")
     at = operating_point(diagram, point, options)
+    diagram = diagram.replace(at.parameters) if at.parameters else diagram  # what a trim has found belongs to it
     return _linearize(diagram, at, inputs, outputs, openings, plants=plants, step=options.get("step"))
 
 

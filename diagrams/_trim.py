@@ -52,7 +52,7 @@ class _Equations:
         self.free_p = np.array([i for i in range(n) if flat.width + i not in target.fixed], dtype=int)
         self.sizes = [len(self.free_x), at.w.size, len(self.free_p), sum(f.start.size for f in free)]
         self.function = self._function()
-        self._memory: tuple[bytes, Any] = (b"", None)
+        self._memory: tuple[bytes | None, Any] = (None, None)
         self.names, self.wanted, self.keep = self._rows()
 
     def _function(self) -> Any:
@@ -286,13 +286,13 @@ def _found(
     equations = _Equations(base, flat, guess, parameters, target)
     unknown = solve(equations)
     left = equations.scaled(unknown)
-    order = np.argsort(-left)
+    order = [i for i in np.argsort(-left) if equations.keep[i]]
     residuals = {equations.names[i]: float(left[i]) for i in order}
-    worst = float(left[order[0]]) if left.size else 0.0
+    worst = float(left[order[0]]) if order else 0.0
     x, w, xp, q = equations.split(unknown)
     if not worst <= tolerance:
         shown = "; ".join(f"{name}: {value:.3g}" for name, value in list(residuals.items())[:5])
-        stuck = [f.name for f, v in zip(parameters, q, strict=True) if np.any((v <= f.low) | (v >= f.high))]
+        stuck = [f.name for f, v in zip(parameters, q, strict=True) if f.is_at_bound(v)]
         advice = f"{', '.join(stuck)} is at its bound. " if stuck else ""
         raise SimulationError(
             f"no operating point was found: relative to 1 + their size, these are left: {shown}; expected at most "

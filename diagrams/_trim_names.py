@@ -65,6 +65,11 @@ class Free:
         """Return the parameter's value from its entries."""
         return value.reshape(self.shape).copy() if self.shape else float(value[0])
 
+    def is_at_bound(self, value: np.ndarray) -> bool:
+        """Whether an entry has come to a bound, as near as the search goes."""
+        near = 1e-3 * np.where(np.isfinite(self.high - self.low), self.high - self.low, 0.0)
+        return bool(np.any((value <= self.low + near) | (value >= self.high - near)))
+
     def changed(self, value: np.ndarray) -> Any:
         """Return the block with another value."""
         return _changed(self.block, self.keys, self.shaped(value))

@@ -1,0 +1,218 @@
+"""Operating points by trim, from given states, and runs that start there."""
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from loopwright.blocks import (
+    Constant,
+    Delay,
+    Ellipse,
+    Function,
+    Integrator,
+    OptionError,
+    ParameterError,
+    Reference,
+    SimulationError,
+    UnitDelay,
+    UnknownNameError,
+)
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.fig3 import Channel, fig3
+from loopwright.fmus import Fmu, gantry, mass_spring_damper
+from loopwright.fmus.mass_spring_damper import MassSpringDamper
+
+PATH = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))
+
+
+def pendulum():
+    """θ̈ = −9.81 sin θ − θ̇ + τ."""
+    torque = Constant(value=0.0, name="torque")
+    rate, angle = Integrator(name="rate"), Integrator(name="angle")
+    acceleration = Function(lambda a, w, tau: -9.81 * np.sin(a) - w + tau, name="motion")
+    return Diagram("pendulum", angle(rate(acceleration(angle.y, rate.y, torque))))
+
+
+def mass():
+    """A mass of 1 kg on a spring of 100 N/m, as an FMU, driven by a constant force."""
+    plant = Fmu(mass_spring_damper.build(), name="plant")
+    return Diagram("mass", plant(force=Constant(value=0.0, name="force")))
+
+
+def fig3_at_rest(xi=0.0, eta=0.12):
+    plant = Fmu(gantry.build(), name="plant", start={"position": PATH.to_plane(eta + 0.02, xi - 0.01)})
+    par, perp = (Channel(Reference(v, unit="m", name=n)) for v, n in ((eta, "eta_d"), (xi, "xi_d")))
+    return fig3(plant, PATH, par, perp)
+
+
+def test_a_parameter_is_found_for_a_signal_at_rest():
+    point = pendulum().trim(free={"torque.value": (-10, 10)}, targets={"angle.y": 0.5})
+    assert point.how == "trim"
+    assert point.parameters["torque.value"] == pytest.approx(9.81 * np.sin(0.5), rel=1e-12)
+    assert point.values["rate.y"] == pytest.approx(0.0, abs=1e-12)
+    assert point.residual <= 1e-9
+    assert set(point.residuals) == {"d/dt angle.y", "d/dt rate.y", "angle.y"}
+
+
+def test_states_alone_are_found_where_parameters_are_given():
+    point = pendulum().replace({"torque.value": 3.0}).trim()
+    assert point.values["angle.y"] == pytest.approx(np.arcsin(3.0 / 9.81), rel=1e-12)
+
+
+def test_the_branch_is_chosen_by_where_the_search_begins_and_by_bounds():
+    diagram = pendulum()
+    above = diagram.trim(at=diagram.operating_point(states={"angle.y": 3.0}))
+    assert above.values["angle.y"] == pytest.approx(np.pi, rel=1e-12)
+    bounded = diagram.trim(free={"angle.y": (2.0, 4.0)})
+    assert bounded.values["angle.y"] == pytest.approx(np.pi, rel=1e-12)
+
+
+def test_a_rate_that_is_asked_for_is_had():
+    point = pendulum().trim(free=["torque.value"], targets={"angle.y": 0.2}, rates={"angle.y": 1.5, "rate.y": 0.0})
+    assert point.values["rate.y"] == pytest.approx(1.5, rel=1e-12)
+    assert point.parameters["torque.value"] == pytest.approx(9.81 * np.sin(0.2) + 1.5, rel=1e-12)
+
+
+def test_what_is_fixed_stays_and_a_free_rate_is_no_equation():
+    point = pendulum().trim(fixed=["angle.y", "rate.y"], rates={"rate.y": None, "angle.y": None})
+    assert point.values["angle.y"] == 0.0
+    assert point.residuals == {}
+
+
+def test_an_fmu_stands_where_it_is_asked_to_and_the_run_from_there_stays():
+    diagram = mass()
+    point = diagram.trim(free={"force.value": (-100, 100)}, targets={"plant.position": 0.2}, step=1e-3)
+    assert point.parameters["force.value"] == pytest.approx(20.0, rel=1e-12)
+    assert point.plants["plant"]["state"]["position"] == pytest.approx(0.2, rel=1e-12)
+    run = diagram.simulate(0.5, start=point, progress=False)
+    assert np.max(np.abs(run["plant.position"] - 0.2)) <= 1e-14
+    assert run["force.y"][0] == pytest.approx(20.0, rel=1e-12)
+
+
+def test_an_fmus_own_parameter_is_found():
+    """a = (F − d v − k s)/m: 0.5 = (20.5 − 0 − 20)/m."""
+    diagram = mass().replace({"force.value": 20.5})
+    point = diagram.trim(
+        free={"plant.start.mass": (0.1, 10.0)},
+        targets={"plant.position": 0.2, "plant.acceleration": 0.5},
+        rates={"plant.velocity": None},
+        step=1e-3,
+    )
+    assert point.parameters["plant.start.mass"] == pytest.approx(1.0, rel=1e-9)
+
+
+def test_fig3_at_rest_at_a_point_off_the_path_stays_there():
+    diagram = fig3_at_rest(xi=0.03)
+    point = diagram.trim()
+    assert point.residual <= 1e-12
+    np.testing.assert_allclose(point.plants["plant"]["state"]["position"], PATH.to_plane(0.12, 0.03), atol=1e-13)
+    np.testing.assert_allclose(point.z[:2], gantry.nominal.weight, atol=1e-10)
+    run = diagram.simulate(1.0, start=point, progress=False)
+    assert np.max(np.abs(run["position"] - run["position"][0])) <= 1e-12
+    assert np.max(np.abs(run["xi"][:, 0] - 0.03)) <= 1e-12
+
+
+def test_a_trim_is_linearized_with_its_parameters():
+    """At θ = 0.5 the stiffness is 9.81 cos 0.5."""
+    diagram = pendulum()
+    model = diagram.linearize(diagram.trim(free=["torque.value"], targets={"angle.y": 0.5}))
+    assert model.is_equilibrium
+    stiffness = 9.81 * np.cos(0.5)
+    np.testing.assert_allclose(np.poly(model.A), [1.0, 1.0, stiffness], rtol=1e-9)
+
+
+def test_sampled_states_repeat():
+    """q⁺ = 0.5 q + u and a delay: q = 2 u."""
+
+    @subsystem(sample_time=0.1)
+    def law(u):
+        q = UnitDelay(initial_value=0.0, name="q")
+        return Delay(steps=3, initial_value=0.0, name="late")(q(0.5 * q.y + u)).named("late")
+
+    point = Diagram("d", law(Constant(value=1.5, name="u"))).trim()
+    assert point.values["law.late.y"] == pytest.approx(3.0, rel=1e-12)
+    run = Diagram("d", law(Constant(value=1.5, name="u"))).simulate(1.0, start=point, progress=False)
+    np.testing.assert_allclose(run["late"], 3.0, rtol=1e-12)
+
+
+def test_an_algebraic_loop_is_solved_along():
+    """x' = v − x with v = cos(v) + x/2."""
+    x = Integrator(name="x")
+    v = Function(lambda v, x: np.cos(v) + 0.5 * x, name="v")
+    diagram = Diagram("d", x(v(v.y, x.y) - x.y), loops="solve")
+    point = diagram.trim()
+    assert point.values["x.y"] == pytest.approx(brentq(lambda s: np.cos(s) - 0.5 * s, 0, 2), rel=1e-10)
+
+
+def test_targets_out_of_reach_are_an_error_with_what_is_left():
+    with pytest.raises(SimulationError, match=r"no operating point.*torque\.value is at its bound"):
+        pendulum().trim(free={"torque.value": (-1, 1)}, targets={"angle.y": 0.5})
+    near = pendulum().trim(free={"torque.value": (-1, 1)}, targets={"angle.y": 0.5}, tolerance=np.inf)
+    assert near.residual > 1e-3
+    assert next(iter(near.residuals.values())) == near.residual
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "text"),
+    [
+        ({"targets": {"angel.y": 1.0}}, UnknownNameError, "angle"),
+        ({"free": {"torque.valu": None}}, UnknownNameError, "value"),
+        ({"fixed": ["angel"]}, UnknownNameError, "angle"),
+        ({"rates": {"angel": 1.0}}, UnknownNameError, "angle"),
+        ({"free": {"torque.value": 3.0}}, OptionError, "pair"),
+        ({"free": {"torque.value": (2.0, 1.0)}}, OptionError, "lowest value first"),
+        ({"free": "torque.value"}, OptionError, "in a list|bounds"),
+        ({"targets": {"angle.y": (1.0, 2.0)}}, OptionError, "shape"),
+    ],
+)
+def test_what_does_not_fit_is_refused(arguments, error, text):
+    with pytest.raises(error, match=text):
+        pendulum().trim(**arguments)
+
+
+def test_a_parameter_that_is_structure_is_refused():
+    @subsystem(sample_time=0.1)
+    def law(u):
+        return Delay(steps=2, name="late")(u)
+
+    with pytest.raises(ParameterError, match="a trim finds numbers alone"):
+        Diagram("d", law(Constant(value=1.5, name="u"))).trim(free=["late.steps"])
+    start = Diagram("d", MassSpringDamper(name="m")(force=Constant(value=1.0)))
+    with pytest.raises(ParameterError, match="structure"):
+        start.trim(free=["m.start_position"])
+
+
+def test_given_states_make_the_signals_that_follow_from_them():
+    point = mass().operating_point(step=1e-3, states={"plant.position": 0.3, "plant.velocity": -0.1})
+    assert point.how == "given"
+    assert point.values["plant.acceleration"] == pytest.approx(-30.0 + 0.1, rel=1e-12)
+    with pytest.raises(UnknownNameError, match="position"):
+        mass().operating_point(step=1e-3, states={"plant.positon": 0.3})
+
+
+def test_a_run_from_given_states_begins_there():
+    """s(t) of a free mass from s = 0.3 against its closed form, at the FMU's internal step of 1 ms (RK4)."""
+    diagram = mass()
+    run = diagram.simulate(
+        0.5, start=diagram.operating_point(step=1e-3, states={"plant.position": 0.3}), progress=False
+    )
+    w, t = np.sqrt(100 - 0.25), run.t
+    want = 0.3 * np.exp(-0.5 * t) * (np.cos(w * t) + 0.5 / w * np.sin(w * t))
+    np.testing.assert_allclose(run["plant.position"], want, atol=1e-9)
+
+
+def test_a_run_goes_on_from_an_operating_point_of_a_run():
+    diagram = fig3_at_rest()
+    whole = diagram.simulate(0.4, progress=False)
+    rest = diagram.simulate(0.2, start=diagram.operating_point(0.2), progress=False)
+    np.testing.assert_allclose(rest.t, whole.t[200:], rtol=1e-12)
+    np.testing.assert_allclose(rest["position"], whole["position"][200:], atol=1e-11)
+
+
+def test_a_run_from_a_point_on_other_ticks_is_refused():
+    diagram = mass()
+    point = diagram.operating_point(0.003, step=1e-3)
+    with pytest.raises(OptionError, match="ticks"):
+        diagram.simulate(0.1, step=2e-3, start=point, progress=False)
+    with pytest.raises(OptionError, match="another diagram"):
+        fig3_at_rest().simulate(0.1, start=diagram.operating_point(step=1e-3), progress=False)
