@@ -35,7 +35,7 @@ def add_report(commands: Any) -> None:
         "  2    wrong usage; nothing was analysed\n  130  interrupted (Ctrl-C); nothing is written",
     )
     report.add_argument("what", nargs="?", metavar="WHAT", help="A, B, C, D, or FILE.py:NAME")
-    report.add_argument("--out", metavar="FILE.html", help="the page (default: fig3.html, or NAME.html)")
+    report.add_argument("--out", metavar="FILE.html", help="the page (default: fig3.html, or the diagram's name)")
     report.add_argument("--pdf", action="store_true", help="the same as PDF beside it (pip install 'loopwright[pdf]')")
     report.add_argument("--json", action="store_true", help="all numbers as JSON beside it")
     report.add_argument("--plant", metavar="FILE.fmu", help="another plant in place of the gantry")
@@ -54,10 +54,15 @@ def report_command(arguments: argparse.Namespace) -> int:
     from ._report_files import check_files, write_report
 
     what = arguments.what or DEFAULT
-    with _subject(what, arguments) as (diagram, experiment):
-        if diagram is None:
-            return 1
-        out = arguments.out or f"{diagram.name}.html"
+    with contextlib.ExitStack() as open_file:
+        try:
+            diagram, experiment = open_file.enter_context(_subject(what, arguments))
+        except OptionError:
+            raise
+        except LoopwrightError as error:
+            say(f"loopwright: error: {error}", sys.stderr)
+            return 1 if isinstance(error, FmuError) and not isinstance(error, FmuFileError) else 2
+        out = arguments.out or (f"{diagram.name}.html" if arguments.what else "fig3.html")
         check_files(out, pdf=arguments.pdf, json=arguments.json)
         began = time.perf_counter()
         try:
@@ -105,8 +110,8 @@ def _progress(name: str) -> Iterator[Callable[[str], None]]:
 
 
 @contextlib.contextmanager
-def _subject(what: str, arguments: argparse.Namespace) -> Iterator[tuple[Diagram | None, Experiment | None]]:
-    """Yield the diagram and its experiment, where it is one; no diagram where a plant can't be built."""
+def _subject(what: str, arguments: argparse.Namespace) -> Iterator[tuple[Diagram, Experiment | None]]:
+    """Yield the diagram, and its experiment where it is one."""
     if ".py" in what:
         for name, given in (("--option", arguments.options), ("--plant", arguments.plant)):
             if given:
@@ -115,16 +120,7 @@ def _subject(what: str, arguments: argparse.Namespace) -> Iterator[tuple[Diagram
             found = _diagram(vars(module), str(path), path.name, name)
             yield (found.diagram, found) if isinstance(found, Experiment) else (found, None)
         return
-    try:
-        experiment = _experiment(what, arguments)
-    except OptionError:
-        raise
-    except LoopwrightError as error:
-        if not isinstance(error, FmuError) or isinstance(error, FmuFileError):
-            raise OptionError(str(error)) from error
-        say(f"loopwright: error: {error}", sys.stderr)
-        yield None, None
-        return
+    experiment = _experiment(what, arguments)
     yield experiment.diagram, experiment
 
 
