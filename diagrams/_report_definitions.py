@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -35,10 +36,38 @@ DEFINITIONS: Mapping[str, str] = MappingProxyType(
         "force_tracking": "The admittance without stiffness (k = 0), which tracks a desired force.",
         "rule_of_thumb": "(d + b_e)/T_d with T_d half a sample, plus a sample for each sample of delay.",
         "first_non_passive": "The lowest frequency at which Re Y(jω) < 0. Re Y ≥ 0 does not prove passivity.",
-        "residual": "What is left of the equations at the operating point.",
+        "residual": "The largest change of a state over the next tick, and of a continuous one in a second, at the "
+        "operating point, relative to 1 + its size; 0 at rest.",
+        "affine": "The largest entry of the linear model's constant term: 0 at an equilibrium.",
+        "t": "The time of the operating point.",
         "spectral_radius": "The largest magnitude of the closed-loop poles of a sampled loop.",
         "growth_rate": "σ of the fastest closed-loop pole: what is not at rest grows with e^(σt).",
         "deviation": "The largest relative deviation between two computations of the same response.",
+        "frequency": "The frequency of what stands ahead of it in the path.",
+        "gain_margin": "The factor on L with which the closed loop has a pole at this crossing.",
+        "encirclements": "How often L(jω) winds around −1, counter-clockwise.",
+        "stable": "1 where all closed-loop poles are stable, hidden modes aside, else 0.",
+        "gain_low": "Down to this factor the gains of all channels may fall at once, within the disk.",
+        "gain_high": "Up to this factor the gains of all channels may rise at once, within the disk.",
+        "phase_deg": "By this much the phases of all channels may turn at once, to either side, within the disk.",
+        "slowest": "The largest real part of the closed-loop poles, s = log(z)/T where sampled; the memory of "
+        "projections aside.",
+        "coupling": "The largest gain, over frequency, from one direction's virtual input to the other direction's "
+        "coordinate, relative to that to its own.",
+        "polynomial_spread": "The largest difference between the closed loop's characteristic polynomials at points "
+        "along and beside the path, each coefficient relative to the size of the poles.",
+        "from_matched": "The same difference from the polynomial with matched parameters.",
+        "polynomial_difference": "The largest difference of a coefficient of the characteristic polynomial from what "
+        "was asked, time scaled by the size of the poles.",
+        "mean": "The mean of the poles, which scatter less together than each by itself.",
+        "pole": "A closed-loop pole of the error dynamics, s = log(z)/T where sampled; real and imaginary part.",
+        "gain": "The gain of the error dynamics that puts the sampled poles where they were asked.",
+        "target": "A parameter of the admittance that is asked for.",
+        "ke_frequency": "The frequency at which the loop oscillates at the limit of the environment's stiffness.",
+        "me_frequency": "The frequency at which the loop oscillates at the limit of the environment's mass.",
+        "be_frequency": "The frequency at which the loop oscillates at the limit of the environment's damping.",
+        "tool_mass_frequency": "The frequency at which the loop oscillates at the limit of the tool's mass.",
+        "subject": "A parameter of the block that its path names.",
     }
 )
 
@@ -54,7 +83,9 @@ def definition(path: str, more: Mapping[str, str] = MappingProxyType({})) -> tup
         Further definitions, which come first.
     """
     for part in reversed(path.split(".")):
-        for known in (more, DEFINITIONS):
-            if part in known:
-                return part, known[part]
+        bare = re.sub(r"^(pole|gain)_[a-z]?\d.*|_friction$|_\d+$", r"\1", part)
+        for name in (part, bare):
+            for known in (more, DEFINITIONS):
+                if name in known:
+                    return name, known[name]
     return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -98,17 +98,17 @@ class _Page:
 
     def _section(self, section: Section, number: tuple[str, ...], key: str) -> str:
         level = min(len(number) + 1, 4)
-        out = [
-            f'<section id="{_anchor("s", key)}" class="level{level}">\n',
-            f'<h{level}><span class="no">{".".join(number)}</span> {_marked(section.title)}</h{level}>\n',
-            _paragraphs(section.text),
-            *(self._plot(plot) for plot in section.plots if plot.key.startswith(DRAWING)),
-            *map(self._table, section.tables),
-            *(self._plot(plot) for plot in section.plots if not plot.key.startswith(DRAWING)),
-        ]
+        drawings = [plot for plot in section.plots if plot.key.startswith(DRAWING)]
+        figures = [plot for plot in section.plots if not plot.key.startswith(DRAWING)]
+        head = f'<h{level}><span class="no">{".".join(number)}</span> {_marked(section.title)}</h{level}>\n'
+        parts = [*map(self._plot, drawings), *map(self._table, section.tables), *map(self._plot, figures)]
+        if parts and not section.text and not parts[0].startswith('<div class="table long'):
+            parts[0] = f'<div class="keep">{head}{parts[0]}</div>\n'  # a heading stays with what it is about
+        else:
+            parts.insert(0, head + _paragraphs(section.text))
         for i, inner in enumerate(section.sections, 1):
-            out.append(self._section(inner, (*number, str(i)), f"{key}.{inner.key}"))
-        return "".join(out) + "</section>\n"
+            parts.append(self._section(inner, (*number, str(i)), f"{key}.{inner.key}"))
+        return f'<section id="{_anchor("s", key)}" class="level{level}">\n{"".join(parts)}</section>\n'
 
     def _plot(self, plot: Plot) -> str:
         self.count["figure"] += 1
@@ -131,13 +131,15 @@ class _Page:
             unit = "" if units[i] in (None, "1") or _says(heading, units[i] or "") else symbol(units[i] or "")
             small = f' <span class="unit">({escape(unit)})</span>' if unit else ""
             heads.append(f'<th scope="col"{_right(right[i])}>{_marked(str(heading))}{small}</th>')
-        reasons = list(dict.fromkeys(v.confirmed_by for row in table.rows for v in row if isinstance(v, Number)))
-        letters = {reason: _letter(i) for i, reason in enumerate(reasons)} if len(reasons) > 1 else {}
+        reasons = _grouped(v.confirmed_by for row in table.rows for v in row if isinstance(v, Number))
+        letters = {kind: _letter(i) for i, kind in enumerate(reasons)} if len(reasons) > 1 else {}
         body = []
         for above, row in zip([(), *table.rows], table.rows, strict=False):
             cells = []
             for i, value in enumerate(row):
                 tag = 'th scope="row"' if i == 0 and not isinstance(value, Number) else "td"
+                if isinstance(value, str) and table.columns[i] == "unit":
+                    value = symbol(value)
                 text = self._cell(value, letters, with_unit=units[i] is None)
                 again = not right[i] and i < columns - 1 and above[: i + 1] == row[: i + 1]
                 cells.append(f"<{tag}{' class=again' if again else _right(right[i])}>{text}</{tag.split()[0]}>")
@@ -156,17 +158,17 @@ class _Page:
         path = self.paths.get(id(value)) or self.equal.get(value)
         text = escape(quantity(value) if with_unit else value_text(value))
         about = escape(f"{path + ': ' if path else ''}{tolerance_text(value)}; confirmed by {value.confirmed_by}")
-        note = f"<sup>{letters[value.confirmed_by]}</sup>" if letters else ""
+        note = f"<sup>{letters[_kind(value.confirmed_by)]}</sup>" if letters else ""
         if path is None:
             return f'<span title="{about}">{text}</span>{note}'
         return f'<a class="n" href="#{_anchor("n", path)}" title="{about}">{text}</a>{note}'
 
-    def _notes(self, table: Table, letters: Mapping[str, str], reasons: Sequence[str]) -> str:
+    def _notes(self, table: Table, letters: Mapping[str, str], reasons: Mapping[str, str]) -> str:
         notes = [_marked(table.note)] if table.note else []
-        if letters:
-            notes += [f"<sup>{letter}</sup> Confirmed by {_marked(why)}." for why, letter in letters.items() if why]
-        elif reasons and reasons[0]:
-            notes.append(f"Confirmed by {_marked(reasons[0])}.")
+        for kind, why in reasons.items():
+            if why:
+                mark = f"<sup>{letters[kind]}</sup> " if letters else ""
+                notes.append(f"{mark}Confirmed by {_marked(why)}.")
         return f'<p class="note">{"<br>".join(notes)}</p>\n' if notes else "\n"
 
     # --- appendices -------------------------------------------------------------------------------------------------
@@ -247,6 +249,20 @@ def _paragraphs(texts: Sequence[str]) -> str:
     return "".join(out) + ("</ul>\n" if items else "")
 
 
+def _kind(reason: str) -> str:
+    """Return how a number was confirmed without the numbers in it."""
+    return re.sub(r"[-−]?\d[\d.]*(?:e[-+]?\d+)?(?:, [-−]?\d[\d.]*(?:e[-+]?\d+)?)*", "…", reason)
+
+
+def _grouped(reasons: Iterable[str]) -> dict[str, str]:
+    """Return each kind of confirmation once: as it is where that is the same for all, else without its numbers."""
+    found: dict[str, str] = {}
+    for reason in reasons:
+        kind = _kind(reason)
+        found[kind] = kind if found.get(kind, reason) != reason else reason
+    return found
+
+
 def _common_unit(table: Table, column: int) -> str | None:
     """Return the unit of all numbers in a column; None where they differ."""
     units = {row[column].unit for row in table.rows if column < len(row) and isinstance(row[column], Number)}
@@ -257,8 +273,8 @@ def _common_unit(table: Table, column: int) -> str | None:
 
 def _says(heading: str, unit: str) -> bool:
     """Return whether a heading names the unit already."""
-    words = re.split(r"[\s(),/\[\]]+", str(heading))
-    return unit in words or symbol(unit) in words or f"/{unit}" in heading.replace(" ", "")
+    words = re.split(r"[\s(),\[\]]+", str(heading))
+    return not {unit, symbol(unit), f"/{unit}"}.isdisjoint(words)
 
 
 def _right(yes: bool) -> str:

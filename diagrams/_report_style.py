@@ -55,6 +55,7 @@ thead th.right { white-space: normal; }
 td.again, th.again { color: #9aa5b1; }
 .unit { color: var(--soft); font-weight: 400; white-space: nowrap; }
 sup { color: var(--soft); font-size: .7em; line-height: 0; margin-left: .1em; }
+.right sup { display: inline-block; width: .9em; text-align: left; }
 .note { font-size: .8rem; line-height: 1.45; color: var(--soft); margin: .4rem 0 0; }
 table.dense { font-size: .82rem; }
 table.dense th, table.dense td { padding: .2rem .5rem; }
@@ -88,9 +89,10 @@ table.definitions td { max-width: 46rem; }
   section.level2:first-child h2 { margin-top: 18pt; }
   h2, h3, h4, caption { break-after: avoid; }
   h2, h3, h4 { break-inside: avoid; }
-  /* room for what follows, taken back: where break-after is not known, neither a heading nor a table's head stays alone */
+  /* room for what follows, taken back: no heading and no table's head stays alone where break-after is not known */
   h3::after, h4::after { content: ""; display: block; height: 60pt; margin-bottom: -60pt; }
-  main h2::after, .long::before { content: ""; display: block; height: 90pt; margin-bottom: -90pt; break-inside: avoid; }
+  main h2::after, .long::before { content: ""; display: block; height: 90pt; margin-bottom: -90pt;
+    break-inside: avoid; }
   nav { position: static; max-height: none; overflow: visible; }
   nav li { margin: 1.5pt 0; }
   nav a, a, a.n { color: inherit; text-decoration: none; }
@@ -102,9 +104,11 @@ table.definitions td { max-width: 46rem; }
   th, td { padding: 1.6pt 5pt; }
   table.dense th, table.dense td { padding: 1.2pt 3.5pt; }
   thead { display: table-header-group; }
-  tr, figure, ol.why li { break-inside: avoid; }
+  tr, figure, ol.why li, .keep { break-inside: avoid; }
   .table:not(.long) { break-inside: avoid; }
   .note { font-size: 7.5pt; }
+  table.numbers { font-size: 7pt; }
+  table.numbers th, table.numbers td { padding: .6pt 3pt; }
   figure { margin: 9pt 0; }
   figure svg { max-width: 100%; max-height: 225mm; height: auto; }
   figure .wide { display: none; }
