@@ -239,7 +239,8 @@ def realization(G: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarra
         return np.zeros((0, 0)), np.zeros((0, p)), np.zeros((q, 0)), np.zeros(0)
     U, sigma, Vt = np.linalg.svd(H0, full_matrices=False)
     relative = float(np.max(noise / rows[:, None] / columns, initial=0.0))
-    floor = max(_NOISE * sigma[0], 0.1 * relative * np.sqrt(H0.size))
+    # the largest singular value of a matrix of noise
+    floor = max(_NOISE * sigma[0], relative * (np.sqrt(m * q) + np.sqrt(m * p)))
     best: Any = None
     for n in range(1, int(np.sum(sigma > floor)) + 1):
         half = np.sqrt(sigma[:n])

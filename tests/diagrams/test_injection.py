@@ -1,0 +1,225 @@
+"""Frequency responses measured on the running diagram, against closed forms and against the linear model.
+
+Every response is one of sampled signals: v, what the wire's port puts out, and u = v + d, what its consumers get.
+"""
+
+import control
+import numpy as np
+import pytest
+
+from loopwright.blocks import (
+    Constant,
+    Ellipse,
+    Function,
+    Gain,
+    Integrator,
+    OptionError,
+    Reference,
+    UnitDelay,
+    WiringError,
+)
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams._injection import injected
+from loopwright.diagrams._linear_parts import find_signal
+from loopwright.diagrams.fig3 import Channel, Rig, fig3
+from loopwright.fmus import Fmu, gantry, mass_spring_damper
+
+PATH = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))
+BAND = np.geomspace(1.0, 150.0, 6)
+
+
+def continuous_loop():
+    """s² + 3 s + 40: L = (3 s + 40)/s² at the command of a double integrator."""
+    place, speed = Integrator(name="place"), Integrator(name="speed")
+    return Diagram("d", place(speed((-3.0 * speed.y - 40.0 * place.y).named("u"))))
+
+
+def fig3_loop(xi=0.0, *, friction=True, **rig):
+    """Fig. 3 with references that stand still: experiment A at rest."""
+    model, start = gantry.nominal, {}
+    if not friction:
+        model, start = model.replace(coulomb_scale=0.0, viscous_scale=0.0), {"coulomb_scale": 0.0, "viscous_scale": 0.0}
+    plant = Fmu(gantry.build(), name="plant", start={**start, "position": PATH.to_plane(0.12, xi)})
+    par, perp = (Channel(Reference(v, unit="m", name=n)) for v, n in ((0.12, "eta_d"), (xi, "xi_d")))
+    return fig3(plant, PATH, par, perp, model=model, rig=Rig(**rig))
+
+
+def test_a_continuous_loop_has_its_closed_form():
+    found = continuous_loop().frequency_response("u", [1.0, 7.0, 30.0], amplitude=0.1, outputs=["place.y"])
+    s = 1j * found.omega
+    L = (3 * s + 40) / s**2
+    for got, want in (
+        (found.L, L),
+        (found.S, 1 / (1 + L)),
+        (found.T, L / (1 + L)),
+        (found.response, 1 / (s**2 + 3 * s + 40)),
+    ):
+        assert isinstance(got, control.FrequencyResponseData)
+        np.testing.assert_allclose(got.frdata[0, 0], want, rtol=1e-6)
+        np.testing.assert_allclose(got.omega, found.omega)
+    assert found.dt == 0
+    assert np.all(found.settled)
+    assert found.moved <= 1e-6
+
+
+@pytest.mark.parametrize("kind", ["sine", "multisine", "chirp"])
+def test_a_sampled_loop_has_its_closed_form(kind):
+    """x⁺ = 0.9 x − 0.3 x: L = 0.3/(z − 0.9)."""
+
+    @subsystem(sample_time=0.01)
+    def law():
+        x = UnitDelay(initial_value=0.0, name="x")
+        return x(0.9 * x.y + Gain(gain=-0.3, name="k")(x.y))
+
+    found = Diagram("d", law()).frequency_response("law.k.y", [2.0, 20.0, 90.0], amplitude=1.0, kind=kind)
+    L = 0.3 / (np.exp(1j * found.omega * 0.01) - 0.9)
+    np.testing.assert_allclose(found.L.frdata[0, 0], L, rtol=1e-6)
+    assert found.L.dt == 0.01
+    np.testing.assert_allclose(found.omega, [2.0, 20.0, 90.0], rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"xi": 0.03}, {"friction": False}, {"xi": 0.03, "friction": False}, {"delay": 1}], ids=str
+)
+@pytest.mark.parametrize("wire", ["v_perp", "v_par"])
+def test_fig3_answers_an_injection_as_its_linear_model_does(options, wire):
+    """The commanded accelerations v_perp and v_par at the ticks of 1 kHz; 1e-3 is asked for, rounding leaves 1e-6."""
+    diagram = fig3_loop(**options)
+    point = diagram.trim()
+    found = diagram.frequency_response(wire, BAND, amplitude=1e-3, at=point)
+    model = diagram.linearize(point)
+    assert found.compare(model) <= 1e-5
+    assert found.compare(model, "S") <= 1e-5
+    assert found.compare(model, "T") <= 1e-5
+    assert found.moved <= 1e-8
+
+
+@pytest.mark.parametrize("kind", ["multisine", "chirp"])
+def test_fig3_answers_other_test_signals_alike(kind):
+    diagram = fig3_loop(xi=0.03)
+    point = diagram.trim()
+    found = diagram.frequency_response("v_perp", BAND, amplitude=1e-3, at=point, kind=kind)
+    assert found.compare(diagram.linearize(point)) <= 1e-5
+    assert np.all(np.isnan(found.distortion)) == (kind == "chirp")
+
+
+def test_both_motor_forces_are_a_matrix():
+    diagram = fig3_loop(xi=0.03)
+    point = diagram.trim()
+    found = diagram.frequency_response("motor_force", BAND[[0, 3, 5]], amplitude=1e-2, at=point)
+    assert found.L.frdata.shape == (2, 2, 3)
+    assert found.compare(diagram.linearize(point)) <= 1e-5
+
+
+def test_a_wire_out_of_an_fmu_is_one_like_any_other():
+    diagram = fig3_loop()
+    point = diagram.trim()
+    found = diagram.frequency_response("velocity", BAND[[0, 3, 5]], amplitude=1e-6, at=point)
+    assert found.compare(diagram.linearize(point)) <= 1e-5
+
+
+def test_the_velocity_at_the_ticks_is_not_its_fundamental():
+    """A mass under held forces: the sampled velocity's phasor differs from the fundamental's by the hold's ripple."""
+
+    @subsystem(sample_time=0.1)
+    def law(s, v):
+        return Function(lambda s, v: -2.0 * s - 2.0 * v, name="law")(s, v)
+
+    place, speed = Integrator(name="place"), Integrator(name="speed")
+    diagram = Diagram("d", place(speed(law(place.y, speed.y).named("u"))))
+    found = diagram.frequency_response("u", [8.0], amplitude=1.0, outputs=["speed.y"])
+    h, w = 0.1, found.omega[0]
+    z = np.exp(1j * w * h)
+    u = found.u[0, 0, 0]
+    np.testing.assert_allclose(found.y[0, 0, 0] / u, h / (z - 1), rtol=1e-6)  # of the sequence
+    fundamental = (1 - 1 / z) / (1j * w * h) / (1j * w)  # zero-order hold, then 1/s
+    assert abs(found.y[0, 0, 0] / u / fundamental - 1) > 0.05
+
+
+def test_several_rates_are_measured_over_their_common_period():
+    """S and T as in the linear model; a wire that is renewed within the period is no loop for a held signal."""
+
+    @subsystem(sample_time=2e-3, offset=1e-3)
+    def slow(y):
+        return Gain(gain=-40.0, name="kp")(y)
+
+    @subsystem(sample_time=1e-3)
+    def fast(v):
+        return Gain(gain=-3.0, name="kd")(v)
+
+    plant = Fmu(mass_spring_damper.build(), name="plant", start={"position": 0.0})
+    diagram = Diagram("d", plant(force=(slow(plant.position) + fast(plant.velocity)).named("f")))
+    for t in (0.004, 0.005):
+        point = diagram.operating_point(t)
+        model = diagram.linearize(point)
+        found = diagram.frequency_response("f", [3.0, 30.0], amplitude=0.1, at=point)
+        assert found.dt == pytest.approx(2e-3)
+        assert found.compare(model, "S") <= 1e-5
+        assert found.compare(model, "T") <= 1e-5
+        assert found.compare(model) == found.compare(model, "S")
+        with pytest.raises(OptionError, match="changes between two samples"):
+            found.L  # noqa: B018
+
+
+def test_the_estimate_knows_when_the_amplitude_is_too_large():
+    """−u³ beside −u: the third harmonic shows as distortion, the smaller amplitude is nearer to the linear model."""
+
+    def loop():
+        place = Integrator(name="x")
+        return Diagram("d", place(Function(lambda x: -5.0 * x - 5.0 * x**3, name="law")(place.y)))
+
+    diagram = loop()
+    model = diagram.linearize()
+    small, large = (diagram.frequency_response("law.y", [5.0], amplitude=a) for a in (1e-2, 2.0))
+    assert small.distortion[0] < 1e-4 < 1e-2 < large.distortion[0]
+    assert small.compare(model) < 1e-4 < 1e-2 < large.compare(model)
+
+
+def test_an_operating_point_that_moves_is_seen():
+    ramp = Integrator(name="ramp")(Constant(value=1.0, name="rate"))
+    place = Integrator(name="x")
+    diagram = Diagram("d", place(Function(lambda x, r: -5.0 * (x - r), name="law")(place.y, ramp)))
+    assert diagram.frequency_response("law.y", [5.0], amplitude=1e-2).moved > 1.0
+
+
+def test_an_operating_point_of_a_run_and_a_time_are_the_same():
+    diagram = fig3_loop()
+    run = diagram.simulate(0.2, progress=False)
+    a, b, c = (
+        diagram.frequency_response("v_perp", [30.0], amplitude=1e-3, at=at)
+        for at in (0.2, run.at(0.2), diagram.operating_point(0.2))
+    )
+    np.testing.assert_array_equal(a.v, b.v)
+    np.testing.assert_array_equal(a.v, c.v)
+
+
+def test_the_injection_leaves_all_other_blocks_where_they_are():
+    diagram = fig3_loop()
+    flat = diagram.flatten()
+    made = injected(diagram, find_signal(flat, "v_perp"), 1, (flat.base, 0 * flat.base))
+    assert set(made.diagram.blocks) - set(diagram.blocks) == {made.source, made.sum}
+    assert set(made.diagram.names) == set(diagram.names)
+    silent = made.diagram.simulate(0.2, progress=False)
+    plain = diagram.simulate(0.2, progress=False)
+    np.testing.assert_array_equal(silent["position"], plain["position"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "text"),
+    [
+        ({"frequencies": [0.0]}, OptionError, "positive"),
+        ({"frequencies": "slow"}, OptionError, "positive"),
+        ({"frequencies": [1e4], "step": 1e-3}, OptionError, "be told apart"),
+        ({"amplitude": 0.0}, OptionError, "amplitude"),
+        ({"kind": "noise"}, OptionError, "'sine'"),
+        ({"windows": 1}, OptionError, "at least 2"),
+        ({"wire": "place.y", "unwired": True}, WiringError, "nothing is wired"),
+    ],
+)
+def test_what_does_not_fit_is_refused(changes, error, text):
+    given = {"wire": "u", "frequencies": [1.0], "amplitude": 0.1, **changes}
+    diagram = continuous_loop()
+    if given.pop("unwired", False):
+        diagram = Diagram("d", Integrator(name="place")(Constant(value=0.0)))
+    with pytest.raises(error, match=text):
+        diagram.frequency_response(**given)
