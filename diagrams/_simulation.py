@@ -109,17 +109,18 @@ class Simulation:
         start: RunState | OperatingPoint | None = None,
         duration: float | None = None,
     ):
+        given: Any = step
         self._point = start if isinstance(start, OperatingPoint) else None
         if self._point is not None:
             diagram = placed(diagram, self._point)
             if not diagram.is_continuous and not diagram.has_clock:
-                step = step or self._point.base
+                given = step or self._point.base
         self.diagram = diagram
         saved = None if isinstance(start, OperatingPoint) else start
-        given, step = step, default_step(diagram, step, duration, solver, saved)
-        options = {"step": step, "solver": solver, "rtol": rtol, "atol": atol, "max_step": max_step, "start": start}
+        base = default_step(diagram, given, duration, solver, saved)
+        options = {"step": base, "solver": solver, "rtol": rtol, "atol": atol, "max_step": max_step, "start": start}
         self.recipe = {name: value for name, value in options.items() if value is not None}
-        self.flat: FlatDiagram = diagram.flatten(step) if step is given else diagram._flattened(step)
+        self.flat: FlatDiagram = diagram.flatten(base) if base is given else diagram._flattened(base)
         if saved is not None:
             check_fits(saved, self.flat, diagram.name)
         self._recording = Recording(self.flat, diagram.name, record, every, states, to, overwrite)
@@ -127,7 +128,7 @@ class Simulation:
         self._start_state = saved
         self._machine = Machine(self.flat)
         self._plants: list[tuple[str, Any]] = []
-        self._every_tick = step is not None or has_plants(self.flat)
+        self._every_tick = base is not None or has_plants(self.flat)
         self._last: int | None = None
         if duration is not None:
             self._last = ticks_in(duration, self.flat.base, diagram.name)
