@@ -142,7 +142,8 @@ class _Page:
                     value = symbol(value)
                 text = self._cell(value, letters, with_unit=units[i] is None)
                 again = not right[i] and i < columns - 1 and above[: i + 1] == row[: i + 1]
-                cells.append(f"<{tag}{' class=again' if again else _right(right[i])}>{text}</{tag.split()[0]}>")
+                kind = " class=again" if again else _right(right[i]) or _breaks(value)
+                cells.append(f"<{tag}{kind}>{text}</{tag.split()[0]}>")
             body.append(f"<tr>{''.join(cells)}</tr>\n")
         wide = ' class="dense"' if columns > 6 else ""
         long = " long" if len(table.rows) > _LONG else ""
@@ -168,7 +169,8 @@ class _Page:
         for kind, why in reasons.items():
             if why:
                 mark = f"<sup>{letters[kind]}</sup> " if letters else ""
-                notes.append(f"{mark}Confirmed by {_marked(why)}.")
+                said = why.capitalize() if why.startswith("given") else f"Confirmed by {why}"
+                notes.append(f"{mark}{_marked(said)}.")
         return f'<p class="note">{"<br>".join(notes)}</p>\n' if notes else "\n"
 
     # --- appendices -------------------------------------------------------------------------------------------------
@@ -279,6 +281,11 @@ def _says(heading: str, unit: str) -> bool:
 
 def _right(yes: bool) -> str:
     return ' class="right"' if yes else ""
+
+
+def _breaks(value: Any) -> str:
+    """Return the mark of a cell with a word that is too long for a column."""
+    return " class=any" if isinstance(value, str) and any(len(word) > 36 for word in value.split()) else ""
 
 
 def _letter(i: int) -> str:

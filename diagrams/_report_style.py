@@ -49,12 +49,12 @@ tbody tr { border-bottom: 1px solid var(--line); }
 tbody tr:last-child { border-bottom: 1.5px solid var(--ink); }
 tbody tr:hover { background: var(--band); }
 tbody td { overflow-wrap: break-word; }
-tbody td:last-child { overflow-wrap: anywhere; }
+td.any { overflow-wrap: anywhere; }
 .right { text-align: right; white-space: nowrap; }
 thead th.right { white-space: normal; }
 td.again, th.again { color: #9aa5b1; }
 .unit { color: var(--soft); font-weight: 400; white-space: nowrap; }
-sup { color: var(--soft); font-size: .7em; line-height: 0; margin-left: .1em; }
+sup { color: var(--soft); font-size: .7em; font-style: italic; line-height: 0; margin-left: .3em; }
 .right sup { display: inline-block; width: .9em; text-align: left; }
 .note { font-size: .8rem; line-height: 1.45; color: var(--soft); margin: .4rem 0 0; }
 table.dense { font-size: .82rem; }

@@ -81,7 +81,7 @@ def cell(value: Any) -> str:
         return ", ".join(cell(v) for v in value)
     if isinstance(value, Number):
         return quantity(value)
-    return str(value)
+    return re.sub(r"(?<![\w.)])-(?=\d)", "−", str(value))
 
 
 def is_numeric(values: Sequence[Any]) -> bool:
