@@ -5,6 +5,7 @@ from ._contract import BlockReport, check_block
 from ._control_values import Comparison, compare_with_control
 from ._diagram import Diagram
 from ._disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
+from ._drawing import Drawing
 from ._flat import FlatDiagram
 from ._frequency_response import FrequencyResponse
 from ._layout import Layout
@@ -14,6 +15,7 @@ from ._number import Number
 from ._nyquist import NyquistCount, nyquist_count
 from ._operating_point import OperatingPoint
 from ._placement import SampledDesign, place, sampled_gains, sampled_poles
+from ._report_model import Report
 from ._run import Run, Snapshot
 from ._sensitivities import (
     GangOfFour,
@@ -35,6 +37,7 @@ __all__ = [
     "Comparison",
     "Diagram",
     "DiskMargin",
+    "Drawing",
     "FlatDiagram",
     "Frame",
     "FrequencyResponse",
@@ -48,6 +51,7 @@ __all__ = [
     "Occurrence",
     "OperatingPoint",
     "PhaseCrossover",
+    "Report",
     "Run",
     "RunState",
     "SampledDesign",

@@ -106,7 +106,7 @@ table.definitions td { max-width: 46rem; }
   thead { display: table-header-group; }
   tr, figure, ol.why li, .keep { break-inside: avoid; }
   .table:not(.long) { break-inside: avoid; }
-  .note { font-size: 7.5pt; }
+  .note, ol.why { font-size: 7.5pt; }
   table.numbers { font-size: 7pt; }
   table.numbers th, table.numbers td { padding: .6pt 3pt; }
   figure { margin: 9pt 0; }

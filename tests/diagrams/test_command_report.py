@@ -1,12 +1,15 @@
 """The command ``loopwright report``."""
 
 import json
+import re
+import shlex
+from pathlib import Path
 
 import pytest
 
 from loopwright.blocks import ConfirmationError
 from loopwright.diagrams import _report_analysis
-from loopwright.diagrams._cli import main
+from loopwright.diagrams._cli import _parser, main
 from loopwright.diagrams._number import Number
 from loopwright.diagrams._report_model import Report, Section
 
@@ -150,3 +153,12 @@ def test_the_method_of_a_diagram_writes_the_same(folder, asked):
     made = experiments.compliance().diagram.report("fig3.html", json=True)
     assert set(made.numbers()) == {"inner.u.continuous.phase_margin_deg"}
     assert (folder / "fig3.json").is_file()
+
+
+def test_the_commands_of_the_page_on_reports_are_understood():
+    text = (Path(__file__).parents[2] / "docs" / "reports.md").read_text(encoding="utf-8")
+    lines = [line for part in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in part.splitlines()]
+    commands = [shlex.split(line, comments=True)[1:] for line in lines]
+    assert len(commands) == 3
+    for command in commands:
+        assert _parser().parse_args(command).command == "report"
