@@ -45,7 +45,7 @@ DEFINITIONS: Mapping[str, str] = MappingProxyType(
         "deviation": "The largest relative deviation between two computations of the same response.",
         "frequency": "The frequency of what stands ahead of it in the path.",
         "gain_margin": "The factor on L with which the closed loop has a pole at this crossing.",
-        "encirclements": "Clockwise encirclements of −1 by L: unstable closed-loop poles minus unstable open-loop ones.",
+        "encirclements": "Clockwise encirclements of −1 by L: unstable poles, closed loop minus open loop.",
         "stable": "1 where all closed-loop poles are stable, hidden modes aside, else 0.",
         "gain_low": "Down to this factor the gains of all channels may fall at once, within the disk.",
         "gain_high": "Up to this factor the gains of all channels may rise at once, within the disk.",
