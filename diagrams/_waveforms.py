@@ -75,7 +75,8 @@ def phasors_of(part: Part, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     n = part.samples
     k = np.arange(n)
-    data = data[:n] - np.outer(k / n - 0.5, data[n] - data[0]) - np.mean(data[:n], axis=0)
+    data = data[:n] - np.outer(k / n, data[n] - data[0])
+    data = data - np.mean(data, axis=0)
     turns = np.exp(-2j * np.pi / n * (np.outer(part.lines, k) % n))
     phasors = 2.0 / n * turns @ data
     lines = len(part.lines)

@@ -21,6 +21,7 @@ from loopwright.blocks import (
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams._injection import injected
 from loopwright.diagrams._linear_parts import find_signal
+from loopwright.diagrams._waveforms import phasors_of, plan_of
 from loopwright.diagrams.fig3 import Channel, Rig, fig3
 from loopwright.fmus import Fmu, gantry, mass_spring_damper
 
@@ -116,6 +117,16 @@ def test_a_wire_out_of_an_fmu_is_one_like_any_other():
     point = diagram.trim()
     found = diagram.frequency_response("velocity", BAND[[0, 3, 5]], amplitude=1e-6, at=point)
     assert found.compare(diagram.linearize(point)) <= 1e-5
+
+
+def test_a_drift_is_no_part_of_a_phasor():
+    part = next(plan_of("sine", np.array([20.0]), 1e-3, 1.0))
+    k = np.arange(part.samples + 1)
+    angle = part.omega[0] * 1e-3 * k
+    signal = 3.0 * np.cos(angle) - 4.0 * np.sin(angle) + 0.2 * np.sin(3 * angle) + 5.0 + 0.1 * k
+    phasors, rest = phasors_of(part, signal[:, None])
+    np.testing.assert_allclose(phasors, [[3.0 + 4.0j]], rtol=1e-9)
+    np.testing.assert_allclose(rest, 0.2 / 5.0, rtol=1e-9)
 
 
 def test_the_velocity_at_the_ticks_is_not_its_fundamental():

@@ -9,6 +9,7 @@ from loopwright.blocks import (
     Delay,
     Ellipse,
     Function,
+    Gain,
     Integrator,
     OptionError,
     ParameterError,
@@ -133,6 +134,19 @@ def test_sampled_states_repeat():
     assert point.values["law.late.y"] == pytest.approx(3.0, rel=1e-12)
     run = Diagram("d", law(Constant(value=1.5, name="u"))).simulate(1.0, start=point, progress=False)
     np.testing.assert_allclose(run["late"], 3.0, rtol=1e-12)
+
+
+def test_a_box_that_does_not_act_at_the_start_holds_what_it_puts_out_at_the_point():
+    """x' = 1 − x + h with h = −2 x held by a box with an offset: x = 1/3."""
+
+    @subsystem(sample_time=0.1, offset=0.05)
+    def law(x):
+        return Gain(gain=-2.0, name="k")(x)
+
+    x = Integrator(name="x", initial_value=5.0)
+    diagram = Diagram("d", x(Constant(value=1.0) - x.y + law(x.y)))
+    run = diagram.simulate(1.0, start=diagram.trim(), progress=False)
+    np.testing.assert_allclose(run["x.y"], 1 / 3, rtol=1e-9)
 
 
 def test_an_algebraic_loop_is_solved_along():
