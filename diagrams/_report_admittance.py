@@ -19,6 +19,7 @@ from ._report_model import Plot, Section, Table
 from ._stability_limits import StabilityLimit, stability_limit
 
 DAMPINGS = (0.0, 10.0, 100.0)
+SPRING = 10.0  # N/m, that holds a mass where the admittance has no stiffness
 VARIANTS: Mapping[str, Mapping[str, Any]] = {
     "continuous": {"implementation": "continuous", "delay": 0},
     "sampled_d0": {"implementation": "sampled", "delay": 0},
@@ -180,17 +181,20 @@ def _again(found: StabilityLimit) -> str:
 def _masses(loops: Loops, side: str, numbers: dict[str, Number]) -> Iterator[Table]:
     rows = []
     sets = [("", loops.plain[side]), (FRICTION, loops.rough.get(side))]
+    # without any stiffness the robot drifts, and there is no limit to lose
+    moored = {} if loops.plain[side].admittance.stiffness > 0 else {"stiffness": SPRING}
     for suffix, loop in sets:
         for name, variant in _variants(loop) if loop is not None else ():
             shown = []
             for over, key in (("mass", "me_limit"), ("tool_mass", "tool_mass_limit")):
-                found = stability_limit(variant, over)
+                found = stability_limit(variant, over, **moored)
                 path = f"{key}{suffix}.{name}"
                 numbers[path] = found.number
                 shown += [numbers[path], _again(found)]
             rows.append((name + suffix, *shown))
     columns = ("variant", "largest m_e", "stable again", "largest tool mass", "stable again")
-    yield Table("Largest masses, without spring and damper", columns, tuple(rows))
+    how = f"on a spring of {SPRING:g} N/m" if moored else "without spring and damper"
+    yield Table(f"Largest masses, {how}", columns, tuple(rows))
 
 
 def _rendered(loops: Loops, side: str) -> Plot:

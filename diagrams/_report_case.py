@@ -24,6 +24,7 @@ FRICTION = "_friction"
 """How the keys of variants end that have the plant's friction, where those without it are analysed as well."""
 NO_FRICTION = {"coulomb_scale": 0.0, "viscous_scale": 0.0}
 AT_REST = 1e-6
+LATER = 10  # ticks after the start that an operating point is at, where the first tick is unlike the others
 SIDES = {"par": "v_par", "perp": "v_perp"}
 COORDINATES = ("controller.eta", "controller.xi")
 NAMES = {"continuous": "continuous", "sampled_d0": "sampled, no delay", "sampled_d1": "sampled, one sample of delay"}
@@ -53,6 +54,7 @@ class Variant:
     where: Any
     delay: int = 0
     problem: str = ""
+    source: Diagram | None = None
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
     loops: dict[tuple[str, ...], Any] = field(default_factory=dict)
@@ -61,7 +63,7 @@ class Variant:
     @cached_property
     def point(self) -> OperatingPoint:
         """Its operating point."""
-        return point_of(self.diagram, self.where)
+        return point_of(self.diagram, self.where, self.source)
 
     @cached_property
     def model(self) -> Linearization:
@@ -104,7 +106,7 @@ class Case:
         self.wires: tuple[str, ...] | None = wires
         self.notes: list[str] = []
         self.variants: dict[str, Variant] = {}
-        base = self._without_delay()
+        base = self._resting(self._without_delay())
         smooth = self._smooth(base)
         for plain, suffix, title in self._plants(base, smooth):
             for key, variant, delay in self._implementations(plain):
@@ -200,6 +202,26 @@ class Case:
             self.notes.append(f"Its own delay could not be taken out: {error.message}")
             return self.diagram
 
+    def _resting(self, base: Diagram) -> Diagram:
+        """Return Fig. 3 at rest where its references begin, where it starts elsewhere and no point was given."""
+        if not self.is_fig3 or self.point is not None:
+            return base
+        here = Variant("", "", base, None)
+        if here.rests:
+            return base
+        try:
+            first = [float(np.ravel(here.point.values[f"{name}.y"])[0]) for name in ("eta_d", "xi_d")]
+            found = base.replace({"plant.start.position": self.path.to_plane(*first)})
+        except (LoopwrightError, KeyError):
+            return base
+        if not Variant("", "", found, None).rests:
+            return base
+        self.notes.append(
+            "It starts off its references, and moves. It is analysed at rest where they begin: "
+            f"η = {first[0]:.6g} m, ξ = {first[1]:.6g} m."
+        )
+        return found
+
     def _implementations(self, plain: Diagram) -> Iterator[tuple[str, Any, int]]:
         if not plain.has_clock:
             yield "continuous", plain, 0
@@ -217,12 +239,16 @@ class Case:
         problem = ""
         if isinstance(diagram, LoopwrightError):
             diagram, problem = self.diagram, str(diagram)
-        wires: dict[str, tuple[str, ...]] = {}
+        wires: dict[str, Any] = {}
         if self.is_fig3:
             wires = {"inputs": tuple(f"controller.{v}" for v in SIDES.values()), "outputs": COORDINATES}
-        variant = Variant(key, title, diagram, self.point, delay, problem, **wires)
+        variant = Variant(key, title, diagram, self.point, delay, problem, self.diagram, **wires)
         if not problem:
             try:
+                later = self.point is None and any("unlike every later tick" in note for note in variant.model.notes)
+                if later:
+                    at = LATER * variant.model.dt
+                    variant = Variant(key, title, diagram, at, delay, problem, self.diagram, **wires)
                 _ = variant.model
             except LoopwrightError as error:
                 variant.problem = str(error)
@@ -249,9 +275,15 @@ def delayed_boxes(diagram: Diagram) -> list[str]:
     return sorted(found)
 
 
+def in_s(poles: Any, dt: float) -> np.ndarray:
+    """Return poles in 1/s; of those of a sampled model, z, without those at z = 0: memory, or a delay."""
+    values = np.asarray(poles, dtype=complex)
+    return np.asarray(np.log(values[np.abs(values) > 1e-12]) / dt if dt else values)
+
+
 def with_parameters(variant: Variant, changes: Mapping[str, Any], where: Any = ...) -> Variant:
     """Return a variant with other parameters, at its own operating point."""
     at = variant.where if where is ... else where
     found = variant.diagram.replace(changes)
-    kept = {name: getattr(variant, name) for name in ("delay", "inputs", "outputs")}
+    kept = {name: getattr(variant, name) for name in ("delay", "source", "inputs", "outputs")}
     return Variant(variant.key, variant.title, found, at, **kept)

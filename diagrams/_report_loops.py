@@ -14,7 +14,7 @@ from ._disk import mimo_disk_margin
 from ._margins import Margins, margins
 from ._number import Number
 from ._realization import Realization
-from ._report_case import FRICTION, SIDES, Case
+from ._report_case import FRICTION, SIDES, Case, in_s
 from ._report_model import Section, Table
 
 DEFINITIONS = (
@@ -102,12 +102,18 @@ def _wire(case: Case, key: str, wire: str) -> Section | None:
             continue
         found[v.key], loops[v.key] = m, L
         numbers |= {f"{v.key}.{name}": number for name, number in _numbers(m).items()}
-        if m.stable and not v.key.endswith(FRICTION):
-            for c in compare_with_control(_minimal(L)):
-                numbers[f"{v.key}.control.{c.name}"] = _theirs(m, c)
-                compared.append((v.title, c.name, c.value, c.control, c.function, c.right, c.why))
         if not m.stable:
             notes.append(f"{v.title}: the closed loop is not stable, so that it has no margins.")
+        elif not v.key.endswith(FRICTION):
+            try:
+                with np.errstate(all="ignore"):
+                    beside = compare_with_control(_minimal(L))
+            except np.linalg.LinAlgError as error:
+                notes.append(f"{v.title}: python-control's values can't be judged ({error}).")
+                continue
+            for c in beside:
+                numbers[f"{v.key}.control.{c.name}"] = _theirs(m, c)
+                compared.append((v.title, c.name, c.value, c.control, c.function, c.right, c.why))
     if not found:
         return None
     titles = {v.key: v.title for v in case.usable()}
@@ -148,10 +154,11 @@ def _numbers(m: Margins) -> dict[str, Number]:
     found["encirclements"] = Number(
         m.encirclements, "1", 0.0, "winding of 1 + L, and eigenvalues of open and closed loop"
     )
-    for kind, crossings, margin in (
+    kinds: tuple[tuple[str, tuple[Any, ...], str], ...] = (
         ("gain_crossover", m.gain_crossovers, "phase_margin_deg"),
         ("phase_crossover", m.phase_crossovers, "gain_margin"),
-    ):
+    )
+    for kind, crossings, margin in kinds:
         for i, c in enumerate(crossings, 1):
             found[f"{kind}_{i}.frequency"] = c.frequency
             found[f"{kind}_{i}.{margin}"] = getattr(c, margin)
@@ -181,9 +188,7 @@ def _crossings(found: Mapping[str, Margins], titles: Mapping[str, str]) -> Itera
 
 
 def _poles(poles: Iterable[complex], dt: float) -> str:
-    values = np.array(list(poles), dtype=complex)
-    if dt:
-        values = np.log(values[np.abs(values) > 1e-12]) / dt  # those at z = 0 are memory, or a delay
+    values = in_s(list(poles), dt)
     values = values[np.lexsort((-values.imag, np.abs(values)))]
     shown, skip = [], False
     for v in values:
@@ -202,7 +207,8 @@ def _poles(poles: Iterable[complex], dt: float) -> str:
 
 def _several(case: Case, key: str, wire: str) -> Section | None:
     """Return what is said of a wire with several entries: its MIMO disk margin."""
-    numbers, rows, notes = {}, [], []
+    numbers: dict[str, Number] = {}
+    rows, notes = [], []
     for v in case.usable():
         try:
             disk = mimo_disk_margin(v.loop(wire))

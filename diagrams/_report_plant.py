@@ -38,7 +38,7 @@ class MooredGantry(Gantry):
         """Return velocity and acceleration."""
         return x.velocity, self.accelerated(x, u)[0]
 
-    def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:  # type: ignore[override]
+    def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
         """Return acceleration and contact force."""
         a, pulled = self.accelerated(x, u)
         inertial = np.where(t > 0.0, self.load * (self.direction @ a), 0.0)  # nothing has acted yet at the start

@@ -28,7 +28,8 @@ def _look(key: str, i: int) -> dict[str, Any]:
 
 def _span(loops: Mapping[str, Any], found: Mapping[str, Margins]) -> tuple[float, float]:
     """Return the frequencies that matter: a decade and a half around the crossings."""
-    marks = [c.frequency.value for m in found.values() for c in (*m.gain_crossovers, *m.phase_crossovers)]
+    marks = [c.frequency.value for m in found.values() for c in m.gain_crossovers]
+    marks += [p.frequency.value for m in found.values() for p in m.phase_crossovers]
     marks = [w for w in marks if 0 < w < np.inf]
     tops = [np.pi / L.dt for L in loops.values() if L.dt]
     low = min(marks, default=1.0) / 30
@@ -176,7 +177,7 @@ def admittances(key: str, side: str, w: np.ndarray, curves: Mapping[str, tuple[s
 
 def stability(key: str, side: str, shown: Any, lines: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Plot:
     """Draw a stability map: growth rates, and the limits of several variants."""
-    looks = {
+    looks: dict[str, dict[str, Any]] = {
         "sampled d0": {"color": BLUE, "linewidth": 1.6},
         "sampled d1": {"color": VERMILION, "linestyle": (0, (4, 2))},
         "sampled d0, friction slope at rest": {"color": GREEN},

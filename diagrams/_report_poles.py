@@ -12,7 +12,7 @@ from ..blocks._errors import LoopwrightError
 from ._number import Number
 from ._placement import _difference, sampled_gains, sampled_poles
 from ._realization import Realization
-from ._report_case import COORDINATES, FRICTION, SIDES, Case, Variant, with_parameters
+from ._report_case import COORDINATES, FRICTION, SIDES, Case, Variant, in_s, with_parameters
 from ._report_loops import places
 from ._report_model import Section, Table
 
@@ -55,7 +55,7 @@ def poles(case: Case) -> Section | None:
 def _closed_loops(case: Case, numbers: dict[str, Number]) -> Table:
     rows = []
     for v in case.usable():
-        s = in_s(v)
+        s = in_s(v.model.poles, v.model.dt)
         stable = bool(np.all(s.real < 0))
         if s.size:
             slowest, fastest = float(np.max(s.real)), float(np.min(s.real))
@@ -66,14 +66,6 @@ def _closed_loops(case: Case, numbers: dict[str, Number]) -> Table:
             rows.append((v.title, len(s), "yes" if stable else "no", numbers[f"{v.key}.slowest"], f"{fastest:.6g} 1/s"))
     note = "Of the whole diagram, all loops closed, memory aside; s = log(z)/T where sampled."
     return Table("Closed loop", ("variant", "poles", "stable", "largest Re s", "smallest Re s"), tuple(rows), note)
-
-
-def in_s(v: Variant) -> np.ndarray:
-    """Return a variant's poles in 1/s, without those at z = 0."""
-    found = v.model.poles
-    if not v.model.dt:
-        return np.asarray(found)
-    return np.asarray(np.log(found[np.abs(found) > 1e-12].astype(complex)) / v.model.dt)
 
 
 def _scatter(v: Variant) -> float:
@@ -95,7 +87,7 @@ def _asked(case: Case, side: str, wire: str, block: Any, numbers: dict[str, Numb
     wanted = np.sort_complex(np.roots(asked))
     centre = -float(block.a2) / 3
     numbers[f"{side}.asked.mean"] = Number(centre, "1/s", 1e-15 * abs(centre), "given: −a₂/3")
-    rows = [("asked", _listed(_cleaned(asked, wanted)), "")]
+    rows: list[tuple[Any, ...]] = [("asked", _listed(_cleaned(asked, wanted)), "")]
     gains: list[tuple[Any, ...]] = []
     for v in case.usable():
         try:
@@ -112,7 +104,7 @@ def _asked(case: Case, side: str, wire: str, block: Any, numbers: dict[str, Numb
             rows.append((v.title, _listed(np.roots(got)), numbers[f"{side}.{v.key}.polynomial_difference"]))
             continue
         if v.key.endswith(FRICTION):
-            rows.append((v.title, _listed(np.log(1 + np.linalg.eigvals(r.closed())) / r.dt), ""))
+            rows.append((v.title, _listed(in_s(1 + np.linalg.eigvals(r.closed()), r.dt)), ""))
             continue
         design = sampled_poles([block.a0, block.a1, block.a2], r.dt, delay=v.delay)
         got, formula = np.poly(r.closed()), np.array(design.polynomial) * r.dt ** np.arange(len(design.polynomial))
@@ -185,9 +177,9 @@ def _claims(case: Case) -> Iterator[Section]:
     rough = bases.get("sampled_d0" + FRICTION)
     if rough is not None:
         model = inverted(rough)
-        for name, share in (("friction_10", 1.1), ("friction_m10", 0.9), ("friction_m100", 0.0)):
-            scales = {n: getattr(model, n) * share for n in ("coulomb_scale", "viscous_scale")}
-            title = f"{rough.title}, model's friction {100 * (share - 1):+.0f} %"
+        for name, left in (("friction_10", 1.1), ("friction_m10", 0.9), ("friction_m100", 0.0)):
+            scales = {n: getattr(model, n) * left for n in ("coulomb_scale", "viscous_scale")}
+            title = f"{rough.title}, model's friction {100 * (left - 1):+.0f} %"
             claims.judge(with_model(rough, model.replace(**scales)), name, title, rough.key)
     if claims.rows:
         yield claims.section()
@@ -230,7 +222,10 @@ class _Claims:
             "coupling": Number(max(coupled), "1", 1e-9, "frequency responses on a grid, at all the points"),
             "polynomial_spread": Number(spread, "1", 1e-9, "characteristic polynomials at all the points"),
             "slowest": Number(
-                max(float(np.max(in_s(w).real)) for w in at), "1/s", max(map(_scatter, at)), "eigenvalues at all points"
+                max(float(np.max(in_s(w.model.poles, w.model.dt).real)) for w in at),
+                "1/s",
+                max(map(_scatter, at)),
+                "eigenvalues at all points",
             ),
         }
         if base is not None and len(self.matched.get(base, ())) == len(at):
@@ -250,9 +245,12 @@ class _Claims:
             "without offset, where the diagram is at rest."
         )
         text = (
-            "The paper claims that exact linearization decouples the directions, and that the poles depend neither on "
-            "the path point nor on the offset. Both hold for the continuous design with matched parameters; the "
-            "numbers say how well, what sampling leaves of it, and what a mismatch does.",
+            (
+                "The paper claims that exact linearization decouples the directions, and that the poles "
+                "depend neither on "
+                "the path point nor on the offset. Both hold for the continuous design with matched parameters; the "
+                "numbers say how well, what sampling leaves of it, and what a mismatch does."
+            ),
         )
         table = Table("Claims", columns, tuple(self.rows), note)
         return Section("claims", "The paper's claims", text, (table,), (), self.numbers)
