@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
@@ -17,6 +18,11 @@ from ._report_values import cell, is_numeric, quantity, symbol, tolerance_text, 
 _LONG = 30
 """Rows above which a table may go over to the next page."""
 
+
+NO_VALUE = "no value"
+
+_LONG_WORD, _PIECES = re.compile(r"(?<![<&])[\w./\\-]{25,}"), re.compile(r"[^/\\._-]{1,16}[/\\._-]?|[/\\._-]")
+"""Words that are too long for a column, such as digests and paths of files, and where they may break."""
 
 _NUMBERS = """\
 <section id="numbers" class="level2">
@@ -69,7 +75,9 @@ class _Page:
             if key == "definitions" or value in (None, "", {}, ()):
                 continue
             if isinstance(value, Mapping):
-                value = ", ".join(f"{k} {cell(v)}" for k, v in value.items())
+                pairs = {str(k): cell(v) for k, v in value.items()}
+                plainly = all(len(text.split()) == 1 for text in pairs.values())
+                value = (", " if plainly else "; ").join(f"{k}{' ' if plainly else ': '}{v}" for k, v in pairs.items())
             elif isinstance(value, list | tuple):
                 value = ", ".join(map(cell, value))
             name = escape(str(key).replace("_", " "))
@@ -131,7 +139,7 @@ class _Page:
             unit = "" if units[i] in (None, "1") or _says(heading, units[i] or "") else symbol(units[i] or "")
             small = f' <span class="unit">({escape(unit)})</span>' if unit else ""
             heads.append(f'<th scope="col"{_right(right[i])}>{_marked(str(heading))}{small}</th>')
-        reasons = _grouped(v.confirmed_by for row in table.rows for v in row if isinstance(v, Number))
+        reasons = _grouped(_reason(v) for row in table.rows for v in row if isinstance(v, Number))
         letters = {kind: _letter(i) for i, kind in enumerate(reasons)} if len(reasons) > 1 else {}
         body = []
         for above, row in zip([(), *table.rows], table.rows, strict=False):
@@ -142,7 +150,7 @@ class _Page:
                     value = symbol(value)
                 text = self._cell(value, letters, with_unit=units[i] is None)
                 again = not right[i] and i < columns - 1 and above[: i + 1] == row[: i + 1]
-                kind = " class=again" if again else _right(right[i]) or _breaks(value)
+                kind = " class=again" if again else _right(right[i])
                 cells.append(f"<{tag}{kind}>{text}</{tag.split()[0]}>")
             body.append(f"<tr>{''.join(cells)}</tr>\n")
         wide = ' class="dense"' if columns > 6 else ""
@@ -155,11 +163,11 @@ class _Page:
 
     def _cell(self, value: Any, letters: Mapping[str, str], *, with_unit: bool) -> str:
         if not isinstance(value, Number):
-            return _marked(cell(value))
+            return _LONG_WORD.sub(lambda word: "<wbr>".join(_PIECES.findall(word[0])), _marked(cell(value)))
         path = self.paths.get(id(value)) or self.equal.get(value)
         text = escape(quantity(value) if with_unit else value_text(value))
         about = escape(f"{path + ': ' if path else ''}{tolerance_text(value)}; confirmed by {value.confirmed_by}")
-        note = f"<sup>{letters[_kind(value.confirmed_by)]}</sup>" if letters else ""
+        note = f"<sup>{letters[_kind(_reason(value))]}</sup>" if letters else ""
         if path is None:
             return f'<span title="{about}">{text}</span>{note}'
         return f'<a class="n" href="#{_anchor("n", path)}" title="{about}">{text}</a>{note}'
@@ -169,8 +177,8 @@ class _Page:
         for kind, why in reasons.items():
             if why:
                 mark = f"<sup>{letters[kind]}</sup> " if letters else ""
-                said = why.capitalize() if why.startswith("given") else f"Confirmed by {why}"
-                notes.append(f"{mark}{_marked(said)}.")
+                said = why[0].upper() + why[1:] if why.startswith(("given", NO_VALUE)) else f"Confirmed by {why}"
+                notes.append(f"{mark}{_marked(said)}{'' if said.endswith(('…', '.')) else '.'}")
         return f'<p class="note">{"<br>".join(notes)}</p>\n' if notes else "\n"
 
     # --- appendices -------------------------------------------------------------------------------------------------
@@ -283,9 +291,9 @@ def _right(yes: bool) -> str:
     return ' class="right"' if yes else ""
 
 
-def _breaks(value: Any) -> str:
-    """Return the mark of a cell with a word that is too long for a column."""
-    return " class=any" if isinstance(value, str) and any(len(word) > 36 for word in value.split()) else ""
+def _reason(number: Number) -> str:
+    """Return how a number was confirmed, or why there is none."""
+    return f"{NO_VALUE}: {number.confirmed_by}" if math.isnan(number.value) else number.confirmed_by
 
 
 def _letter(i: int) -> str:

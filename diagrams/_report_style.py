@@ -38,7 +38,7 @@ nav li { margin: .3rem 0; }
 nav a { color: var(--ink); }
 main { min-width: 0; }
 .table { margin: 1.25rem 0; overflow-x: auto; }
-table { border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums lining-nums; }
+table { min-width: 18em; border-collapse: collapse; font-size: .9rem; font-variant-numeric: tabular-nums lining-nums; }
 caption { text-align: left; padding-bottom: .4rem; caption-side: top; }
 th, td { padding: .28rem .75rem; text-align: left; vertical-align: baseline; }
 th:first-child, td:first-child { padding-left: .35rem; }
@@ -49,7 +49,6 @@ tbody tr { border-bottom: 1px solid var(--line); }
 tbody tr:last-child { border-bottom: 1.5px solid var(--ink); }
 tbody tr:hover { background: var(--band); }
 tbody td { overflow-wrap: break-word; }
-td.any { overflow-wrap: anywhere; }
 .right { text-align: right; white-space: nowrap; }
 thead th.right { white-space: normal; }
 td.again, th.again { color: #9aa5b1; }

@@ -108,6 +108,29 @@ def test_confirmations_stand_below_the_table_by_letters():
     assert "A note with <code>code</code>." in html
 
 
+def test_kinds_of_confirmation_stand_once_and_why_there_is_no_value():
+    numbers = [Number(1.0, "1", 0.0, f"eigenvalues: stable at {x}, unstable at {2 * x}") for x in (0.5, 1.5)]
+    numbers += [Number(math.nan, "1", math.nan, "the loop is not sampled"), Number(2.0, "1", 0.0, "given")]
+    html = to_html(Report("R", (Section("s", "S", tables=(Table("T", ("x",), tuple((n,) for n in numbers)),)),)))
+    notes = re.search(r'<p class="note">(.*?)</p>', html)[1].split("<br>")
+    assert [re.sub("<.*?>", "", note) for note in notes] == [
+        "a Confirmed by eigenvalues: stable at …, unstable at …",
+        "b No value: the loop is not sampled.",
+        "c Given.",
+    ]
+
+
+def test_digests_and_paths_may_break_and_are_whole():
+    digest, file = "0123456789abcdef" * 4, "/home/someone/models/of/plants/gantry_with_contact.fmu"
+    html = to_html(
+        Report("R", (Section("s", "S", tables=(Table("T", ("x", "y"), ((digest, file), ("short-name", 1))),)),))
+    )
+    assert "abcdef<wbr>0123" in html
+    assert [text_of(cell) for cell in parsed(html).iter("td")] == [file, "1"]
+    assert digest in [text_of(cell) for cell in parsed(html).iter("th")]
+    assert "short-name" in html
+
+
 def test_a_unit_that_a_whole_column_shares_stands_in_its_heading():
     tree = parsed(to_html(report()))
     assert [text_of(th) for th in next(tree.iter("thead")).iter("th")] == [
