@@ -332,9 +332,8 @@ def _remainder(polynomial: np.ndarray, divisor: np.ndarray, size: float) -> np.n
     """Return the remainder of a division of polynomials in w/size, padded to the degree of the divisor."""
     scaled = polynomial * size ** np.arange(len(polynomial) - 1, -1, -1.0)
     by = divisor * size ** np.arange(len(divisor) - 1, -1, -1.0)
-    if len(scaled) < len(by):
-        rest = scaled
-    else:
+    rest: np.ndarray = scaled
+    if len(scaled) >= len(by):
         _, rest = np.polydiv(scaled, by)
     out = np.zeros(len(by) - 1)
     out[len(out) - len(rest) :] = rest
