@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from ..blocks import Constant, Step
-from ..blocks._errors import ConfirmationError, LoopwrightError
+from ..blocks import Constant, Reference, Step
+from ..blocks._errors import LoopwrightError
 from . import _report_plots as figures
 from ._number import Number
 from ._report_case import FRICTION, Case, Variant, in_s, with_parameters
@@ -23,13 +23,7 @@ CONFIRMED = 1e-3
 
 
 def injected(case: Case) -> Section | None:
-    """Return the section that compares each sampled loop with its measured response.
-
-    Raises
-    ------
-    ConfirmationError
-        If a settled measurement refutes the linear model.
-    """
+    """Return the section that compares each sampled loop with its measured response."""
     numbers: dict[str, Number] = {}
     rows: list[tuple[Any, ...]] = []
     text = [
@@ -57,12 +51,11 @@ def injected(case: Case) -> Section | None:
                 text.append(f"{v.title} at {wire}: {error}")
                 continue
             worst, own = float(np.max(deviation)), float(np.max(found.uncertainty))
-            if worst - 10 * own > REFUTED and bool(np.all(found.settled)) and not v.model.notes:
-                raise ConfirmationError(
-                    f"found a response that differs by {worst:.3g} from the linear model, with an uncertainty of "
-                    f"{own:.3g}; expected less than {REFUTED:g}. Look at what acts there and is not smooth, and at "
-                    "the operating point.",
-                    block=f"injection at {wire}",
+            if worst - 10 * own > REFUTED:
+                text.append(
+                    f"{v.title} at {wire}: the measurement refutes the linear model, by {worst:.3g}. Something there "
+                    "is not smooth at this point, such as a contact that just begins, or the point moves; the margins "
+                    "of this variant say nothing of the running loop."
                 )
             where = f"{key}.{v.key}"
             low, high = float(found.omega[0]), float(found.omega[-1])
@@ -104,13 +97,16 @@ def _source(v: Variant, wire: str) -> str:
 
 
 def _at_rest(v: Variant) -> Variant:
-    """Return Fig. 3 with its set-points and desired forces held at zero, so that it stays where it is."""
-    changes = {
+    """Return Fig. 3 with its references held, set-points and desired forces at zero, so that it stays where it is."""
+    changes: dict[str, Any] = {
         path: Constant(value=0.0, unit=block.unit, name=path)
         for path, block in v.diagram.blocks.items()
         if path in ("set_point", "desired_force_par", "desired_force_perp") and isinstance(block, Step)
     }
-    return with_parameters(v, changes) if changes else v
+    for name in ("eta_d", "xi_d"):
+        if f"{name}.y" in v.point.values:
+            changes[name] = Reference(float(np.ravel(v.point.values[f"{name}.y"])[0]), unit="m", name=name)
+    return with_parameters(v, changes)
 
 
 def _plot(key: str, wire: str, measured: dict[str, tuple[Any, Any]]) -> Plot:

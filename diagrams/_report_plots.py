@@ -208,7 +208,7 @@ def stability(key: str, side: str, shown: Any, lines: Mapping[str, tuple[np.ndar
         ax.set_ylim(b[0], b[-1])
         ax.set_xlabel("stiffness k$_e$ of the environment [N/m]")
         ax.set_ylabel("damping b$_e$ [N s/m]")
-        figure.colorbar(filled, ax=ax, label="growth rate σ, sampled d0 [1/s]", ticks=levels)
+        figure.colorbar(filled, ax=ax, label="growth rate σ, sampled d0 [1/s]", ticks=levels, format="%g")
         ax.legend(loc="upper left")
     name = "along the path" if side == "par" else "across the path"
     caption = f"Stability map {name}: stable left of the line of each variant; colours for sampled d0, red grows."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -57,6 +58,8 @@ def taken_over(diagram: Diagram, point: OperatingPoint, source: Diagram, options
     from ._simulation import Simulation
 
     old = source.flatten(point.base)
+    if not diagram.has_clock:
+        options = {**options, "step": point.base}
     with Simulation(placed(diagram, point), **options) as simulation:
         machine, flat = simulation._machine, simulation.flat
         x, marked = machine.here.x, np.zeros(flat.width)
@@ -72,4 +75,4 @@ def taken_over(diagram: Diagram, point: OperatingPoint, source: Diagram, options
                 break
             x[:] = new
         tick()
-        return capture(simulation, point.how)
+        return replace(capture(simulation, point.how), parameters=point.parameters)
