@@ -21,7 +21,8 @@ _LONG = 30
 
 NO_VALUE = "no value"
 
-_LONG_WORD, _PIECES = re.compile(r"(?<![<&])[\w./\\-]{25,}"), re.compile(r"[^/\\._-]{1,16}[/\\._-]?|[/\\._-]")
+_LONG_WORD = re.compile(r"\b[0-9a-f]{32,}\b|(?<![<&])[\w./\\-]{40,}")
+_PIECES = re.compile(r"[^/\\._-]{1,16}[/\\._-]?|[/\\._-]")
 """Words that are too long for a column, such as digests and paths of files, and where they may break."""
 
 _NUMBERS = """\

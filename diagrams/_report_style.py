@@ -25,7 +25,7 @@ a.n { color: inherit; text-decoration: underline dotted var(--line); text-underl
 a.n:hover { color: var(--link); text-decoration-color: var(--link); }
 table.about { font-size: .87rem; }
 table.about th { color: var(--soft); white-space: nowrap; vertical-align: baseline; }
-table.about td { overflow-wrap: anywhere; }
+table.about td { overflow-wrap: break-word; }
 table.about th, table.about td { padding: .08rem 1rem .08rem 0; }
 table.about tbody tr, table.about tbody tr:last-child { border: 0; }
 nav { position: sticky; top: 0; align-self: start; max-height: 100vh; overflow-y: auto; padding: .5rem 0;
@@ -72,19 +72,19 @@ table.definitions th { white-space: nowrap; padding-right: 1.5rem; }
 table.definitions td { max-width: 46rem; }
 @media screen and (max-width: 60rem) {
   body { display: block; padding: 0 1rem 3rem; }
-  nav { position: static; max-height: none; }
+  nav { position: static; max-height: none; margin-bottom: 2rem; }
 }
 @page { size: A4; margin: 18mm 17mm 18mm 20mm;
   @bottom-right { content: counter(page); font-size: 8pt; color: #5b6875; } }
 @media print {
   html { scroll-behavior: auto; }
-  body { display: block; max-width: none; padding: 0; font-size: 9.5pt; line-height: 1.4; }
+  body { display: block; max-width: none; padding: 0; font-size: 8.5pt; line-height: 1.38; }
   header { padding: 0 0 8pt; margin: 0 0 12pt; }
-  header table.about, nav, table, figcaption { font-size: 8.5pt; }
-  h1 { font-size: 19pt; }
-  h2 { font-size: 14pt; margin: 18pt 0 6pt; }
-  h3 { font-size: 11pt; margin: 12pt 0 4pt; }
-  h4 { font-size: 10pt; margin: 9pt 0 3pt; }
+  header table.about, nav, table, figcaption { font-size: 7.5pt; }
+  h1 { font-size: 17pt; }
+  h2 { font-size: 12.5pt; margin: 16pt 0 5pt; }
+  h3 { font-size: 10pt; margin: 11pt 0 4pt; }
+  h4 { font-size: 9pt; margin: 9pt 0 3pt; }
   section.level2:first-child h2 { margin-top: 18pt; }
   h2, h3, h4, caption { break-after: avoid; }
   h2, h3, h4 { break-inside: avoid; }
@@ -99,15 +99,15 @@ table.definitions td { max-width: 46rem; }
   .table, figure .scroll { overflow: visible; }
   .table { margin: 9pt 0; }
   table { max-width: 100%; }
-  table.dense { font-size: 7.5pt; }
-  th, td { padding: 1.6pt 5pt; }
-  table.dense th, table.dense td { padding: 1.2pt 3.5pt; }
+  table.dense { font-size: 6.5pt; }
+  th, td { padding: 1.2pt 4pt; }
+  table.dense th, table.dense td { padding: .9pt 3pt; }
   thead { display: table-header-group; }
   tr, figure, ol.why li, .keep { break-inside: avoid; }
   .table:not(.long) { break-inside: avoid; }
-  .note, ol.why { font-size: 7.5pt; }
-  table.numbers { font-size: 7pt; }
-  table.numbers th, table.numbers td { padding: .6pt 3pt; }
+  .note, ol.why { font-size: 6.5pt; }
+  table.numbers { font-size: 6pt; }
+  table.numbers th, table.numbers td { padding: .35pt 3pt; }
   figure { margin: 9pt 0; }
   figure svg { max-width: 100%; max-height: 225mm; height: auto; }
   figure .wide { display: none; }
