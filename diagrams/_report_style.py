@@ -109,7 +109,7 @@ table.definitions td { max-width: 46rem; }
   table.numbers { font-size: 6pt; }
   table.numbers th, table.numbers td { padding: .35pt 3pt; }
   figure { margin: 9pt 0; }
-  figure svg { max-width: 100%; max-height: 225mm; height: auto; }
+  figure svg { max-width: 85%; max-height: 225mm; height: auto; }
   figure .wide { display: none; }
   figure .paper { display: block; }
   figure .paper svg { max-height: 225mm; width: auto; }
