@@ -182,7 +182,7 @@ def _masses(loops: Loops, side: str, numbers: dict[str, Number]) -> Iterator[Tab
     rows = []
     sets = [("", loops.plain[side]), (FRICTION, loops.rough.get(side))]
     # without any stiffness the robot drifts, and there is no limit to lose
-    moored = {} if loops.plain[side].admittance.stiffness > 0 else {"stiffness": SPRING}
+    moored: dict[str, Any] = {} if loops.plain[side].admittance.stiffness > 0 else {"stiffness": SPRING}
     for suffix, loop in sets:
         for name, variant in _variants(loop) if loop is not None else ():
             shown = []
