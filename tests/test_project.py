@@ -19,6 +19,7 @@ from xml.etree import ElementTree as ET
 
 import matplotlib
 import nbformat
+import numpy as np
 import pytest
 from nbclient import NotebookClient
 
@@ -182,6 +183,29 @@ def test_the_page_on_diagrams_runs(tmp_path):
     with chdir(tmp_path):
         for snippet in blocks_of_code((ROOT / "docs" / "diagrams.md").read_text(encoding="utf-8")):
             exec(snippet, scope)
+
+
+def as_in_a_table(value):
+    return "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.6g}"
+
+
+def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_path):
+    text, scope = (ROOT / "docs" / "frequency.md").read_text(encoding="utf-8"), {}
+    with chdir(tmp_path):
+        for snippet in blocks_of_code(text):
+            exec(snippet, scope)
+    for name, cells in re.findall(r"^\| `([\w.]+)` \|(.*)\|$", text, re.MULTILINE):
+        told = [c.strip() for c in re.split(r"(?<!\\)\|", cells)]
+        if name in scope["limits"]:
+            limit = scope["limits"][name]
+            assert told == [as_in_a_table(limit.value), as_in_a_table(limit.rule_of_thumb)], name
+        else:
+            made = [
+                getattr(scope["disks" if hasattr(scope["disks"][v], name) else "found"][v], name)
+                for v in ("continuous", "sampled_d0", "sampled_d1")
+            ]
+            assert told[-3:] == [as_in_a_table(float(v)) for v in made], name
+    assert f"here {scope['sign'].frequency:.3f} rad/s" in text
 
 
 def test_the_page_on_export_runs(tmp_path):
