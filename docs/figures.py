@@ -1,9 +1,15 @@
 """Make the README's figures anew: python docs/figures.py."""
 
+from __future__ import annotations
+
 import re
 import sys
 from contextlib import chdir
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 HERE = Path(__file__).parent
 
@@ -12,6 +18,21 @@ def first_example() -> str:
     """Return the code that the README opens with."""
     text = (HERE.parent / "README.md").read_text(encoding="utf-8")
     return re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]
+
+
+def bode() -> Figure:
+    """Return the Bode diagram of Fig. 3's loop across the path, with its margins marked."""
+    from loopwright.diagrams import experiments, margins
+    from loopwright.diagrams._report_plots import bode
+
+    robot = experiments.compliance().diagram
+    variants = {"continuous": robot.continuous(), "sampled_d0": robot}
+    variants["sampled_d1"] = robot.replace({"controller.delay": 1})
+    loops = {key: variant.linearize().loop("v_perp") for key, variant in variants.items()}
+    found = {key: margins(loop) for key, loop in loops.items()}
+    names = {"continuous": "continuous", "sampled_d0": "1 kHz", "sampled_d1": "1 kHz, one sample of delay"}
+    titles = {key: f"{name}: phase margin {found[key].phase_margin_deg.value:.1f}°" for key, name in names.items()}
+    return bode("frequency", "v_perp", loops, found, titles).figure
 
 
 def main(folder: Path) -> None:
@@ -24,6 +45,7 @@ def main(folder: Path) -> None:
         exec(first_example(), {})  # it writes loop.png
     experiment = experiments.hand_guiding()
     plot_path(experiment, experiment.simulate(progress=False)).savefig(folder / "C_path.png", dpi=120)
+    bode().savefig(folder / "frequency.png", dpi=120)
 
 
 if __name__ == "__main__":
