@@ -39,6 +39,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams._machine import Machine
 
 
 def two_rates(duration, **options):
@@ -623,3 +624,12 @@ def test_a_rate_that_is_not_finite_names_the_block_that_made_it_so():
 def test_options_that_are_none_are_refused(options, words):
     with pytest.raises(OptionError, match=words):
         Diagram("d", Integrator()(Constant(value=1.0))).simulate(1.0, **options)
+
+
+def test_the_derivative_that_implicit_solvers_are_given_is_that_of_the_rates():
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(3, 3))
+    plant = StateSpace(A=A, B=np.zeros(3), C=np.eye(3), D=np.zeros(3), name="plant")
+    flat = Diagram("d", plant(Constant(value=0.0)), Lag(name="after", k=7.0)(Constant(value=1.0))).flatten(0.1)
+    slope = Machine(flat).jacobian()(0.0, rng.normal(size=4))
+    assert np.allclose(slope, np.block([[np.array([[-7.0]]), np.zeros((1, 3))], [np.zeros((3, 1)), A]]), rtol=1e-13)
