@@ -62,8 +62,10 @@ class Continuous:
         self._flow, self._jacobian = machine.flow(), None
         problem = Problem(self.where.size, self._rate, self._slope, state_names(flat))
         longest = max_step
+        if longest is None and _remembers(flat):
+            longest = float(flat.base)  # what is remembered is renewed at accepted steps, and must not grow stale
         if self.delays is not None:
-            longest = min(max_step or math.inf, self.delays.shortest)
+            longest = min(longest or math.inf, self.delays.shortest)
         self.solver = make_solver(
             solver,
             problem,
@@ -89,7 +91,7 @@ class Continuous:
             self._driven = np.zeros(flat.plant_inputs.total)
             self._drive = machine.plain(driven_function(flat), [self._driven], machine.trial)
         self.sources = [
-            flat.table.blocks[path]
+            (path, flat.table.blocks[path])
             for path in sorted(flat.checked.traced)
             if not flat.table.sampled(flat.table.frame_of[path])
             and type(flat.table.blocks[path]).next_instant is not Block.next_instant
@@ -314,7 +316,7 @@ class Continuous:
     """Whether a stop condition is true in what was evaluated last; set by the run."""
 
     def _next_edge(self, t: float) -> float:
-        self._sources_edge = min((source.next_instant(t) for source in self.sources), default=math.inf)
+        self._sources_edge = min((_next_instant(path, source, t) for path, source in self.sources), default=math.inf)
         return min(self._sources_edge, math.inf if self.delays is None else self.delays.next_edge(t))
 
     # --- saved states ------------------------------------------------------------------------------------------------
@@ -334,6 +336,27 @@ class Continuous:
         if self.delays is not None and saved["delays"] is not None:
             self.delays.restore(saved["delays"])
         recall(self.solver, saved["solver"])
+
+
+def _next_instant(path: str, block: Block, t: float) -> float:
+    """Return the next instant of a block; one that does not come after t would keep the run where it is."""
+    try:
+        found = block.next_instant(t)
+        later = found > t
+    except Exception as error:
+        raise SimulationError(
+            f"its next_instant({t!r}) failed: {type(error).__name__}: {error}. Expected a time after that, or math.inf "
+            "if there is none.",
+            block=path,
+            t=t,
+        ) from error
+    if not later:
+        raise SimulationError(
+            f"its next_instant({t!r}) is {found!r}; expected a time after that, or math.inf if there is none.",
+            block=path,
+            t=t,
+        )
+    return found
 
 
 _MEMORY = ("planned", "_hits", "_misses", "_easy")
@@ -359,6 +382,12 @@ def recall(solver: Any, kept: dict[str, Any]) -> None:
                 recall(method, kept["methods"][method.name])
             if method.name == kept["active"]:
                 solver._active = method
+
+
+def _remembers(flat: FlatDiagram) -> bool:
+    """Whether a block in a continuous frame has a memory, such as a projection's last foot point."""
+    table = flat.table
+    return any(table.blocks[p].memory and not table.sampled(table.frame_of[p]) for p in flat.checked.traced)
 
 
 def state_names(flat: FlatDiagram) -> list[str]:

@@ -47,7 +47,7 @@ from contextlib import ExitStack
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
-from ..blocks._errors import SimulationError
+from ..blocks._errors import OptionError, SimulationError
 from ._continuous import Continuous, check_solver
 from ._duration import default_step, ticks_in
 from ._failures import failure
@@ -108,8 +108,9 @@ class Simulation:
         duration: float | None = None,
     ):
         self.diagram = diagram
-        given, step = step, default_step(diagram, step, duration, solver, start)
-        self.flat: FlatDiagram = diagram.flatten(step) if step is given else diagram._flattened(step)
+        chosen: Any = default_step(diagram, step, duration, solver, start)
+        self.flat: FlatDiagram = diagram.flatten(step) if chosen is step else diagram._flattened(chosen)
+        step = chosen
         if start is not None:
             check_fits(start, self.flat, diagram.name)
         self._recording = Recording(self.flat, diagram.name, record, every, states, to, overwrite)
@@ -136,6 +137,7 @@ class Simulation:
         self._stops = self._stop_ports()
         self._tick, self._count, self._elapsed, self._begun = 0, 0, 0.0, False
         self._stopped: Stopped | None = None
+        self._open: bool | None = None  # until it is begun; False once it has ended
         self._recorder = self._new_recorder()
 
     # --- what belongs to it ------------------------------------------------------------------------------------------
@@ -156,17 +158,31 @@ class Simulation:
     # --- life --------------------------------------------------------------------------------------------------------
 
     def __enter__(self) -> Simulation:
+        if self._open is not None:
+            raise self._not_open()
         try:
+            self._open = True
             self._load()
             self._stack.push(self._finish)
             self._begin()
         except BaseException:
+            self._open = False
             self._stack.__exit__(*sys.exc_info())
             raise
         return self
 
     def __exit__(self, *error: Any) -> None:
+        self._open = False
         self._stack.__exit__(*error)
+
+    def _not_open(self) -> OptionError:
+        """Return the error of a run that is used before it has begun, or after it has ended."""
+        found = "has not begun" if self._open is None else "has ended, and its FMUs are freed"
+        return OptionError(
+            f"this run {found}; expected it to be used inside of its with statement, once: with "
+            "diagram.simulation(…) as simulation: …. To go on later, keep simulation.save() and give it as start=….",
+            block=self.diagram.name,
+        )
 
     def _load(self) -> None:
         try:
@@ -227,8 +243,10 @@ class Simulation:
         SimulationError
             See `Diagram.simulate`; ``error.run`` holds what was recorded until then.
         OptionError
-            A duration that is not positive, or no multiple of the step.
+            A duration that is not positive, or no multiple of the step; a run that has not begun, or has ended.
         """
+        if not self._open:
+            raise self._not_open()
         last = self._tick + ticks_in(duration, self.flat.base, self.diagram.name)
         started = time.perf_counter()
 
@@ -273,7 +291,7 @@ class Simulation:
         """Run ticks up to ``last`` with a solver between them."""
         continuous = self._continuous
         assert continuous is not None
-        clocks, count = self.flat.distinct, 0
+        clocks, count, width = self.flat.distinct, 0, float(self.flat.base)
         while self._tick < last:
             k = self._tick
             every = continuous.fixed or self._plants
@@ -293,7 +311,7 @@ class Simulation:
                 self._note_stop(ended)
                 return
             for _, plant in self._plants:
-                plant.step(now, self.time_of(following) - now)
+                plant.step(now, width)
             self._at_tick(following)
             if self._stopped is not None:
                 return
@@ -317,8 +335,10 @@ class Simulation:
             continuous.at(now)
             if (acting or self._plants) and continuous.delays is not None:
                 continuous.delays.edge(now)  # what is held has jumped
+            before = machine.log[self.flat.log.total :].copy()
             if continuous.settle(now):
-                machine.look()
+                taken = self.flat.taken_at(acting)
+                machine.log[self.flat.log.total :][taken] = before[taken]
         self._recorder.row(now, machine.log)
         self._tick = k
         self._ended()
@@ -397,7 +417,8 @@ class Simulation:
     @property
     def can_save(self) -> bool:
         """Whether the complete state can be saved: every FMU can turn its state into bytes."""
-        return self._begun and all(plant.can_serialize and not plant.failed for _, plant in self._plants)
+        begun = self._begun and (self._open or not self._plants)
+        return begun and all(plant.can_serialize and not plant.failed for _, plant in self._plants)
 
     def save(self) -> RunState:
         """Return the complete state at this tick, that of the FMUs included.
@@ -406,7 +427,11 @@ class Simulation:
         ------
         FmuError
             If an FMU can't save its state, or can't turn it into bytes.
+        OptionError
+            If the run has not begun, or has ended and its FMUs are freed.
         """
+        if not self._begun or (self._plants and not self._open):
+            raise self._not_open()
         machine = self._machine
         return RunState(
             t=self.t if self._stopped is None else self._stopped.t,
@@ -429,8 +454,11 @@ class Simulation:
         Raises
         ------
         OptionError
-            If it is no state of such a diagram: another base, other blocks or states.
+            If it is no state of such a diagram: another base, other blocks or states. If the run has not begun, or has
+            ended.
         """
+        if not self._open:
+            raise self._not_open()
         check_fits(state, self.flat, self.diagram.name)
         machine = self._machine
         for path, plant in self._plants:
