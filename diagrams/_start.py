@@ -82,11 +82,8 @@ def _boxes(machine: Machine) -> None:
     for name, column in done.held.items():
         where = flat.held.slices[name]
         x[where] = np.ravel(np.array(column))
-    events = {(e.path, e.name) for e in flat.events}
     for box, where in flat.gates.slices.items():
-        now = float(above(done.control(box)))
-        discrete_enable = flat.table.frames[box].control == "enabled" and (box, "enable") not in events
-        x[where] = 1.0 if discrete_enable else now  # at its first tick an enabled box has its start values anyway
+        x[where] = float(above(done.control(box)))
 
 
 def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]]) -> np.ndarray:

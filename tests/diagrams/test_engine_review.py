@@ -1,0 +1,171 @@
+"""Cases that a review of the engine found: what it did silently wrong, or did not end."""
+
+import math
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import (
+    Block,
+    Compare,
+    Constant,
+    DiscreteIntegrator,
+    Integrator,
+    OptionError,
+    Output,
+    SimulationError,
+    Step,
+)
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.fmus import Fmu, mass_spring_damper
+
+ONE = Constant(value=1.0, name="one")
+
+
+@pytest.fixture(scope="module")
+def spring():
+    return mass_spring_damper.build()
+
+
+# --- discontinuities that a block announces -----------------------------------------------------------------------------
+
+
+class Announces(Block):
+    y = Output()
+
+    def output(self, t, x, u):
+        return 1.0 + 0.0 * t
+
+
+@pytest.mark.parametrize(
+    ("instant", "found"),
+    [
+        (lambda t: t, r"next_instant\(0\.0\) is 0\.0"),
+        (lambda t: t - 1.0, r"next_instant\(0\.0\) is -1\.0"),
+        (lambda t: math.nan, r"next_instant\(0\.0\) is nan"),
+        (lambda t: None, r"next_instant\(0\.0\) failed: TypeError"),
+        (lambda t: 1.0 / t, r"next_instant\(0\.0\) failed: ZeroDivisionError"),
+    ],
+)
+def test_an_announced_instant_that_does_not_come_later_ends_the_run(instant, found):
+    """It held the run where it was for ever, or was passed over."""
+    kind = type("Announces", (Announces,), {"next_instant": lambda self, t: instant(t)})
+    diagram = Diagram("d", Integrator(name="i")(kind(name="source")))
+    with pytest.raises(SimulationError, match=rf"^source, t = 0 s: its {found}.*xpected a time after that"):
+        diagram.simulate(1.0, step=0.1, progress=False)
+
+
+# --- a box that is reset, and boxes of other rates in it ----------------------------------------------------------------
+
+
+def ticks(sample_time, name, **options):
+    """A box that counts its own ticks in seconds, from 0."""
+
+    @subsystem(sample_time=sample_time, name=name, **options)
+    def box(u):
+        return DiscreteIntegrator(name="i")(u)
+
+    return box
+
+
+@pytest.mark.parametrize(("outer", "inner", "offset"), [(2, 1, 0), (1, 2, 0), (2, 2, 1), (3, 2, 1), (2, 6, 0)])
+def test_a_box_that_is_reset_resets_what_has_another_rate_in_it(outer, inner, offset):
+    """Only what acted at the very tick at which the box was enabled again was reset."""
+    last, first = 8.5, 12.5  # disabled between these
+
+    @subsystem(sample_time=outer, enabled="reset")
+    def box(u):
+        return DiscreteIntegrator(name="own")(u), ticks(inner, "inner", offset=offset)(u)
+
+    enable = Step(times=(last, first), values=(0.0, 1.0), initial_value=1.0)
+    own, other = box(ONE, enable=enable)
+    run = Diagram("d", own.named("own"), other.named("other")).simulate(30, step=1, progress=False)
+
+    def opened(k):
+        """Whether the box is enabled at tick k: it looks at its own ticks."""
+        k -= k % outer
+        return not last < k < first
+
+    again = next(k for k in range(13, 31) if k % outer == 0)
+    for name, every, start in (("own", outer, 0), ("other", inner, offset)):
+        held, state, expected = 0.0, 0.0, []
+        for k in range(31):
+            if k == again:
+                state = 0.0
+            if k >= start and (k - start) % every == 0 and opened(k):
+                held, state = state, state + every
+            expected.append(held)
+        assert run[name].tolist() == expected
+
+
+def test_states_in_a_closed_box_stay_though_a_box_inside_of_it_is_told_to_reset():
+    @subsystem(enabled="reset")
+    def inner(u):
+        return DiscreteIntegrator(name="i")(u)
+
+    @subsystem(sample_time=1, enabled="held")
+    def outer(u, v):
+        return inner(u, enable=v)
+
+    on = Step(times=(3.5, 9.5), values=(0.0, 1.0), initial_value=1.0, name="on")
+    inside = Step(times=(2.5, 5.5), values=(0.0, 1.0), initial_value=1.0, name="inside")
+    diagram = Diagram("d", outer(ONE, inside, enable=on).named("y"))
+    run = diagram.simulate(12, progress=False)
+    assert run["y"].tolist() == [0, 1, 2, 2, 2, 2, 2, 2, 2, 2, 0, 1, 2]
+    state = run.data[:, run.layout.total + diagram.flatten().states.slices["outer.inner.i"].start]
+    assert state.tolist() == [0, 1, 2, 3, 3, 3, 3, 3, 3, 3, 3, 1, 2]
+
+
+# --- what is recorded ---------------------------------------------------------------------------------------------------
+
+
+def test_a_state_is_recorded_as_its_tick_found_it_also_where_an_event_fires_at_that_tick():
+    """At such a tick the state that the next one would find was recorded."""
+
+    def run(*more):
+        diagram = Diagram("d", ticks(0.5, "box")(ONE).named("y"), *more)
+        result = diagram.simulate(2.0, progress=False)
+        return result.data[:, result.layout.total + diagram.flatten().states.slices["box.i"].start], result
+
+    plain, _ = run(Integrator(name="other")(ONE))
+    with_event, result = run(Compare(">", name="jumps")(Step(times=1.0, values=1.0), 0.5))
+    assert [e.t for e in result.events] == [1.0]
+    assert plain.tolist() == with_event.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
+
+
+# --- FMUs ---------------------------------------------------------------------------------------------------------------
+
+
+def test_an_fmu_takes_steps_of_one_length_beside_continuous_blocks(spring):
+    """The difference of two times, each rounded, is not always the same; some FMUs refuse any other step."""
+    diagram = Diagram("d", Fmu(spring, name="m")(force=0.0), Integrator(name="i")(ONE))
+    widths = []
+    with diagram.simulation(step=0.1) as simulation:
+        plant = simulation._plants[0][1]
+        step = plant.step
+        plant.step = lambda t, h: (widths.append(h), step(t, h))
+        simulation.advance(2.0)
+    assert widths == [0.1] * 20
+
+
+# --- a run in the making ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["blocks", "with an FMU"])
+def test_a_run_that_has_not_begun_or_has_ended_is_not_gone_on_with(spring, kind):
+    """It ran without its start and without its FMUs."""
+    root = Integrator(name="i", initial_value=3.0)(ONE) if kind == "blocks" else Fmu(spring, name="m")(force=0.0)
+    simulation = Diagram("d", root).simulation(step=0.1)
+    for use in (lambda: simulation.advance(0.1), simulation.save):
+        with pytest.raises(OptionError, match=r"^d: this run has not begun; expected it to be used inside"):
+            use()
+    with simulation:
+        simulation.advance(0.2)
+        state = simulation.save()
+    for use in (lambda: simulation.advance(0.1), lambda: simulation.restore(state), simulation.__enter__):
+        with pytest.raises(OptionError, match=r"^d: this run has ended, and its FMUs are freed; expected it"):
+            use()
+    run = simulation.run()
+    assert run.t.tolist() == [0.0, 0.1, 0.2]
+    assert (run.final_state is None) == (kind == "with an FMU")
+    assert np.all(np.isfinite(run.data))
