@@ -190,6 +190,20 @@ def _check_boxes(table: Structure, traced: dict[str, Traced], shapes: dict[Port,
             raise ShapeError(
                 f"{wire} has shape {found}; expected a logic signal, one number. Index it.", block=box, port=port
             )
+    for (path, port), handed in sorted(table.handed.items()):
+        for box, output in handed:
+            frame, clock = table.frames[box], table.clock(table.frame_of[path])
+            same = clock is not None and (clock.sample_time, clock.offset) == (frame.sample_time, frame.offset)
+            if not (frame.control or frame.delay) and (frame.sample_time is None or same):
+                continue
+            what = frame.control or ("delayed" if frame.delay else "sampled")
+            raise WiringError(
+                f"it is wired to {box}.{output}, and that box is {what}, but no block in it makes this output: it comes "
+                "from outside and would be handed on as it is. Put a block between, such as Gain(gain=1.0), or wire "
+                "what is outside.",
+                block=path,
+                port=port,
+            )
     for path in sorted(table.blocks):
         gates = table.gates(table.frame_of[path])
         if gates and path not in traced:
@@ -229,7 +243,7 @@ def _reads_sample_time(block: Block, trace: Traced) -> bool:
 
 def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, shared: dict[Any, Traced]) -> Traced:
     frame = table.frame_of[path]
-    sampled, method = table.sampled(frame), table.frames[frame].method
+    sampled, method = table.sampled(frame), table.method(frame)
     try:
         return trace(block, shapes, sampled=sampled, method=method, cache=shared)
     except LoopwrightError as error:

@@ -7,14 +7,18 @@ import pytest
 
 from loopwright.blocks import (
     Block,
+    Clock,
     Compare,
     Constant,
     DiscreteIntegrator,
+    Gain,
     Integrator,
     OptionError,
     Output,
     SimulationError,
     Step,
+    TransferFunction,
+    WiringError,
 )
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, mass_spring_damper
@@ -114,6 +118,86 @@ def test_states_in_a_closed_box_stay_though_a_box_inside_of_it_is_told_to_reset(
     assert run["y"].tolist() == [0, 1, 2, 2, 2, 2, 2, 2, 2, 2, 0, 1, 2]
     state = run.data[:, run.layout.total + diagram.flatten().states.slices["outer.inner.i"].start]
     assert state.tolist() == [0, 1, 2, 3, 3, 3, 3, 3, 3, 3, 3, 1, 2]
+
+
+# --- boxes ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("sampled", {"sample_time": 0.5}),
+        ("delayed", {"sample_time": 0.25, "delay": 1}),
+        ("enabled", {"enabled": "held"}),
+        ("triggered", {"triggered": "rising"}),
+    ],
+)
+def test_a_signal_that_a_box_hands_on_as_it_is_is_refused_where_the_box_would_change_it(kind, options):
+    """It went through unsampled, not delayed, and not held."""
+
+    @subsystem
+    def inner(u):
+        return Gain(gain=2.0, name="g")(u), u
+
+    @subsystem(name="box", **options)
+    def box(u):
+        doubled, same = inner(u)
+        return {"doubled": doubled, "same": same}
+
+    control = {"enabled": {"enable": ONE}, "triggered": {"trigger": ONE}}.get(kind, {})
+    call = box(Clock(), **control)
+    with pytest.raises(WiringError, match=rf"^uses\.u: it is wired to box\.same, and that box is {kind}, but no block"):
+        Diagram("d", Integrator(name="i")(call.doubled), Gain(gain=1.0, name="uses")(call.same))
+    Diagram("d", Integrator(name="i")(box(Clock(), **control).doubled))  # nothing uses it
+
+
+def test_a_box_that_only_groups_may_hand_on_a_signal_until_it_is_given_a_rate():
+    @subsystem
+    def box(u):
+        return u
+
+    diagram = Diagram("d", Integrator(name="i")(box(ONE)))
+    assert diagram.simulate(1.0, step=0.5, progress=False)["i.y"].tolist() == pytest.approx([0.0, 0.5, 1.0])
+    assert diagram.sampled(0.5).simulate(1.0, progress=False)["i.y"].tolist() == [0.0, 0.5, 1.0]
+    with pytest.raises(WiringError, match=r"^i\.u: it is wired to box\.u, and that box is sampled"):
+        diagram.replace({"box.sample_time": 0.5})
+
+
+def test_a_signal_that_a_box_hands_on_may_go_to_what_has_the_same_rate():
+    @subsystem(sample_time=0.5)
+    def sensors(u):
+        return u
+
+    run = Diagram("d", ticks(0.5, "box")(sensors(Clock())).named("y")).simulate(2.0, progress=False)
+    assert run["y"].tolist() == [0.0, 0.0, 0.25, 0.75, 1.5]
+
+
+def test_a_box_that_only_groups_is_discretized_by_the_method_of_the_box_around_it():
+    """It was discretized exactly, whatever the box said that it stood in."""
+
+    def step_response(outer, nested, **options):
+        @subsystem(**options)
+        def group(u):
+            return TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="lag")(u)
+
+        @subsystem(sample_time=0.5, method=outer)
+        def box(u):
+            return group(u) if nested else TransferFunction(numerator=[1.0], denominator=[1.0, 1.0], name="lag")(u)
+
+        return Diagram("d", box(ONE).named("y"))
+
+    def response(diagram):
+        return diagram.simulate(2.0, progress=False)["y"]
+
+    for method, pole in (("exact", math.exp(-0.5)), ("forward", 0.5), ("trapezoidal", 0.75 / 1.25)):
+        expected = 1.0 - pole ** np.arange(5)
+        for nested in (False, True):
+            assert response(step_response(method, nested)) == pytest.approx(expected, abs=1e-14)
+        assert response(step_response("exact", True, method=method)) == pytest.approx(expected, abs=1e-14)
+        changed = step_response("exact", True).replace({"box.method": method})
+        assert response(changed) == pytest.approx(expected, abs=1e-14)
+        whole = step_response("exact", True).continuous().sampled(0.5, method=method)
+        assert response(whole) == pytest.approx(expected, abs=1e-14)
 
 
 # --- what is recorded ---------------------------------------------------------------------------------------------------
