@@ -198,8 +198,8 @@ def _check_boxes(table: Structure, traced: dict[str, Traced], shapes: dict[Port,
                 continue
             what = frame.control or ("delayed" if frame.delay else "sampled")
             raise WiringError(
-                f"it is wired to {box}.{output}, and that box is {what}, but no block in it makes this output: it comes "
-                "from outside and would be handed on as it is. Put a block between, such as Gain(gain=1.0), or wire "
+                f"it is wired to {box}.{output}, and that box is {what}, but no block in it makes this output: it "
+                "comes from outside and would be handed on as it is. Put a block between, such as Gain(gain=1.0), or wire "
                 "what is outside.",
                 block=path,
                 port=port,

@@ -316,7 +316,7 @@ def _common(frames: list[str]) -> str:
 
 
 def _resolve(signal: Signal, paths: dict[int, str], crossed: list[tuple[SubsystemCall, str]] | None = None) -> Wire:
-    """Follow a signal through subsystem borders to the block that makes it; ``crossed`` takes the outputs on the way."""
+    """Follow a signal through subsystem borders to its block; ``crossed`` takes the outputs of boxes on the way."""
     index = signal.index
     while True:
         if isinstance(signal.source, FrameInput):
