@@ -51,6 +51,7 @@ def check(table: Structure) -> Checked:
     _check_ports(table)
     traced, shapes = _infer_shapes(table)
     _check_boxes(table, traced, shapes)
+    _check_stops(table, shapes)
     return Checked(traced, shapes, _check_units(table, shapes))
 
 
@@ -199,8 +200,8 @@ def _check_boxes(table: Structure, traced: dict[str, Traced], shapes: dict[Port,
             what = frame.control or ("delayed" if frame.delay else "sampled")
             raise WiringError(
                 f"it is wired to {box}.{output}, and that box is {what}, but no block in it makes this output: it "
-                "comes from outside and would be handed on as it is. Put a block between, such as Gain(gain=1.0), or wire "
-                "what is outside.",
+                "comes from outside and would be handed on as it is. Put a block between, such as Gain(gain=1.0), or "
+                "wire what is outside.",
                 block=path,
                 port=port,
             )
@@ -230,6 +231,24 @@ def _check_boxes(table: Structure, traced: dict[str, Traced], shapes: dict[Port,
                 f"the box {inner.path if inner else ''} has a sample time of its own inside of the triggered box "
                 f"{triggered}; it acts whenever {triggered} is triggered. Leave the sample time out.",
                 block=path,
+            )
+
+
+def _check_stops(table: Structure, shapes: dict[Port, Shape]) -> None:
+    for path, block in sorted(table.blocks.items()):
+        if block.stops is None:
+            continue
+        if block.stops not in block.outputs:
+            raise UnknownNameError(
+                f"found stops = {block.stops!r}; expected the name of an output. {near(block.stops, block.outputs)}",
+                block=path,
+            )
+        if shapes[path, block.stops] != ():
+            raise ShapeError(
+                f"found shape {shapes[path, block.stops]}; expected one number, as it ends the run where it is above "
+                "0.5. Put out np.max of it, for instance.",
+                block=path,
+                port=block.stops,
             )
 
 

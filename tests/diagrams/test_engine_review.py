@@ -15,9 +15,11 @@ from loopwright.blocks import (
     Integrator,
     OptionError,
     Output,
+    ShapeError,
     SimulationError,
     Step,
     TransferFunction,
+    UnknownNameError,
     WiringError,
 )
 from loopwright.diagrams import Diagram, subsystem
@@ -215,6 +217,28 @@ def test_a_state_is_recorded_as_its_tick_found_it_also_where_an_event_fires_at_t
     with_event, result = run(Compare(">", name="jumps")(Step(times=1.0, values=1.0), 0.5))
     assert [e.t for e in result.events] == [1.0]
     assert plain.tolist() == with_event.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
+
+
+# --- stop conditions ----------------------------------------------------------------------------------------------------
+
+
+def test_what_ends_a_run_is_one_number_that_the_block_puts_out():
+    """A name that is none was a KeyError when the run began; of a vector only the first entry was looked at."""
+
+    class Wide(Block):
+        stops = "reached"
+        reached = Output(shape=(2,))
+
+        def output(self, t, x, u):
+            return np.stack([0.0 * t, 1.0 + 0.0 * t])
+
+    class Misspelt(Announces):
+        stops = "x"
+
+    with pytest.raises(ShapeError, match=r"^stop\.reached: found shape \(2,\); expected one number"):
+        Diagram("d", Wide(name="stop"))
+    with pytest.raises(UnknownNameError, match=r"^stop: found stops = 'x'; expected the name of an output.*y"):
+        Diagram("d", Misspelt(name="stop"))
 
 
 # --- FMUs ---------------------------------------------------------------------------------------------------------------
