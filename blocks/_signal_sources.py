@@ -15,7 +15,7 @@ from typing import Any, Self
 import numpy as np
 
 from ._errors import ParameterError
-from ._instants import next_edge, period_of
+from ._instants import earliest, next_edge, period_of
 from ._lookup import piecewise
 from ._ports import Output
 from ._sources import Source
@@ -174,6 +174,10 @@ class _Table(Source):
                 port="values",
             )
 
+    def begins(self) -> np.ndarray:
+        """Return where the piece after each time begins."""
+        return self.times
+
     @property
     def slopes(self) -> np.ndarray:
         """Slopes between the times, one row each, for linear interpolation."""
@@ -188,8 +192,8 @@ class _Table(Source):
         coefficients = np.stack(
             [np.concatenate([columns[:1], columns]), np.concatenate([still, self.slopes, still])], axis=2
         )
-        span = 1.0 + np.abs(self.times[[0, -1]])
-        breaks = np.concatenate([[self.times[0] - span[0]], self.times, [self.times[-1] + span[1]]])
+        span, times = 1.0 + np.abs(self.times[[0, -1]]), self.begins()
+        breaks = np.concatenate([[times[0] - span[0]], times, [times[-1] + span[1]]])
         y = piecewise(breaks, coefficients, t)
         return y if np.ndim(self.values) == 2 else y[0]
 
@@ -214,8 +218,8 @@ class PiecewiseLinear(_Table):
 class Recorded(_Table):
     """Recorded data: y is interpolated between the samples; the first and the last value are held beyond them.
 
-    ``linear`` interpolates, ``previous`` holds each value until the next time, as a sampled signal does. A solver lands
-    on every sample, in a continuous frame.
+    ``linear`` interpolates, ``previous`` holds each value until the next time, as a sampled signal does; the times may
+    be off by their rounding, as those of ``np.linspace`` are. A solver lands on every sample, in a continuous frame.
 
     Raises
     ------
@@ -234,6 +238,10 @@ class Recorded(_Table):
                 block=self.label,
                 port="interpolation",
             )
+
+    def begins(self) -> np.ndarray:
+        """Return the times, less their rounding where a value jumps."""
+        return earliest(self.times) if self.interpolation == "previous" else self.times
 
     @property
     def slopes(self) -> np.ndarray:
