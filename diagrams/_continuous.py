@@ -103,10 +103,15 @@ class Continuous:
         t = self._left if t >= self._edge else t
         if self.delays is not None:
             self.delays.outputs_at(t, self.machine.trial.w)
+        if self._loops:  # whatever was tried in between: Newton's method starts from the last accepted solution
+            self.machine.trial.x[self._loops] = self.machine.here.x[self._loops]
         return t
 
     def _rate(self, t: float, x: np.ndarray) -> np.ndarray:
-        rates = self._flow(self._time(t), x)
+        try:
+            rates = self._flow(self._time(t), x)
+        except SimulationError:  # a loop without a solution: the solver shortens the step, if it can
+            rates = np.full(self.where.size, math.nan)
         if not np.isfinite(rates).all():
             self.beyond = (t, x.copy())
         return rates
@@ -143,8 +148,8 @@ class Continuous:
         self._put(t, x)
         try:
             self.machine.look()
-        except SimulationError:
-            return None
+        except SimulationError as error:
+            return error
         return None if self.machine.ok[0] else failure(self.machine, NOTHING).at(t=t)  # type: ignore[return-value]
 
     def _inputs_of_delays(self, t: float, x: np.ndarray) -> np.ndarray:

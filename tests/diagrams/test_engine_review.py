@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import erf
 
 from loopwright.blocks import (
     Block,
@@ -12,6 +13,7 @@ from loopwright.blocks import (
     Constant,
     DiscreteIntegrator,
     Gain,
+    Input,
     Integrator,
     OptionError,
     Output,
@@ -239,6 +241,60 @@ def test_what_ends_a_run_is_one_number_that_the_block_puts_out():
         Diagram("d", Wide(name="stop"))
     with pytest.raises(UnknownNameError, match=r"^stop: found stops = 'x'; expected the name of an output.*y"):
         Diagram("d", Misspelt(name="stop"))
+
+
+# --- algebraic loops ------------------------------------------------------------------------------------------------------
+
+
+class Cubic(Block):
+    """y³ − y = v, as a loop through u: three solutions for |v| < 0.385, one beyond."""
+
+    u = Input()
+    v = Input()
+    y = Output()
+
+    def output(self, t, x, u):
+        return u.u - (u.u**3 - u.u - u.v)
+
+
+class Burst(Block):
+    y = Output()
+
+    def output(self, t, x, u):
+        return 100.0 * np.exp(-(((t - 1.03) / 1e-3) ** 2))
+
+
+@pytest.mark.parametrize(("solver", "max_step"), [("RK45", 0.1), ("RK45", 0.05), ("DOP853", 0.05), ("DOP853", 0.03)])
+def test_a_trial_of_a_solver_neither_ends_a_run_with_a_loop_nor_leads_it_to_another_solution(solver, max_step):
+    """A step that is too long tries states at which the loop has no solution near by; it is to be shortened."""
+    loop = Cubic(name="c")
+    x = Integrator(name="x")(Burst(name="burst"))
+    diagram = Diagram("d", loop(u=loop.y, v=x), Integrator(name="z")(loop.y), loops="solve")
+    options = {"rtol": 1e-8, "atol": 1e-10, "max_step": max_step}
+    run = diagram.simulate(2.0, step=0.1, solver=solver, progress=False, **options)
+    end = 0.1 * math.sqrt(math.pi)
+
+    def solution(v):
+        return 2 / math.sqrt(3) * np.cos((np.arccos(1.5 * math.sqrt(3) * v) + 4 * np.pi) / 3)
+
+    assert run["x.y"][-1] == pytest.approx(end, abs=1e-8)
+    assert run["c.y"] == pytest.approx(solution(run["x.y"]), abs=1e-9)
+    t = np.linspace(1.02, 1.04, 200001)
+    z = np.trapezoid(solution(0.5 * end * (1 + erf((t - 1.03) / 1e-3))), t) + 0.96 * solution(end)
+    assert run["z.y"][-1] == pytest.approx(z, abs=2e-8)
+
+
+@pytest.mark.parametrize("solver", ["rk4", "RK45", "Radau", "BDF", "LSODA", "CVODE_BDF"])
+def test_a_loop_whose_solution_ends_is_told_as_such(solver):
+    loop = Cubic(name="c")
+    x = Integrator(name="x")(ONE)
+    diagram = Diagram("d", loop(u=loop.y, v=x), Integrator(name="z")(loop.y), loops="solve")
+    with pytest.raises(
+        SimulationError, match=r"(?s)the algebraic loop was not solved.*c\.y is wired to c\.u"
+    ) as caught:
+        diagram.simulate(1.0, step=0.01, solver=solver, progress=False)
+    assert caught.value.block == "c"
+    assert caught.value.t == pytest.approx(2 / math.sqrt(27), abs=0.02)
 
 
 # --- FMUs ---------------------------------------------------------------------------------------------------------------
