@@ -287,7 +287,8 @@ def subsystem(
         inputs then. In the first ticks it is what was computed first.
     enabled : {"held", "reset"}, optional
         The box is called with one more input, ``enable``, and acts only while that is true (above 0.5). Else its
-        outputs and states are held; with "reset" the states start anew when it is enabled again.
+        outputs and states are held; with "reset" the states start anew when it is enabled again. With a sample time it
+        looks at its own ticks, and boxes of other rates in it go by the last one.
     triggered : {"rising", "falling", "both"}, optional
         The box is called with one more input, ``trigger``, and acts only at the instants at which that becomes true
         (rising), false (falling), or either. Between them its outputs are held. Blocks inside have no sample time.
