@@ -47,7 +47,7 @@ from contextlib import ExitStack
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
-from ..blocks._errors import OptionError, SimulationError
+from ..blocks._errors import SimulationError
 from ._continuous import Continuous, check_solver
 from ._duration import default_step, ticks_in
 from ._failures import failure
@@ -61,7 +61,7 @@ from ._recording import Recording
 from ._run import Run
 from ._sampled import CHUNK, run_ticks
 from ._start import initialize
-from ._state import RunState, check_fits, layout_of
+from ._state import RunState, check_fits, layout_of, not_open
 from ._stored import Occurrence, Stopped
 from ._structure import join
 
@@ -137,7 +137,7 @@ class Simulation:
         self._stops = self._stop_ports()
         self._tick, self._count, self._elapsed, self._begun = 0, 0, 0.0, False
         self._stopped: Stopped | None = None
-        self._open: bool | None = None  # until it is begun; False once it has ended
+        self._open: bool | None = None  # until it begins; False once it has ended
         self._recorder = self._new_recorder()
 
     # --- what belongs to it ------------------------------------------------------------------------------------------
@@ -159,7 +159,7 @@ class Simulation:
 
     def __enter__(self) -> Simulation:
         if self._open is not None:
-            raise self._not_open()
+            raise not_open(self._open, self.diagram.name)
         try:
             self._open = True
             self._load()
@@ -174,15 +174,6 @@ class Simulation:
     def __exit__(self, *error: Any) -> None:
         self._open = False
         self._stack.__exit__(*error)
-
-    def _not_open(self) -> OptionError:
-        """Return the error of a run that is used before it has begun, or after it has ended."""
-        found = "has not begun" if self._open is None else "has ended, and its FMUs are freed"
-        return OptionError(
-            f"this run {found}; expected it to be used inside of its with statement, once: with "
-            "diagram.simulation(…) as simulation: …. To go on later, keep simulation.save() and give it as start=….",
-            block=self.diagram.name,
-        )
 
     def _load(self) -> None:
         try:
@@ -246,7 +237,7 @@ class Simulation:
             A duration that is not positive, or no multiple of the step; a run that has not begun, or has ended.
         """
         if not self._open:
-            raise self._not_open()
+            raise not_open(self._open, self.diagram.name)
         last = self._tick + ticks_in(duration, self.flat.base, self.diagram.name)
         started = time.perf_counter()
 
@@ -431,7 +422,7 @@ class Simulation:
             If the run has not begun, or has ended and its FMUs are freed.
         """
         if not self._begun or (self._plants and not self._open):
-            raise self._not_open()
+            raise not_open(self._open, self.diagram.name)
         machine = self._machine
         return RunState(
             t=self.t if self._stopped is None else self._stopped.t,
@@ -458,7 +449,7 @@ class Simulation:
             ended.
         """
         if not self._open:
-            raise self._not_open()
+            raise not_open(self._open, self.diagram.name)
         check_fits(state, self.flat, self.diagram.name)
         machine = self._machine
         for path, plant in self._plants:
