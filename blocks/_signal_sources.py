@@ -176,7 +176,8 @@ class _Table(Source):
 
     def begins(self) -> np.ndarray:
         """Return where the piece after each time begins."""
-        return self.times
+        times: np.ndarray = self.times
+        return times
 
     @property
     def slopes(self) -> np.ndarray:
@@ -241,7 +242,8 @@ class Recorded(_Table):
 
     def begins(self) -> np.ndarray:
         """Return the times, less their rounding where a value jumps."""
-        return earliest(self.times) if self.interpolation == "previous" else self.times
+        times: np.ndarray = self.times
+        return earliest(times) if self.interpolation == "previous" else times
 
     @property
     def slopes(self) -> np.ndarray:
