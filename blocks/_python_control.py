@@ -123,10 +123,15 @@ class SampleTimeOfFrame:
     label: Any
 
     def constants(self, T: float, method: str) -> dict[str, Any]:
-        """Compare the sample times when the diagram is built."""
-        if T != 1.0 and self.mismatch(T):  # tracing asks with 1 s, whatever the frame's is: then the guard does
-            raise SampleTimeError(self._message(T), block=self.label, port="dt")
+        """Compare the sample times where numbers are made for one."""
+        if T != 1.0:  # tracing asks with 1 s, whatever the frame's is
+            self.check_rate(T)
         return {}
+
+    def check_rate(self, T: float) -> None:
+        """Compare the sample times when the diagram is built."""
+        if self.mismatch(T):
+            raise SampleTimeError(self._message(T), block=self.label, port="dt")
 
     def mismatch(self, T: float) -> bool:
         """Whether ``T`` is another sample time; both may carry a rounding error."""

@@ -21,6 +21,7 @@ from ..blocks._errors import (
     near,
 )
 from ..blocks._ports import Shape
+from ..blocks._python_control import SampleTimeOfFrame
 from ..blocks._tracing import Traced, trace, traced_parameters
 from ..blocks._units import describe_mismatch, same_unit
 from ._structure import Structure, Wire
@@ -262,8 +263,10 @@ def _reads_sample_time(block: Block, trace: Traced) -> bool:
 
 def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, shared: dict[Any, Traced]) -> Traced:
     frame = table.frame_of[path]
-    sampled, method = table.sampled(frame), table.method(frame)
+    sampled, method, rate = table.sampled(frame), table.method(frame), table.rate(frame)
     try:
+        if rate is not None and isinstance(block, SampleTimeOfFrame):
+            block.check_rate(float(rate))
         return trace(block, shapes, sampled=sampled, method=method, cache=shared)
     except LoopwrightError as error:
         error.block = path
