@@ -182,7 +182,9 @@ def test_a_system_of_another_sample_time_is_refused_when_the_diagram_is_built(bl
     def box(u):
         return block(u)
 
-    with pytest.raises(SampleTimeError, match=rf"^box\.d\.dt: it holds for .* 0\.2 s, and its frame has one of {T:g} s"):
+    with pytest.raises(
+        SampleTimeError, match=rf"^box\.d\.dt: it holds for .* 0\.2 s, and its frame has one of {T:g} s"
+    ):
         Diagram("d", box(Constant(value=1.0)))
     good = Diagram("d", box.replace(sample_time=0.2)(Constant(value=1.0)))
     with pytest.raises(SampleTimeError, match=r"^box\.d\.dt: it holds for"):
