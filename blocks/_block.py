@@ -11,7 +11,7 @@ import numpy as np
 
 from ._documentation import port_section, with_section
 from ._errors import DefinitionError, GuardError, WiringError, near
-from ._ports import Event, Input, Output, Port, State
+from ._ports import Event, Input, Output, Port, State, check_port_names
 from ._signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, bind, check_name, primary_outputs
 from ._trapezoid import SOLVED
 from ._values import Value
@@ -95,6 +95,7 @@ class Block(Value, Wireable):
     _hint: ClassVar[str | None] = None
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
+        check_port_names(cls)
         super().__init_subclass__(**kwargs)
         ports: dict[str, Port] = {}
         for base in reversed(cls.__mro__):
