@@ -140,6 +140,13 @@ class Block(Value, Wireable):
         """Return the next time after t at which the outputs are not smooth in time: never, unless overridden."""
         return math.inf
 
+    def time_scale(self) -> float:
+        """Return the time in s within which the outputs change by themselves, a tenth of a period say: any, by default.
+
+        In a continuous frame events are looked for as often, and no step of a solver is longer than five of them.
+        """
+        return math.inf
+
     def replace(self, **changes: Any) -> Self:
         """Return a variant with some parameters (or the name) changed; it is another node."""
         result = type(self)(**{**self.parameters, "name": self.name, **changes})

@@ -96,6 +96,11 @@ class Chirp(Source):
         """Return where the sweep starts and ends."""
         return np.array([self.start_time, self.start_time + self.duration])
 
+    def time_scale(self) -> float:
+        """Return a tenth of the shortest period."""
+        fastest = max(self.start_frequency, self.end_frequency)
+        return 0.1 / fastest if fastest else math.inf
+
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the sweep."""
         first, last, D = self.start_frequency, self.end_frequency, self.duration

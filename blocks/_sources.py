@@ -222,6 +222,10 @@ class Sine(Source):
     bias: float = parameter(default=0.0, description="mean value")
     y = Output()
 
+    def time_scale(self) -> float:
+        """Return a tenth of a period."""
+        return 0.1 / self.frequency if self.frequency else math.inf
+
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the sine."""
         return self.amplitude * np.sin(2.0 * np.pi * self.frequency * t + self.phase) + self.bias

@@ -61,9 +61,12 @@ class Continuous:
         self.delays = delays_of(flat)
         self._flow, self._jacobian = machine.flow(), None
         problem = Problem(self.where.size, self._rate, self._slope, state_names(flat))
+        self.time_scale = _time_scale(flat)
         longest = max_step
         if longest is None and _remembers(flat):
             longest = float(flat.base)  # what is remembered is renewed at accepted steps, and must not grow stale
+        if longest is None and self.time_scale < math.inf:
+            longest = 5.0 * self.time_scale  # else a step may fit whole periods of a source
         if self.delays is not None:
             longest = min(longest or math.inf, self.delays.shortest)
         self.solver = make_solver(
@@ -85,7 +88,7 @@ class Continuous:
         self.domains: Domains | None = None
         if flat.events:
             self._indicators, self._opened = machine.indicators()
-            self.domains = Domains(flat, self._g, self._opened)
+            self.domains = Domains(flat, self._g, self._opened, self.time_scale)
             self._jump, self._fired = machine.jump()
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
@@ -387,6 +390,13 @@ def recall(solver: Any, kept: dict[str, Any]) -> None:
                 recall(method, kept["methods"][method.name])
             if method.name == kept["active"]:
                 solver._active = method
+
+
+def _time_scale(flat: FlatDiagram) -> float:
+    """Return the shortest time within which a source in a continuous frame changes."""
+    table = flat.table
+    paths = (p for p in flat.checked.traced if not table.sampled(table.frame_of[p]))
+    return min((float(table.blocks[p].time_scale()) for p in paths), default=math.inf)
 
 
 def _remembers(flat: FlatDiagram) -> bool:

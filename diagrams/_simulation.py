@@ -10,15 +10,14 @@ which a box acts, or every tick where there is an FMU, a ``step``, or a solver o
 
 1. The outputs of the FMUs are those at the end of their last step: a co-simulation FMU has no feedthrough between
    communication points (FMI 3.0, Step Mode). The continuous states are what the solver arrived at, from the left.
-2. If the instant is a tick: all blocks are evaluated once, each port after what it depends on (`_order`). A box acts if
-   its clock ticks and whatever enables or triggers it says so. The next states of sampled blocks, and what is held,
-   take effect.
-3. Discontinuities of sources in time (a step, an edge of a pulse) are in what was just evaluated: a source's value at t
-   is its value from the right.
-4. Indicators of events are looked at. Those that have changed their domain fire, all together: each jump sees the
+2. Discontinuities of sources in time (a step, an edge of a pulse) take effect: a source's value at t is its value from
+   the right.
+3. Indicators of events are looked at. Those that have changed their domain fire, all together: each jump sees the
    instant before all of them. Then they are looked at again, until none fires. The same happens between ticks wherever
-   the solver finds a change; such an instant has no step 2. A box that is enabled or triggered in continuous time is
-   such an event.
+   the solver finds a change. A box that is enabled or triggered in continuous time is such an event.
+4. If the instant is a tick: all blocks are evaluated once, each port after what it depends on (`_order`). A box acts if
+   its clock ticks and whatever enables or triggers it says so. The next states of sampled blocks, and what is held,
+   take effect. Then point 3 is gone through again, for what the boxes have changed.
 5. What is to be recorded is evaluated and recorded: the values from the right, after all events.
 6. A stop condition that is true ends the run; nothing steps beyond.
 7. The continuous states go on to the next tick, with everything sampled and the FMUs' outputs held; then the inputs of
@@ -318,6 +317,8 @@ class Simulation:
         acting = self.flat.acting(k)
         if continuous is not None:
             continuous.at(now)
+            if k > 0 and acting:
+                continuous.settle(now)  # what changes by itself at this instant, boxes see changed
         machine.tick(acting)()
         if not machine.ok[0]:
             raise failure(machine, acting).at(t=now)
