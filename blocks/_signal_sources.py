@@ -8,6 +8,7 @@ instant that is a few rounding errors before such an edge (1e-15 t) counts as th
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 from functools import lru_cache
 from typing import Any, Self
