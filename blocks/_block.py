@@ -11,7 +11,7 @@ import numpy as np
 
 from ._documentation import port_section, with_section
 from ._errors import DefinitionError, GuardError, WiringError, near
-from ._ports import Event, Input, Output, Port, State
+from ._ports import Event, Input, Output, Port, State, check_port_names
 from ._signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, bind, check_name, primary_outputs
 from ._trapezoid import SOLVED
 from ._values import Value
@@ -95,6 +95,7 @@ class Block(Value, Wireable):
     _hint: ClassVar[str | None] = None
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
+        check_port_names(cls)
         super().__init_subclass__(**kwargs)
         ports: dict[str, Port] = {}
         for base in reversed(cls.__mro__):
@@ -137,6 +138,13 @@ class Block(Value, Wireable):
 
     def next_instant(self, t: float) -> float:
         """Return the next time after t at which the outputs are not smooth in time: never, unless overridden."""
+        return math.inf
+
+    def time_scale(self) -> float:
+        """Return the time in s within which the outputs change by themselves, a tenth of a period say: any, by default.
+
+        In a continuous frame events are looked for as often, and no step of a solver is longer than five of them.
+        """
         return math.inf
 
     def replace(self, **changes: Any) -> Self:

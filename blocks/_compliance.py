@@ -10,7 +10,7 @@ import numpy as np
 from ._block import Block
 from ._discretization import hold
 from ._errors import ParameterError
-from ._ports import Input, Output, State
+from ._ports import Event, Input, Output, State
 from ._values import Array, parameter
 
 
@@ -93,6 +93,8 @@ class AdmittanceFilter(Block):
     IV-A): in a tick in which one would be exceeded its acceleration a is cut to the admissible value and held over the
     tick, and r^p and ṙ^p advance by v T + a T²/2 and a T. Whether it would be is foreseen with ṙ^d + r̈^d T for the rate
     of the reference at the next tick; what a reference with a jerk is off that (by T² times it) is cut from ṙ^p then.
+    In a continuous frame a is cut all the time; the speed limit is an event, and so is the acceleration's turn inward
+    that releases ṙ^p again. With a speed limit r^p is what is integrated there: where the reference jumps, it does not.
     """
 
     mass: float = parameter(unit="kg", above=0.0, description="rendered mass m")
@@ -110,7 +112,12 @@ class AdmittanceFilter(Block):
     forcing: ClassVar[Array]
     error = State(unit="m", description="e")
     error_rate = State(unit="m/s", description="ė")
-    limited = State(description="1 after a tick in which a limit acted: then the states hold r^p and ṙ^p, not e and ė")
+    limited = State(
+        description="1 after a tick in which a limit acted: then the states hold r^p and ṙ^p, not e and ė; in a "
+        "continuous frame 1 where there is a speed limit, 2 while ṙ^p is held there",
+    )
+    reached = Event("rising", "the speed limit is reached; with velocity_limit")
+    released = Event("rising", "the acceleration turns inward; with velocity_limit")
 
     @property
     def has_limits(self) -> bool:
@@ -122,7 +129,26 @@ class AdmittanceFilter(Block):
         """E and ė, and where there are limits whether one acted."""
         cls = type(self)
         free = {"error": cls.error, "error_rate": cls.error_rate}
-        return {**free, "limited": cls.limited} if self.has_limits else free
+        if not self.has_limits:
+            return free
+        events = self.velocity_limit is not None
+        return {**free, "limited": State(None, cls.limited.description, discrete=events, name="limited")}
+
+    @property
+    def events(self) -> Mapping[str, Event]:  # type: ignore[override]
+        """What happens at the speed limit, if there is one."""
+        cls = type(self)
+        return {} if self.velocity_limit is None else {"reached": cls.reached, "released": cls.released}
+
+    @property
+    def starts_from_inputs(self) -> bool:
+        """Whether the states are r^p and ṙ^p from the start."""
+        return self.velocity_limit is not None
+
+    def initial(self, u: Any) -> tuple[Any, ...]:
+        """Return r^p and an admissible ṙ^p."""
+        top: Any = self.velocity_limit
+        return u.reference[0], _clip(u.reference[1], -top, top), 1.0
 
     def check(self) -> None:
         """Refuse a damping that is given twice or not at all."""
@@ -158,9 +184,9 @@ class AdmittanceFilter(Block):
         """Return ë of (15) while no limit acts."""
         return drive - (self.effective_damping * e_rate + self.stiffness * e) / self.mass
 
-    def deviation(self, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return e and ė at this tick."""
-        if not self.has_limits:
+    def deviation(self, x: Any, u: Any, T: Array = None) -> tuple[Array, Array]:
+        """Return e and ė at this instant."""
+        if not self.has_limits or (T is None and self.velocity_limit is None):
             return x.error, x.error_rate
         after_cut = x.limited > 0.5
         e = np.where(after_cut, x.error - u.reference[0], x.error)
@@ -173,7 +199,7 @@ class AdmittanceFilter(Block):
 
     def step(self, x: Any, u: Any, T: Array) -> tuple[tuple[Array, ...], Array]:
         """Return the states at the next tick, and ë that is held over this one."""
-        e, e_rate = self.deviation(x, u)
+        e, e_rate = self.deviation(x, u, T)
         drive = self.driving_acceleration(u)
         a = self.acceleration(e, e_rate, drive)
         free = self.transition @ np.stack([e, e_rate]) + self.forcing @ np.stack([0.0 * drive, drive])
@@ -198,21 +224,45 @@ class AdmittanceFilter(Block):
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> Array:
         """Return r^p with its derivatives."""
         if T is None:
-            return u.reference + np.stack([x.error, x.error_rate, self.derivative(t, x, u)[1]])
-        return u.reference + np.stack([*self.deviation(x, u), self.step(x, u, T)[1]])
+            return u.reference + np.stack([*self.deviation(x, u), self.limited_acceleration(x, u) - u.reference[2]])
+        return u.reference + np.stack([*self.deviation(x, u, T), self.step(x, u, T)[1]])
 
     def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, ...]:
-        """Return ė and ë; at a velocity limit the acceleration points inwards."""
-        a = self.acceleration(x.error, x.error_rate, self.driving_acceleration(u))
-        v_d, a_d = u.reference[1], u.reference[2]
-        wanted = a_d + a
-        if self.acceleration_limit is not None:
-            wanted = _clip(wanted, -self.acceleration_limit, self.acceleration_limit)
-        if self.velocity_limit is not None:
-            v = v_d + x.error_rate
-            outwards = np.logical_and(np.abs(v) >= self.velocity_limit, v * wanted > 0.0)
-            wanted = np.where(outwards, 0.0, wanted)
-        return (x.error_rate, wanted - a_d, 0.0 * t) if self.has_limits else (x.error_rate, a)
+        """Return ė and ë; with a speed limit ṙ^p and r̈^p."""
+        if not self.has_limits:
+            return x.error_rate, self.acceleration(x.error, x.error_rate, self.driving_acceleration(u))
+        a = self.limited_acceleration(x, u)
+        if self.velocity_limit is None:
+            return x.error_rate, a - u.reference[2], 0.0 * t
+        return x.error_rate, np.where(x.limited > 0.5, a, a - u.reference[2])
+
+    def wanted_acceleration(self, x: Any, u: Any) -> Array:
+        """Return r̈^p of (15), within its limit."""
+        e, e_rate = self.deviation(x, u)
+        wanted = u.reference[2] + self.acceleration(e, e_rate, self.driving_acceleration(u))
+        if self.acceleration_limit is None:
+            return wanted
+        return _clip(wanted, -self.acceleration_limit, self.acceleration_limit)
+
+    def limited_acceleration(self, x: Any, u: Any) -> Array:
+        """Return r̈^p in continuous time: zero while ṙ^p is held at its limit."""
+        wanted = self.wanted_acceleration(x, u)
+        return wanted if self.velocity_limit is None else np.where(x.limited > 1.5, 0.0, wanted)
+
+    def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return how far ṙ^p is beyond its limit, and how r̈^p turns inward; each is −1 where it can't happen."""
+        held, inward = x.limited > 1.5, -np.sign(x.error_rate) * self.wanted_acceleration(x, u)
+        top: Any = self.velocity_limit
+        beyond = np.abs(x.error_rate) - (1.0 + 1e-12) * top  # rounding of what was just released is not beyond
+        return np.where(held, -1.0, beyond), np.where(held, inward, -1.0)
+
+    def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[Array, Array, Array]:
+        """Hold ṙ^p at the limit, or let it go."""
+        reached, released = fired.reached > 0.5, fired.released > 0.5
+        top: Any = self.velocity_limit
+        onto = np.where(x.error_rate > 0.0, top, -top)
+        held = np.where(reached, 2.0, np.where(released, 1.0, x.limited))
+        return x.error, np.where(reached, onto, x.error_rate), held
 
     def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, ...]:
         """Return the states at the next tick."""

@@ -25,6 +25,14 @@ def is_before(a: float, b: float) -> bool:
     return a < b - 2.0 * _TOLERANCE * abs(b) if b < math.inf else a < b
 
 
+def earliest(instants: Array) -> Array:
+    """Return the first times that count as the given instants: 2e-15 t before, as times may be off by their rounding.
+
+    Three times 0.1 is more than the tick at 0.3, and so are times of ``np.linspace``; both mean the tick.
+    """
+    return instants - 2.0 * _TOLERANCE * np.abs(instants)
+
+
 def period_of(t: Array, period: Array, delay: Array) -> tuple[Array, Array, Array]:
     """Return the number of the period at t, the time since it began in periods, and the rounding of it."""
     passed = (t - delay) / period

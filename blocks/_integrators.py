@@ -294,3 +294,9 @@ class FilteredDerivative(Block):
     def derivative(self, t: Array, x: Any, u: Any) -> Array:
         """Return the same."""
         return (u.u - x.filtered) / self.time_constant
+
+    def to_control(self) -> Any:
+        """Return the `control.TransferFunction` of a scalar input, s / (T_f s + 1), with the block's name."""
+        import control
+
+        return control.tf([1.0, 0.0], [self.time_constant, 1.0], name=self.name)

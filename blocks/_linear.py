@@ -10,7 +10,16 @@ import numpy as np
 from ._block import Block
 from ._errors import ParameterError
 from ._ports import Input, Output, State
-from ._python_control import SampleTimeOfFrame, check_names, check_system, labels, names_of, sample_time_of
+from ._python_control import (
+    SampleTimeOfFrame,
+    block_name,
+    check_names,
+    check_single,
+    check_system,
+    labels,
+    names_of,
+    sample_time_of,
+)
 from ._values import Array, parameter
 
 Names = tuple[str, ...] | None
@@ -97,7 +106,7 @@ class _StateSpace(Block):
         C, D = (C[0], D[0]) if system.noutputs == 1 else (C, D)
         if discrete:
             more["dt"] = dt
-        return cls(A=system.A, B=B, C=C, D=D, name=name, **names_of(system), **more)
+        return cls(A=system.A, B=B, C=C, D=D, name=block_name(system, name), **names_of(system), **more)
 
     def _to_control(self, dt: float | bool) -> Any:
         import control
@@ -131,6 +140,8 @@ class StateSpace(_StateSpace):
     @classmethod
     def from_control(cls, system: Any, *, initial_state: Any = 0.0, name: str | None = None) -> Self:
         """Return the block of a `control.StateSpace` in continuous time; one input or output becomes a scalar.
+
+        It takes over the names of the signals, and the system's own where that is an identifier and none is given.
 
         Raises
         ------
@@ -166,6 +177,8 @@ class DiscreteStateSpace(SampleTimeOfFrame, _StateSpace):
     @classmethod
     def from_control(cls, system: Any, *, initial_state: Any = 0.0, name: str | None = None) -> Self:
         """Return the block of a `control.StateSpace` in discrete time; one input or output becomes a scalar.
+
+        It takes over the names of the signals, and the system's own where that is an identifier and none is given.
 
         Raises
         ------
@@ -234,16 +247,10 @@ class _TransferFunction(Block):
     @classmethod
     def _from_control(cls, system: Any, *, discrete: bool, name: str | None) -> Self:
         dt = check_system(cls, system, "TransferFunction", discrete=discrete)
-        if system.ninputs != 1 or system.noutputs != 1:
-            raise ParameterError(
-                f"found {system.ninputs} inputs and {system.noutputs} outputs; expected one each. Take one entry, "
-                "system[0, 0], or use the state space: control.ss(system).",
-                block=cls.__name__,
-                port="system",
-            )
+        check_single(cls, system)
         a, b = (np.asarray(c[0][0], dtype=float) for c in (system.den, system.num))
         more: dict[str, Any] = {"dt": dt} if discrete else {}
-        return cls(numerator=b, denominator=a, name=name, **names_of(system), **more)
+        return cls(numerator=b, denominator=a, name=block_name(system, name), **names_of(system), **more)
 
     def _to_control(self, dt: float | bool) -> Any:
         import control
@@ -300,6 +307,8 @@ class TransferFunction(_TransferFunction):
     def from_control(cls, system: Any, *, name: str | None = None) -> Self:
         """Return the block of a `control.TransferFunction` in continuous time, of one input and one output.
 
+        It takes over the names of the signals, and the system's own where that is an identifier and none is given.
+
         Raises
         ------
         ParameterError
@@ -342,6 +351,8 @@ class DiscreteTransferFunction(SampleTimeOfFrame, _TransferFunction):
     @classmethod
     def from_control(cls, system: Any, *, name: str | None = None) -> Self:
         """Return the block of a `control.TransferFunction` in discrete time, of one input and one output.
+
+        It takes over the names of the signals, and the system's own where that is an identifier and none is given.
 
         Raises
         ------

@@ -106,6 +106,23 @@ class PID(Block):
             more = {"kd": gain * derivative_time, "filter_time": derivative_time / ratio, **more}
         return cls(kp=gain, ki=0.0 if integral_time is None else gain / integral_time, **more)
 
+    def to_control(self) -> Any:
+        """Return the linear part as a `control.StateSpace` from r and y to u, with the block's name.
+
+        Without limits, anti-windup and tracking (``actual`` is taken to be u), in continuous time, from rest. A
+        controller without ki has no integral in it, one without kd no filter.
+        """
+        import control
+
+        lag = np.inf if self.filter_time is None else self.filter_time
+        A, B = np.diag([0.0, -1.0 / lag]), np.array([[self.ki, -self.ki], [self.c / lag, -1.0 / lag]])
+        C, D = np.array([[1.0, -self.kd / lag]]), np.array([[self.kp * self.b, -self.kp]])
+        D = D + self.kd / lag * np.array([[self.c, -1.0]])
+        kept = [i for i, gain in enumerate((self.ki, self.kd)) if gain]
+        states = [("integral", "filtered")[i] for i in kept]
+        names: dict[str, Any] = {"inputs": ["r", "y"], "outputs": ["u"], "states": states, "name": self.name}
+        return control.ss(A[np.ix_(kept, kept)], B[kept], C[:, kept], D, 0, **names)
+
     def check(self) -> None:
         """Refuse what can't work."""
 

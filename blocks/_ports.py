@@ -55,22 +55,34 @@ class Port:
             raise DefinitionError(f"found nominal {nominal!r}; expected a positive number.")
 
     def __set_name__(self, owner: type, name: str) -> None:
-        if name.startswith("_") or name in {
-            "name",
-            "inputs",
-            "outputs",
-            "states",
-            "events",
-            "replace",
-            "parameters",
-            "T",
-        }:
-            raise DefinitionError(f"a port can't be called {name!r}; choose another name.", block=owner.__name__)
-        self.name = name
+        self.name = name  # checked once the class is made: Python wraps what is raised here in a RuntimeError
 
     def __repr__(self) -> str:
         unit = "" if self.unit is None else f", unit={self.unit!r}"
         return f"{type(self).__name__}({self.name}, shape={self.shape}{unit})"
+
+
+_TAKEN = frozenset({"name", "inputs", "outputs", "states", "events", "replace", "parameters"})
+
+
+def check_port_names(cls: type) -> None:
+    """Refuse ports of a class whose names mean something else.
+
+    Raises
+    ------
+    DefinitionError
+        The name of an attribute of every block, T, or a name that begins with an underscore.
+    """
+    for name in (n for n, item in vars(cls).items() if isinstance(item, Port)):
+        if name == "T":
+            why, step = "in equations T is the sample time in s", "another name, such as temperature or T_1"
+        elif name in _TAKEN:
+            why, step = "every block has an attribute of that name", f"another name, such as {name}_1"
+        elif name.startswith("_"):
+            why, step = "names that begin with an underscore are private", f"{name.strip('_') or 'another name'}"
+        else:
+            continue
+        raise DefinitionError(f"a port can't be called {name!r}: {why}. Take {step}.", block=cls.__name__, port=name)
 
 
 class Input(Port):

@@ -60,6 +60,28 @@ def names_of(system: Any) -> dict[str, tuple[str, ...]]:
     return {k: tuple(v) for k, v in found.items() if not all(re.fullmatch(r"[uyx]\[\d+\]", name) for name in v)}
 
 
+def block_name(system: Any, name: str | None) -> str | None:
+    """Return the given name, else the system's where it can name a block; one that was made up, ``sys[0]``, can't."""
+    return system.name if name is None and system.name.isidentifier() else name
+
+
+def check_single(cls: type[Block], system: Any) -> None:
+    """Refuse a transfer function of several inputs or outputs.
+
+    Raises
+    ------
+    ParameterError
+        Not one of each.
+    """
+    if system.ninputs != 1 or system.noutputs != 1:
+        raise ParameterError(
+            f"found {system.ninputs} inputs and {system.noutputs} outputs; expected one each. Take one entry, "
+            "system[0, 0], or use the state space: control.ss(system).",
+            block=cls.__name__,
+            port="system",
+        )
+
+
 def labels(block: Any) -> dict[str, Any]:
     """Return the keywords of python-control's constructors for the names that a block holds."""
     found = {
@@ -101,10 +123,15 @@ class SampleTimeOfFrame:
     label: Any
 
     def constants(self, T: float, method: str) -> dict[str, Any]:
-        """Compare the sample times when the diagram is built."""
-        if T != 1.0 and self.mismatch(T):  # tracing asks with 1 s, whatever the frame's is: then the guard does
-            raise SampleTimeError(self._message(T), block=self.label, port="dt")
+        """Compare the sample times where numbers are made for one."""
+        if T != 1.0:  # tracing asks with 1 s, whatever the frame's is
+            self.check_rate(T)
         return {}
+
+    def check_rate(self, T: float) -> None:
+        """Compare the sample times when the diagram is built."""
+        if self.mismatch(T):
+            raise SampleTimeError(self._message(T), block=self.label, port="dt")
 
     def mismatch(self, T: float) -> bool:
         """Whether ``T`` is another sample time; both may carry a rounding error."""

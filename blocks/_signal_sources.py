@@ -8,6 +8,7 @@ instant that is a few rounding errors before such an edge (1e-15 t) counts as th
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 from functools import lru_cache
 from typing import Any, Self
@@ -15,7 +16,7 @@ from typing import Any, Self
 import numpy as np
 
 from ._errors import ParameterError
-from ._instants import next_edge, period_of
+from ._instants import earliest, next_edge, period_of
 from ._lookup import piecewise
 from ._ports import Output
 from ._sources import Source
@@ -96,6 +97,11 @@ class Chirp(Source):
         """Return where the sweep starts and ends."""
         return np.array([self.start_time, self.start_time + self.duration])
 
+    def time_scale(self) -> float:
+        """Return a tenth of the shortest period."""
+        fastest = max(self.start_frequency, self.end_frequency)
+        return 0.1 / fastest if fastest else math.inf
+
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the sweep."""
         first, last, D = self.start_frequency, self.end_frequency, self.duration
@@ -174,6 +180,11 @@ class _Table(Source):
                 port="values",
             )
 
+    def begins(self) -> np.ndarray:
+        """Return where the piece after each time begins."""
+        times: np.ndarray = self.times
+        return times
+
     @property
     def slopes(self) -> np.ndarray:
         """Slopes between the times, one row each, for linear interpolation."""
@@ -188,8 +199,8 @@ class _Table(Source):
         coefficients = np.stack(
             [np.concatenate([columns[:1], columns]), np.concatenate([still, self.slopes, still])], axis=2
         )
-        span = 1.0 + np.abs(self.times[[0, -1]])
-        breaks = np.concatenate([[self.times[0] - span[0]], self.times, [self.times[-1] + span[1]]])
+        span, times = 1.0 + np.abs(self.times[[0, -1]]), self.begins()
+        breaks = np.concatenate([[times[0] - span[0]], times, [times[-1] + span[1]]])
         y = piecewise(breaks, coefficients, t)
         return y if np.ndim(self.values) == 2 else y[0]
 
@@ -214,8 +225,8 @@ class PiecewiseLinear(_Table):
 class Recorded(_Table):
     """Recorded data: y is interpolated between the samples; the first and the last value are held beyond them.
 
-    ``linear`` interpolates, ``previous`` holds each value until the next time, as a sampled signal does. A solver lands
-    on every sample, in a continuous frame.
+    ``linear`` interpolates, ``previous`` holds each value until the next time, as a sampled signal does; the times may
+    be off by their rounding, as those of ``np.linspace`` are. A solver lands on every sample, in a continuous frame.
 
     Raises
     ------
@@ -234,6 +245,11 @@ class Recorded(_Table):
                 block=self.label,
                 port="interpolation",
             )
+
+    def begins(self) -> np.ndarray:
+        """Return the times, less their rounding where a value jumps."""
+        times: np.ndarray = self.times
+        return earliest(times) if self.interpolation == "previous" else times
 
     @property
     def slopes(self) -> np.ndarray:

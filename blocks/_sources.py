@@ -1,4 +1,8 @@
-"""Sources that are given by a few numbers. Times in s; a change at ``t0`` acts from the first instant t ≥ t0 on."""
+"""Sources that are given by a few numbers. Times in s; a change at ``t0`` acts from the first instant t ≥ t0 on.
+
+Times may be off by their rounding: an instant that is less than 2e-15 t before a change counts as the change itself, so
+that a step at ``3 * 0.1`` acts at the tick at 0.3 s.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ import numpy as np
 
 from ._block import Block
 from ._errors import ParameterError, UnitError
+from ._instants import earliest
 from ._ports import Output, Unit
 from ._units import parse_unit, rate_of
 from ._values import Array, parameter
@@ -66,9 +71,9 @@ class Source(Block):
         return np.zeros(0)
 
     def next_instant(self, t: float) -> float:
-        """Return the first of `instants` after t."""
+        """Return the first of `instants` after t, without one that t counts as."""
         times = np.ravel(self.instants())
-        return float(np.min(times[times > t], initial=math.inf))
+        return float(np.min(times[earliest(times) > t], initial=math.inf))
 
 
 class Constant(Source):
@@ -144,7 +149,7 @@ class SmoothStep(Source):
 
 
 class Step(Source):
-    """Steps: y is ``initial_value``, and ``values[i]`` from ``times[i]`` on."""
+    """Steps: y is ``initial_value``, and ``values[i]`` from ``times[i]`` on, which may be off by its rounding."""
 
     times: Array = parameter(unit="s", description="when it steps, rising; a number or several")
     values: Array = parameter(description="the value from then on, one for each time")
@@ -169,7 +174,7 @@ class Step(Source):
         """Return the value at t."""
         y = self.initial_value + 0.0 * t
         for time, value in zip(np.atleast_1d(self.times), np.atleast_1d(self.values), strict=True):
-            y = np.where(t >= time, value, y)
+            y = np.where(t >= earliest(time), value, y)
         return y
 
 
@@ -216,6 +221,10 @@ class Sine(Source):
     phase: float = parameter(default=0.0, unit="rad", description="phase at t = 0")
     bias: float = parameter(default=0.0, description="mean value")
     y = Output()
+
+    def time_scale(self) -> float:
+        """Return a tenth of a period."""
+        return 0.1 / self.frequency if self.frequency else math.inf
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the sine."""

@@ -3,15 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from ._block import Block
 from ._errors import ParameterError
-from ._linear import section
+from ._linear import Names, section
 from ._ports import Input, Output, State
-from ._python_control import SampleTimeOfFrame
+from ._python_control import (
+    SampleTimeOfFrame,
+    block_name,
+    check_names,
+    check_single,
+    check_system,
+    labels,
+    names_of,
+    sample_time_of,
+)
 from ._values import Array, parameter
 
 Numbers = tuple[complex, ...]
@@ -81,6 +90,8 @@ class _ZeroPoleGain(Block):
     zeros: Numbers = parameter(default=(), structural=True, description="zeros; complex ones in conjugate pairs")
     poles: Numbers = parameter(structural=True, description="poles, at least one; complex ones in conjugate pairs")
     gain: float = parameter(default=1.0, description="factor k")
+    input_names: Names = parameter(default=None, description="name of the input, for python-control")
+    output_names: Names = parameter(default=None, description="name of the output, for python-control")
     u = Input(description="input")
     y = Output(description="output")
     x = State(start=lambda block: np.zeros(len(block.poles)), description="states of the sections, one after another")
@@ -104,6 +115,7 @@ class _ZeroPoleGain(Block):
                 block=self.label,
                 port="poles",
             )
+        check_names(self, input_names=1, output_names=1)
 
     def factors(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return numerator and denominator of each section, monic and of equal length."""
@@ -127,6 +139,26 @@ class _ZeroPoleGain(Block):
     def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
         """Return output and advance of one section, and the factor that its output is short of."""
         raise NotImplementedError
+
+    @classmethod
+    def _from_control(cls, system: Any, *, discrete: bool, name: str | None) -> Self:
+        dt = check_system(cls, system, "TransferFunction", discrete=discrete)
+        check_single(cls, system)
+        b, a = (np.trim_zeros(np.asarray(c[0][0], dtype=float), "f") for c in (system.num, system.den))
+        more: dict[str, Any] = {"dt": dt} if discrete else {}
+        return cls(
+            zeros=tuple(complex(z) for z in np.roots(b)),
+            poles=tuple(complex(p) for p in np.roots(a)),
+            gain=b[0] / a[0] if len(b) else 0.0,
+            name=block_name(system, name),
+            **names_of(system),
+            **more,
+        )
+
+    def _to_control(self, dt: float | bool) -> Any:
+        import control
+
+        return control.zpk(list(self.zeros), list(self.poles), self.gain, dt, **labels(self))
 
 
 class ZeroPoleGain(_ZeroPoleGain):
@@ -167,6 +199,24 @@ class ZeroPoleGain(_ZeroPoleGain):
         """Return ẋ."""
         return self.cascade(x, u)[1]
 
+    @classmethod
+    def from_control(cls, system: Any, *, name: str | None = None) -> Self:
+        """Return the block of a `control.TransferFunction` in continuous time, of one input and one output.
+
+        python-control keeps polynomials: zeros and poles are their roots, so several at one place come apart. It takes
+        over the names of the signals, and the system's own where that is an identifier and none is given.
+
+        Raises
+        ------
+        ParameterError
+            No transfer function, or one in discrete time, one of several inputs or outputs, or without poles.
+        """
+        return cls._from_control(system, discrete=False, name=name)
+
+    def to_control(self) -> Any:
+        """Return the `control.TransferFunction`, with the names of its signals: its polynomials, multiplied out."""
+        return self._to_control(0)
+
 
 class DiscreteZeroPoleGain(SampleTimeOfFrame, _ZeroPoleGain):
     """Zeros, poles and gain: Y(z) = k (z − z₁) … (z − z_m) / ((z − p₁) … (z − p_n)) U(z), m ≤ n; it starts at rest.
@@ -197,3 +247,21 @@ class DiscreteZeroPoleGain(SampleTimeOfFrame, _ZeroPoleGain):
     def update(self, t: Array, x: Any, u: Any) -> Array:
         """Return the next state."""
         return self.cascade(x, u)[1]
+
+    @classmethod
+    def from_control(cls, system: Any, *, name: str | None = None) -> Self:
+        """Return the block of a `control.TransferFunction` in discrete time, of one input and one output.
+
+        python-control keeps polynomials: zeros and poles are their roots, so several at one place come apart. It takes
+        over the names of the signals, and the system's own where that is an identifier and none is given.
+
+        Raises
+        ------
+        ParameterError
+            No transfer function, or one in continuous time, one of several inputs or outputs, or without poles.
+        """
+        return cls._from_control(system, discrete=True, name=name)
+
+    def to_control(self) -> Any:
+        """Return the `control.TransferFunction`, with the names of its signals: its polynomials, multiplied out."""
+        return self._to_control(sample_time_of(self))

@@ -21,6 +21,7 @@ from ..blocks._errors import (
     near,
 )
 from ..blocks._ports import Shape
+from ..blocks._python_control import SampleTimeOfFrame
 from ..blocks._tracing import Traced, trace, traced_parameters
 from ..blocks._units import describe_mismatch, same_unit
 from ._structure import Structure, Wire
@@ -51,6 +52,7 @@ def check(table: Structure) -> Checked:
     _check_ports(table)
     traced, shapes = _infer_shapes(table)
     _check_boxes(table, traced, shapes)
+    _check_stops(table, shapes)
     return Checked(traced, shapes, _check_units(table, shapes))
 
 
@@ -190,6 +192,20 @@ def _check_boxes(table: Structure, traced: dict[str, Traced], shapes: dict[Port,
             raise ShapeError(
                 f"{wire} has shape {found}; expected a logic signal, one number. Index it.", block=box, port=port
             )
+    for (path, port), handed in sorted(table.handed.items()):
+        for box, output in handed:
+            frame, clock = table.frames[box], table.clock(table.frame_of[path])
+            same = clock is not None and (clock.sample_time, clock.offset) == (frame.sample_time, frame.offset)
+            if not (frame.control or frame.delay) and (frame.sample_time is None or same):
+                continue
+            what = frame.control or ("delayed" if frame.delay else "sampled")
+            raise WiringError(
+                f"it is wired to {box}.{output}, and that box is {what}, but no block in it makes this output: it "
+                "comes from outside and would be handed on as it is. Put a block between, such as Gain(gain=1.0), or "
+                "wire what is outside.",
+                block=path,
+                port=port,
+            )
     for path in sorted(table.blocks):
         gates = table.gates(table.frame_of[path])
         if gates and path not in traced:
@@ -219,6 +235,24 @@ def _check_boxes(table: Structure, traced: dict[str, Traced], shapes: dict[Port,
             )
 
 
+def _check_stops(table: Structure, shapes: dict[Port, Shape]) -> None:
+    for path, block in sorted(table.blocks.items()):
+        if block.stops is None:
+            continue
+        if block.stops not in block.outputs:
+            raise UnknownNameError(
+                f"found stops = {block.stops!r}; expected the name of an output. {near(block.stops, block.outputs)}",
+                block=path,
+            )
+        if shapes[path, block.stops] != ():
+            raise ShapeError(
+                f"found shape {shapes[path, block.stops]}; expected one number, as it ends the run where it is above "
+                "0.5. Put out np.max of it, for instance.",
+                block=path,
+                port=block.stops,
+            )
+
+
 def _reads_sample_time(block: Block, trace: Traced) -> bool:
     """Whether a block's equations, or its precomputed numbers, depend on the sample time."""
     position = sum(int(np.size(value)) for _, value in traced_parameters(block))
@@ -229,8 +263,10 @@ def _reads_sample_time(block: Block, trace: Traced) -> bool:
 
 def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, shared: dict[Any, Traced]) -> Traced:
     frame = table.frame_of[path]
-    sampled, method = table.sampled(frame), table.frames[frame].method
+    sampled, method, rate = table.sampled(frame), table.method(frame), table.rate(frame)
     try:
+        if rate is not None and isinstance(block, SampleTimeOfFrame):
+            block.check_rate(float(rate))
         return trace(block, shapes, sampled=sampled, method=method, cache=shared)
     except LoopwrightError as error:
         error.block = path

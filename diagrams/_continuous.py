@@ -61,9 +61,14 @@ class Continuous:
         self.delays = delays_of(flat)
         self._flow, self._jacobian = machine.flow(), None
         problem = Problem(self.where.size, self._rate, self._slope, state_names(flat))
+        self.time_scale = _time_scale(flat)
         longest = max_step
+        if longest is None and _remembers(flat):
+            longest = float(flat.base)  # what is remembered is renewed at accepted steps, and must not grow stale
+        if longest is None and self.time_scale < math.inf:
+            longest = 5.0 * self.time_scale  # else a step may fit whole periods of a source
         if self.delays is not None:
-            longest = min(max_step or math.inf, self.delays.shortest)
+            longest = min(longest or math.inf, self.delays.shortest)
         self.solver = make_solver(
             solver,
             problem,
@@ -83,13 +88,13 @@ class Continuous:
         self.domains: Domains | None = None
         if flat.events:
             self._indicators, self._opened = machine.indicators()
-            self.domains = Domains(flat, self._g, self._opened)
+            self.domains = Domains(flat, self._g, self._opened, self.time_scale)
             self._jump, self._fired = machine.jump()
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
             self._drive = machine.plain(driven_function(flat), [self._driven], machine.trial)
         self.sources = [
-            flat.table.blocks[path]
+            (path, flat.table.blocks[path])
             for path in sorted(flat.checked.traced)
             if not flat.table.sampled(flat.table.frame_of[path])
             and type(flat.table.blocks[path]).next_instant is not Block.next_instant
@@ -101,10 +106,15 @@ class Continuous:
         t = self._left if t >= self._edge else t
         if self.delays is not None:
             self.delays.outputs_at(t, self.machine.trial.w)
+        if self._loops:  # whatever was tried in between: Newton's method starts from the last accepted solution
+            self.machine.trial.x[self._loops] = self.machine.here.x[self._loops]
         return t
 
     def _rate(self, t: float, x: np.ndarray) -> np.ndarray:
-        rates = self._flow(self._time(t), x)
+        try:
+            rates = self._flow(self._time(t), x)
+        except SimulationError:  # a loop without a solution: the solver shortens the step, if it can
+            rates = np.full(self.where.size, math.nan)
         if not np.isfinite(rates).all():
             self.beyond = (t, x.copy())
         return rates
@@ -141,8 +151,8 @@ class Continuous:
         self._put(t, x)
         try:
             self.machine.look()
-        except SimulationError:
-            return None
+        except SimulationError as error:
+            return error
         return None if self.machine.ok[0] else failure(self.machine, NOTHING).at(t=t)  # type: ignore[return-value]
 
     def _inputs_of_delays(self, t: float, x: np.ndarray) -> np.ndarray:
@@ -314,7 +324,7 @@ class Continuous:
     """Whether a stop condition is true in what was evaluated last; set by the run."""
 
     def _next_edge(self, t: float) -> float:
-        self._sources_edge = min((source.next_instant(t) for source in self.sources), default=math.inf)
+        self._sources_edge = min((_next_instant(path, source, t) for path, source in self.sources), default=math.inf)
         return min(self._sources_edge, math.inf if self.delays is None else self.delays.next_edge(t))
 
     # --- saved states ------------------------------------------------------------------------------------------------
@@ -334,6 +344,27 @@ class Continuous:
         if self.delays is not None and saved["delays"] is not None:
             self.delays.restore(saved["delays"])
         recall(self.solver, saved["solver"])
+
+
+def _next_instant(path: str, block: Block, t: float) -> float:
+    """Return the next instant of a block; one that does not come after t would keep the run where it is."""
+    try:
+        found = block.next_instant(t)
+        later = found > t
+    except Exception as error:
+        raise SimulationError(
+            f"its next_instant({t!r}) failed: {type(error).__name__}: {error}. Expected a time after that, or math.inf "
+            "if there is none.",
+            block=path,
+            t=t,
+        ) from error
+    if not later:
+        raise SimulationError(
+            f"its next_instant({t!r}) is {found!r}; expected a time after that, or math.inf if there is none.",
+            block=path,
+            t=t,
+        )
+    return found
 
 
 _MEMORY = ("planned", "_hits", "_misses", "_easy")
@@ -359,6 +390,19 @@ def recall(solver: Any, kept: dict[str, Any]) -> None:
                 recall(method, kept["methods"][method.name])
             if method.name == kept["active"]:
                 solver._active = method
+
+
+def _time_scale(flat: FlatDiagram) -> float:
+    """Return the shortest time within which a source in a continuous frame changes."""
+    table = flat.table
+    paths = (p for p in flat.checked.traced if not table.sampled(table.frame_of[p]))
+    return min((float(table.blocks[p].time_scale()) for p in paths), default=math.inf)
+
+
+def _remembers(flat: FlatDiagram) -> bool:
+    """Whether a block in a continuous frame has a memory, such as a projection's last foot point."""
+    table = flat.table
+    return any(table.blocks[p].memory and not table.sampled(table.frame_of[p]) for p in flat.checked.traced)
 
 
 def state_names(flat: FlatDiagram) -> list[str]:

@@ -254,7 +254,7 @@ class Diagram(Analysis):
         step : float or Fraction, optional
             Seconds between two ticks (samples, steps of a solver of fixed step, communication points of FMUs). Without
             one it is the greatest common divisor of all sample times, of which those are visited at which a box acts;
-            for a diagram that is continuous only, a thousandth of the duration.
+            for a diagram without any, a thousandth of the duration.
         solver : str
             What integrates continuous states: "auto", of fixed step "euler", "heun", "rk4", of variable step "RK23",
             "RK45", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams". The default changes from an explicit

@@ -40,9 +40,9 @@ def default_step(diagram: Diagram, step: Any, duration: float | None, solver: st
     """Return the seconds between two samples of a run that has neither a ``step`` nor a clock.
 
     That of the run that is gone on from; else a thousandth of the duration, in whole nanoseconds where it has them,
-    where the diagram is continuous, has no FMU and the solver chooses its own steps.
+    where the diagram has no FMU and the solver chooses its own steps.
     """
-    if step is not None or not diagram.is_continuous or diagram.has_clock:
+    if step is not None or diagram.has_clock:
         return step
     if start is not None and hasattr(start, "base"):
         return start.base

@@ -2,9 +2,10 @@
 
 An indicator is in one of two domains, z > 0 or z ≤ 0 (with a hysteresis δ it leaves the first at z ≤ −δ, the second at
 z > δ). A change in the declared direction fires. Changes are looked for at a few instants inside each step of the
-solver, no further apart than two ticks, and, after an event, at instants that come geometrically closer to it; each is
-then located on the step's dense output with Brent's method, to the resolution of floating point, on the side where the
-domain has changed.
+solver, no further apart than two ticks or a source's time scale, and, after an event, at instants that come
+geometrically closer to it; an indicator that is closest to zero between two of them is followed to where it is closest;
+each is then located on the step's dense output with Brent's method, to the resolution of floating point, on the side
+where the domain has changed.
 """
 
 from __future__ import annotations
@@ -21,17 +22,25 @@ from ._flat import FlatDiagram
 
 _SAMPLES = 4
 _HALVINGS = 40
+_CLOSE = 1e-3
 _SAME_INSTANT = 100  # events that fire each other at one instant
 _CHATTER, _SPAN = 500, 1e-8  # so many events within so many seconds (relative to 1 + |t|)
-_ZENO, _SHRUNK = 8, 1e-7  # intervals that shrink by one ratio, down to this part of the largest one
+_ZENO, _SHRUNK = 8, 1e-6  # intervals that shrink from one to the next, down to this part of the largest one
 
 
 class Domains:
     """The domains of all indicators, and the events that changes of them fire."""
 
-    def __init__(self, flat: FlatDiagram, g: Callable[[float, np.ndarray], np.ndarray], opened: np.ndarray):
+    def __init__(
+        self,
+        flat: FlatDiagram,
+        g: Callable[[float, np.ndarray], np.ndarray],
+        opened: np.ndarray,
+        time_scale: float = math.inf,
+    ):
         self.events, self._g, self._open = flat.events, g, opened
-        self._spacing = float(flat.base)
+        self._spacing = min(float(flat.base), time_scale)
+        self._finest = 2e-16 * self._spacing
         self.rising = np.array([e.direction != "falling" for e in flat.events])
         self.falling = np.array([e.direction != "rising" for e in flat.events])
         self._hysteresis = np.array([e.hysteresis for e in flat.events])
@@ -43,7 +52,11 @@ class Domains:
         self._recent = deque[tuple[float, tuple[int, ...]]](maxlen=_CHATTER)
 
     def _domains(self, t: float, x: np.ndarray, before: np.ndarray) -> np.ndarray:
-        now = self._g(t, x) > np.where(before, -self._hysteresis, self._hysteresis)
+        return self._taken(self._g(t, x), before)
+
+    def _taken(self, z: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """Return the domains at the values z of the indicators that were evaluated last."""
+        now = z > np.where(before, -self._hysteresis, self._hysteresis)
         return np.where(self._open > 0.5, now, before)  # what a closed box holds, this too
 
     def begin(self, t: float, x: np.ndarray) -> None:
@@ -77,21 +90,66 @@ class Domains:
             The continuous states at a time within the step.
         """
         a = t_old
+        seen = [(t_old, self._values(t_old, state), self.above)]  # the last two instants, indicators and domains there
         for b in self._instants(t_old, t_new):
-            x = state(b)
-            now = self._domains(b, x, self.above)
+            z = self._values(b, state)
+            now = self._taken(z, self.above)
             fires = self._fires(self.above, now)
-            if fires.any():
-                times = [self._root(int(i), a, b, state) for i in np.flatnonzero(fires)]
-                t = min(times)
-                now = self._domains(t, state(t), self.above)
-                fired = self._fires(self.above, now)
+            ends = [(int(i), a, b) for i in np.flatnonzero(fires)]
+            if len(seen) > 1:
+                ends += self._excursions(seen, b, z, now, state)
+            if ends:
+                t = min(self._root(i, low, high, state) for i, low, high in ends)
+                before = next(above for at, _, above in reversed([*seen, (math.inf, z, now)]) if at <= t)
+                now = self._domains(t, state(t), before)
                 self.above = now
-                return t, fired
+                return t, self._fires(before, now)
             self.above = now
+            seen = [seen[-1], (b, z, now)]
             a = b
         self.fresh = False
         return None
+
+    def _excursions(
+        self, seen: list[Any], b: float, z: np.ndarray, now: np.ndarray, state: Callable[[float], np.ndarray]
+    ) -> list[tuple[int, float, float]]:
+        """Return the indicators that go to the other domain and back between three instants, and where to look.
+
+        Where the middle one is closest to zero, the parabola through the three tells how close it may come in between.
+        """
+        (first, z0, above0), (middle, z1, above1) = seen
+        if not first < middle < b:
+            return []
+        size0, size1, size2 = np.abs(z0), np.abs(z1), np.abs(z)
+        near = (size1 <= size0) & (size1 <= size2) & (above0 == above1) & (above1 == now)
+        found = []
+        for i in np.flatnonzero(near):
+            h0, h1 = middle - first, b - middle
+            slope0, slope1 = (z1[i] - z0[i]) / h0, (z[i] - z1[i]) / h1
+            bend = (slope1 - slope0) / (h0 + h1)
+            if bend == 0.0 or not math.isfinite(bend):
+                continue
+            tangent = slope0 + bend * h0
+            lowest = z1[i] - tangent * tangent / (4.0 * bend)
+            if (lowest > 0.0) == (z1[i] > 0.0) and abs(lowest) > 0.3 * max(size0[i], size2[i]):
+                continue
+            t = self._closest(int(i), first, b, state)
+            if self._taken(self._values(t, state), above1)[i] != above1[i] and first < t < b:
+                found.append((int(i), first, t))
+        return found
+
+    def _closest(self, i: int, low: float, high: float, state: Callable[[float], np.ndarray]) -> float:
+        """Return the instant at which an indicator is closest to the other domain."""
+        from scipy.optimize import minimize_scalar
+
+        sign = 1.0 if self.above[i] else -1.0
+        best = minimize_scalar(
+            lambda t: sign * self._values(t, state)[i], bounds=(low, high), method="bounded", options={"xatol": 0.0}
+        )
+        return float(best.x)
+
+    def _values(self, t: float, state: Callable[[float], np.ndarray]) -> np.ndarray:
+        return np.array(self._g(t, state(t)))
 
     def _instants(self, a: float, b: float) -> Iterator[float]:
         n = max(_SAMPLES, math.ceil((b - a) / self._spacing))
@@ -101,8 +159,12 @@ class Domains:
                 t = a + h * 0.5**k
                 if a < t < a + h:
                     yield t
+        elif a + _CLOSE * h > a:
+            yield a + _CLOSE * h  # these two tell which way it goes at the ends
         for i in range(1, n):
             yield a + i * h
+        if b - _CLOSE * h < b:
+            yield b - _CLOSE * h
         yield b
 
     def _root(self, i: int, a: float, b: float, state: Callable[[float], np.ndarray]) -> float:
@@ -121,14 +183,14 @@ class Domains:
             return a
         if za == 0.0 or not za * zb < 0.0:
             low, high = a, b
-            while high - low > 4 * math.ulp(high):
+            while high - low > max(4 * math.ulp(high), self._finest):
                 middle = 0.5 * (low + high)
                 low, high = (low, middle) if is_changed(middle) else (middle, high)
             return high
         from scipy.optimize import brentq
 
-        t = float(brentq(z, a, b, xtol=4 * math.ulp(max(abs(a), abs(b))), rtol=1e-15, maxiter=200))
-        step = math.ulp(t)
+        t = float(brentq(z, a, b, xtol=max(4 * math.ulp(max(abs(a), abs(b))), self._finest), rtol=1e-15, maxiter=200))
+        step = max(math.ulp(t), self._finest)
         while t < b and not is_changed(t):
             t, step = min(b, t + step), 2 * step
         return t
@@ -170,9 +232,8 @@ class Domains:
         intervals = np.diff(np.array(times))
         if not np.all(intervals > 0.0) or intervals[-1] > _SHRUNK * self._largest[i]:
             return
-        ratios = intervals[1:] / intervals[:-1]
-        r = float(np.median(ratios))
-        if r < 1.0 and np.all(np.abs(ratios - r) < 0.05 * max(r, 1.0 - r, 0.2)):
+        r = float((intervals[-1] / intervals[0]) ** (1.0 / (len(intervals) - 1)))
+        if r < 0.9999 and np.all(intervals[1:] < 1.5 * intervals[:-1]):  # by one ratio, but for what the solver adds
             event, t = self.events[i], times[-1]
             limit = t + intervals[-1] * r / (1.0 - r)
             raise SimulationError(

@@ -106,6 +106,19 @@ class FlatDiagram:
         """Return the clocks that tick at tick ``k``."""
         return frozenset(c for c in self.distinct if c.acts(k))
 
+    def taken_at(self, acting: frozenset[Clock]) -> np.ndarray:
+        """Return the entries of x that a tick renews at which the given clocks act: what sampled boxes keep."""
+        key = ("taken", acting)
+        if key in self._slices:
+            return self._slices[key]  # type: ignore[no-any-return]
+        owners = [(where, name) for part in (self.states, self.starts) for name, where in part.slices.items()]
+        owners += [(where, self.ports[name][0]) for name, where in self.held.slices.items()]
+        frames = [(where, self.table.frame_of[path]) for where, path in owners]
+        frames += [(where, box) for box, where in self.gates.slices.items()]
+        found = [np.arange(w.start, w.stop) for w, frame in frames if self.clocks.get(frame) in acting]
+        self._slices[key] = np.concatenate([*found, np.zeros(0, dtype=int)])
+        return self._slices[key]  # type: ignore[no-any-return]
+
     def ticks(self, k: int, last: int, *, every: bool) -> Iterator[int]:
         """Yield the ticks to visit after tick ``k``: all, or those at which something acts, and the last one."""
         if every or not self.distinct or Clock() in self.distinct:

@@ -155,7 +155,7 @@ class Machine:
         """Return the call that solves the algebraic loops at some vectors; None where there are none.
 
         Newton's method with the exact derivative, started from the last solution; a step that makes the residual larger
-        is halved.
+        is halved, and on, as long as that helps.
         """
         if not self.looped:
             return None
@@ -176,9 +176,9 @@ class Machine:
         def solve() -> None:
             call()
             v = x[where]
-            found = size_of(r, v)
+            size = float(np.linalg.norm(r))
             for _ in range(_ITERATIONS):
-                if not found > _ROUNDING:
+                if not size_of(r, v) > _ROUNDING:
                     break
                 try:
                     direction = np.linalg.solve(J.reshape(n, n, order="F"), r)
@@ -186,19 +186,25 @@ class Machine:
                     break
                 if not np.all(np.isfinite(direction)):
                     break
-                better, step = found, 1.0
+                best, step = 0.0, 1.0  # the mismatch itself must shrink: relative to values that run away, any would
                 for _ in range(30):
                     x[where] = v - step * direction
                     call()
-                    better = size_of(r, x[where])
-                    if better < found:
+                    now = float(np.linalg.norm(r))
+                    if now < size:
+                        best, size = step, now
+                    elif best:
+                        break
+                    if best == 1.0:
                         break
                     step *= 0.5
-                if not better < found:  # no further: at the level of rounding, or stuck
-                    x[where] = v
+                if best != step:
+                    x[where] = v - best * direction  # the best one; 0 at the level of rounding, or where it is stuck
                     call()
+                if not best:
                     break
-                v, found = x[where], better
+                v = x[where]
+            found = size_of(r, x[where])
             if not found <= TOLERANCE and math.isfinite(found):  # a NaN that comes in is told by who made it
                 raise self.unsolved(found, float(vectors.t[0]))
 

@@ -117,6 +117,9 @@ class Pass:
         for box in self.flat.gates.slices:
             if self._acts(box):
                 self.is_open(box)  # one without blocks of its own remembers, too
+        for path in flat.starts.slices:  # what has another rate than the box that resets it
+            if not acts[path] and any(self._resets(box) for box in table.gates(table.frame_of[path])):
+                self.new[path] = self._state(path)
         return self
 
     def _acts(self, frame: str) -> bool:
@@ -189,8 +192,8 @@ class Pass:
             return self._gate[box]
         table, frame = self.flat.table, self.flat.table.frames[box]
         last = rows(self.x, self.flat.gates.slices[box])
-        if (box, "enable") in self._events:
-            gate = above(last)
+        if (box, "enable") in self._events or not self._acts(box):
+            gate = above(last)  # blocks of another rate in it go by its last tick
         elif (box, "trigger") in self._events:
             i = self._events[box, "trigger"]
             gate = False if self.fired is None else above(self.fired[i : i + 1])
@@ -215,11 +218,17 @@ class Pass:
         state = rows(self.x, flat.states.slices[path])
         if path not in flat.starts.slices or self.opened:
             return state
+        outer: Any = True
         for box in flat.table.gates(flat.table.frame_of[path]):
-            if flat.table.frames[box].when == "reset" and (box, "enable") not in self._events:
-                entering = both(self.is_open(box), negated(above(rows(self.x, flat.gates.slices[box]))))
+            outer = both(outer, self.is_open(box))
+            if self._resets(box):
+                entering = both(outer, negated(above(rows(self.x, flat.gates.slices[box]))))
                 state = choose(entering, rows(self.x, flat.starts.slices[path]), state)
         return state
+
+    def _resets(self, box: str) -> bool:
+        """Whether states may start anew at this instant because a box, not by an event, is enabled."""
+        return self.flat.table.frames[box].when == "reset" and (box, "enable") not in self._events and self._acts(box)
 
 
 def above(value: Any) -> Any:

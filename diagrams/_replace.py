@@ -87,7 +87,7 @@ def _changed_box(frame: Frame, what: str, value: Any) -> Frame:
     new, path = value, frame.path
     if what == "sample_time" and value is not None:
         new = exact_time(value, block=path)
-    elif what == "method":
+    elif what == "method" and value is not None:
         check_method(value)
     elif what == "offset":
         new = exact_offset(value, frame.sample_time, block=path)

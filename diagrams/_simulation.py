@@ -10,15 +10,14 @@ which a box acts, or every tick where there is an FMU, a ``step``, or a solver o
 
 1. The outputs of the FMUs are those at the end of their last step: a co-simulation FMU has no feedthrough between
    communication points (FMI 3.0, Step Mode). The continuous states are what the solver arrived at, from the left.
-2. If the instant is a tick: all blocks are evaluated once, each port after what it depends on (`_order`). A box acts if
-   its clock ticks and whatever enables or triggers it says so. The next states of sampled blocks, and what is held,
-   take effect.
-3. Discontinuities of sources in time (a step, an edge of a pulse) are in what was just evaluated: a source's value at t
-   is its value from the right.
-4. Indicators of events are looked at. Those that have changed their domain fire, all together: each jump sees the
+2. Discontinuities of sources in time (a step, an edge of a pulse) take effect: a source's value at t is its value from
+   the right.
+3. Indicators of events are looked at. Those that have changed their domain fire, all together: each jump sees the
    instant before all of them. Then they are looked at again, until none fires. The same happens between ticks wherever
-   the solver finds a change; such an instant has no step 2. A box that is enabled or triggered in continuous time is
-   such an event.
+   the solver finds a change. A box that is enabled or triggered in continuous time is such an event.
+4. If the instant is a tick: all blocks are evaluated once, each port after what it depends on (`_order`). A box acts if
+   its clock ticks and whatever enables or triggers it says so. The next states of sampled blocks, and what is held,
+   take effect. Then point 3 is gone through again, for what the boxes have changed.
 5. What is to be recorded is evaluated and recorded: the values from the right, after all events.
 6. A stop condition that is true ends the run; nothing steps beyond.
 7. The continuous states go on to the next tick, with everything sampled and the FMUs' outputs held; then the inputs of
@@ -63,7 +62,7 @@ from ._recording import Recording
 from ._run import Run
 from ._sampled import CHUNK, run_ticks
 from ._start import initialize
-from ._state import RunState, check_fits, layout_of
+from ._state import RunState, check_fits, layout_of, not_open
 from ._stored import Occurrence, Stopped
 from ._structure import join
 
@@ -147,6 +146,7 @@ class Simulation:
         self._stops = self._stop_ports()
         self._tick, self._count, self._elapsed, self._begun = 0, 0, 0.0, False
         self._stopped: Stopped | None = None
+        self._open: bool | None = None  # until it begins; False once it has ended
         self._recorder = self._new_recorder()
 
     # --- what belongs to it ------------------------------------------------------------------------------------------
@@ -167,16 +167,21 @@ class Simulation:
     # --- life --------------------------------------------------------------------------------------------------------
 
     def __enter__(self) -> Simulation:
+        if self._open is not None:
+            raise not_open(self._open, self.diagram.name)
         try:
+            self._open = True
             self._load()
             self._stack.push(self._finish)
             self._begin()
         except BaseException:
+            self._open = False
             self._stack.__exit__(*sys.exc_info())
             raise
         return self
 
     def __exit__(self, *error: Any) -> None:
+        self._open = False
         self._stack.__exit__(*error)
 
     def _load(self) -> None:
@@ -240,8 +245,10 @@ class Simulation:
         SimulationError
             See `Diagram.simulate`; ``error.run`` holds what was recorded until then.
         OptionError
-            A duration that is not positive, or no multiple of the step.
+            A duration that is not positive, or no multiple of the step; a run that has not begun, or has ended.
         """
+        if not self._open:
+            raise not_open(self._open, self.diagram.name)
         last = self._tick + ticks_in(duration, self.flat.base, self.diagram.name)
         started = time.perf_counter()
 
@@ -286,7 +293,7 @@ class Simulation:
         """Run ticks up to ``last`` with a solver between them."""
         continuous = self._continuous
         assert continuous is not None
-        clocks, count = self.flat.distinct, 0
+        clocks, count, width = self.flat.distinct, 0, float(self.flat.base)
         while self._tick < last:
             k = self._tick
             every = continuous.fixed or self._plants
@@ -306,7 +313,7 @@ class Simulation:
                 self._note_stop(ended)
                 return
             for _, plant in self._plants:
-                plant.step(now, self.time_of(following) - now)
+                plant.step(now, width)
             self._at_tick(following)
             if self._stopped is not None:
                 return
@@ -322,6 +329,8 @@ class Simulation:
         acting = self.flat.acting(k)
         if continuous is not None:
             continuous.at(now)
+            if k > 0 and acting:
+                continuous.settle(now)  # what changes by itself at this instant, boxes see changed
         machine.tick(acting)()
         if not machine.ok[0]:
             raise failure(machine, acting).at(t=now)
@@ -330,8 +339,10 @@ class Simulation:
             continuous.at(now)
             if (acting or self._plants) and continuous.delays is not None:
                 continuous.delays.edge(now)  # what is held has jumped
+            before = machine.log[self.flat.log.total :].copy()
             if continuous.settle(now):
-                machine.look()
+                taken = self.flat.taken_at(acting)
+                machine.log[self.flat.log.total :][taken] = before[taken]
         self._recorder.row(now, machine.log)
         self._tick = k
         self._ended()
@@ -411,7 +422,8 @@ class Simulation:
     @property
     def can_save(self) -> bool:
         """Whether the complete state can be saved: every FMU can turn its state into bytes."""
-        return self._begun and all(plant.can_serialize and not plant.failed for _, plant in self._plants)
+        begun = self._begun and (self._open or not self._plants)
+        return begun and all(plant.can_serialize and not plant.failed for _, plant in self._plants)
 
     def save(self) -> RunState:
         """Return the complete state at this tick, that of the FMUs included.
@@ -420,7 +432,11 @@ class Simulation:
         ------
         FmuError
             If an FMU can't save its state, or can't turn it into bytes.
+        OptionError
+            If the run has not begun, or has ended and its FMUs are freed.
         """
+        if not self._begun or (self._plants and not self._open):
+            raise not_open(self._open, self.diagram.name)
         machine = self._machine
         return RunState(
             t=self.t if self._stopped is None else self._stopped.t,
@@ -443,8 +459,11 @@ class Simulation:
         Raises
         ------
         OptionError
-            If it is no state of such a diagram: another base, other blocks or states.
+            If it is no state of such a diagram: another base, other blocks or states. If the run has not begun, or has
+            ended.
         """
+        if not self._open:
+            raise not_open(self._open, self.diagram.name)
         check_fits(state, self.flat, self.diagram.name)
         machine = self._machine
         for path, plant in self._plants:

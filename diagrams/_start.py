@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from ..blocks._equations import initial_state
-from ..blocks._errors import LoopwrightError, SimulationError
+from ..blocks._errors import LoopwrightError, NonFiniteError, SimulationError
 from ..blocks._symbols import bundle
 from ._failures import failure, inputs_text, shaped_inputs
+from ._flat import FlatDiagram
 from ._machine import Machine
 from ._pass import Pass, above
 
@@ -63,6 +64,8 @@ def _states(machine: Machine) -> None:
             block, trace = blocks[path], flat.checked.traced[path]
             if block.starts_from_inputs and path not in ready:
                 ready.add(path)
+                for port, column in inputs.items():
+                    _check_finite(flat, path, port, column)
                 u = bundle("u", shaped_inputs(trace, inputs))
                 x[flat.states.slices[path]] = _initial(path, block, u, trace.states)
 
@@ -71,6 +74,22 @@ def _states(machine: Machine) -> None:
         ).run()
     for path, where in flat.starts.slices.items():
         x[where] = x[flat.states.slices[path]]
+
+
+def _check_finite(flat: FlatDiagram, path: str, port: str, column: Any) -> None:
+    """Refuse to start a block from an input that is not finite: whoever made that is to blame."""
+    wire = flat.table.wires.get((path, port))
+    if column is None or wire is None:
+        return
+    values = np.ravel(np.array(column, dtype=float))
+    if not np.all(np.isfinite(values)):
+        raise NonFiniteError(
+            f"found {values.tolist()} at the start; expected finite numbers, since {path}.{port} begins with it. Look "
+            "for a division by zero, or a root or a logarithm of a negative number.",
+            block=wire.block,
+            port=wire.port,
+            t=0.0,
+        )
 
 
 def _boxes(machine: Machine) -> None:
@@ -82,11 +101,8 @@ def _boxes(machine: Machine) -> None:
     for name, column in done.held.items():
         where = flat.held.slices[name]
         x[where] = np.ravel(np.array(column))
-    events = {(e.path, e.name) for e in flat.events}
     for box, where in flat.gates.slices.items():
-        now = float(above(done.control(box)))
-        discrete_enable = flat.table.frames[box].control == "enabled" and (box, "enable") not in events
-        x[where] = 1.0 if discrete_enable else now  # at its first tick an enabled box has its start values anyway
+        x[where] = float(above(done.control(box)))
 
 
 def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]]) -> np.ndarray:

@@ -87,3 +87,13 @@ def check_fits(state: RunState, flat: FlatDiagram, name: str) -> None:
                     block=name,
                     port="start",
                 )
+
+
+def not_open(opened: bool | None, name: str) -> OptionError:
+    """Return the error of a run that is used before it has begun (``opened`` is None), or after it has ended."""
+    found = "has not begun" if opened is None else "has ended, and its FMUs are freed"
+    return OptionError(
+        f"this run {found}; expected it to be used inside of its with statement, once: with diagram.simulation(…) as "
+        "simulation: …. To go on later, keep simulation.save() and give it as start=….",
+        block=name,
+    )

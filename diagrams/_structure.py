@@ -24,6 +24,8 @@ class Frame:
     ----------
     sample_time : Fraction or None
         Its own, in s; None where it has the rate of what surrounds it.
+    method : str or None
+        How continuous blocks in it are discretized; None: as in what surrounds it, see `Structure.method`.
     offset : Fraction
         Time of its first tick in s, of a box with a sample time.
     delay : int
@@ -37,7 +39,7 @@ class Frame:
 
     path: str
     sample_time: Fraction | None
-    method: str
+    method: str | None
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
     offset: Fraction = Fraction(0)
@@ -71,6 +73,8 @@ class Structure:
     names: dict[str, Wire] = field(default_factory=dict)
     controls: dict[str, Wire] = field(default_factory=dict)
     """The source of what enables or triggers a subsystem, by the subsystem's path."""
+    handed: dict[tuple[str, str], tuple[tuple[str, str], ...]] = field(default_factory=dict)
+    """For an input: the boxes, with their outputs, that its signal comes out of though nothing in them makes it."""
 
     def clock(self, frame: str) -> Frame | None:
         """Return the frame whose sample time holds in a frame: itself, or the nearest one around it."""
@@ -78,6 +82,12 @@ class Structure:
             frame = frame.rpartition(".")[0]
         found = self.frames[frame]
         return None if found.sample_time is None else found
+
+    def method(self, frame: str) -> str:
+        """Return how continuous blocks in a frame are discretized: by its own method, or the nearest one around it."""
+        while frame and self.frames[frame].method is None:
+            frame = frame.rpartition(".")[0]
+        return self.frames[frame].method or "exact"
 
     def rate(self, frame: str) -> Fraction | None:
         """Return the sample time that holds in a frame, None where it is continuous."""
@@ -269,7 +279,13 @@ class Collector:
             table.frame_of[paths[key]] = frames[key]
         for key, call in self.calls.items():
             for port, signal in call.wires.items():
-                table.wires[paths[key], port] = _resolve(signal, paths)
+                crossed: list[tuple[SubsystemCall, str]] = []
+                wire = table.wires[paths[key], port] = _resolve(signal, paths, crossed)
+                maker = f"{table.frame_of[wire.block]}."
+                outputs = [(box_path(box), output) for box, output in crossed]
+                handed = tuple((box, output) for box, output in outputs if not maker.startswith(f"{box}."))
+                if handed:
+                    table.handed[paths[key], port] = handed
         for box in self.boxes.values():
             if box.subsystem.control:
                 table.controls[box_path(box)] = _resolve(box.wires[box.subsystem.control_input], paths)
@@ -299,14 +315,16 @@ def _common(frames: list[str]) -> str:
     return ".".join(common)
 
 
-def _resolve(signal: Signal, paths: dict[int, str]) -> Wire:
-    """Follow a signal through subsystem borders to the block that makes it."""
+def _resolve(signal: Signal, paths: dict[int, str], crossed: list[tuple[SubsystemCall, str]] | None = None) -> Wire:
+    """Follow a signal through subsystem borders to its block; ``crossed`` takes the outputs of boxes on the way."""
     index = signal.index
     while True:
         if isinstance(signal.source, FrameInput):
             inner = signal.source.frame.wires[signal.source.port]
         elif isinstance(signal.source, SubsystemCall):
             inner = signal.source.results[signal.port]
+            if crossed is not None:
+                crossed.append((signal.source, signal.port))
         else:
             return Wire(paths[id(signal.source)], signal.port, index)
         if index is not None and inner.index is not None:

@@ -92,14 +92,15 @@ class Subsystem:
         function: Callable[..., Any],
         *,
         sample_time: Any = None,
-        method: str = "exact",
+        method: str | None = None,
         name: str | None = None,
         offset: Any = 0,
         delay: int = 0,
         enabled: str | None = None,
         triggered: str | None = None,
     ):
-        check_method(method)
+        if method is not None:
+            check_method(method)
         self.function, self.method = function, method
         own = getattr(function, "__name__", "")  # a functools.partial has none, a lambda no identifier
         own = own if own.isidentifier() else "subsystem"
@@ -245,7 +246,7 @@ def subsystem(function: Callable[..., Any], /) -> Subsystem: ...
 def subsystem(
     *,
     sample_time: float | Fraction | None = None,
-    method: str = "exact",
+    method: str | None = None,
     name: str | None = None,
     offset: float | Fraction = 0,
     delay: int = 0,
@@ -257,7 +258,7 @@ def subsystem(
     /,
     *,
     sample_time: float | Fraction | None = None,
-    method: str = "exact",
+    method: str | None = None,
     name: str | None = None,
     offset: float | Fraction = 0,
     delay: int = 0,
@@ -275,6 +276,7 @@ def subsystem(
         How continuous blocks inside are discretized: ``exact`` is the zero-order hold for blocks that are linear in
         their states, forward Euler for others; ``trapezoidal`` is of second order, solved by Newton's method where a
         block is not linear, and the run stops at a step that it does not solve; see `loopwright.blocks.hold`.
+        Without one it is that of the box around, or ``exact``.
     name : str, optional
         Name of the box; without one, the function's.
     offset : float or Fraction
@@ -285,7 +287,8 @@ def subsystem(
         inputs then. In the first ticks it is what was computed first.
     enabled : {"held", "reset"}, optional
         The box is called with one more input, ``enable``, and acts only while that is true (above 0.5). Else its
-        outputs and states are held; with "reset" the states start anew when it is enabled again.
+        outputs and states are held; with "reset" the states start anew when it is enabled again. With a sample time it
+        looks at its own ticks, and boxes of other rates in it go by the last one.
     triggered : {"rising", "falling", "both"}, optional
         The box is called with one more input, ``trigger``, and acts only at the instants at which that becomes true
         (rising), false (falling), or either. Between them its outputs are held. Blocks inside have no sample time.

@@ -15,7 +15,6 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from ..blocks._errors import ShapeError
@@ -198,9 +197,10 @@ def delays_of(flat: FlatDiagram) -> Delays | None:
             ) from None
     outputs = [flat.plant_outputs.slices[join(p, "y")] for p in paths]
     delays = Delays([b.delay for b in blocks], inputs, outputs, starts)
-    f = driven_function(flat)
-    through = np.array(ca.DM(f.jac_sparsity(0, 2), 1.0)) != 0.0
-    delays.smoothed = not (flat.loops.slices or any(through[i, o].any() for i in inputs for o in outputs))
+    rows, columns = driven_function(flat).jac_sparsity(0, 2).get_triplet()
+    into, out = (np.concatenate([np.arange(s.start, s.stop) for s in part]) for part in (inputs, outputs))
+    straight = bool(np.any(np.isin(rows, into) & np.isin(columns, out)))  # from one delay into another one, or itself
+    delays.smoothed = not (flat.loops.slices or straight)
     return delays
 
 

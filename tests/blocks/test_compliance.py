@@ -5,6 +5,7 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from loopwright.blocks import AdmittanceFilter, Block, Constant, Output, ParameterError
@@ -153,38 +154,111 @@ def test_at_rest_under_a_constant_force_it_brakes_at_the_limit_and_stays_there()
 # --- continuous -------------------------------------------------------------------------------------------------------
 
 
-def rates_by_hand(m, d, k, e, reference, drive, velocity_limit=np.inf, acceleration_limit=np.inf):
-    """(e', e'') in continuous time: the acceleration of the path reference is cut, and never leads out of a speed limit."""
-    _, r1, r2 = reference
-    a = np.clip(r2 + (drive - d * e[1] - k * e[0]) / m, -acceleration_limit, acceleration_limit)
-    v = r1 + e[1]
-    if (v >= velocity_limit and a > 0) or (v <= -velocity_limit and a < 0):
-        a = 0.0
+def rates_by_hand(m, d, k, e, reference, drive, held, acceleration_limit=np.inf):
+    """(e', e'') in continuous time: the acceleration of the path reference is cut, and zero at a speed limit."""
+    _, _, r2 = reference
+    a = 0.0 if held else np.clip(r2 + (drive - d * e[1] - k * e[0]) / m, -acceleration_limit, acceleration_limit)
     return np.array([e[1], a - r2])
 
 
 @EVERY
 @EACH
-def test_in_continuous_time_the_acceleration_is_cut_and_never_leads_out_of_the_speed_limit(limits, m, d, k):
+def test_in_continuous_time_the_acceleration_is_cut_and_zero_at_the_speed_limit(limits, m, d, k):
+    """With a speed limit the states are the path reference itself, else the deviation from the reference."""
     rng = np.random.default_rng(22)
     continuous, cut, stopped = equations(AdmittanceFilter(mass=m, damping=d, stiffness=k, **limits), None), 0, 0
+    has_speed, most = "velocity_limit" in limits, limits.get("acceleration_limit", np.inf)
     for i in range(300):
-        e, reference = rng.normal(0, (0.05, 0.15)), rng.normal(0, (0.5, 0.15, 1.0))
-        if i % 3 == 0 and "velocity_limit" in limits:  # exactly at the limit
-            side = rng.choice([-1.0, 1.0])
-            e[1], reference[1] = 0.25 * side, 0.3 * side - 0.25 * side
+        e, reference = rng.normal(0, (0.05, 0.03)), rng.normal(0, (0.5, 0.03, 1.0))
+        held = has_speed and i % 3 == 0
+        if held:
+            e[1] = 0.3 * rng.choice([-1.0, 1.0]) - reference[1]
         force, desired, offset = rng.normal(0, m * 2.0), rng.normal(0, m), rng.normal(0, 0.02)
-        row, rates = continuous((*e, 0.0), reference, force, desired, offset)
+        state = (*(e + reference[:2]), 1.0 + held) if has_speed else (*e, 0.0)
+        row, rates = continuous(state, reference, force, desired, offset)
         drive = force - desired + k * offset
-        want = rates_by_hand(m, d, k, e, reference, drive, **limits)
-        np.testing.assert_allclose(rates[:2], want, rtol=1e-12, atol=1e-12)
-        if abs(reference[1] + e[1]) <= limits.get("velocity_limit", np.inf):
-            np.testing.assert_allclose(row, reference + np.array([*e, want[1]]), rtol=1e-12, atol=1e-12)
-        free = rates_by_hand(m, d, k, e, reference, drive)
-        cut += bool(want[1] != free[1])
-        stopped += bool(want[1] == -reference[2])
-    assert cut > 30 if limits else cut == 0
-    assert stopped > 20 if "velocity_limit" in limits else stopped == 0
+        want = rates_by_hand(m, d, k, e, reference, drive, held, most)
+        path = reference[1:] if has_speed else np.zeros(2)
+        np.testing.assert_allclose(rates[:2], want + path, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(row, reference + np.array([*e, want[1]]), rtol=1e-12, atol=1e-12)
+        cut += bool(want[1] != rates_by_hand(m, d, k, e, reference, drive, held)[1])
+        stopped += held
+    assert cut > 30 if "acceleration_limit" in limits else cut == 0
+    assert stopped == 100 * has_speed
+
+
+@pytest.mark.parametrize("name", ["velocity", "both"])
+def test_in_continuous_time_it_runs_into_the_speed_limit_and_out_of_it_at_events(name):
+    """Against SciPy's solution of the two motions, at the limit and below it, one after the other."""
+    m, d, k, limits, end = 0.5, 2.7, 10.0, LIMITS[name], 4.0
+    top, most = limits["velocity_limit"], limits.get("acceleration_limit", np.inf)
+
+    def wanted(t, s):
+        w = 2.0
+        r, v, a = 0.1 * np.sin(w * t), 0.1 * w * np.cos(w * t), -0.1 * w**2 * np.sin(w * t)
+        force = 4.0 * np.sin(3.0 * t) + 3.0 * np.sin(7.0 * t)
+        return np.clip(a + (force - d * (s[1] - v) - k * (s[0] - r)) / m, -most, most)
+
+    class Moves(Block):
+        force = Output(unit="N")
+        reference = Output(shape=(3,), unit=("m", "m/s", "m/s2"))
+
+        def output(self, t, x, u):
+            w = 2.0
+            moving = np.stack([0.1 * np.sin(w * t), 0.1 * w * np.cos(w * t), -0.1 * w**2 * np.sin(w * t)])
+            return 4.0 * np.sin(3.0 * t) + 3.0 * np.sin(7.0 * t), moving
+
+    given = Moves(name="given")()
+    block = AdmittanceFilter(name="f", mass=m, damping=d, stiffness=k, **limits)
+    diagram = Diagram("d", block(given.force, given.reference))
+    run = diagram.simulate(end, step=1e-2, rtol=1e-11, atol=1e-13, progress=False)
+
+    t, s, held, rows, instants = 0.0, np.array([0.0, 0.2]), 0, [], []
+    while t < end:
+        rate, event = (
+            (lambda t, s: [s[1], 0.0], lambda t, s, side=held: side * wanted(t, s))
+            if held
+            else (lambda t, s: [s[1], wanted(t, s)], lambda t, s: abs(s[1]) - top)
+        )
+        event.terminal, event.direction = True, -1 if held else 1
+        part = solve_ivp(
+            rate, (t, end), s, "DOP853", rtol=1e-12, atol=1e-14, events=event, max_step=0.02, dense_output=True
+        )
+        rows += [part.sol(time) for time in run.t[(run.t >= t) & (run.t < part.t[-1])]]
+        t, s = part.t[-1], part.y[:, -1]
+        held = 0 if held else int(np.sign(s[1]))
+        if t < end:
+            instants.append(t)
+            s = np.array([s[0], held * top if held else s[1]])
+    rows.append(s)
+    assert len(instants) >= 6
+    found = [e.t for e in run.events]
+    assert [e.event for e in run.events] == (["reached", "released"] * len(found))[: len(found)]
+    np.testing.assert_allclose(found, instants, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(run["f.path_reference"][:, :2], rows, rtol=0, atol=1e-9)
+    sampled = [
+        np.max(np.abs(diagram.sampled(T).simulate(end, progress=False)["f.path_reference"][:, 0] - at[:, 0]))
+        for T, at in ((T, diagram.simulate(end, step=T, progress=False)["f.path_reference"]) for T in (1e-2, 5e-3))
+    ]
+    assert 1.8 < sampled[0] / sampled[1] < 2.2  # the sampled one is of first order
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_a_reference_that_starts_too_fast_is_followed_at_the_limit(sampled):
+    class Fast(Block):
+        reference = Output(shape=(3,), unit=("m", "m/s", "m/s2"))
+
+        def output(self, t, x, u):
+            return np.stack([0.25 + 2.0 * t, 2.0 + 0.0 * t, 0.0 * t])
+
+    block = AdmittanceFilter(name="f", mass=1.0, damping=0.0, stiffness=0.0, velocity_limit=0.5)
+    diagram = Diagram("d", block(0.0, Fast(name="fast").reference))
+    diagram = diagram.sampled(0.125) if sampled else diagram
+    run = diagram.simulate(1.0, step=0.125, progress=False)
+    p, v, a = run["f.path_reference"].T
+    np.testing.assert_allclose(p, 0.25 + 0.5 * run.t, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(v, 0.5, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(a, 0.0, rtol=0, atol=1e-12)
 
 
 @EACH

@@ -396,6 +396,20 @@ def test_a_port_is_not_named_like_an_equation(define, name):
         define()
 
 
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("T", r"in equations T is the sample time in s\. Take another name, such as temperature or T_1"),
+        ("inputs", "every block has an attribute of that name"),
+        ("_x", "names that begin with an underscore are private"),
+    ],
+)
+def test_a_port_whose_name_means_something_else_is_refused_by_an_error_that_says_why(name, why):
+    for port in (Input(), Output(), State(start=300.0, output=True)):
+        with pytest.raises(DefinitionError, match=rf"^Tank\.{name}: a port can't be called '{name}': {why}"):
+            type("Tank", (Block,), {name: port})
+
+
 # --- start values -----------------------------------------------------------------------------------------------------
 
 

@@ -212,3 +212,10 @@ def test_a_filtered_derivative_starts_at_zero_unless_told():
     u = np.full((5, 2), 3.0)
     assert not Alone(FilteredDerivative(time_constant=0.2), T=T, u=(2,)).ticks(u=u)["y"].any()
     assert Alone(FilteredDerivative(time_constant=0.2, initial_value=1.0), T=T).ticks(u=[3.0])["y"][0] == 10.0
+
+
+def test_the_filtered_derivative_goes_to_python_control():
+    system = FilteredDerivative(time_constant=0.2, name="rate").to_control()
+    assert (system.name, system.dt) == ("rate", 0)
+    for s in (0.5j, 1.0 + 3.0j):
+        assert system(s) == pytest.approx(s / (0.2 * s + 1.0), rel=1e-14)

@@ -257,6 +257,20 @@ def test_names_that_python_control_made_up_are_left_out():
     assert TransferFunction.from_control(control.tf(1, [1, 1])).output_names is None
 
 
+@pytest.mark.parametrize("dt", [0, 0.1], ids=str)
+def test_a_name_that_can_name_a_block_is_taken_over(dt):
+    space, transfer = control.ss(0.5, 1, 1, 0, dt), control.tf(1, [1, 0.5], dt)
+    spaces, transfers = (StateSpace, TransferFunction) if dt == 0 else (DiscreteStateSpace, DiscreteTransferFunction)
+    for cls, system in ((spaces, space), (transfers, transfer)):
+        assert cls.from_control(system).name is None  # made up: sys[0]
+        system.name = "motor"
+        assert cls.from_control(system).name == "motor"
+        assert cls.from_control(system).to_control().name == "motor"
+        assert cls.from_control(system, name="drive").name == "drive"
+        system.name = "motor 2"
+        assert cls.from_control(system).name is None
+
+
 def test_no_direct_term_goes_to_python_control_as_zeros():
     block = StateSpace(A=-np.eye(2), B=np.eye(2), C=np.eye(2))
     np.testing.assert_array_equal(block.to_control().D, np.zeros((2, 2)))

@@ -11,6 +11,8 @@ from loopwright.blocks import (
     Constant,
     Delay,
     DiscreteStateSpace,
+    DiscreteTransferFunction,
+    DiscreteZeroPoleGain,
     Function,
     Integrator,
     LimitedIntegrator,
@@ -163,6 +165,30 @@ def test_a_discrete_system_stands_in_a_frame_of_its_sample_time():
         SampleTimeError, match=r"d.*it holds for a sample time of 0.2 s, and its frame has one of 0.1 s"
     ):
         build(0.1)
+
+
+@pytest.mark.parametrize("T", [0.1, 1.0], ids=str)
+@pytest.mark.parametrize(
+    "block",
+    [
+        DiscreteStateSpace(A=[[0.5]], B=[1.0], C=[1.0], dt=0.2, name="d"),
+        DiscreteTransferFunction(numerator=1.0, denominator=[1.0, 0.5], dt=0.2, name="d"),
+        DiscreteZeroPoleGain(poles=[0.5], dt=0.2, name="d"),
+    ],
+    ids=lambda block: type(block).__name__,
+)
+def test_a_system_of_another_sample_time_is_refused_when_the_diagram_is_built(block, T):
+    @subsystem(sample_time=T)
+    def box(u):
+        return block(u)
+
+    with pytest.raises(
+        SampleTimeError, match=rf"^box\.d\.dt: it holds for .* 0\.2 s, and its frame has one of {T:g} s"
+    ):
+        Diagram("d", box(Constant(value=1.0)))
+    good = Diagram("d", box.replace(sample_time=0.2)(Constant(value=1.0)))
+    with pytest.raises(SampleTimeError, match=r"^box\.d\.dt: it holds for"):
+        good.replace({"box.sample_time": T})
 
 
 def test_states_of_any_width_go_through_a_diagram():

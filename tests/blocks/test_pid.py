@@ -28,6 +28,25 @@ def test_its_transfer_functions_are_those_of_two_degrees_of_freedom(gains):
         np.testing.assert_allclose(response(found, s)[0], laplace(s, **gains), rtol=1e-13)
 
 
+@pytest.mark.parametrize(
+    ("gains", "states"),
+    [
+        ({"kp": 3.0}, []),
+        ({"kp": -3.0, "ki": -5.0}, ["integral"]),
+        ({"kp": 3.0, "kd": 0.4, "filter_time": 0.05, "b": 0.0}, ["filtered"]),
+        (FULL, ["integral", "filtered"]),
+    ],
+)
+def test_its_linear_part_goes_to_python_control(gains, states):
+    limited = PID(**gains, lower=-1.0, upper=1.0, tracking=bool(gains.get("ki")), tracking_time=0.3, name="speed")
+    system = limited.to_control()
+    assert (system.input_labels, system.output_labels, system.state_labels) == (["r", "y"], ["u"], states)
+    assert (system.name, system.dt) == ("speed", 0)
+    for s in (0.5j, 1.0 + 3.0j, 60.0j):
+        np.testing.assert_allclose(system(s)[0], laplace(s, **gains), rtol=1e-13)
+    assert system.poles().real.max(initial=-1.0) <= 0.0
+
+
 def test_the_ideal_form_is_the_parallel_one():
     block = PID.ideal(gain=2.0, integral_time=0.5, derivative_time=0.1, ratio=8.0, b=0.6, name="speed")
     s = 1.0 + 2.0j

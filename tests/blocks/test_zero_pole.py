@@ -1,5 +1,6 @@
 """Zeros, poles and gain: against their product, however close or far apart they are."""
 
+import control
 import numpy as np
 import pytest
 from scipy.signal import cheb1ap, ellipap, lfilter
@@ -108,3 +109,39 @@ def test_what_is_no_real_proper_function_is_refused(z, p, text):
 def test_another_sample_time_is_refused():
     with pytest.raises(SampleTimeError, match=r"it holds for a sample time of 0.2 s, and its frame has one of 0.1 s"):
         Alone(DiscreteZeroPoleGain(poles=[0.5], dt=0.2), T=0.1)
+
+
+# --- python-control ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("z", "p"), SYSTEMS[:2] + SYSTEMS[5:])
+@pytest.mark.parametrize("dt", [0, 0.1, True], ids=str)
+def test_zeros_poles_and_gain_go_to_python_control_and_back(dt, z, p):
+    cls = ZeroPoleGain if dt == 0 else DiscreteZeroPoleGain
+    system = control.zpk(z, p, -3.0, dt, inputs="force", outputs="position", name="arm")
+    block = cls.from_control(system)
+    back = block.to_control()
+    for s in POINTS:
+        want = product(z, p, -3.0, s)
+        assert product(block.zeros, block.poles, block.gain, s) == pytest.approx(want, rel=1e-9)
+        assert back(s) == pytest.approx(want, rel=1e-9)
+    assert (block.name, block.input_names, back.name, back.dt) == ("arm", ("force",), "arm", dt)
+    assert (back.input_labels, back.output_labels) == (["force"], ["position"])
+
+
+def test_a_transfer_function_with_leading_zeros_and_another_first_coefficient():
+    block = ZeroPoleGain.from_control(control.tf([0.0, 6.0, 12.0], [2.0, 8.0, 6.0]))
+    assert (block.zeros, block.gain) == ((-2.0,), 3.0)
+    assert sorted(p.real for p in block.poles) == pytest.approx([-3.0, -1.0], rel=1e-14)
+    assert (block.name, block.input_names) == (None, None)
+
+
+def test_systems_that_have_no_zeros_poles_and_gain_are_refused():
+    with pytest.raises(ParameterError, match="found a StateSpace; expected a control.TransferFunction"):
+        ZeroPoleGain.from_control(control.ss(-1, 1, 1, 0))
+    with pytest.raises(ParameterError, match="found 2 inputs and 1 outputs"):
+        ZeroPoleGain.from_control(control.tf([[[1], [1]]], [[[1, 1], [1, 1]]]))
+    with pytest.raises(ParameterError, match="Use ZeroPoleGain, or sample it"):
+        DiscreteZeroPoleGain.from_control(control.tf(1, [1, 1]))
+    with pytest.raises(ParameterError, match="use Gain where there are none"):
+        ZeroPoleGain.from_control(control.tf([2.0], [1.0]))

@@ -217,7 +217,8 @@ CASES = [
     (ErrorDynamics.from_poles([-20.0] * 3), {}, BOTH),
     (AdmittanceFilter(mass=0.5, damping_ratio=0.6, stiffness=10.0), {}, BOTH),
     (AdmittanceFilter(mass=0.5, damping_ratio=0.6, stiffness=10.0, acceleration_limit=2.0), {}, BOTH),
-    (AdmittanceFilter(mass=0.5, damping_ratio=0.6, stiffness=10.0, velocity_limit=0.5), {"frames": SAMPLED}, SAMPLED),
+    (AdmittanceFilter(mass=0.5, damping_ratio=0.6, stiffness=10.0, velocity_limit=0.5), {}, BOTH),
+    (AdmittanceFilter(mass=0.5, damping_ratio=0.6, stiffness=10.0, velocity_limit=0.5, acceleration_limit=2.0), {}, BOTH),
     # what the robot meets
     (HandForce(Circle(radius=0.5)), {"inputs": PLANE}, BOTH),
     (PathSpring(Circle(radius=0.5), stiffness=100.0, cubic_stiffness=50.0), {"inputs": PLANE}, BOTH),

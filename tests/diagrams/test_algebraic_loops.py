@@ -270,3 +270,12 @@ def test_the_loop_of_direct_feedthroughs_is_the_feedback_of_state_spaces():
     steady = np.linalg.solve(closed, -B / (1 + D))
     x = np.array([steady - expm(closed * t) @ steady for t in run.t])
     assert np.max(np.abs(run["e.y"] - (1 - x @ C) / (1 + D))) < 1e-11
+
+
+@pytest.mark.parametrize("root", [3.0, -40.0, 1e3])
+def test_newtons_steps_that_go_too_far_are_shortened(root):
+    """Y = y − atan(y − root): from 0 the full steps of Newton's method run away, and so does the size of y."""
+    turn = Function(lambda v: v - np.arctan(v - root), name="turn")
+    e = Sum(signs="++", name="e")
+    run = Diagram("loop", e(Constant(value=0.0), turn(e.y)), loops="solve").simulate(0.1, step=0.1, progress=False)
+    assert run["e.y"] == pytest.approx([root, root], rel=1e-12)

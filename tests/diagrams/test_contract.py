@@ -14,7 +14,6 @@ from library import CASES, is_base
 
 import loopwright.blocks
 from loopwright.blocks import (
-    AdmittanceFilter,
     Block,
     DefinitionError,
     Event,
@@ -89,13 +88,6 @@ def test_the_code_of_the_page_of_the_library_runs():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("lag keeps the contract of a block.")
-
-
-@pytest.mark.xfail(raises=DefinitionError, strict=True, reason="a speed limit cuts the acceleration without an event")
-def test_a_limited_admittance_is_smooth_between_events():
-    check_block(
-        AdmittanceFilter(mass=0.5, damping_ratio=0.6, stiffness=10.0, velocity_limit=0.5), frames=["continuous"]
-    )
 
 
 # --- what is reported -----------------------------------------------------------------------------------------------------

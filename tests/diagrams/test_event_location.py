@@ -357,3 +357,12 @@ def test_a_jump_is_told_which_of_its_events_fired():
     run = Diagram("d", Two(name="two")(u)).simulate(1.0, step=0.5, progress=False)
     assert run["two.code"][-1] == 123.0  # the first, the second, both
     assert [e.event for e in run.events] == ["one", "two", "one", "two"]
+
+
+def test_events_of_unrelated_blocks_that_follow_closely_have_their_own_instants():
+    run = Diagram("d", Crossings(name="late")(Clock() - 0.502), Crossings(name="early")(Clock() - 0.501)).simulate(
+        1.0, step=1.0, progress=False
+    )
+    assert [e.block for e in run.events] == ["early", "late"]
+    assert [e.t for e in run.events] == pytest.approx([0.501, 0.502], abs=1e-15)
+    assert (run["early.last"][-1], run["late.last"][-1]) == pytest.approx((0.501, 0.502), abs=1e-15)

@@ -246,7 +246,9 @@ def test_an_fmu_that_fails_in_a_step_is_named_with_its_own_log_and_keeps_the_run
     light = {"external_force": (0, 0), "translational_mass": (1e-10, 1.0), "equivalent_mass": (0, 1)}
     plant = Fmu(file, name="plant", start=light)
     force = Gain(gain=(1.0, 0.0))(push)
-    with pytest.raises(FmuRuntimeError, match=r"^plant, t = 0\.005 s: .* failed with fmi3Error\. The FMU says: .*") as error:
+    with pytest.raises(
+        FmuRuntimeError, match=r"^plant, t = 0\.005 s: .* failed with fmi3Error\. The FMU says: .*"
+    ) as error:
         Diagram("d", plant(motor_force=force)).simulate(0.01, step=1e-3, progress=False)
     assert len(error.value.run.t) == 6  # up to and including the tick whose step failed
     assert error.value.run["step.y"][-1] == 1e300

@@ -15,6 +15,7 @@ from loopwright.blocks import (
     Clock,
     Compare,
     Constant,
+    Counter,
     Ellipse,
     Event,
     Function,
@@ -29,6 +30,7 @@ from loopwright.blocks import (
     PulseTrain,
     PythonFunction,
     Ramp,
+    Relay,
     SimulationError,
     Sine,
     State,
@@ -39,6 +41,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams._machine import Machine
 
 
 def two_rates(duration, **options):
@@ -152,8 +155,7 @@ def test_a_box_holds_its_outputs_between_its_ticks_while_the_solver_goes_on():
     assert np.max(np.abs(run["u"] - held)) < 6e-12
 
 
-def test_a_sampled_box_reads_the_continuous_states_from_the_left_and_before_events_of_the_instant():
-    """A jump at the tick of a sampled box is not yet seen by the box at that tick; what is recorded has jumped."""
+def test_a_sampled_box_sees_what_a_source_has_made_jump_at_its_tick():
     jump = Takes(name="jump")
 
     @subsystem(sample_time=0.5)
@@ -164,7 +166,63 @@ def test_a_sampled_box_reads_the_continuous_states_from_the_left_and_before_even
     run = Diagram("d", box(wired), Falls(name="f")).simulate(1.0, progress=False)
     assert run.t.tolist() == [0.0, 0.5, 1.0]
     assert run["jump.y"].tolist() == [0.0, 7.0, 7.0]
+    assert run["sampled"].tolist() == [0.0, 7.0, 7.0]
+
+
+def test_what_a_box_makes_jump_at_its_tick_is_recorded_after_the_jump_and_sampled_at_the_next_tick():
+    jump = Takes(name="jump")
+
+    @subsystem(sample_time=0.5)
+    def trigger(t):
+        return Gain(gain=1.0, name="g")(t).named("trigger")
+
+    @subsystem(sample_time=0.5)
+    def box(u):
+        return Gain(gain=1.0, name="g")(u).named("sampled")
+
+    wired = jump(Constant(value=7.0), trigger(Step(times=0.5, values=1.0)))
+    run = Diagram("d", box(wired), Falls(name="f")).simulate(1.0, progress=False)
+    assert run["jump.y"].tolist() == [0.0, 7.0, 7.0]
     assert run["sampled"].tolist() == [0.0, 0.0, 7.0]
+
+
+def test_a_sampled_box_in_an_enabled_one_acts_while_that_is_true_at_its_tick():
+    @subsystem(sample_time=0.1)
+    def count(one):
+        n = UnitDelay(initial_value=0.0, name="n")
+        n(Sum(name="next")(n.y, one))
+        return n.y
+
+    @subsystem(enabled="held")
+    def gate(one):
+        return count(one)
+
+    pulse = PulseTrain(period=1.0, duty=0.5)
+    run = Diagram("d", gate(Constant(value=1.0), enable=pulse).named("n")).simulate(2.5, progress=False)
+    ticks = np.arange(26)
+    acting = ticks % 10 < 5  # tick k is at k/10 s, an edge belongs to the tick at it
+    assert run["n"].tolist() == np.where(acting, np.cumsum(acting) - 1, np.cumsum(acting) - 1).tolist()
+
+
+@pytest.mark.parametrize("frequency", [5.0, 49.0, 50.0, 100.0])
+@pytest.mark.parametrize("options", [{}, {"solver": "rk4", "step": 0.1}])
+def test_events_of_a_fast_source_are_found_however_long_the_steps_are(frequency, options):
+    relay = Relay(on_point=0.1, off_point=-0.1)(Sine(frequency=frequency))
+    run = Diagram("d", Integrator(name="i")(relay)).simulate(10.0, progress=False, **options)
+    assert len(run.events) == 20 * frequency
+    assert run["i.y"][-1] == pytest.approx(5.0, abs=1e-3)
+
+
+def test_an_indicator_that_crosses_for_a_small_part_of_a_step_is_followed():
+    count = Counter(name="count")(Compare(">")(Sine(frequency=50.0), 0.99))
+    run = Diagram("d", count, Integrator()(Constant(value=1.0))).simulate(2.0, progress=False)
+    assert run["count.y"][-1] == 100.0
+
+
+@pytest.mark.parametrize("solver", ["auto", "LSODA", "BDF", "CVODE_BDF", "CVODE_Adams"])
+def test_no_solver_lets_a_ball_through_the_floor(solver):
+    with pytest.raises(SimulationError, match="shows Zeno behaviour"):
+        Diagram("d", Ball(name="ball")).simulate(6.0, solver=solver, progress=False)
 
 
 def test_a_source_at_a_tick_has_its_value_from_the_right():
@@ -623,3 +681,13 @@ def test_a_rate_that_is_not_finite_names_the_block_that_made_it_so():
 def test_options_that_are_none_are_refused(options, words):
     with pytest.raises(OptionError, match=words):
         Diagram("d", Integrator()(Constant(value=1.0))).simulate(1.0, **options)
+
+
+def test_the_derivative_that_implicit_solvers_are_given_is_that_of_the_rates():
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(3, 3))
+    plant = StateSpace(A=A, B=np.zeros(3), C=np.eye(3), D=np.zeros(3), name="plant")
+    flat = Diagram("d", plant(Constant(value=0.0)), Lag(name="after", k=7.0)(Constant(value=1.0))).flatten(0.1)
+    machine = Machine(flat)  # its functions write into its vectors
+    slope = machine.jacobian()(0.0, rng.normal(size=4))
+    assert np.allclose(slope, np.block([[np.array([[-7.0]]), np.zeros((1, 3))], [np.zeros((3, 1)), A]]), rtol=1e-13)

@@ -8,6 +8,7 @@ from scipy.linalg import expm
 from loopwright.blocks import (
     AlgebraicLoopError,
     Block,
+    Circle,
     Clock,
     Constant,
     Delay,
@@ -16,6 +17,7 @@ from loopwright.blocks import (
     Gain,
     Integrator,
     ParameterError,
+    PathProjection,
     SampleTimeError,
     SimulationError,
     Sine,
@@ -207,3 +209,10 @@ def test_functions_of_signals_are_the_same_in_both():
     diagram = Diagram("d", Function(np.tanh, name="tanh")(Sine(frequency=1.0)).named("y"))
     smooth = diagram.simulate(1.0, step=0.1, progress=False)
     assert np.array_equal(diagram.sampled(0.1).simulate(1.0, progress=False)["y"], smooth["y"])
+
+
+def test_a_projection_in_continuous_time_follows_however_smooth_the_rest_is():
+    position = Function(lambda t: 0.6 * np.stack([np.cos(3.0 * t), np.sin(3.0 * t)]))(Clock())
+    theta = PathProjection(Circle(radius=0.5))(position).named("theta")
+    run = Diagram("d", Integrator()(theta)).simulate(10.0, progress=False)
+    assert np.abs(run["theta"] - 3.0 * run.t).max() < 1e-12 * 30.0  # nearly five laps, counted
