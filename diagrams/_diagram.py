@@ -293,7 +293,7 @@ class Diagram(Analysis):
         OptionError
             A duration that is not positive, or no multiple of the step; an unknown solver, a tolerance out of range.
         """
-        from ._simulation import simulate
+        from ._simulate import simulate
 
         return simulate(
             self,

@@ -56,7 +56,6 @@ from ._machine import Machine
 from ._operating_point import OperatingPoint
 from ._pass import TRUE
 from ._plants import bind, has_plants, loaded
-from ._progress import progress_bar
 from ._recorder import Recorder
 from ._recording import Recording
 from ._run import Run
@@ -478,17 +477,3 @@ class Simulation:
             self._recording.overwrite = True
         self._recorder = self._new_recorder()
         self._recorder.row(state.t, machine.log)
-
-
-def simulate(
-    diagram: Diagram, duration: Any, *, progress: bool | None, start: RunState | OperatingPoint | None, **options: Any
-) -> Run:
-    """Run a diagram; see `Diagram.simulate`."""
-    if duration is None:
-        ticks_in(duration, Fraction(1), diagram.name)  # refused
-    with Simulation(diagram, duration=duration, start=start, **options) as simulation:
-        first = simulation.t
-        with progress_bar(diagram.name, first, first + float(duration), progress) as show:
-            if simulation.stopped is None:
-                simulation.advance(duration, progress=show)
-        return simulation.run()
