@@ -71,9 +71,9 @@ def place(A: Any, B: Any, poles: Sequence[complex]) -> np.ndarray:
     else:
         _controllable(A, B)
         K = _chains(A, B, wanted)
-        if K is None or _difference(np.poly(A - B @ K), polynomial) > AGREE:
+        if K is None or _difference(np.poly(A - B @ K), polynomial, float(np.linalg.norm(A))) > AGREE:
             K = _heymann(A, B, polynomial)
-    _confirm_polynomial(np.poly(A - B @ K), polynomial, "place")
+    _confirm_polynomial(np.poly(A - B @ K), polynomial, "place", float(np.linalg.norm(A)))
     return np.asarray(K)
 
 
@@ -177,7 +177,9 @@ def _heymann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarray
             K = F + q @ _ackermann(A - B @ F, B @ q, polynomial)
         except np.linalg.LinAlgError:
             continue
-        cost = float(np.linalg.norm(K)) * (1 + 1e6 * _difference(np.poly(A - B @ K), polynomial))
+        cost = float(np.linalg.norm(K)) * (
+            1 + 1e6 * _difference(np.poly(A - B @ K), polynomial, float(np.linalg.norm(A)))
+        )
         if best is None or cost < best[0]:
             best = cost, K
     if best is None:
@@ -185,16 +187,19 @@ def _heymann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarray
     return best[1]
 
 
-def _difference(found: np.ndarray, wanted: np.ndarray) -> float:
-    """Return the largest difference of two monic polynomials' coefficients, time scaled by the size of the roots."""
+def _difference(found: np.ndarray, wanted: np.ndarray, size: float = 0.0) -> float:
+    """Return the largest difference of two monic polynomials' coefficients, time scaled by the size of the roots.
+
+    ``size`` is taken where all roots that are wanted are at zero.
+    """
     n = len(wanted) - 1
-    size = max(np.max(np.abs(wanted[1:]) ** (1 / np.arange(1, n + 1)), initial=0.0), 1e-300)
-    scale = size ** np.arange(n + 1)
+    roots = float(np.max(np.abs(wanted[1:]) ** (1 / np.arange(1, n + 1)), initial=0.0))
+    scale = (roots or size or 1.0) ** np.arange(n + 1)
     return float(np.max(np.abs(found - wanted) / scale) / np.max(np.abs(wanted) / scale))
 
 
-def _confirm_polynomial(found: np.ndarray, wanted: np.ndarray, who: str) -> None:
-    difference = _difference(found, wanted)
+def _confirm_polynomial(found: np.ndarray, wanted: np.ndarray, who: str, size: float = 0.0) -> None:
+    difference = _difference(found, wanted, size)
     if not difference < AGREE:
         raise ConfirmationError(
             f"the characteristic polynomial that was found differs from the one asked for by {difference:.3g} of its "
@@ -261,7 +266,7 @@ def sampled_poles(
         polynomial[-len(part) :] += a * part
     w = np.roots(polynomial)
     with np.errstate(divide="ignore"):
-        s = np.log(1 + sample_time * w) / sample_time
+        s = np.log((1 + sample_time * w).astype(complex)) / sample_time
     order = np.argsort(np.abs(s))
     return SampledDesign(
         gains=tuple(float(a) for a in gains),
@@ -315,7 +320,7 @@ def sampled_gains(
     columns = [_remainder(part, asked, size) for part in parts]
     gains = np.linalg.solve(np.array(columns).T, -_remainder(base, asked, size))
     design = sampled_poles([float(a) for a in gains], sample_time, delay=delay, integral=integral)
-    quotient, _ = np.polydiv(np.array(design.polynomial), asked)
+    quotient, _ = _divide(np.array(design.polynomial), asked)
     _confirm_polynomial(np.array(design.polynomial), np.polymul(quotient, asked), "sampled_gains")
     others = 1 + sample_time * np.roots(quotient)
     if np.any(np.abs(others) >= 1):
@@ -332,13 +337,17 @@ def _remainder(polynomial: np.ndarray, divisor: np.ndarray, size: float) -> np.n
     """Return the remainder of a division of polynomials in w/size, padded to the degree of the divisor."""
     scaled = polynomial * size ** np.arange(len(polynomial) - 1, -1, -1.0)
     by = divisor * size ** np.arange(len(divisor) - 1, -1, -1.0)
-    if len(scaled) < len(by):
-        rest = scaled
-    else:
-        _, rest = np.polydiv(scaled, by)
-    out = np.zeros(len(by) - 1)
-    out[len(out) - len(rest) :] = rest
-    return out
+    return _divide(np.append(np.zeros(max(0, len(by) - len(scaled))), scaled), by)[1]
+
+
+def _divide(polynomial: np.ndarray, divisor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return quotient and remainder, which has as many coefficients as the divisor has roots (np.polydiv's varies)."""
+    rest, steps = np.array(polynomial, dtype=float), len(polynomial) - len(divisor) + 1
+    quotient = np.zeros(steps)
+    for k in range(steps):
+        quotient[k] = rest[k] / divisor[0]
+        rest[k : k + len(divisor)] -= quotient[k] * divisor
+    return quotient, rest[steps:]
 
 
 def _pencil(gains: int, T: float, delay: int, integral: Integral) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -374,7 +383,7 @@ def _held(k: int, T: float) -> np.ndarray:
         for j in range(n):
             longer[j] = (j + 1) * (eulerian[j] if j < n - 1 else 0.0) + (n - j) * (eulerian[j - 1] if j else 0.0)
         eulerian = longer
-    out = np.zeros(1)
+    out: np.ndarray = np.zeros(1)
     for c in eulerian:
-        out = np.asarray(np.polyadd(np.polymul(out, [T, 1.0]), [c]), dtype=float)
+        out = np.polyadd(np.polymul(out, [T, 1.0]), [c])
     return np.asarray(np.trim_zeros(out, "f")) / factorial(k)

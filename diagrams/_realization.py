@@ -155,22 +155,38 @@ class Realization:
         return Realization(*_delayed(self.A, self.B, self.C, self.D), self.dt, self.hidden)
 
     def minimal(self) -> Realization:
-        """Return the part that is controllable and observable; what was split off is kept in ``hidden``."""
-        hidden, part = [self.hidden], self
-        for _ in range(2):
-            part, rest = _split(part)
-            part = _dual(part)
-            hidden.append(rest)
+        """Return the part that is controllable and observable; what was split off is kept in ``hidden``.
+
+        States that no path of couplings connects are dropped as they are; others are found by a rotation of the
+        states, which is kept only where it leaves the response alone.
+        """
+        part, hidden = self, [self.hidden]
+        for split in (_connected, _split):
+            before, found = part, []
+            for _ in range(2):  # reached, then, of the dual, seen
+                part, rest = split(part)
+                part = _dual(part)
+                found.append(rest)
+            if split is _split and part.order < before.order and not part.agrees(before):
+                part, found = before, []
+            hidden += found
         if part.order == self.order:
             return self
-        part = Realization(*_balanced(part.A, part.B, part.C), self.D, self.dt, np.concatenate(hidden))
-        poles = self.logarithm(np.linalg.eigvals(self.A))
-        size = np.abs(poles[np.isfinite(poles)])
-        top = min(10 * size.max(initial=1.0), self.nyquist)
-        s = 1j * np.geomspace(top * 1e-5, top, 101) * (1 + 1e-4)
-        before, after = self.matrix(s), part.matrix(s)
-        worst = np.max(np.abs(before - after), axis=(1, 2)) / (np.max(np.abs(before), axis=(1, 2)) + 1e-300)
-        return part if np.max(worst) < 1e-9 else self
+        return Realization(*_balanced(part.A, part.B, part.C), self.D, self.dt, np.concatenate(hidden))
+
+    def agrees(self, other: Realization) -> bool:
+        """Whether the responses are the same to 1e-9 around every open- and closed-loop pole."""
+        p = [np.linalg.eigvals(other.A)]
+        if other.B.shape[1] == len(other.C) and np.linalg.cond(np.eye(len(other.D)) + other.D) < 1e12:
+            p.append(other.eigenvalues())
+        size = np.abs(self.logarithm(np.concatenate(p)))
+        size = size[np.isfinite(size)]
+        size = size[size > 1e-4 * size.max(initial=0.0)]
+        omega = np.outer(size if len(size) else [1.0], np.geomspace(0.3, 3, 7)).ravel() * (1 + 1e-4)
+        omega = omega[omega < self.nyquist]
+        one, two = self.matrix(1j * omega), other.matrix(1j * omega)
+        worst = np.max(np.abs(one - two), axis=(1, 2)) / (np.max(np.abs(two), axis=(1, 2)) + 1e-300)
+        return bool(np.max(worst, initial=0.0) < 1e-9)
 
     def _solve(self, s: np.ndarray, right: np.ndarray) -> np.ndarray:
         return np.linalg.solve(self.point(s)[:, None, None] * np.eye(self.order) - self.A, right)
@@ -203,6 +219,17 @@ def _balanced(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, 
         return A, B, C
     _, (d, _) = matrix_balance(A, permute=False, separate=True)
     return A * d / d[:, None], B / d[:, None], C * d
+
+
+def _connected(r: Realization) -> tuple[Realization, np.ndarray]:
+    """Return the states that a path of couplings connects to an input, and the poles of the others."""
+    reached = np.any(r.B != 0, axis=1)
+    for _ in range(r.order):
+        reached = reached | np.any(r.A[:, reached] != 0, axis=1)
+    if reached.all():
+        return r, np.zeros(0)
+    rest = np.linalg.eigvals(r.A[~reached][:, ~reached])
+    return Realization(r.A[reached][:, reached], r.B[reached], r.C[:, reached], r.D, r.dt, r.hidden), rest
 
 
 def _split(r: Realization) -> tuple[Realization, np.ndarray]:
