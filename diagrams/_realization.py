@@ -11,6 +11,7 @@ import numpy as np
 from ..blocks._errors import ParameterError
 
 Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+MARGINAL = 1e-14  # relative to the size of A: a pole that near to the limit of stability is taken to lie on it
 HIDDEN = 1e-11  # relative size of a coupling that counts as none when hidden modes are split off
 
 
@@ -138,8 +139,10 @@ class Realization:
         return np.asarray(square / (1 + np.sqrt(1 + square)))
 
     def unstable(self, factor: Any = 1.0) -> int:
-        """Return the number of closed-loop poles that are not stable."""
-        return int(np.sum(self.growth(self.eigenvalues(factor)) >= 0))
+        """Return the number of closed-loop poles that are not stable; within rounding of the limit is not stable."""
+        closed = self.closed(factor)
+        rounding = MARGINAL * float(np.linalg.norm(closed)) if self.order else 0.0
+        return int(np.sum(self.growth(np.linalg.eigvals(closed)) >= -rounding))
 
     def stable(self, factor: Any = 1.0) -> bool:
         """Whether all closed-loop poles are stable."""

@@ -11,6 +11,7 @@ from loops import open_loops, sampled_triple, stabilized_loops, triple
 from loopwright.blocks import ConfirmationError, LoopwrightError, ParameterError
 from loopwright.diagrams import Number, margins, nyquist_count
 from loopwright.diagrams import _confirm as confirm
+from loopwright.diagrams._crossings import Scan
 from loopwright.diagrams._realization import Realization
 
 RANDOM = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
@@ -165,6 +166,23 @@ def test_an_unstable_closed_loop_has_no_margins_but_crossings_and_poles():
     assert "not stable: 2 of its poles" in found.phase_margin_deg.confirmed_by
     assert found.gain_crossovers
     assert sum(p.real > 0 for p in found.closed_loop_poles) == found.encirclements == 2
+
+
+def test_a_closed_loop_on_the_limit_is_not_called_stable_by_rounding():
+    loop = control.ss(np.diag([-1.0, 1.0]), [[2.063406], [2.063406]], [[-2.557134, 2.557134]], 2.0)  # L real for all ω
+    found = margins(loop)
+    assert not found.stable
+    assert max(abs(p.real) for p in found.closed_loop_poles) < 1e-12
+
+
+def test_two_crossings_between_two_samples_are_found_by_the_slope():
+    r = Realization.of(control.tf([1.05 * 0.2 * 5, 0.0], [1, 0.2 * 5, 25]))  # |L| = 1.05 at 5 rad/s, nothing else
+    scan = Scan(r)
+    assert len(scan.gain_crossovers()) == 2
+    scan.segments = [np.array([0.5, 4.0, 6.0, 50.0])]
+    scan.samples = [(L, dL * w) for w, (L, dL) in zip(scan.segments, map(r.response, scan.segments), strict=True)]
+    assert np.all(np.abs(scan.samples[0][0]) < 1)
+    assert [c.omega for c in scan.gain_crossovers()] == pytest.approx([c.omega for c in Scan(r).gain_crossovers()])
 
 
 def test_hidden_modes_are_split_off_and_named():
