@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,10 @@ import numpy as np
 from ..blocks._errors import ParameterError
 
 Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-MARGINAL = 1e-14  # relative to the size of A: a pole that near to the limit of stability is taken to lie on it
-HIDDEN = 1e-11  # relative size of a coupling that counts as none when hidden modes are split off
+MARGINAL = 1e-14  # relative to the largest pole: one that near to the limit of stability is taken to lie on it
+ROUNDING = (1e-8, 1e-10, 1e-12)  # couplings relative to the largest that are perhaps rounding, tried in this order
+LARGE = 1e4
+HIDDEN = 1e-11  # the same for states that are found hidden by a rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +143,9 @@ class Realization:
 
     def unstable(self, factor: Any = 1.0) -> int:
         """Return the number of closed-loop poles that are not stable; within rounding of the limit is not stable."""
-        closed = self.closed(factor)
-        rounding = MARGINAL * float(np.linalg.norm(closed)) if self.order else 0.0
-        return int(np.sum(self.growth(np.linalg.eigvals(closed)) >= -rounding))
+        poles = self.eigenvalues(factor)
+        rounding = MARGINAL * np.abs(poles).max(initial=0.0)
+        return int(np.sum(self.growth(poles) >= -rounding))
 
     def stable(self, factor: Any = 1.0) -> bool:
         """Whether all closed-loop poles are stable."""
@@ -160,36 +163,37 @@ class Realization:
     def minimal(self) -> Realization:
         """Return the part that is controllable and observable; what was split off is kept in ``hidden``.
 
-        States that no path of couplings connects are dropped as they are; others are found by a rotation of the
-        states, which is kept only where it leaves the response alone.
+        States that no path of couplings connects are dropped as they are, couplings by the rounding of a linearization
+        left out of account; others are found by a rotation of the states. Both only where the response stays.
         """
-        part, hidden = self, [self.hidden]
-        for split in (_connected, _split):
-            before, found = part, []
-            for _ in range(2):  # reached, then, of the dual, seen
-                part, rest = split(part)
-                part = _dual(part)
-                found.append(rest)
-            if split is _split and part.order < before.order and not part.agrees(before):
-                part, found = before, []
-            hidden += found
+        part, hidden = self, np.zeros(0)
+        for split, tolerance in [*((_connected, t) for t in ROUNDING), (_connected, 0.0), (_split, HIDDEN)]:
+            fewer, rest = _both_ways(part, partial(split, tolerance=tolerance))
+            if fewer.order < part.order and (tolerance == 0.0 or fewer.agrees(part)):
+                part, hidden = fewer, np.concatenate([hidden, rest])
         if part.order == self.order:
             return self
-        return Realization(*_balanced(part.A, part.B, part.C), self.D, self.dt, np.concatenate(hidden))
+        hidden = np.concatenate([self.hidden, hidden])
+        return Realization(part.A, part.B, part.C, self.D, self.dt, hidden)
 
     def agrees(self, other: Realization) -> bool:
-        """Whether the responses are the same to 1e-9 around every open- and closed-loop pole."""
+        """Whether the responses are the same to 1e-9 around every open- and closed-loop pole.
+
+        Where they are very large, near several poles at s = 0 that scatter, nothing depends on them.
+        """
         p = [np.linalg.eigvals(other.A)]
         if other.B.shape[1] == len(other.C) and np.linalg.cond(np.eye(len(other.D)) + other.D) < 1e12:
             p.append(other.eigenvalues())
-        size = np.abs(self.logarithm(np.concatenate(p)))
-        size = size[np.isfinite(size)]
-        size = size[size > 1e-4 * size.max(initial=0.0)]
-        omega = np.outer(size if len(size) else [1.0], np.geomspace(0.3, 3, 7)).ravel() * (1 + 1e-4)
-        omega = omega[omega < self.nyquist]
+        s = self.logarithm(np.concatenate(p))
+        s = s[np.isfinite(s)]
+        s = s[np.abs(s) > 1e-7 * np.abs(s).max(initial=0.0)]
+        around = np.outer(np.abs(s) if len(s) else [1.0], np.geomspace(0.3, 3, 7)).ravel()
+        omega = np.concatenate([around, np.abs(s.imag), np.abs(s.imag) + np.abs(s.real)]) * (1 + 1e-9)
+        omega = omega[(omega < self.nyquist) & (omega > 1e-3 * around.min())]
         one, two = self.matrix(1j * omega), other.matrix(1j * omega)
-        worst = np.max(np.abs(one - two), axis=(1, 2)) / (np.max(np.abs(two), axis=(1, 2)) + 1e-300)
-        return bool(np.max(worst, initial=0.0) < 1e-9)
+        size, apart = np.max(np.abs(two), axis=(1, 2)), np.max(np.abs(one - two), axis=(1, 2))
+        judged = size < LARGE
+        return bool(judged.any() and np.all(apart[judged] <= 1e-9 * size[judged]))
 
     def _solve(self, s: np.ndarray, right: np.ndarray) -> np.ndarray:
         return np.linalg.solve(self.point(s)[:, None, None] * np.eye(self.order) - self.A, right)
@@ -215,38 +219,52 @@ def _delayed(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Matr
 
 
 def _balanced(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Scale the states by powers of two, so that A's rows and columns are of one size."""
+    """Scale the states by powers of two, so that A's rows and columns are of one size.
+
+    Couplings by rounding alone are left out of account, else they would be scaled up until they matter.
+    """
     from scipy.linalg import matrix_balance
 
     if not len(A):
         return A, B, C
-    _, (d, _) = matrix_balance(A, permute=False, separate=True)
+    seen = np.where(np.abs(A) > 1e-8 * np.abs(A).max(), A, 0.0)
+    _, (d, _) = matrix_balance(seen, permute=False, separate=True)
     return A * d / d[:, None], B / d[:, None], C * d
 
 
-def _connected(r: Realization) -> tuple[Realization, np.ndarray]:
+def _connected(r: Realization, tolerance: float) -> tuple[Realization, np.ndarray]:
     """Return the states that a path of couplings connects to an input, and the poles of the others."""
-    reached = np.any(r.B != 0, axis=1)
+    coupled = np.abs(r.A) > tolerance * np.abs(r.A).max(initial=0.0)
+    reached = np.any(np.abs(r.B) > tolerance * np.abs(r.B).max(axis=0, initial=0.0), axis=1)
     for _ in range(r.order):
-        reached = reached | np.any(r.A[:, reached] != 0, axis=1)
+        reached = reached | np.any(coupled[:, reached], axis=1)
     if reached.all():
         return r, np.zeros(0)
     rest = np.linalg.eigvals(r.A[~reached][:, ~reached])
     return Realization(r.A[reached][:, reached], r.B[reached], r.C[:, reached], r.D, r.dt, r.hidden), rest
 
 
-def _split(r: Realization) -> tuple[Realization, np.ndarray]:
+def _both_ways(
+    r: Realization, split: Callable[[Realization], tuple[Realization, np.ndarray]]
+) -> tuple[Realization, np.ndarray]:
+    """Split off what is not reached and, of the dual system, what is not seen."""
+    part, one = split(r)
+    part, other = split(_dual(part))
+    return _dual(part), np.concatenate([one, other])
+
+
+def _split(r: Realization, tolerance: float) -> tuple[Realization, np.ndarray]:
     """Return the controllable part, and the poles of the rest (block Krylov staircase)."""
     if not r.order:
         return r, np.zeros(0)
     size = np.linalg.norm(r.B, axis=0)
-    new = _range(r.B / np.where(size > 0, size, 1.0), 1.0)
+    new = _range(r.B / np.where(size > 0, size, 1.0), tolerance)
     Q = new
     while new.shape[1] and Q.shape[1] < r.order:
         reached = r.A @ new
         for _ in range(2):
             reached = reached - Q @ (Q.T @ reached)
-        new = _range(reached, r.scale)
+        new = _range(reached, tolerance * r.scale)
         Q = np.hstack([Q, new])
     if Q.shape[1] == r.order:
         return r, np.zeros(0)
@@ -256,6 +274,6 @@ def _split(r: Realization) -> tuple[Realization, np.ndarray]:
     return part, np.linalg.eigvals(rest.T @ r.A @ rest)
 
 
-def _range(M: np.ndarray, scale: float) -> np.ndarray:
+def _range(M: np.ndarray, tolerance: float) -> np.ndarray:
     U, sigma, _ = np.linalg.svd(M, full_matrices=False)
-    return np.asarray(U[:, sigma > HIDDEN * scale])
+    return np.asarray(U[:, sigma > tolerance])

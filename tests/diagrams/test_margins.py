@@ -214,6 +214,20 @@ def test_a_state_that_is_not_seen_does_not_cost_three_integrators_their_accuracy
     assert found.phase_margin_deg.value == margins(loop).phase_margin_deg.value
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-16, 1e-14, 1e-12])
+def test_states_at_one_that_only_rounding_couples_do_not_make_a_loop_unstable(noise):
+    loop, rng, T = sampled_triple(20.0), np.random.default_rng(0), 1e-3
+    other = sampled_triple(40.0)
+    A = np.eye(8)
+    A[:3, :3], A[3:6, 3:6], A[6, 6] = loop.A, other.A - other.B @ other.C, 0.0
+    A, B = A + noise * rng.normal(size=(8, 8)), np.vstack([loop.B, np.zeros((5, 1))]) + noise * rng.normal(size=(8, 1))
+    C = np.hstack([loop.C, np.zeros((1, 5))]) + noise * rng.normal(size=(1, 8))
+    found = margins(control.ss(A, B, C, 0, T))
+    assert found.stable
+    assert len(found.hidden_poles) == 5
+    assert found.phase_margin_deg.value == pytest.approx(margins(loop).phase_margin_deg.value, abs=1e-8 + 1e7 * noise)
+
+
 @pytest.mark.parametrize(
     ("loop", "options", "message"),
     [
