@@ -9,6 +9,8 @@ from loops import sampled_triple, triple
 
 from loopwright.blocks import ParameterError
 from loopwright.diagrams import compare_with_control, disk_margin, margins, nyquist_count, place
+from loopwright.diagrams._features import Features, scan
+from loopwright.diagrams._realization import Realization
 
 T = 1e-3
 
@@ -91,6 +93,15 @@ def test_spurious_crossings_at_low_frequency_are_not_taken_for_margins():
     assert slower["gain_margin_high"].value == pytest.approx(2 / (0.03 * T), rel=1e-9)
     assert 1 < slower["gain_margin_high"].control < 10
     assert "stable just beyond" in slower["gain_margin_high"].why
+
+
+def test_three_scattered_poles_at_one_are_one_cluster_below_which_nothing_is_read():
+    r = Realization.of(with_rounding(20.0))
+    features = Features.of(r)
+    assert [(a.omega, a.multiplicity) for a in features.axis_poles] == [(0.0, 3)]
+    assert features.axis_poles[0].scatter > 1e-3  # rad/s, where a triple pole is exact in the original matrices
+    assert features.unstable_poles() == 0
+    assert scan(r, features)[0][0] >= 30 * features.axis_poles[0].scatter
 
 
 def test_its_polynomial_method_finds_a_gain_margin_of_two_where_there_are_sixteen_hundred():
