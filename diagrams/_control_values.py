@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..blocks._errors import ConfirmationError
+from ..blocks._errors import ConfirmationError, ParameterError
 from . import _confirm
 from ._crossings import Scan
 from ._margins import Margins, margins
@@ -58,10 +58,20 @@ def compare_with_control(loop: Any, *, delay: int = 0) -> tuple[Comparison, ...]
         L with one channel, closed loop stable.
     delay : int
         Whole samples of delay in series with a sampled loop.
+
+    Raises
+    ------
+    ParameterError
+        If the closed loop is not stable.
     """
     import control
 
     ours = margins(loop, delay=delay)
+    if not ours.stable:
+        raise ParameterError(
+            "found a closed loop that is not stable; expected a stable one: it has no margins to compare.",
+            block="compare_with_control",
+        )
     r = Realization.of(loop, delay=delay)
     L = control.ss(loop)
     for _ in range(delay):

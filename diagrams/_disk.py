@@ -146,6 +146,8 @@ def _minimal_scaling(M: np.ndarray, *, polish: bool = True) -> float:
         U, sigma, V = np.linalg.svd(d[:, None] * M / d)
         return float(sigma[0]), sigma[0] * (np.abs(U[:, 0]) ** 2 - np.abs(V[0]) ** 2)[:-1]
 
+    if not M.any():
+        return 0.0
     size = np.abs(M) + 1e-12 * np.abs(M).max()
     d = np.ones(len(M))
     for _ in range(20):  # Osborne: rows and columns of one size
@@ -188,7 +190,7 @@ def mu_lower(M: np.ndarray) -> tuple[float, np.ndarray]:
     turn = np.exp(1j * np.append(0.0, x))
     eigenvalues = np.linalg.eigvals(M * turn)
     largest = eigenvalues[np.argmax(np.abs(eigenvalues))]
-    return float(abs(largest)), turn / largest
+    return float(abs(largest)), turn / largest if largest else np.full(n, np.inf, dtype=complex)
 
 
 def factor(delta: Any, skew: float = 0.0) -> Any:

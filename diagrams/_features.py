@@ -163,6 +163,8 @@ def _refine(r: Realization, omega: np.ndarray, delay: float) -> np.ndarray:
         with np.errstate(divide="ignore", invalid="ignore"):
             step = np.log(L[1:] / L[:-1])
         coarse = ~((np.abs(step.real) < 0.3) & (np.abs(step.imag) < 0.15)) & (np.diff(omega) > 1e-12 * omega[1:])
+        if delay:  # a delay turns without end; where |L| is small that does not matter
+            coarse &= np.maximum(np.abs(L[1:]), np.abs(L[:-1])) > 0.3
         if not coarse.any() or len(omega) > 40_000:
             break
         omega = np.sort(np.concatenate([omega, np.sqrt(omega[1:] * omega[:-1])[coarse]]))

@@ -120,12 +120,15 @@ def delayed_hold(plant: Any, sample_time: float, delay: float = 0.0) -> Any:
     Phi, _ = over(sample_time)
     rest, new = over(sample_time - fraction)
     old = rest @ over(fraction)[1]
-    states = n + m * (samples + 1)  # x, u[k − 1], u[k − 2], …
+    kept = samples + (fraction > 0)  # commands underway: u[k − 1], u[k − 2], …
+    if not kept:
+        return control.ss(Phi, new, P.C, 0, sample_time)
+    states = n + m * kept
     A, B = np.zeros((states, states)), np.zeros((states, m))
     A[:n, :n] = Phi
     B[n : n + m] = np.eye(m)
-    A[n + m :, n:-m] = np.eye(m * samples)
-    for gain, lag in ((new, samples), (old, samples + 1)):
+    A[n + m :, n:-m] = np.eye(m * (kept - 1))
+    for gain, lag in ((new, samples), (old, samples + 1))[: 1 + (fraction > 0)]:
         if lag == 0:
             B[:n] += gain
         else:
