@@ -13,6 +13,9 @@ from ..blocks._errors import ParameterError
 Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 HIDDEN = 1e-11  # relative size of a coupling that counts as none when hidden modes are split off
 STRUCTURE = 1e-14  # relative size, all scaled, below which an entry is what rounding has left of a zero
+ROUNDING = (1e-8, 1e-10, 1e-12)  # sizes below which it perhaps is, tried in this order and held against the response
+MARGINAL = 1e-14  # relative to the largest pole: one that near to the limit of stability is taken to lie on it
+LARGE = 1e4  # |L| above which a difference shows nowhere in the closed loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,8 +145,10 @@ class Realization:
         return np.asarray(square / (1 + np.sqrt(1 + square)))
 
     def unstable(self, factor: Any = 1.0) -> int:
-        """Return the number of closed-loop poles that are not stable."""
-        return int(np.sum(self.growth(self.eigenvalues(factor)) >= 0))
+        """Return the number of closed-loop poles that are not stable; within rounding of the limit is not stable."""
+        poles = self.eigenvalues(factor)
+        rounding = MARGINAL * float(np.abs(poles).max(initial=0.0))
+        return int(np.sum(self.growth(poles) >= -rounding))
 
     def stable(self, factor: Any = 1.0) -> bool:
         """Whether all closed-loop poles are stable."""
@@ -160,10 +165,33 @@ class Realization:
 
     def minimal(self) -> Realization:
         """Return the part that is controllable and observable; what was split off is kept in ``hidden``."""
-        whole = self._without(*_connected(self))
+        whole = self._without(*_connected(self, STRUCTURE))
+        for tolerance in ROUNDING:
+            fewer = whole._without(*_connected(whole, tolerance))
+            if fewer.order < whole.order and fewer.agrees(whole):
+                whole = fewer
         part, first = _split(whole)
         part, second = _split(_dual(part))
         return whole._without(_dual(part), np.concatenate([first, second]))
+
+    def agrees(self, other: Realization) -> bool:
+        """Whether the responses are the same to 1e-9 around every open- and closed-loop pole.
+
+        Where they are very large, near several poles at s = 0 that scatter, nothing depends on them.
+        """
+        p = [np.linalg.eigvals(other.A)]
+        if other.B.shape[1] == len(other.C) and np.linalg.cond(np.eye(len(other.D)) + other.D) < 1e12:
+            p.append(other.eigenvalues())
+        s = self.logarithm(np.concatenate(p))
+        s = s[np.isfinite(s)]
+        s = s[np.abs(s) > 1e-7 * np.abs(s).max(initial=0.0)]
+        around = np.outer(np.abs(s) if len(s) else [1.0], np.geomspace(0.3, 3, 7)).ravel()
+        omega = np.concatenate([around, np.abs(s.imag), np.abs(s.imag) + np.abs(s.real)]) * (1 + 1e-9)
+        omega = omega[(omega < self.nyquist) & (omega > 1e-3 * around.min())]
+        one, two = self.matrix(1j * omega), other.matrix(1j * omega)
+        size, apart = np.max(np.abs(two), axis=(1, 2)), np.max(np.abs(one - two), axis=(1, 2))
+        judged = size < LARGE
+        return bool(judged.any() and np.all(apart[judged] <= 1e-9 * size[judged]))
 
     def _without(self, part: Realization, hidden: np.ndarray) -> Realization:
         """Return a part of this system whose response is the same, with the poles of the rest; else this system."""
@@ -233,13 +261,13 @@ def _scaled(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np
     return A * d / d[:, None], B / d[:, None], C * d
 
 
-def _connected(r: Realization) -> tuple[Realization, np.ndarray]:
+def _connected(r: Realization, tolerance: float) -> tuple[Realization, np.ndarray]:
     """Return what the input reaches and the output sees along couplings above rounding, and the poles of the rest."""
     A, B, C = _scaled(r.A, r.B, r.C)
     n = len(A)
     whole = np.block([[A, B], [C, np.zeros((len(C), B.shape[1]))]])
     size = np.abs(whole).max(initial=0.0)
-    A, B, C = (np.abs(M) > STRUCTURE * size for M in (A, B, C))
+    A, B, C = (np.abs(M) > tolerance * size for M in (A, B, C))
     reached, seen = B.any(axis=1), C.any(axis=0)
     for _ in range(n):
         reached, seen = reached | A[:, reached].any(axis=1), seen | A[seen].any(axis=0)
