@@ -86,7 +86,7 @@ def identified(
             y0, outputs, rtol=1e-6, atol=1e-9 * (1.0 + np.max(np.abs(y0), initial=0.0))
         ):
             raise FmuError(
-                f"it gives no derivatives, and its state can't be set, so it can be linearized only where it comes to "
+                f"by its responses alone it can be linearized only where it comes to "
                 f"rest by itself from its start values: there its outputs are {y0.tolist()}, at the operating point "
                 f"{np.ravel(outputs).tolist()}. Give it start values of that point, or an operating point at rest.",
                 block=block.label,
@@ -148,7 +148,7 @@ class _Runner:
         while still < 10:
             if self._k >= SETTLING:
                 raise FmuError(
-                    f"it gives no derivatives, and its state can't be set; identified it can be only at rest, and with "
+                    f"it can be identified from its responses at rest only, and with "
                     f"the inputs of the operating point held it still moves after {SETTLING * self.h:g} s. Choose an "
                     "operating point at which it rests, or export it with directional derivatives.",
                     block=self.block.label,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -45,9 +45,11 @@ class OperatingPoint:
         Time, states and inputs of each FMU by path, as `Fmu.linear_model` takes them.
     residual : float
         How far it is from an equilibrium: the largest change of a state over the next tick, and of a continuous state
-        in one second, relative to 1 + its size.
+        in one second, relative to 1 + its size. States of FMUs count: by their rates, or by their change over a step
+        where the rates are not to be had. It means the same however the point was found; what a trim has left of its
+        equations is in ``residuals``.
     largest : str
-        The state with that residual.
+        The block with that residual, of an FMU its state; empty where nothing moves.
     how : str
         "run", "trim" or "given".
     """
@@ -89,7 +91,8 @@ class OperatingPoint:
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """Parameters that belong to it, where a trim has found them, by path, as `Diagram.replace` takes them."""
     residuals: Mapping[str, float] = field(default_factory=dict, repr=False)
-    """What a trim has left of each of its equations, by name, largest first."""
+    """What a trim has left of each of its equations, by name, largest first, relative to 1 + the size of what they
+    belong to."""
 
 
 def capture(simulation: Any, how: str = "run") -> OperatingPoint:
@@ -101,8 +104,7 @@ def capture(simulation: Any, how: str = "run") -> OperatingPoint:
     w = machine.log[: flat.plant_outputs.total].copy()
     plants = {path: plant.operating_point() for path, plant in simulation._plants}
     values = {name: machine.log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
-    residual, largest = from_equilibrium(flat, simulation.t, x, w, machine.x_next)
-    return OperatingPoint(
+    point = OperatingPoint(
         simulation.t,
         simulation._tick,
         flat.base,
@@ -110,27 +112,32 @@ def capture(simulation: Any, how: str = "run") -> OperatingPoint:
         w,
         machine.z.copy(),
         plants,
-        residual,
-        largest,
-        how,
-        values,
-        layout_of(flat),
+        how=how,
+        values=values,
+        layout=layout_of(flat),
     )
+    return judged(flat, point, machine.x_next)
 
 
-def from_equilibrium(
-    flat: FlatDiagram, t: float, x: np.ndarray, w: np.ndarray, x_next: np.ndarray
-) -> tuple[float, str]:
-    """Return the largest relative change of a state, and whose it is."""
-    found, who = 0.0, ""
+def judged(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) -> OperatingPoint:
+    """Return an operating point with its residual: the largest relative change of a state, and whose it is."""
+    from ._plant_models import plant_changes
+
+    x, found, who = point.x, 0.0, ""
     rates = np.zeros(flat.width)
     if flat.continuous.size:
-        rates[flat.continuous] = np.ravel(np.array(flat.flow(t, x, w, flat.p)))
-    for path, where in flat.states.slices.items():
-        change = np.maximum(np.abs(x_next[where] - x[where]), np.abs(rates[where])) / (1.0 + np.abs(x[where]))
-        if change.size and change.max() > found:
-            found, who = float(change.max()), path
-    return found, who
+        rates[flat.continuous] = np.ravel(np.array(flat.flow(point.t, x, point.w, flat.p)))
+    changes = {
+        path: np.maximum(np.abs(x_next[where] - x[where]), np.abs(rates[where])) / (1.0 + np.abs(x[where]))
+        for path, where in flat.states.slices.items()
+    }
+    for name, change in (changes | plant_changes(flat, point)).items():
+        worst = float(np.max(change, initial=0.0))
+        if worst > found or np.isnan(worst):
+            found, who = worst, name
+        if np.isnan(found):
+            break
+    return replace(point, residual=found, largest=who)
 
 
 def check_options(diagram: Diagram, options: Mapping[str, Any], what: str) -> None:

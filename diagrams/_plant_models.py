@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..blocks._errors import FmuError, OptionError
+from ..blocks._errors import FmuError, LoopwrightError, OptionError
 from ._flat import FlatDiagram
 from ._identification import identified
 from ._operating_point import OperatingPoint
@@ -97,6 +97,31 @@ def joined(flat: FlatDiagram, models: Sequence[PlantModel], which: str) -> np.nd
 def states_of(models: Sequence[PlantModel]) -> list[str]:
     """Return the names of the states of all FMUs."""
     return [name for m in models for name in m.states]
+
+
+def plant_changes(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray]:
+    """Return how fast the states of the FMUs change, relative to 1 + their size, by the states' names.
+
+    In one second, or over a step where the rates are not to be had; states that an FMU does not show don't count.
+    """
+    found: dict[str, np.ndarray] = {}
+    for path in plants(flat):
+        block: Any = flat.table.blocks[path]
+        if not block.description.states:
+            continue
+        now = {**at.plants[path], "inputs": _inputs(flat, at, path, at.z)}
+        try:
+            m = block.linear_model(**now)
+            change = m.f
+        except LoopwrightError:
+            try:
+                m = block.step_difference(float(flat.base), **now)
+            except LoopwrightError:
+                continue
+            change = m.f - m.x0
+        size = np.abs(change) / (1.0 + np.abs(m.x0))
+        found |= {f"{path}.{name}": size[i : i + 1] for i, name in enumerate(m.states)}
+    return found
 
 
 def continuous_models(flat: FlatDiagram, at: OperatingPoint, way: str | None) -> list[PlantModel]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..blocks._errors import OptionError, SimulationError
 from ._flat import FlatDiagram
-from ._operating_point import OperatingPoint, elements, names_of_states, operating_point
+from ._operating_point import OperatingPoint, elements, judged, names_of_states, operating_point
 from ._pass import Pass
 from ._trim_names import Free, Target, free_parameters, known_states, named_states, targets_of
 from ._trim_plants import Plants
@@ -305,8 +305,7 @@ def _found(
     final = diagram.replace({**guess.parameters, **values})
     plants = equations.plants.points(xp, equations.at_unknown(unknown)[2], equations.plants.changed(parameters, q))
     return _completed(final, guess, x, w, plants, {
-        "parameters": {**guess.parameters, **values}, "residual": worst, "residuals": residuals,
-        "largest": next(iter(residuals), ""), "how": how,
+        "parameters": {**guess.parameters, **values}, "residuals": residuals, "how": how,
     })  # fmt: skip
 
 
@@ -320,9 +319,11 @@ def _completed(
 ) -> OperatingPoint:
     """Return the operating point with all its signals: the boxes hold what they put out there."""
     flat = diagram.flatten(guess.base)
-    _, z, log, _ = (np.ravel(np.array(v)) for v in flat.at_tick(frozenset(flat.clocks.values()))(guess.t, x, w, flat.p))
+    at_tick = flat.at_tick(frozenset(flat.clocks.values()))
+    x_next, z, log, _ = (np.ravel(np.array(v)) for v in at_tick(guess.t, x, w, flat.p))
     values = {name: log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
     x = x.copy()
     for name, where in flat.held.slices.items():
         x[where] = np.ravel(values[name])
-    return replace(guess, x=x, w=w.copy(), z=z, plants=plants, values=values, **more)
+    point = replace(guess, x=x, w=w.copy(), z=z, plants=plants, values=values, **more)
+    return judged(flat, point, x_next)

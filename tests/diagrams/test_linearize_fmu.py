@@ -407,3 +407,31 @@ def test_the_tool_needs_a_point_after_the_start():
 def test_a_constant_may_drive_the_fmu():
     plant = mass(position=0.0)
     assert Diagram("d", plant(force=Constant(value=0.0))).linearize(step=T).dt == T
+
+
+# --- how far an operating point is from rest --------------------------------------------------------------------------
+
+
+def driven_motor(**start):
+    motor = Fmu(dc_motor.build(), start=start, name="motor")
+    return Diagram("driven", motor(voltage=Constant(value=1.0), load_torque=0.0))
+
+
+def test_the_states_of_an_fmu_count_in_the_residual():
+    point = driven_motor().operating_point(0.0, step=T)
+    assert point.residual == pytest.approx(1.0 / L, rel=1e-12)  # di/dt = V/L from rest
+    assert point.largest == "motor.current"
+
+
+def test_the_residual_counts_a_step_where_an_fmu_tells_no_rates(monkeypatch):
+    def refuse(self, **given):
+        raise FmuError("no", block="motor")
+
+    monkeypatch.setattr(Fmu, "linear_model", refuse)
+    point = driven_motor().operating_point(0.0, step=T)
+    assert point.residual == pytest.approx(held(A_MOTOR, B_MOTOR)[1][:, 0].max(), rel=1e-6)
+
+
+def test_at_rest_the_residual_of_an_fmu_is_zero():
+    diagram = Diagram("rest", Fmu(dc_motor.build(), name="motor")(voltage=Constant(value=0.0), load_torque=0.0))
+    assert diagram.operating_point(0.0, step=T).residual == 0.0
