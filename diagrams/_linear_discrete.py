@@ -46,13 +46,12 @@ class Model:
 def discrete(flat: FlatDiagram, parts: Parts, at: OperatingPoint, way: str | None) -> Model:
     """Return the model over the least common period of all clocks."""
     period = math.lcm(*(clock.every for clock in flat.distinct)) if flat.distinct else 1
-    chain = _Chain(flat, parts, at, way)
-    for k, following in _ticks(flat, at.tick, period):
+    chain = Chain(flat, parts, at, way)
+    for k, following in ticks(flat, at.tick, period):
         chain.go(k, following - k)
     A, B = chain.M, chain.N
-    names = names_of_states(flat) + states_of(chain.models)
-    names += [f"held({e})" for name, shape in flat.plant_inputs.shapes.items() for e in elements(name, shape)]
-    keep = _needed(A, chain.C, _own(flat), set(range(flat.width, flat.width + chain.n_p)))
+    names = state_names(flat, chain.models)
+    keep = needed(A, chain.C, own_states(flat), set(range(flat.width, flat.width + chain.n_p)))
     memory, notes = _memory(flat, A, names)
     notes += chain.notes(at.tick + period)
     A, B, C = A[np.ix_(keep, keep)], B[keep], chain.C[:, keep]
@@ -69,18 +68,24 @@ def discrete(flat: FlatDiagram, parts: Parts, at: OperatingPoint, way: str | Non
     )
 
 
-def _ticks(flat: FlatDiagram, first: int, period: int) -> Iterator[tuple[int, int]]:
+def state_names(flat: FlatDiagram, models: Sequence[PlantModel]) -> list[str]:
+    """Return the names of a chain's states: of blocks, of FMUs, and of what FMUs are given."""
+    names = names_of_states(flat) + states_of(models)
+    return names + [f"held({e})" for name, shape in flat.plant_inputs.shapes.items() for e in elements(name, shape)]
+
+
+def ticks(flat: FlatDiagram, first: int, period: int) -> Iterator[tuple[int, int]]:
     """Yield the ticks of a period with the one after each: all where an FMU is stepped, else those that matter."""
     every = bool(flat.plant_outputs.total or flat.plant_inputs.total)
     ticks = [k for k in range(first, first + period) if every or k == first or flat.acting(k)]
     yield from zip(ticks, [*ticks[1:], first + period], strict=True)
 
 
-class _Chain:
+class Chain:
     """The way through a period, tick by tick.
 
     M and N lead from the state just before the first tick, and from what is injected, to the state before the tick that
-    is reached; C and D to what is measured at the first tick.
+    is reached; C and D to what is measured at the first tick. ``steps`` holds the four matrices of each tick.
     """
 
     def __init__(self, flat: FlatDiagram, parts: Parts, at: OperatingPoint, way: str | None):
@@ -91,6 +96,7 @@ class _Chain:
         self.uncertainty, self.n_p = 0.0, 0
         self._reuse: dict[str, Any] = {}
         self._begun = False
+        self.steps: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
         self._fired: list[str] = []
         self._first_tick: dict[Any, Any] = {}
 
@@ -119,8 +125,9 @@ class _Chain:
         P = Bp @ z_of
         P[:, nx : nx + n_p] += Ap
         M, N = np.vstack([x_of, P, z_of]), np.vstack([x_by_d, Bp @ z_by_d, z_by_d])
+        self.steps.append((M, N, *after("y")))
         if not self._begun:
-            self.M, self.N, (self.C, self.D), self.n_p = M, N, after("y"), n_p
+            (self.M, self.N, self.C, self.D), self.n_p = self.steps[0], n_p
             self._begun, self._first_tick = True, tick
         else:
             self.M, self.N = M @ self.M, M @ self.N + N
@@ -309,7 +316,7 @@ def _moves(flat: FlatDiagram, signal: Signal) -> bool:
 # --- what counts as a state ------------------------------------------------------------------------------------------
 
 
-def _own(flat: FlatDiagram) -> set[int]:
+def own_states(flat: FlatDiagram) -> set[int]:
     """Return the states of blocks that are states of the model: not the modes that only events change.
 
     Nor what a block in continuous time only starts its search from.
@@ -321,7 +328,7 @@ def _own(flat: FlatDiagram) -> set[int]:
     return found
 
 
-def _needed(A: np.ndarray, C: np.ndarray, own: set[int], plants: set[int]) -> list[int]:
+def needed(A: np.ndarray, C: np.ndarray, own: set[int], plants: set[int]) -> list[int]:
     """Return the states of blocks and FMUs, and of the rest those that act on anything.
 
     The rest only records: what is held since a tick, solutions of loops.

@@ -17,6 +17,7 @@ from ..blocks._errors import LoopwrightError, OptionError, WiringError
 from ._between import NONE
 from ._flat import FlatDiagram
 from ._linear_discrete import EQUILIBRIUM, Model, discrete, moves_between
+from ._linear_loops import confirm_closed, loop_model, moved, period_of, ticks_to_renewal
 from ._linear_parts import Parts, Signal, find_signal, steps_only
 from ._operating_point import OperatingPoint, check_options, names_of_states, operating_point
 from ._plant_models import continuous_models, joined, states_of
@@ -118,16 +119,20 @@ class Linearization:
         """Whether the operating point is an equilibrium."""
         return bool(np.max(np.abs(self.affine), initial=0.0) <= EQUILIBRIUM)
 
-    def loop(self, *wires: str) -> Any:
+    def loop(self, *wires: str, lifted: bool = False) -> Any:
         """Return the loop transfer function L at a wire, all other loops closed: S = 1/(1 + L).
 
         The wire is cut behind the port, for all its consumers; L = −(what comes back) / (what is injected). With
-        several wires, or a wire with several entries, L is the matrix of the loops cut all at once.
+        several wires, or a wire with several entries, L is the matrix of the loops cut all at once. Over a period of
+        several ticks it begins where the wire is renewed. Closing L is checked to give the diagram's poles.
 
         Parameters
         ----------
         *wires : str
             Names of wires, paths of ports, or entries of them: ``"motor_force"``, ``"motor_force[0]"``.
+        lifted : bool, default: False
+            Whether a wire that is renewed several times in the model's period gets one channel for each renewal:
+            ``"u@0"``, ``"u@1"``, …. A common factor of all of them is a gain in the wire.
 
         Returns
         -------
@@ -138,12 +143,20 @@ class Linearization:
         OptionError
             In a model over a period, a wire that changes between ticks and is used there: a held injection, seen at
             ticks, is not its loop.
+        WiringError
+            A wire that is renewed several times in the model's period, unless ``lifted``: its loop is periodic.
+        ConfirmationError
+            If closing L does not give the diagram's own poles.
         """
-        cut = self._at(wires, openings=wires, whole=True)
+        cut = self._at(wires, openings=wires, loop="lifted" if lifted else "one")
         return cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})")
 
     def sensitivity(self, *wires: str) -> Any:
-        """Return S at a wire: from what is injected there to what its consumers get, all loops closed."""
+        """Return S at a wire: from what is injected there to what its consumers get, all loops closed.
+
+        Over a period of several ticks, the injected signal is held from where the wire is renewed to the next period.
+        At a wire that is renewed several times in it, this is not 1/(1 + L), as there is no L at one rate.
+        """
         closed = self._at(wires)
         return closed._state_space(closed.C, closed.D + np.eye(len(closed.D)), f"S({', '.join(wires)})")
 
@@ -152,13 +165,24 @@ class Linearization:
         closed = self._at(wires)
         return closed._state_space(-closed.C, -closed.D, f"T({', '.join(wires)})")
 
-    def _at(self, wires: tuple[str, ...], openings: tuple[str, ...] = (), *, whole: bool = False) -> Linearization:
+    def _at(self, wires: tuple[str, ...], openings: tuple[str, ...] = (), loop: str = "") -> Linearization:
         if not wires:
             raise OptionError(
                 "no wire was named. Name one, such as .loop('v_perp').", block=self.diagram.name, port="wires"
             )
-        more = {"plants": self.plants, "step": self.step}
-        return _linearize(self.diagram, self.point, wires, wires, openings, whole_loop=whole, **more)
+        more: dict[str, Any] = {"plants": self.plants, "step": self.step}
+        flat = self.diagram.flatten(self.point.base)
+        at, shift = self.point, 0
+        if self.dt and period_of(flat) > 1:
+            shift = ticks_to_renewal(flat, [find_signal(flat, w).port for w in wires], at.tick)
+            at = moved(flat, at, self.plants, shift)
+        made = _linearize(self.diagram, at, wires, wires, openings, loop=loop, **more)
+        if loop:
+            own = not shift and not self.openings
+            closed = self if own else _linearize(self.diagram, at, (), (), (), **more)
+            cut = Model((made.A, made.B, made.C, made.D), made.dt, [], made.affine, uncertainty=made.uncertainty)
+            confirm_closed(cut, closed.A, wires, self.diagram.name)
+        return made
 
 
 def linearize(
@@ -187,7 +211,7 @@ def _linearize(
     *,
     plants: str | None,
     step: Any,
-    whole_loop: bool = False,
+    loop: str = "",
 ) -> Linearization:
     if step is not None and exact_time(step, block=diagram.name) != at.base and (diagram.has_clock or diagram.has_fmu):
         raise OptionError(
@@ -203,15 +227,20 @@ def _linearize(
     found = [[find_signal(flat, n) for n in group] for group in names]
     for signal in found[2]:
         _check_opening(flat, signal)
-    parts = Parts(flat, *found)
+    parts, channels = Parts(flat, *found), list[str]()
     if diagram.has_clock or (diagram.has_fmu and step is not None):
-        if whole_loop:
+        if loop:
             _check_loop(flat, parts, at)
-        model = discrete(flat, parts, at, plants)
+        if loop and period_of(flat) > 1:
+            model, channels = loop_model(flat, parts, at, plants, lifted=loop == "lifted")
+        else:
+            model = discrete(flat, parts, at, plants)
     else:
         model = _continuous(diagram, flat, parts, at, plants)
     A, B, C, D = model.matrices
     n, ins, outs = len(A), *(tuple(e for s in group for e in s.labels) for group in found[:2])
+    if channels:
+        ins = outs = tuple(channels)
     opaque = {p: "differences of the block" for p, b in flat.table.blocks.items() if b.opaque}
     return Linearization(
         diagram,

@@ -1,0 +1,115 @@
+"""Loops cut in a model over several ticks: the oracle is the diagram itself, with a gain put in at the wire."""
+
+import numpy as np
+import pytest
+import scipy.optimize
+
+from loopwright.blocks import PID, Constant, Gain, TransferFunction
+from loopwright.blocks._errors import ConfirmationError, WiringError
+from loopwright.diagrams import Diagram, margins, subsystem
+from loopwright.diagrams._linear_discrete import Model
+from loopwright.diagrams._linear_loops import confirm_closed
+
+
+def offset(phase, gain=1.0, behind=False):
+    plant = TransferFunction(numerator=[2.0], denominator=[1.0, 3.0, 2.0], name="plant")
+
+    @subsystem(sample_time=0.1, offset=phase)
+    def box(r, y):
+        return Gain(gain=gain, name="k")(PID(kp=3.0, ki=2.0)(r, y)).named("u")
+
+    u = box(Constant(value=0.0), plant.y.named("y"))
+    return Diagram("offset", plant(Gain(gain=1.0, name="after")(u).named("after_hold") if behind else u))
+
+
+def cascade(inner=1.0, outer=1.0):
+    """A current loop at 2 ms in a speed loop at 10 ms."""
+    electric = TransferFunction(numerator=[1.0], denominator=[0.02, 1.0], name="electric")
+    mechanic = TransferFunction(numerator=[5.0], denominator=[1.0, 0.2], name="mechanic")
+
+    @subsystem(sample_time=0.01)
+    def speed_loop(r, y):
+        return Gain(gain=outer, name="k")(PID(kp=2.0, ki=3.0)(r, y)).named("reference")
+
+    @subsystem(sample_time=0.002)
+    def current_loop(r, y):
+        return Gain(gain=inner, name="k")(PID(kp=2.0, ki=60.0)(r, y)).named("voltage")
+
+    voltage = current_loop(speed_loop(Constant(value=0.0), mechanic.y), electric.y)
+    return Diagram("cascade", mechanic(electric(voltage)))
+
+
+def limit(diagram_with):
+    """The gain at which the diagram's own poles reach the unit circle."""
+    return scipy.optimize.brentq(lambda k: np.abs(diagram_with(k).linearize().poles).max() - 1.0, 1.5, 100.0)
+
+
+def lifted_limit(L):
+    def beyond(k):
+        poles = np.linalg.eigvals(L.A - L.B @ np.linalg.solve(np.eye(L.ninputs) / k + L.D, L.C))
+        return np.abs(poles).max() - 1.0
+
+    return scipy.optimize.brentq(beyond, 1.5, 100.0)
+
+
+@pytest.mark.parametrize("wire", ["u", "y", "after_hold"])
+@pytest.mark.parametrize("phase", [0.03, 0.07, 0.09])
+def test_an_offset_of_the_only_clock_does_not_change_the_loop(phase, wire):
+    behind = wire == "after_hold"
+    model = offset(phase, behind=behind).linearize()
+    L, same = model.loop(wire), offset(0.0, behind=behind).linearize().loop(wire)
+    for w in (0.5, 2.0, 10.0):
+        z = np.exp(0.1j * w)
+        assert L(z) == pytest.approx(same(z), rel=1e-10)
+        assert model.sensitivity(wire)(z) == pytest.approx(1.0 / (1.0 + L(z)), rel=1e-10)
+        assert model.complementary(wire)(z) == pytest.approx(L(z) / (1.0 + L(z)), rel=1e-10)
+
+
+def test_the_gain_margin_with_an_offset_is_where_the_diagram_becomes_unstable():
+    found = margins(offset(0.03).linearize().loop("u")).gain_margin_high.value
+    assert found == pytest.approx(limit(lambda k: offset(0.03, k)), rel=1e-9)
+
+
+def test_a_wire_that_is_renewed_once_in_the_period_has_the_gain_margin_of_the_diagram():
+    model = cascade().linearize()
+    L, z = model.loop("reference"), np.exp(0.3j)
+    assert margins(L).gain_margin_high.value == pytest.approx(limit(lambda k: cascade(outer=k)), rel=1e-8)
+    assert model.sensitivity("reference")(z) == pytest.approx(1.0 / (1.0 + L(z)), rel=1e-10)
+
+
+def test_a_signal_that_changes_often_but_is_read_once_in_the_period_has_a_loop():
+    L = cascade().linearize().loop("mechanic.y")
+    assert L.ninputs == 1
+    assert margins(L).gain_margin_high.value == pytest.approx(limit(lambda k: cascade(outer=k)), rel=1e-8)
+
+
+@pytest.mark.parametrize("wire", ["voltage"])
+def test_a_wire_that_is_renewed_several_times_in_the_period_is_refused(wire):
+    with pytest.raises(WiringError, match=r"^current_loop\.k\.y: 'voltage' is renewed 5 times .* lifted=True"):
+        cascade().linearize().loop(wire)
+
+
+def test_the_lifted_loop_has_the_gain_limit_and_the_poles_of_the_diagram():
+    model = cascade().linearize()
+    L = model.loop("voltage", lifted=True)
+    assert L.ninputs == 5
+    assert L.input_labels[0].endswith("@0")
+    assert L.dt == pytest.approx(0.01)
+    assert lifted_limit(L) == pytest.approx(limit(lambda k: cascade(inner=k)), rel=1e-8)
+    poles = np.linalg.eigvals(L.A - L.B @ np.linalg.solve(np.eye(5) + L.D, L.C))
+    largest = np.sort(np.abs(poles))[::-1][: len(model.poles)]
+    assert largest == pytest.approx(np.sort(np.abs(model.poles))[::-1][: len(largest)], abs=1e-9)
+
+
+def test_lifting_a_wire_that_is_renewed_once_changes_nothing():
+    model, z = cascade().linearize(), np.exp(0.3j)
+    assert model.loop("reference", lifted=True)(z) == pytest.approx(model.loop("reference")(z), rel=1e-12)
+
+
+def test_a_loop_that_does_not_close_to_the_diagram_is_refused():
+    one = np.eye(1)
+    cut = Model((0.5 * one, one, -0.2 * one, 0 * one), 0.1, ["x"], np.zeros(1))
+    confirm_closed(cut, 0.3 * one, ("u",), "d")
+    confirm_closed(cut, np.diag([0.3, 0.0]), ("u",), "d")  # what is only held for later does not count
+    with pytest.raises(ConfirmationError, match="'u', closed, has the poles of another system"):
+        confirm_closed(cut, 0.31 * one, ("u",), "d")
