@@ -78,7 +78,9 @@ class Realization:
             D = np.where(np.abs(D) <= STRUCTURE * size, 0.0, D)
         for _ in range(int(delay)):
             A, B, C, D = _delayed(A, B, C, D)
-        return cls(*_balanced(A, B, C), D, float(dt), np.zeros(0)).minimal()
+        made = cls(*_balanced(A, B, C), D, float(dt), np.zeros(0)).minimal()
+        # once more, with input and output: A alone may have been scaled by what rounding has left in it
+        return cls(*_scaled(made.A, made.B, made.C), D, made.dt, made.hidden)
 
     @property
     def order(self) -> int:

@@ -370,3 +370,11 @@ def test_encirclements_and_open_loop_poles_give_the_closed_loop_poles(loop):
     closed = np.abs(np.linalg.eigvals(A - B @ C / (1 + D[0, 0]))) - 1
     if np.abs(closed).min() > 1e-6:  # else on the limit, hidden modes among them
         assert nyquist_count(loop).closed_loop == int(np.sum(closed > 0))
+
+
+def test_rounding_in_a_chain_of_integrators_is_not_scaled_up_to_be_seen():
+    # (3p s² + 3p² s + p³)/s³ as a reduction left it: A alone has no loop but one by rounding, 1e-14
+    A = [[3.1e-16, -1.56e-15, 1.379e-14], [32.0, -1.85e-16, -2.2e-30], [5.4e-31, 8.99645162, 2.4e-15]]
+    found = margins(control.ss(A, [[14.2278318], [0.0], [0.0]], [[8.43417339, 10.54271674, 15.625]], 0.0))
+    assert found.gain_margin_low.value == pytest.approx(1 / 9, abs=1e-6)
+    assert [c.frequency.value > 1.0 for c in found.phase_crossovers] == [True]
