@@ -153,7 +153,9 @@ class Diagram(Analysis):
     def continuous(self) -> Diagram:
         """Return the diagram with every sampled subsystem taken as ideal: continuous, without sampling, hold or delay.
 
-        A projection then solves its equation at each evaluation, from the foot point of the last accepted step.
+        A projection then solves its equation at each evaluation, from the foot point of the last accepted step. With an
+        FMU, a run still exchanges signals with it at multiples of ``step`` only, and holds its inputs between; the
+        linear model, of its equations, has no such hold.
 
         Raises
         ------

@@ -87,7 +87,11 @@ def tracking(loop: AdmittanceLoop) -> AdmittanceLoop:
 
 
 def admittance(case: Case) -> tuple[Section, Loops] | None:
-    """Return the section about the admittances, and their loops; None where the diagram has none."""
+    """Return the section about the admittances, and their loops; None where the diagram has none.
+
+    Where the diagram has friction, ``ke_limit`` is that of the design without it, and ``ke_limit_friction`` that of
+    ``stiffness_limits(AdmittanceLoop.of(diagram))``.
+    """
     if not case.is_fig3 or any(f"controller.admittance_{s}" not in case.diagram.blocks for s in SIDES):
         return None
     try:

@@ -6,11 +6,13 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from ..blocks._errors import OptionError
+from ._linear_parts import find_signal
 from ._report_admittance import admittance
 from ._report_case import Case
 from ._report_injection import injected
 from ._report_loops import inner
 from ._report_model import Report, Section
+from ._report_points import STEP
 from ._report_poles import poles
 from ._report_subject import operating_points, subject, versions
 from ._report_terms import DEFINITIONS
@@ -69,6 +71,8 @@ def analyse(
         If a number and its independent confirmation disagree.
     OptionError
         An unknown section.
+    UnknownNameError
+        If there is no wire with a name in ``loops``.
     """
     from ._diagram import Diagram
 
@@ -80,7 +84,10 @@ def analyse(
     wanted = set(SECTIONS if only is None else only)
     tell = progress or (lambda key: None)
     tell("variants")
-    case = Case(diagram, point, experiment, None if loops is None else tuple(loops))
+    wires = None if loops is None else tuple([loops] if isinstance(loops, str) else loops)
+    for wire in wires or ():
+        find_signal(diagram.flatten(None if diagram.has_clock else STEP), wire)
+    case = Case(diagram, point, experiment, wires)
     sections: list[Section | None] = []
     reduced: Any = None
     limits: dict[str, Any] = {}

@@ -16,6 +16,7 @@ from ._number import Number
 from ._realization import Realization
 from ._report_case import FRICTION, SIDES, Case, in_s
 from ._report_model import Section, Table
+from ._report_uncertainty import left_out, widened
 
 DEFINITIONS = (
     "L is the loop transfer function at a wire that is cut behind its source for all its consumers, all other loops "
@@ -75,12 +76,16 @@ def _key(name: str) -> str:
 
 def inner(case: Case) -> Section:
     """Return the section about the loops, one part for each wire."""
-    wires = wires_on_loops(case)
-    parts = [part for key, wire in wires.items() if (part := _wire(case, key, wire)) is not None]
+    text, parts = [DEFINITIONS], []
+    for key, wire in wires_on_loops(case).items():
+        part = _wire(case, key, wire)
+        if part is None:
+            text += left_out(case, wire, _on_cycles(case.diagram))
+        else:
+            parts.append(widened(case, wire, part))
     if case.is_fig3:
         parts += _motor_forces(case)
-    text = [DEFINITIONS]
-    if not parts:
+    if not parts and len(text) == 1:
         text.append("No wire of this diagram lies on a loop that has dynamics.")
     return Section("inner", "Inner loops", tuple(text), sections=tuple(parts))
 

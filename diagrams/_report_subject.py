@@ -10,7 +10,7 @@ import numpy as np
 
 from ..blocks._block import Block
 from ._number import Number
-from ._report_case import Case
+from ._report_case import AT_REST, Case
 from ._report_model import Section, Table
 
 PACKAGES = ("loopwright", "numpy", "scipy", "casadi", "control", "fmpy", "matplotlib")
@@ -126,11 +126,11 @@ def operating_points(case: Case) -> Section:
         numbers[f"{v.key}.affine"] = Number(worst, "1", 1e-12 * (1 + worst), "the linear model's affine term")
         plants = "; ".join(f"{p}: {h}" for p, h in model.how.items())
         rows.append((v.title, numbers[f"{v.key}.t"], point.how, numbers[f"{v.key}.residual"], point.largest, plants))
-        if not point.residual < 1e-6:
-            notes.append(
-                f"{v.title}: not an equilibrium (residual {point.residual:.3g}, of {point.largest}); the linear model "
-                "follows the motion through one period only."
-            )
+        if not point.residual < AT_REST:
+            notes.append(_moving(v))
+        hidden = [p for p, b in v.diagram.blocks.items() if hasattr(b, "description") and not b.description.states]
+        if hidden:
+            notes.append(f"{v.title}: {', '.join(sorted(hidden))} shows no states; the residual does not count them.")
         notes += [f"{v.title}: {note}" for note in model.notes]
     tables = [
         Table("Operating points", ("variant", "t", "how", "residual", "largest of", "derivative of FMUs"), tuple(rows))
@@ -146,12 +146,24 @@ def operating_points(case: Case) -> Section:
     text = (
         (
             "The linear models below are made at these points. The residual is the largest change of a "
-            "state over the next "
-            "tick, and of a continuous state in one second, relative to 1 + its size; it is 0 at rest."
+            "state over the next tick, "
+            "and of a continuous state, an FMU's as well, in one second, relative to 1 + its size; it is 0 at rest."
         ),
         *notes,
     )
     return Section("operating_points", "Operating points", text, tuple(tables), (), numbers)
+
+
+def _moving(v: Any) -> str:
+    """Return what is said of an operating point that is no equilibrium."""
+    point, model = v.point, v.model
+    start = f"{v.title}: not an equilibrium (residual {point.residual:.3g}, of {point.largest}); "
+    moving = [i for i, change in enumerate(model.affine) if not abs(change) <= AT_REST]
+    fed = model.A - np.eye(len(model.A)) if model.dt else model.A
+    if moving and np.max(np.abs(fed[:, moving])) <= 1e-9 * (model.dt or 1.0):
+        names = ", ".join(model.states[i] for i in moving)
+        return f"{start}nothing but {names} moves, on which nothing depends: all else is as at an equilibrium."
+    return f"{start}the linear model follows the motion through one period only."
 
 
 def _value(v: Any, wire: Any) -> Any:

@@ -9,7 +9,8 @@ DEFINITIONS: Mapping[str, str] = MappingProxyType(
     {
         "sample_time": "Time between two ticks of a subsystem.",
         "affine": "Largest change of a state of the linear model at the operating point itself, per period or second.",
-        "residual": "Largest change of a state over a tick, of a continuous one in a second, over 1 + its size.",
+        "residual": "Largest change of a state over a tick, of a continuous one, an FMU's too, in a second, over 1 + "
+        "its size.",
         "slowest": "Largest real part of the poles, s = log(z)/T where sampled.",
         "polynomial_difference": "Largest difference of coefficients of two polynomials, scaled, over the largest.",
         "polynomial_spread": "The same difference, largest over the path points and offsets.",
@@ -26,8 +27,10 @@ DEFINITIONS: Mapping[str, str] = MappingProxyType(
         "gain_high": "Largest factor in all channels at once within the disk.",
         "phase_deg": "Largest rotation in all channels at once within the disk.",
         "ke_frequency": "Frequency at which the coupled loop oscillates at the limit of stiffness.",
-        "ke_limit": "First stiffness of the environment at which contact is no longer stable; none up to 1e8 N/m: ∞.",
-        "ke_limit_friction": "The same with the slope that the friction has at rest, and with its compensation.",
+        "ke_limit": "First stiffness of the environment at which contact is no longer stable; none up to 1e8 N/m: ∞. "
+        "Of the design without friction, where the diagram has some.",
+        "ke_limit_friction": "The same with the slope that the friction has at rest, and with its compensation: of the "
+        "diagram as it is, as stiffness_limits(AdmittanceLoop.of(diagram)) returns it.",
         "me_limit": "First mass of the environment, from below up to 1e4 kg, at which contact is no longer stable.",
         "me_limit_friction": "The same with the slope that the friction has at rest, and with its compensation.",
         "tool_mass_limit_friction": "The same with the slope that the friction has at rest, and with its compensation.",

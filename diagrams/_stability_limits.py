@@ -194,6 +194,9 @@ def stability_limit(
 def stiffness_limits(loop: AdmittanceLoop, dampings: Sequence[float] = (0.0, 10.0, 100.0)) -> dict[str, StabilityLimit]:
     """Return the limits of the environment's stiffness side by side: continuous, and sampled without and with a delay.
 
+    They are the loop's as it is: with `AdmittanceLoop.of` and a diagram with friction, those that a report calls
+    ``ke_limit_friction``. A report's ``ke_limit`` is that of the design without friction.
+
     Parameters
     ----------
     loop : AdmittanceLoop
