@@ -2,8 +2,8 @@
 
 **Which signals.** At the wire, v is what the port puts out, d the test signal, u = v + d what all its consumers get.
 S = u/d, T = −v/d, L = −v/u: the loop that `Linearization.loop` cuts at this wire, all other loops closed. All of them
-are sampled where the linear model is: at the ticks of the least common period of what is sampled, with d held from one
-to the next. They are the phasors of sequences, not of what is between the ticks: a plant's velocity read at 1 kHz holds
+are sampled where the linear model's loops are: at the ticks of the least common period of what is sampled, from the one on
+at which the wire is renewed, with d held from one to the next. They are the phasors of sequences, not of what is between the ticks: a plant's velocity read at 1 kHz holds
 the ripple of the controller's hold, aliased, and differs from the velocity's fundamental by 1e-4 to 1e-3. In a diagram
 that is continuous throughout, d is continuous too. Where v changes between the samples (several rates; continuous
 states), S and T are still what the linear model calls them, but no loop is cut by a held signal: there is no L.
@@ -30,6 +30,7 @@ from ..blocks._errors import OptionError
 from ._between import NONE
 from ._flat import FlatDiagram
 from ._injection import Experiment, injected
+from ._linear_loops import ticks_to_renewal
 from ._linear_parts import find_signal
 from ._operating_point import OperatingPoint, operating_point
 from ._pass import Pass
@@ -210,7 +211,8 @@ def frequency_response(
             chosen.setdefault("max_step", 0.5 * np.pi / omega[-1])
     plan = list(plan_of(kind, omega, dt, amplitude))
     tick = point.tick if point is not None else round(t0 / float(flat.base))
-    held = (period, (tick % every) * flat.base) if discrete else None
+    wait = ticks_to_renewal(flat, [signal.port], tick) if discrete and every > 1 else 0  # as for the linear model
+    held = (period, ((tick + wait) % every) * flat.base) if discrete else None
     made = injected(diagram, signal, len(plan[0].waveform.amplitude), held)
     lines = np.concatenate([part.omega for part in plan])
     found = _Found(len(lines), len(signal.entries), sum(len(o.entries) for o in measured))
@@ -218,6 +220,8 @@ def frequency_response(
         with Experiment(diagram, made, signal, measured, point, chosen) as experiment:
             if point is None and t0 > 0:
                 experiment.simulation.advance(t0)
+            if wait:
+                experiment.go(wait, 1)
             before = experiment.stands()
             for i, part in enumerate(plan):
                 _measure(experiment, part, entry, j, every, windows, agreement, found, i)

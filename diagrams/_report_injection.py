@@ -42,13 +42,14 @@ def injected(case: Case) -> Section | None:
         measured = {}
         for v in case.usable("sampled_d0", "sampled_d1", "sampled_d0" + FRICTION):
             if not v.rests:
-                text.append(f"{v.title} at {wire}: not done, as the operating point is not at rest.")
+                text.append(f"{v.title} at {wire}: not done, as the operating point is not at rest{_moving(v)}.")
                 continue
             try:
+                L = v.loop(wire)  # a wire without a loop at one rate needs no measurement
                 found, model = _measured(case, v, wire)
-                deviation = found.deviation(model)
+                deviation = found.deviation(model, "L")
             except LoopwrightError as error:
-                text.append(f"{v.title} at {wire}: {error}")
+                text.append(f"{v.title} at {wire}: not done. {error.message}")
                 continue
             worst, own = float(np.max(deviation)), float(np.max(found.uncertainty))
             if worst - 10 * own > REFUTED:
@@ -66,14 +67,26 @@ def injected(case: Case) -> Section | None:
             shown = (numbers[f"{where}.{n}"] for n in ("deviation", "uncertainty"))
             verdict = "yes" if worst <= CONFIRMED else "no"
             rows.append((wire, v.title, span, *shown, verdict))
-            measured[v.title] = (found, model)
+            measured[v.title] = (found, L)
         if measured:
             plots.append(_plot(key, wire, measured))
     if not rows:
-        return None
+        return Section("injection", "Injection check", tuple(text[1:])) if text[1:] else None
     columns = ("wire", "variant", "frequencies", "largest deviation", "uncertainty", f"within {CONFIRMED:g}")
     table = Table("Injected against linearized", columns, tuple(rows))
     return Section("injection", "Injection check", tuple(text), (table,), tuple(plots), numbers)
+
+
+def _moving(v: Variant) -> str:
+    """Name the state that moves most at an operating point; a measurement would wander off along it."""
+    try:
+        moves = np.abs(v.model.affine)
+    except LoopwrightError:
+        return ""
+    if not moves.size or len(moves) != len(v.model.states) or not np.max(moves) > 0.0:
+        return ""
+    most = int(np.argmax(moves))
+    return f": {v.model.states[most]} moves by {moves[most]:.3g} " + ("in a period" if v.model.dt else "per second")
 
 
 def _measured(case: Case, v: Variant, wire: str) -> tuple[Any, Any]:
@@ -110,11 +123,10 @@ def _at_rest(v: Variant) -> Variant:
 
 
 def _plot(key: str, wire: str, measured: dict[str, tuple[Any, Any]]) -> Plot:
-    """Draw the measured points over the linear model."""
+    """Draw the measured points over the linear model's L."""
     curves = {}
-    for title, (found, model) in measured.items():
+    for title, (found, L) in measured.items():
         w = np.geomspace(found.omega[0], found.omega[-1], 200)
-        L = model.loop(wire)
         points = np.array([complex(np.ravel(v)[0]) for v in np.moveaxis(np.atleast_1d(found.L.frdata), -1, 0)])
         curves[title] = (w, figures.response(L, w), found.omega, points)
     return figures.injected(f"injection_{key}", wire, curves)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from loopwright.blocks import PID, Constant, Gain, TransferFunction
+from loopwright.blocks import PID, Constant, Gain, Integrator, TransferFunction
 from loopwright.blocks._errors import ConfirmationError, WiringError
 from loopwright.diagrams import Diagram, margins, subsystem
 from loopwright.diagrams._linear_discrete import Model
@@ -113,3 +113,38 @@ def test_a_loop_that_does_not_close_to_the_diagram_is_refused():
     confirm_closed(cut, np.diag([0.3, 0.0]), ("u",), "d")  # what is only held for later does not count
     with pytest.raises(ConfirmationError, match="'u', closed, has the poles of another system"):
         confirm_closed(cut, 0.31 * one, ("u",), "d")
+
+
+def test_an_injection_at_a_box_with_an_offset_measures_the_loop():
+    diagram = offset(0.03)
+    found = diagram.frequency_response("u", [2.0, 10.0], amplitude=0.01)
+    assert found.held
+    for of in "LST":
+        assert found.compare(diagram.linearize(), of) <= 1e-6
+
+
+def test_a_report_says_why_a_periodic_wire_has_no_margins_and_is_not_injected_into():
+    report = cascade().report(only=("inner", "injection"))
+    text = [line for s in report.sections for line in (*s.text, *(t for part in s.sections for t in part.text))]
+    assert sum("'current_loop.voltage' is renewed 5 times" in line for line in text) >= 2
+    numbers = report.numbers()
+    assert "inner.voltage.sampled_d0.gain_margin_high" not in numbers
+    assert not [name for name in numbers if name.startswith("injection.voltage")]
+    assert numbers["inner.reference.sampled_d0.gain_margin_high"].value == pytest.approx(
+        limit(lambda k: cascade(outer=k)), rel=1e-8
+    )
+    assert numbers["injection.reference.sampled_d0.deviation"].value < 1e-5
+
+
+def test_a_report_names_the_state_that_keeps_an_operating_point_from_rest():
+    angle = Integrator(name="angle", initial_value=0.0)
+    plant = TransferFunction(numerator=[2.0], denominator=[1.0, 1.0], name="plant")
+
+    @subsystem(sample_time=0.1)
+    def box(r, y):
+        return PID(kp=1.0, ki=2.0)(r, y).named("u")
+
+    diagram = Diagram("turning", angle(plant(box(Constant(value=1.0), plant.y))))
+    report = diagram.report(only=("injection",), point=diagram.operating_point(20.0))
+    (text,) = [line for s in report.sections if s.key == "injection" for line in s.text if "no delay" in line]
+    assert "at box.u: not done, as the operating point is not at rest: angle.y moves by 0.1 in a period" in text
