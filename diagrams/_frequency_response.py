@@ -1,12 +1,13 @@
 """Frequency responses measured on the running diagram, by a test signal that is injected at a wire.
 
-**Which signals.** At the wire, v is what the port puts out, d the test signal, u = v + d what all its consumers get.
-S = u/d, T = −v/d, L = −v/u: the loop that `Linearization.loop` cuts at this wire, all other loops closed. All of them
-are sampled where the linear model's loops are: at the ticks of the least common period of what is sampled, from the one on
-at which the wire is renewed, with d held from one to the next. They are the phasors of sequences, not of what is between the ticks: a plant's velocity read at 1 kHz holds
-the ripple of the controller's hold, aliased, and differs from the velocity's fundamental by 1e-4 to 1e-3. In a diagram
-that is continuous throughout, d is continuous too. Where v changes between the samples (several rates; continuous
-states), S and T are still what the linear model calls them, but no loop is cut by a held signal: there is no L.
+**Which signals.** At the wire, v is what the port puts out, d the test signal, u = v + d what all its consumers get. S
+= u/d, T = −v/d, L = −v/u: the loop that `Linearization.loop` cuts at this wire, all other loops closed. All of them
+are sampled where the linear model's loops are: at the ticks of the least common period of what is sampled, from the
+one on at which the wire is renewed, with d held from one to the next. They are the phasors of sequences, not of what
+is between the ticks: a plant's velocity read at 1 kHz holds the ripple of the controller's hold, aliased, and differs
+from the velocity's fundamental by 1e-4 to 1e-3. In a diagram that is continuous throughout, d is continuous too. Where
+v changes between the samples (several rates; continuous states), S and T are still what the linear model calls them,
+but no loop is cut by a held signal: there is no L.
 
 **Frequencies** are moved by less than half a sample in a window, so that whole periods fit into it.
 
