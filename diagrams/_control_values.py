@@ -33,7 +33,7 @@ class Comparison:
     function : str
         The function that gave it.
     right : str
-        "both", "ours", or "neither is refuted".
+        "both", "ours" (also where python-control gives none), or "neither is refuted".
     why : str
         What decides it.
     """
@@ -154,10 +154,11 @@ class _Judge:
         if name in self.ours.numbers():
             how += " by " + self.ours.numbers()[name].confirmed_by
         if np.isnan(theirs):
-            none = mine in (0.0, np.inf)
-            text = reason or "it gives none"
-            return Comparison(name, mine, theirs, function, "both" if none else "ours", f"{text}; {how}")
-        refuted = self._refuted(name, theirs)
+            return Comparison(name, mine, theirs, function, "ours", f"{reason or 'it gives none'}; {how}")
+        try:
+            refuted = self._refuted(name, mine, theirs)
+        except (np.linalg.LinAlgError, ArithmeticError) as error:
+            refuted, reason = "", f"theirs can't be judged ({error})"
         return Comparison(
             name, mine, theirs, function, "ours" if refuted else "neither is refuted", f"{refuted or reason}; {how}"
         )

@@ -29,7 +29,10 @@ DEFINITIONS: Mapping[str, str] = MappingProxyType(
         "bandwidth": "The lowest frequency at which |T| falls below 1/√2 of its value at low frequency.",
         "gain_crossover": "A frequency at which |L| = 1.",
         "phase_crossover": "A frequency at which L is real and negative.",
-        "ke_limit": "The first environment stiffness, on a scan from below, at which contact is no longer stable.",
+        "ke_limit": "The first environment stiffness, on a scan from below, at which contact is no longer stable; of "
+        "the design without friction, where the diagram has some.",
+        "ke_limit_friction": "The same limit of the diagram as it is, with its friction and the compensation, as "
+        "stiffness_limits(AdmittanceLoop.of(diagram)) returns it.",
         "me_limit": "The first environment mass, on a scan from below, at which contact is no longer stable.",
         "be_limit": "The first environment damping, on a scan from below, at which contact is no longer stable.",
         "tool_mass_limit": "The first mass beyond the force sensor, from below, at which the loop is no longer stable.",
@@ -68,6 +71,7 @@ DEFINITIONS: Mapping[str, str] = MappingProxyType(
         "be_frequency": "The frequency at which the loop oscillates at the limit of the environment's damping.",
         "tool_mass_frequency": "The frequency at which the loop oscillates at the limit of the tool's mass.",
         "subject": "A parameter of the block that its path names.",
+        "control": "python-control's own value of the same number.",
     }
 )
 
@@ -82,7 +86,14 @@ def definition(path: str, more: Mapping[str, str] = MappingProxyType({})) -> tup
     more : mapping, optional
         Further definitions, which come first.
     """
-    for part in reversed(path.split(".")):
+    parts = path.split(".")
+    if parts[0] == "subject" and parts[-1] != "sample_time":  # boxes, blocks and parameters have names of their own
+        parts = ["subject"]
+    elif parts[0] == "inner" and parts[3:4] == ["control"]:  # inner.WIRE.VARIANT.control.NUMBER
+        parts = ["control"]
+    elif parts[0] in ("inner", "injection"):
+        del parts[1:2]  # the wire's name
+    for part in reversed(parts):
         bare = re.sub(r"^(pole|gain)_[a-z]?\d.*|_friction$|_\d+$", r"\1", part)
         for name in (part, bare):
             for known in (more, DEFINITIONS):

@@ -78,7 +78,8 @@ class _Page:
             if isinstance(value, Mapping):
                 pairs = {str(k): cell(v) for k, v in value.items()}
                 plainly = all(len(text.split()) == 1 for text in pairs.values())
-                value = (", " if plainly else "; ").join(f"{k}{' ' if plainly else ': '}{v}" for k, v in pairs.items())
+                said = [v if k == v else f"{k}{' ' if plainly else ': '}{v}" for k, v in pairs.items()]
+                value = (", " if plainly else "; ").join(said)
             elif isinstance(value, list | tuple):
                 value = ", ".join(map(cell, value))
             name = escape(str(key).replace("_", " "))

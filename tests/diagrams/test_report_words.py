@@ -9,6 +9,9 @@ from scipy.optimize import brentq, minimize_scalar
 
 from loopwright.blocks import PID, Constant, Encoder, Integrator, UnknownNameError
 from loopwright.diagrams import Diagram, analyse, subsystem
+from loopwright.diagrams._report_definitions import definition
+from loopwright.diagrams._report_html import to_html
+from loopwright.diagrams._report_terms import DEFINITIONS
 from loopwright.fmus import Fmu, dc_motor
 
 T, KP, KI = 1e-3, 0.05, 2.0
@@ -123,3 +126,44 @@ def test_a_loop_through_an_encoder_is_there_with_slope_zero():
 def test_a_named_wire_off_all_loops_is_said_to_be_off_them():
     diagram = Diagram("open", Integrator(name="x")(Constant(value=1.0).named("r")).named("y"))
     assert "r does not lie on a loop." in list(texts(analyse(diagram, loops=["r"], only=("inner",)).sections[0]))
+
+
+# --- definitions, and other words -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("more", [{}, DEFINITIONS])
+@pytest.mark.parametrize(
+    ("path", "term"),
+    [
+        ("subject.control.pi.kp", "subject"),
+        ("subject.control.amplifier.gain", "subject"),
+        ("subject.plant.mean", "subject"),
+        ("inner.u.continuous.control.phase_margin_deg", "control"),
+        ("inner.control.continuous.phase_margin_deg", "phase_margin_deg"),
+        ("inner.u.continuous.gain_crossover_1.frequency", "frequency"),
+        ("poles.par.sampled_d0.pole_1_real", "pole"),
+        ("admittance.par.ke_limit_friction.sampled_d0.be_10", "ke_limit_friction"),
+    ],
+)
+def test_names_that_users_choose_are_not_taken_for_terms(path, term, more):
+    found = definition(path, more)
+    assert found is not None
+    assert found[0] == term
+
+
+@pytest.mark.parametrize("path", ["injection.gain.sampled_d0.nothing", "inner.control.continuous.nothing"])
+def test_a_wires_name_defines_nothing(path):
+    assert definition(path, DEFINITIONS) is None
+
+
+def test_where_python_control_gives_no_value_it_is_not_called_right():
+    numbers = moving_report().numbers()
+    theirs = {path: n for path, n in numbers.items() if ".control." in path and np.isnan(n.value)}
+    assert theirs
+    assert all("right: ours" in n.confirmed_by for n in theirs.values())
+
+
+def test_a_variant_that_is_called_as_its_key_is_named_once():
+    page = to_html(analyse(Diagram("open", Integrator(name="x")(Constant(value=1.0))), only=("poles",)))
+    assert "<td>continuous</td>" in page
+    assert "continuous continuous" not in page
