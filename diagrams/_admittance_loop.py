@@ -248,6 +248,7 @@ class AdmittanceLoop(Value):
 
         Each argument may be an array: the matrices then have its axes in front.
         """
+        check_environment(stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
         n = len(self.directions)
         M, C = self.motions[0]
         there = np.diag([float(s == self.side) for s in self.directions])  # where the environment acts
@@ -295,6 +296,15 @@ class AdmittanceLoop(Value):
             B, C_ = np.vstack([B, D]), np.hstack([np.zeros((n, len(A) - n)), eye])
             D = np.zeros((n, 3 * n))
         return Linear(A, B, C_, D)
+
+
+def check_environment(**values: Any) -> None:
+    """Refuse an environment that is not one: NaN, infinite or negative."""
+    for name, value in values.items():
+        if value is not None and not np.all((_float(value) >= 0.0) & np.isfinite(_float(value))):
+            raise ParameterError(
+                f"found {value!r}; expected finite numbers that are not negative.", block="environment", port=name
+            )
 
 
 def held(plant: Linear, T: float, n: int) -> Linear:

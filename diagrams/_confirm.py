@@ -154,6 +154,22 @@ def delay(r: Realization, features: Features, value: float, others: Sequence[flo
     return limit("delay_margin", value, others, 0.0, stable, "encirclements of 1 + L exp(−sτ)")
 
 
+def on_the_limit(r: Realization, n: int) -> None:
+    """Confirm that n samples of delay in series put closed-loop poles on the limit of stability; up to 100 samples."""
+    if n > 100:
+        return
+    delayed = r
+    for _ in range(n):
+        delayed = delayed.delayed()
+    nearest = float(np.min(np.abs(delayed.growth(delayed.eigenvalues()))))
+    if nearest > 1e-6:
+        raise ConfirmationError(
+            f"found a margin of {n} samples, but with these no closed-loop pole is nearer than {nearest:.3g} to the "
+            "unit circle; expected one on it. Look at closed_loop_poles.",
+            block="delay_margin",
+        )
+
+
 def whole_samples(r: Realization, features: Features, n: int) -> int:
     """Return the number of closed-loop poles that are not stable with n samples of delay in series.
 

@@ -14,6 +14,7 @@ from . import _confirm
 from ._crossings import Scan
 from ._margins import Margins, margins
 from ._realization import Realization
+from ._threads import on_one_thread
 
 SAME = 1e-4  # relative difference up to which two values are called the same
 
@@ -72,10 +73,15 @@ def compare_with_control(loop: Any, *, delay: int = 0) -> tuple[Comparison, ...]
             "found a closed loop that is not stable; expected a stable one: it has no margins to compare.",
             block="compare_with_control",
         )
-    r = Realization.of(loop, delay=delay)
     L = control.ss(loop)
     for _ in range(delay):
         L = L * control.ss(0, 1, 1, 0, L.dt)
+    return compared(Realization.of(loop, delay=delay), ours, L)
+
+
+@on_one_thread
+def compared(r: Realization, ours: Margins, L: Any) -> tuple[Comparison, ...]:
+    """Return margins that are there already beside python-control's of L, of which r is the realization."""
     theirs = _ControlValues(L)
     judge = _Judge(r, ours)
     found = []
@@ -163,10 +169,12 @@ class _Judge:
             name, mine, theirs, function, "ours" if refuted else "neither is refuted", f"{refuted or reason}; {how}"
         )
 
-    def _refuted(self, name: str, value: float) -> str:
+    def _refuted(self, name: str, mine: float, value: float) -> str:
         """Return why a value can't be right, empty if it may be."""
         r = self.r
         if name in ("gain_margin_low", "gain_margin_high"):
+            if value in (0.0, np.inf):
+                return f"it says that there is none, and the factor {mine:.9g} ends stability"
             return self._no_limit(value, 1.0, r.stable)
         if name == "phase_margin_deg":
             if not np.isfinite(value):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..blocks._values import Array
-from ._admittance_loop import AdmittanceLoop, Linear, held
+from ._admittance_loop import AdmittanceLoop, Linear, check_environment, held
 
 
 def closed_loop(loop: AdmittanceLoop, **environment: Any) -> Array:
@@ -45,6 +45,7 @@ def closed_loop(loop: AdmittanceLoop, **environment: Any) -> Array:
 def _ideal(
     loop: AdmittanceLoop, stiffness: Array = 0.0, damping: Array = 0.0, mass: Array = 0.0, tool_mass: Any = None
 ) -> Array:
+    check_environment(stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
     a, q = loop.admittance, loop.scale
     tool = loop.tool_mass if tool_mass is None else tool_mass
     k, b, m, tool = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in (stiffness, damping, mass, tool)))

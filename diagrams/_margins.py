@@ -10,9 +10,11 @@ import numpy as np
 from ..blocks._errors import ConfirmationError, ParameterError
 from . import _confirm
 from ._crossings import Crossing, Peak, Scan
+from ._features import clusters
 from ._number import Number
 from ._nyquist import count
 from ._realization import Realization
+from ._threads import on_one_thread
 
 EIGENVALUES = "closed-loop eigenvalues"
 GAINS = (1.5, 2.0, 5.0, 10.0, 100.0, 1e3)
@@ -43,7 +45,7 @@ class Margins:
     Parameters
     ----------
     stable : bool
-        Whether all closed-loop poles are stable, those of hidden modes aside.
+        Whether all of `closed_loop_poles` are stable. Hidden modes are not among them: look at `hidden_unstable`, too.
     gain_crossovers, phase_crossovers : tuple
         All of them, by rising frequency; phase crossovers also at 0, at π/T and at infinity.
     gain_margin_low, gain_margin_high : Number
@@ -68,6 +70,9 @@ class Margins:
         In the s plane (continuous) or the z plane (sampled). Multiple poles scatter, as ε^(1/multiplicity).
     hidden_poles : tuple of complex
         Poles that are not controllable or not observable in the loop, left out of everything above.
+    hidden_unstable : tuple of complex
+        Those of them that are not stable, except on the limit itself. This loop does not show them, and no gain in it
+        stabilizes them: another loop must.
     encirclements : int
         Clockwise encirclements of −1 by L.
     """
@@ -89,6 +94,7 @@ class Margins:
     bandwidth: Number
     closed_loop_poles: tuple[complex, ...]
     hidden_poles: tuple[complex, ...]
+    hidden_unstable: tuple[complex, ...]
     encirclements: int
 
     def numbers(self) -> dict[str, Number]:
@@ -101,9 +107,15 @@ class Margins:
         return {name: number.as_dict() for name, number in self.numbers().items()}
 
     def __str__(self) -> str:
-        return "\n".join(f"{name:22s}{number}" for name, number in self.numbers().items())
+        lines = [f"{name:22s}{number}" for name, number in self.numbers().items()]
+        if self.hidden_unstable:
+            lines.append(
+                f"hidden_unstable       {', '.join(f'{p:.6g}' for p in self.hidden_unstable)}: not in this loop"
+            )
+        return "\n".join(lines)
 
 
+@on_one_thread
 def margins(loop: Any, *, delay: int = 0, skew: float = 0.0) -> Margins:
     """Return all margins of a loop with one channel, each confirmed by a second computation.
 
@@ -182,9 +194,19 @@ class _Judge:
             phase_crossovers=tuple(self._phase_crossover(c) for c in self.phase),
             closed_loop_poles=tuple(complex(p) for p in np.sort_complex(poles + 1 if r.dt else poles)),
             hidden_poles=tuple(complex(p) for p in (r.hidden + 1 if r.dt else r.hidden)),
+            hidden_unstable=self._hidden_unstable(),
             encirclements=encirclements,
             **found,
         )
+
+    def _hidden_unstable(self) -> tuple[complex, ...]:
+        """Return the hidden poles beyond the limit; coinciding ones on it are computed with a scatter to both sides."""
+        r = self.r
+        if not len(r.hidden):
+            return ()
+        _, rest = clusters(r, r.hidden, max(r.scale, float(np.abs(r.hidden).max())))
+        beyond = rest[rest.real > 0]
+        return tuple(complex(p) for p in (np.exp(beyond * r.dt) if r.dt else beyond))
 
     def _frequency(self, c: Crossing, how: str) -> Number:
         ends = c.omega in (0.0, np.inf) or c.omega == self.r.nyquist
@@ -262,6 +284,10 @@ class _Judge:
     def _count_samples(self, n: float, lags: dict[Crossing, float]) -> str:
         """Confirm by the number of unstable poles with the next whole samples below and above."""
         below, above = int(np.floor(n)), int(np.floor(n)) + 1
+        whole = abs(n - round(n)) <= 1e-9 * max(n, 1.0) and n > 0.5
+        if whole:  # with that many samples the poles lie on the limit itself
+            below, above = round(n) - 1, round(n) + 1
+            _confirm.on_the_limit(self.r, round(n))
         for samples in (below, above):
             expected = 0
             for c, lag in lags.items():
@@ -275,7 +301,8 @@ class _Judge:
                     block="delay_margin",
                 )
         with_z = EIGENVALUES if above <= 100 else "encirclements"
-        return f"{with_z} with z⁻ⁿ: stable at n = {below}, as many unstable at n = {above} as crossovers say"
+        on_it = f", on the limit at n = {round(n)}" if whole else ""
+        return f"{with_z} with z⁻ⁿ: stable at n = {below}{on_it}, as many unstable at n = {above} as crossovers say"
 
     def _no_samples(self) -> str:
         def stable(n: float) -> bool:

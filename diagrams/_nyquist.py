@@ -147,6 +147,12 @@ def _follow(r: Realization, s: np.ndarray, delay: float) -> np.ndarray:
     for _ in range(30):
         L, _ = r.values(s)
         f = 1 + L * np.exp(-s * delay)
+        if np.any(f == 0):
+            raise ConfirmationError(
+                "1 + L vanishes on the contour: a closed-loop pole lies on the limit of stability. Look at "
+                "closed_loop_poles.",
+                block="nyquist",
+            )
         coarse = np.abs(np.angle(f[1:] / f[:-1])) > 0.5
         if not coarse.any() or len(s) > 100_000:
             break

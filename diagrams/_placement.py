@@ -53,6 +53,13 @@ def place(A: Any, B: Any, poles: Sequence[complex]) -> np.ndarray:
             f"found A {A.shape}, B {B.shape} and {wanted.size} poles; expected (n, n), (n, m) and n poles.",
             block="place",
         )
+    for name, values in (("A", A), ("B", B), ("poles", wanted)):
+        if not np.isfinite(values).all():
+            raise ParameterError(
+                "found NaN or infinity; expected finite numbers. Look at the operating point of the model.",
+                block="place",
+                port=name,
+            )
     polynomial = _real_polynomial(wanted)
     rank = int(np.linalg.matrix_rank(B))
     multiplicity = max(int(np.sum(np.abs(wanted - p) < 1e-9 * (1 + abs(p)))) for p in wanted)
@@ -306,7 +313,7 @@ def sampled_gains(
         If the polynomial with these gains has not the roots that were asked for.
     """
     wanted = np.asarray(poles, dtype=complex)
-    if wanted.ndim != 1 or not len(wanted) or np.any(wanted.real >= 0):
+    if wanted.ndim != 1 or not len(wanted) or not np.all(wanted.real < 0) or not np.isfinite(wanted).all():
         raise ParameterError(
             f"found {list(poles)!r}; expected poles in the left half plane, one for each gain.",
             block="sampled_gains",

@@ -17,6 +17,7 @@ from ._report_poles import poles
 from ._report_subject import operating_points, subject, versions
 from ._report_terms import DEFINITIONS
 from ._report_time import not_modelled, time_domain
+from ._threads import on_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -28,6 +29,7 @@ SECTIONS = ("subject", "operating_points", "poles", "inner", "admittance", "time
 """Keys of the sections, in order; each starts the dotted paths of its numbers."""
 
 
+@on_one_thread
 def analyse(
     diagram: Diagram | Experiment,
     *,

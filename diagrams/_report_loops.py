@@ -9,7 +9,7 @@ import numpy as np
 
 from ..blocks._errors import LoopwrightError
 from . import _report_plots as figures
-from ._control_values import Comparison, compare_with_control
+from ._control_values import Comparison, compared
 from ._disk import mimo_disk_margin
 from ._margins import Margins, margins
 from ._number import Number
@@ -95,7 +95,7 @@ def _wire(case: Case, key: str, wire: str) -> Section | None:
     loops: dict[str, Any] = {}
     notes: list[str] = []
     numbers: dict[str, Number] = {}
-    compared: list[tuple[Any, ...]] = []
+    beside: list[tuple[Any, ...]] = []
     for v in case.usable():
         try:
             L = v.loop(wire)
@@ -107,18 +107,24 @@ def _wire(case: Case, key: str, wire: str) -> Section | None:
             continue
         found[v.key], loops[v.key] = m, L
         numbers |= {f"{v.key}.{name}": number for name, number in _numbers(m).items()}
+        if m.hidden_unstable:
+            notes.append(
+                f"{v.title}: modes that this loop does not show are not stable, with poles at "
+                f"{_poles(m.hidden_unstable, L.dt)} 1/s. The margins say nothing of them."
+            )
         if not m.stable:
             notes.append(f"{v.title}: the closed loop is not stable, so that it has no margins.")
         elif not v.key.endswith(FRICTION):
             try:
                 with np.errstate(all="ignore"):
-                    beside = compare_with_control(_minimal(L))
-            except np.linalg.LinAlgError as error:
+                    r = Realization.of(L)
+                    rows = compared(r, m, _as_control(r))
+            except (LoopwrightError, np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
                 notes.append(f"{v.title}: python-control's values can't be judged ({error}).")
                 continue
-            for c in beside:
+            for c in rows:
                 numbers[f"{v.key}.control.{c.name}"] = _theirs(m, c)
-                compared.append((v.title, c.name, c.value, c.control, c.function, c.right, c.why))
+                beside.append((v.title, c.name, c.value, c.control, c.function, c.right, c.why))
     if not found:
         return None
     titles = {v.key: v.title for v in case.usable()}
@@ -139,9 +145,9 @@ def _wire(case: Case, key: str, wire: str) -> Section | None:
             "Multiple poles scatter, as ε^(1/multiplicity).",
         ),
     ]
-    if compared:
+    if beside:
         columns = ("variant", "number", "here", "python-control", "its function", "right", "why")
-        tables.append(Table("Beside python-control's own values", columns, tuple(compared)))
+        tables.append(Table("Beside python-control's own values", columns, tuple(beside)))
     plain = {k: v for k, v in loops.items() if not k.endswith(FRICTION)}
     plots = (
         figures.bode(f"inner_{key}_bode", wire, plain, found, titles),
@@ -170,11 +176,10 @@ def _numbers(m: Margins) -> dict[str, Number]:
     return found
 
 
-def _minimal(L: Any) -> Any:
+def _as_control(r: Realization) -> Any:
     """Return the loop without hidden modes, as python-control is given it."""
     import control
 
-    r = Realization.of(L)
     return control.ss(r.A + np.eye(r.order) * bool(r.dt), r.B, r.C, r.D, r.dt)
 
 

@@ -18,6 +18,7 @@ from ..blocks._values import Array
 from ._admittance_loop import AdmittanceLoop
 from ._coupled import crossing_frequency, growth_rate, growth_rate_by_control
 from ._number import Number
+from ._threads import on_one_thread
 
 SCANNED = {"stiffness": (1e-2, 1e8), "damping": (1e-3, 1e6), "mass": (1e-4, 1e4), "tool_mass": (1e-4, 1e4)}
 """What can be limited, and from where to where it is scanned by default."""
@@ -113,6 +114,7 @@ def rule_of_thumb(loop: AdmittanceLoop, damping: float = 0.0) -> float:
     return (d + damping) / (loop.sample_time * (0.5 + loop.delay))
 
 
+@on_one_thread
 def stability_limit(
     loop: AdmittanceLoop,
     over: str = "stiffness",
@@ -144,6 +146,8 @@ def stability_limit(
     ------
     OptionError
         An unknown property, one that is given besides, or a scan that doesn't rise.
+    ParameterError
+        A property that is NaN, infinite or negative.
     ConfirmationError
         If python-control's interconnection of the same parts is not stable below the limit and unstable above it.
     """
@@ -218,6 +222,7 @@ def stiffness_limits(loop: AdmittanceLoop, dampings: Sequence[float] = (0.0, 10.
     }
 
 
+@on_one_thread
 def stability_map(
     loop: AdmittanceLoop,
     x_values: Array,

@@ -505,3 +505,16 @@ def test_force_tracking_against_the_wall_of_the_contact_plant(plant, damping):
 def test_force_tracking_keeps_the_damping():
     assert FORCE_TRACKING["perp"].effective_damping == pytest.approx(12.0)
     assert PATH.length / 2.0 == MIDDLE
+
+
+@pytest.mark.parametrize("implementation", ["ideal", "continuous", "sampled"])
+@pytest.mark.parametrize(
+    "environment",
+    [{"damping": math.nan}, {"damping": -100.0}, {"mass": -50.0}, {"tool_mass": -1.0}, {"mass": math.inf}],
+)
+def test_an_environment_that_is_none_is_refused(implementation, environment):
+    (name,) = environment
+    made = loop().replace(implementation=implementation)
+    for call in (growth_rate, stability_limit):
+        with pytest.raises(ParameterError, match=rf"environment\.{name}: found .*not negative"):
+            call(made, **environment)

@@ -9,6 +9,7 @@ from loops import sampled_triple, triple
 
 from loopwright.blocks import ParameterError
 from loopwright.diagrams import compare_with_control, disk_margin, margins, nyquist_count, place
+from loopwright.diagrams._control_values import _Judge, compared
 from loopwright.diagrams._features import Features, scan
 from loopwright.diagrams._realization import Realization
 
@@ -189,3 +190,31 @@ def test_where_the_two_agree_it_says_so():
 def test_an_unstable_loop_is_compared_only_in_crossings():
     with pytest.raises(ParameterError, match="not stable"):
         compare_with_control(0.1 * triple(20.0))
+
+
+@pytest.mark.parametrize("gain", [1.0, 5.0, 10.0, 15.0])
+def test_a_gain_margin_that_it_calls_infinite_is_refuted_by_ours(gain):
+    loop = control.ss(control.tf([0.1 * gain], [1.0, -1.0], 0.1))  # an integrator under a sampled gain: z = 1 − g T
+    assert quiet(control.stability_margins, loop)[0] == np.inf
+    row = rows(loop)["gain_margin_high"]
+    assert row.value == pytest.approx(20.0 / gain, rel=1e-12)
+    assert (row.right, row.control) == ("ours", np.inf)
+    assert f"the factor {20.0 / gain:.9g} ends stability" in row.why
+
+
+def test_a_value_that_cannot_be_judged_does_not_end_the_comparison(monkeypatch):
+    def fails(*args):
+        raise np.linalg.LinAlgError("did not converge")
+
+    monkeypatch.setattr(_Judge, "_refuted", fails)
+    row = rows(control.ss(control.tf([0.1], [1.0, -1.0], 0.1)))["gain_margin_high"]
+    assert row.right == "neither is refuted"
+    assert "did not converge" in row.why
+
+
+def test_margins_that_are_there_are_compared_without_a_second_reduction(monkeypatch):
+    loop = triple(20.0)
+    ours = margins(loop)
+    monkeypatch.setattr("loopwright.diagrams._control_values.margins", None)
+    found = compared(Realization.of(loop), ours, loop)
+    assert {row.name for row in found} >= {"gain_margin_low", "phase_margin_deg"}

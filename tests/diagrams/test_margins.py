@@ -378,3 +378,34 @@ def test_rounding_in_a_chain_of_integrators_is_not_scaled_up_to_be_seen():
     found = margins(control.ss(A, [[14.2278318], [0.0], [0.0]], [[8.43417339, 10.54271674, 15.625]], 0.0))
     assert found.gain_margin_low.value == pytest.approx(1 / 9, abs=1e-6)
     assert [c.frequency.value > 1.0 for c in found.phase_crossovers] == [True]
+
+
+def test_a_delay_margin_of_exactly_one_sample_is_confirmed():
+    # L = 1/(z − 1): with a sample of delay z² − z + 1, on the unit circle at ±60°; with two z³ − z² + 1, outside
+    found = margins(control.ss(control.tf([1.0], [1.0, -1.0], 0.1)))
+    assert found.delay_margin_samples.value == pytest.approx(1.0, abs=1e-12)
+    assert found.delay_margin_s.value == pytest.approx(0.1, abs=1e-13)
+    assert "on the limit at n = 1" in found.delay_margin_samples.confirmed_by
+    with pytest.raises(ConfirmationError, match="no closed-loop pole is nearer"):
+        confirm.on_the_limit(Realization.of(control.tf([0.9], [1.0, -1.0], 0.1)), 1)
+
+
+@pytest.mark.parametrize(("dt", "pole"), [(0, 2.0), (0.1, 1.2)])
+def test_a_hidden_mode_that_is_not_stable_is_named_beside_stable(dt, pole):
+    loop = control.ss(np.diag([0.5 - (dt == 0), pole]), [[0.3], [0.0]], [[1.0, 1.0]], 0, dt)
+    found = margins(loop)
+    assert found.stable
+    assert np.real(found.hidden_unstable) == pytest.approx([pole], rel=1e-12)
+    assert "hidden_unstable" in str(found)
+
+
+def test_hidden_integrators_that_rounding_scatters_are_not_called_unstable():
+    A = np.zeros((4, 4))
+    A[0, 0] = 0.5
+    A[1:, 1:] = np.eye(3) + np.diag([1.0, 1.0], 1)
+    Q, _ = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))
+    A[1:, 1:] = Q @ A[1:, 1:] @ Q.T
+    found = margins(control.ss(A, [[0.3], [0], [0], [0]], [[1.0, 1.0, 0, 0]], 0, 0.1))
+    assert len(found.hidden_poles) == 3
+    assert np.abs(found.hidden_poles).max() > 1 + 1e-7  # scattered to both sides
+    assert found.hidden_unstable == ()

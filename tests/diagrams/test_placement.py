@@ -191,3 +191,19 @@ def test_gains_with_which_the_delay_adds_an_unstable_pole_are_refused():
 def test_a_sampled_design_that_makes_no_sense_is_refused(call, message):
     with pytest.raises(ParameterError, match=message):
         call()
+
+
+@pytest.mark.parametrize(
+    ("A", "poles", "where"),
+    [(np.full((2, 2), np.nan), [-1.0, -2.0], "place.A"), (np.eye(2), [-1.0, np.nan], "place.poles")],
+)
+def test_nan_is_refused_where_it_stands(A, poles, where):
+    with pytest.raises(ParameterError, match=f"{where}: found NaN"):
+        place(A, [[1.0], [0.5]], poles)
+
+
+def test_sampled_gains_refuse_nan_and_say_which_poles_a_delay_adds():
+    with pytest.raises(ParameterError, match="expected poles in the left half plane"):
+        sampled_gains([np.nan] * 3, 1e-3)
+    with pytest.raises(ParameterError, match="the delay adds others"):
+        sampled_gains([-1000.0] * 3, 1e-3, delay=2)
