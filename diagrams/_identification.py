@@ -150,7 +150,8 @@ class _Runner:
                 raise FmuError(
                     f"it can be identified from its responses at rest only, and with "
                     f"the inputs of the operating point held it still moves after {SETTLING * self.h:g} s. Choose an "
-                    "operating point at which it rests, or export it with directional derivatives.",
+                    "operating point at which it rests, or plants=None where it gives derivatives, or takes "
+                    "its state.",
                     block=self.block.label,
                 )
             y = self.step()

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq, minimize_scalar
 
-from loopwright.blocks import PID, Constant, Encoder, Integrator, UnknownNameError
+from loopwright.blocks import PID, Constant, Encoder, FmuError, Integrator, UnknownNameError
 from loopwright.diagrams import Diagram, analyse, subsystem
 from loopwright.diagrams._report_definitions import definition
 from loopwright.diagrams._report_html import to_html
@@ -167,3 +167,9 @@ def test_a_variant_that_is_called_as_its_key_is_named_once():
     page = to_html(analyse(Diagram("open", Integrator(name="x")(Constant(value=1.0))), only=("poles",)))
     assert "<td>continuous</td>" in page
     assert "continuous continuous" not in page
+
+
+def test_identification_that_was_asked_for_does_not_say_that_an_fmu_gives_no_derivatives():
+    with pytest.raises(FmuError, match=r"identified from its responses at rest only.*still moves") as e:
+        pi_loop().linearize(0.01, plants="identified")
+    assert "no derivatives" not in str(e.value)
