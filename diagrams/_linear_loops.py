@@ -186,8 +186,8 @@ def confirm_closed(cut: Model, A: np.ndarray, wires: tuple[str, ...], name: str)
     if len(D) and not np.linalg.cond(back) < 1e12:
         return  # the loop has no unique solution when closed; its margins say so
     closed = Ac + B @ np.linalg.solve(back, C) if len(D) else Ac
-    size = [float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) for a in (closed, A)]
-    radius = 1.5 * max(size) or 1.0
+    size = [float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) for a in (closed, A, 0.1 * Ac)]
+    radius = 1.5 * max(size) or 1.0  # that of the open loop counts, too: a deadbeat loop's poles are rounding alone
     worst = 0.0
     for angle in (0.3, 1.1, 2.0):  # det(I − A/z): states at zero, such as values held for later, do not count
         z = radius * np.exp(1j * angle)

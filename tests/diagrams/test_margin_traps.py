@@ -183,7 +183,8 @@ def test_coinciding_poles_are_placed_where_the_other_refuses():
 def test_where_the_two_agree_it_says_so():
     found = rows(triple(20.0))
     assert {name for name, row in found.items() if row.right == "both"} >= {"gain_margin_low", "phase_margin_deg"}
-    assert found["gain_margin_high"].right == "both"  # infinite for both: it reports none
+    row = found["gain_margin_high"]
+    assert (row.value, np.isnan(row.control), row.right) == (np.inf, True, "ours")  # it reports none
     assert all(row.right != "neither is refuted" for row in found.values())
 
 

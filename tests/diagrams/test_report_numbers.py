@@ -6,7 +6,18 @@ from functools import cache
 import numpy as np
 import pytest
 
-from loopwright.blocks import PID, Constant, ErrorDynamics, Gain, OptionError, Sine, Step, TransferFunction
+from loopwright.blocks import (
+    PID,
+    ConfirmationError,
+    Constant,
+    ErrorDynamics,
+    Gain,
+    Integrator,
+    OptionError,
+    Sine,
+    Step,
+    TransferFunction,
+)
 from loopwright.diagrams import Diagram, analyse, experiments, subsystem
 from loopwright.diagrams._report_case import Case, delayed_boxes
 from loopwright.diagrams._report_loops import wires_on_loops
@@ -263,3 +274,33 @@ def test_a_given_point_is_taken_over_by_variants_by_the_names_of_their_states():
 def test_a_section_on_poles_needs_error_dynamics_only_for_what_was_asked():
     assert not any(isinstance(b, ErrorDynamics) for b in speed_control().blocks.values())
     assert "poles.sampled_d0.slowest" in speed_report().numbers()
+
+
+def held_integrator(gain, sample_time=0.1):
+    plant = Integrator(name="plant")
+
+    @subsystem(sample_time=sample_time)
+    def controller(y):
+        return (-gain * y).named("u")
+
+    return Diagram("held_integrator", plant(controller(plant.y)))
+
+
+@pytest.mark.parametrize("gain", [1.0, 10.0])
+def test_an_integrator_under_a_sampled_gain_has_its_margins(gain):
+    # L = g T/(z − 1): stable up to g T = 2; g T = 1 is deadbeat, and bears exactly one sample of delay
+    found = analyse(held_integrator(gain), only=("inner",)).numbers()
+    assert found["inner.u.sampled_d0.gain_margin_high"].value == pytest.approx(20.0 / gain, rel=1e-9)
+    if gain == 10.0:
+        assert found["inner.u.sampled_d0.delay_margin_samples"].value == pytest.approx(1.0, abs=1e-9)
+
+
+def test_values_of_python_control_that_fail_leave_the_margins_in_a_report(monkeypatch):
+    def fails(*args):
+        raise ConfirmationError("found something else", block="gain_margin_low")
+
+    monkeypatch.setattr("loopwright.diagrams._report_loops.compared", fails)
+    report = analyse(held_integrator(1.0), only=("inner",))
+    assert report.numbers()["inner.u.sampled_d0.gain_margin_high"].value == pytest.approx(20.0, rel=1e-9)
+    (part,) = next(s for s in report.sections if s.key == "inner").sections
+    assert any("python-control's values can't be judged" in note for note in part.text)
