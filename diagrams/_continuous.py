@@ -28,6 +28,8 @@ from ._stored import Occurrence
 from ._transport import delays_of, driven_function, step_inputs
 
 NOTHING: frozenset[Any] = frozenset()
+TIGHT, ONE_STEP = 1e-9, ("auto", "RK23", "RK45", "DOP853", "Radau")
+"""Below this relative tolerance these methods, to which a stop costs little, land on every sample."""
 
 
 class Continuous:
@@ -84,6 +86,8 @@ class Continuous:
             max_step=longest,
         )
         self.fixed = self.solver.fixed
+        self.lands = rtol < TIGHT and self.solver.name in ONE_STEP
+        """Whether the solver lands on every sample: the dense output is of lower order than the step."""
         if self.fixed and self.delays is not None and float(flat.base) > self.delays.shortest * (1 + 1e-12):
             raise OptionError(
                 f"the step of {float(flat.base):g} s is longer than a transport delay of {self.delays.shortest:g} s. "
