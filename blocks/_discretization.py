@@ -32,6 +32,7 @@ def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
         ``semi_implicit`` is Euler with the states renewed from the last to the first, each with those already renewed:
         for (position, velocity) the velocity first, then the position with the new velocity. ``trapezoidal`` is
         Ad = (I − A T/2)⁻¹ (I + A T/2) and Φ = T (I − A T/2)⁻¹, of second order: x(t + T) = x + T/2 (ẋ(t) + ẋ(t + T)).
+        With g held it is not Tustin's method, which averages g over both ends.
 
     Raises
     ------

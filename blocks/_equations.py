@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import linecache
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ from casadi import ArrayInterface
 
 from ._block import Block
 from ._errors import DefinitionError, LoopwrightError, ShapeError, TraceError
+from ._opaque import Function
 from ._ports import Port, Shape, State
 from ._symbols import flat_column, size
 
@@ -74,7 +76,12 @@ def takes_update(block: Block, sampled: bool) -> bool:
 def untraceable(error: Exception, block: Block, what: str) -> str:
     """Say which line of the user's equations an operation failed on."""
     # by the code's own file, which a notebook's cell and a script have too; helpers beside the equation count as well
-    equation = inspect.unwrap(getattr(type(block), what))
+    written: Any = block.function if isinstance(block, Function) else getattr(type(block), what)
+    equation: Any = inspect.unwrap(written)
+    while isinstance(equation, functools.partial):
+        equation = equation.func
+    if not hasattr(equation, "__code__"):  # an object that can be called
+        equation = type(equation).__call__
     file = getattr(getattr(equation, "__code__", None), "co_filename", None)
     line, step = "", error.__traceback__
     while step is not None:
@@ -85,9 +92,14 @@ def untraceable(error: Exception, block: Block, what: str) -> str:
     text = f"its {what} can't be traced{line}: {type(error).__name__}: {error}."
     if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
         return f"{text} Correct the equation there."
+    arguments, instead = (
+        ("its arguments", ", or PythonFunction, which is not traced")
+        if isinstance(block, Function)
+        else ("(t, x, u)", "")
+    )
     return (
-        f"{text} Use NumPy functions of (t, x, u): np.where for branches, np.stack for vectors, np.sqrt and not "
-        "math.sqrt."
+        f"{text} Use NumPy functions of {arguments}: np.where for branches, np.stack for vectors, np.sqrt and not "
+        f"math.sqrt{instead}."
     )
 
 

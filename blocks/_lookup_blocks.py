@@ -78,7 +78,8 @@ class Lookup1D(Block):
     last value is held, the end piece continued, or the run stopped: ``beyond`` is "hold", "extrapolate" or "error".
 
     The values may be vectors, one row for each breakpoint; a vector u is looked up element by element. NaN passes
-    through. Derivatives of a trace are exact, and a kink needs no event.
+    through. Derivatives of a trace are exact, and a kink needs no event. For a table over time take `PiecewiseLinear`
+    or `Recorded`: a solver lands on their times, while it may step over a short peak of a table that reads a `Clock`.
 
     Raises
     ------

@@ -23,6 +23,7 @@ from ._errors import (
     WiringError,
     near,
 )
+from ._no_numbers import NoNumber
 
 if TYPE_CHECKING:
     from ._block import Block
@@ -31,10 +32,8 @@ recorder: ContextVar[list[Any] | None] = ContextVar("loopwright_calls", default=
 """The calls made while a subsystem's function runs: a closing call whose result nobody uses still counts."""
 
 
-class Wireable:
+class Wireable(NoNumber):
     """What can stand at the source end of a wire: a signal, a call, a block with one output."""
-
-    __array_ufunc__ = None  # NumPy leaves its operators to ours: array * signal is a Gain
 
     def _signal(self) -> Signal:
         raise NotImplementedError
@@ -69,7 +68,11 @@ class Wireable:
 
     def __truediv__(self, other: Any) -> Signal:
         if isinstance(other, Wireable):
-            raise WiringError("a signal can't be divided by a signal; write a Block whose equation does it.")
+            raise WiringError(
+                "a signal can't be divided by a signal; use Function(np.divide)(a, b), or write a Block whose equation "
+                "does it.",
+                block=self._who(),
+            )
         return self * (1.0 / np.asarray(other, dtype=float))
 
     def __getitem__(self, index: int | slice) -> Signal:
@@ -91,11 +94,10 @@ class Wired(Wireable):
     __hash__ = object.__hash__
 
     def _undecided(self, what: str) -> WiringError:
-        signal = getattr(self, "block", None) or getattr(self, "source", None)
         return WiringError(
             f"{self!r} has no {what} while the diagram is wired: its values come with the run. Write the decision as a "
             "block's equation, with np.where(…).",
-            block=getattr(signal, "label", None),
+            block=self._who(),
         )
 
     def __bool__(self) -> bool:

@@ -149,7 +149,10 @@ class SmoothStep(Source):
 
 
 class Step(Source):
-    """Steps: y is ``initial_value``, and ``values[i]`` from ``times[i]`` on, which may be off by its rounding."""
+    """Steps: y is ``initial_value``, and ``values[i]`` from ``times[i]`` on.
+
+    The times may be off by their rounding: a step at ``3 * 0.1`` acts at the tick at 0.3 s.
+    """
 
     times: Array = parameter(unit="s", description="when it steps, rising; a number or several")
     values: Array = parameter(description="the value from then on, one for each time")

@@ -14,14 +14,22 @@ from ..blocks._instants import is_before, left_of
 from ._between import active_loops
 from ._events import Domains
 from ._failures import failure, forget_trials, opaque_failure, state_values
-from ._flat import FlatDiagram
 from ._machine import Machine
+from ._solver_setup import (
+    absolute_tolerances,
+    recall,
+    remembers,
+    solver_memory,
+    state_names,
+    time_scale_of,
+)
 from ._solvers import Problem, make_solver
 from ._stored import Occurrence
-from ._structure import join
 from ._transport import delays_of, driven_function, step_inputs
 
 NOTHING: frozenset[Any] = frozenset()
+TIGHT, ONE_STEP = 1e-9, ("auto", "RK23", "RK45", "DOP853", "Radau")
+"""Below this relative tolerance these methods, to which a stop costs little, land on every sample."""
 
 
 class Continuous:
@@ -61,9 +69,9 @@ class Continuous:
         self.delays = delays_of(flat)
         self._flow, self._jacobian = machine.flow(), None
         problem = Problem(self.where.size, self._rate, self._slope, state_names(flat))
-        self.time_scale = _time_scale(flat)
+        self.time_scale = time_scale_of(flat)
         longest = max_step
-        if longest is None and _remembers(flat):
+        if longest is None and remembers(flat):
             longest = float(flat.base)  # what is remembered is renewed at accepted steps, and must not grow stale
         if longest is None and self.time_scale < math.inf:
             longest = 5.0 * self.time_scale  # else a step may fit whole periods of a source
@@ -78,6 +86,8 @@ class Continuous:
             max_step=longest,
         )
         self.fixed = self.solver.fixed
+        self.lands = rtol < TIGHT and self.solver.name in ONE_STEP
+        """Whether the solver lands on every sample: the dense output is of lower order than the step."""
         if self.fixed and self.delays is not None and float(flat.base) > self.delays.shortest * (1 + 1e-12):
             raise OptionError(
                 f"the step of {float(flat.base):g} s is longer than a transport delay of {self.delays.shortest:g} s. "
@@ -365,70 +375,6 @@ def _next_instant(path: str, block: Block, t: float) -> float:
             t=t,
         )
     return found
-
-
-_MEMORY = ("planned", "_hits", "_misses", "_easy")
-
-
-def solver_memory(solver: Any) -> dict[str, Any]:
-    """Return what a solver would do next: its step, and the method that the default has chosen."""
-    kept = {name: getattr(solver, name) for name in _MEMORY if hasattr(solver, name)}
-    if hasattr(solver, "_active"):
-        kept["active"] = solver._active.name
-        kept["methods"] = {m.name: solver_memory(m) for m in (solver._explicit, solver._implicit)}
-    return kept
-
-
-def recall(solver: Any, kept: dict[str, Any]) -> None:
-    """Let a solver go on as the one did whose `solver_memory` it is; another method starts anew."""
-    for name in _MEMORY:
-        if name in kept and hasattr(solver, name):
-            setattr(solver, name, kept[name])
-    if "active" in kept and hasattr(solver, "_active"):
-        for method in (solver._explicit, solver._implicit):
-            if method.name in kept["methods"]:
-                recall(method, kept["methods"][method.name])
-            if method.name == kept["active"]:
-                solver._active = method
-
-
-def _time_scale(flat: FlatDiagram) -> float:
-    """Return the shortest time within which a source in a continuous frame changes."""
-    table = flat.table
-    paths = (p for p in flat.checked.traced if not table.sampled(table.frame_of[p]))
-    return min((float(table.blocks[p].time_scale()) for p in paths), default=math.inf)
-
-
-def _remembers(flat: FlatDiagram) -> bool:
-    """Whether a block in a continuous frame has a memory, such as a projection's last foot point."""
-    table = flat.table
-    return any(table.blocks[p].memory and not table.sampled(table.frame_of[p]) for p in flat.checked.traced)
-
-
-def state_names(flat: FlatDiagram) -> list[str]:
-    """Return what each continuous state is: ``block.state``, with an index where it has several entries."""
-    found: dict[int, str] = {}
-    for path, where in flat.states.slices.items():
-        position = where.start
-        for name, shape in flat.checked.traced[path].states.items():
-            n = math.prod(shape)
-            for i in range(n):
-                found[position + i] = join(path, name) + (f"[{i}]" if shape else "")
-            position += n
-    return [found[int(i)] for i in flat.continuous]
-
-
-def absolute_tolerances(flat: FlatDiagram, atol: float) -> Any:
-    """Return the absolute tolerance of each continuous state: ``atol`` times its nominal value."""
-    scale = np.ones(flat.width)
-    for path, where in flat.states.slices.items():
-        position = where.start
-        for name, shape in flat.checked.traced[path].states.items():
-            n, nominal = math.prod(shape), flat.table.blocks[path].states[name].nominal
-            scale[position : position + n] = 1.0 if nominal is None else nominal
-            position += n
-    scale = scale[flat.continuous]
-    return atol if np.all(scale == 1.0) or np.ndim(atol) else atol * scale
 
 
 def check_solver(error: SimulationError, machine: Machine, continuous: Continuous | None = None) -> SimulationError:

@@ -170,12 +170,17 @@ class Diagram(Analysis):
     def sampled(self, sample_time: float | Fraction, method: str = "exact") -> Diagram:
         """Return the diagram with everything that is continuous sampled.
 
+        Each block is discretized by itself, and what it reads from others is held over a sample: a plant drawn with
+        `Integrator` blocks becomes forward Euler between them, of first order, whatever the method. To have a method
+        act on a plant as a whole, write it as one block: a `StateSpace`, a `TransferFunction`, a `Block` of one's own.
+
         Parameters
         ----------
         sample_time : float or Fraction
             Sample time in s. Subsystems that have one of their own keep it.
         method : {"exact", "forward", "semi_implicit", "trapezoidal"}
-            How the blocks are discretized that were continuous; see `loopwright.blocks.hold`.
+            How the blocks are discretized that were continuous; see `loopwright.blocks.hold`. As inputs are held,
+            ``trapezoidal`` is not Tustin's method, python-control's ``c2d(…, "bilinear")``, which averages them too.
 
         Raises
         ------

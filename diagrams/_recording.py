@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..blocks._errors import OptionError
 from ._duration import check_memory
 from ._flat import FlatDiagram
 from ._recorder import Recorder, check_every, select
@@ -30,6 +32,12 @@ class Recording:
 
     def __post_init__(self) -> None:
         check_every(self.every)
+        if self.record is not None and not isinstance(self.record, Iterable):
+            raise OptionError(
+                f"found record={self.record!r}; expected names of signals, such as record=['y'].", block=self.name
+            )
+        if self.to is not None and not isinstance(self.to, str | os.PathLike):
+            raise OptionError(f"found to={self.to!r}; expected the path of a folder.", block=self.name)
 
     @property
     def width(self) -> int:

@@ -25,7 +25,8 @@ which a box acts, or every tick where there is an FMU, a ``step``, or a solver o
 
 **Between ticks** the solver integrates all continuous blocks as one system. It lands on every tick at which something
 acts, on every discontinuity that a source announces (`Block.next_instant`), where it takes values from the left, and on
-every event. Other samples come from its dense output. Memory of blocks (a projection's last foot point) and the last
+every event. Other samples come from its dense output, or, where the relative tolerance is below 1e-9, it lands on them,
+too. Memory of blocks (a projection's last foot point) and the last
 solution of an algebraic loop are renewed at accepted steps only.
 
 **At the start** initial states are computed in an order of their own (a block may need its inputs for it), FMUs and
@@ -295,9 +296,10 @@ class Simulation:
         clocks, count, width = self.flat.distinct, 0, float(self.flat.base)
         while self._tick < last:
             k = self._tick
-            every = continuous.fixed or self._plants
+            sampled = self._every_tick or not clocks
+            every = continuous.fixed or self._plants or (continuous.lands and sampled)
             following = k + 1 if every else min([*(c.after(k) for c in clocks), last])
-            between = range(k + 1, following) if self._every_tick or not clocks else range(0)
+            between = range(k + 1, following) if sampled else range(0)
             now = self.time_of(k)
 
             def sample(t: float, progress: Any = progress) -> bool:

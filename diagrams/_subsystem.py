@@ -276,7 +276,10 @@ def subsystem(
         How continuous blocks inside are discretized: ``exact`` is the zero-order hold for blocks that are linear in
         their states, forward Euler for others; ``trapezoidal`` is of second order, solved by Newton's method where a
         block is not linear, and the run stops at a step that it does not solve; see `loopwright.blocks.hold`.
-        Without one it is that of the box around, or ``exact``.
+        Without one it is that of the box around, or ``exact``. Each block is discretized by itself, with its inputs
+        held over the sample: several `Integrator` blocks in a row are forward Euler between them whatever the method
+        (put them into one block, such as a `StateSpace`, for it to act on the whole), and ``trapezoidal`` is not
+        Tustin's method, ``c2d(…, "bilinear")``, which averages the inputs too.
     name : str, optional
         Name of the box; without one, the function's.
     offset : float or Fraction

@@ -1,5 +1,6 @@
 """Functions as blocks: traced ones, and any Python callable, with derivatives by differences and errors that tell."""
 
+import functools
 import math
 import pickle
 
@@ -84,6 +85,33 @@ def test_its_name_is_the_functions():
     assert Function(np.sin).label == "sin"
     assert Function(lambda u: u).label == "function"
     assert Function(product, name="power").label == "power"
+
+
+def branching(u):
+    return 1.0 if u > 0.0 else 2.0
+
+
+class Branching:
+    def __call__(self, u):
+        return branching(u)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [branching, Branching(), functools.partial(lambda gain, u: gain * branching(u), 2.0), lambda u: branching(u)],
+    ids=["function", "object", "partial", "lambda"],
+)
+def test_what_can_not_be_traced_is_found_in_the_users_own_lines(function):
+    line = branching.__code__.co_firstlineno + 1
+    with pytest.raises(TraceError, match=rf"line {line} of .*test_functions\.py, 'return 1\.0 if u > 0") as error:
+        traced(Function(function, arguments="u"))
+    assert "Use NumPy functions of its arguments" in str(error.value)
+    assert "or PythonFunction, which is not traced" in str(error.value)
+
+
+def test_a_function_of_c_has_no_line():
+    with pytest.raises(TraceError, match="its output can't be traced: RuntimeError"):
+        traced(Function(math.sin, arguments="u"))
 
 
 def test_what_traces_wrongly_or_not_at_all_is_refused():

@@ -91,7 +91,7 @@ def test_the_sample_time_is_that_of_the_frame():
         return network(8).replace(name="other")(u)
 
     signal = Wave()()
-    run = Diagram("rates", slow(signal), fast(signal)).simulate(1.0, progress=False)
+    run = Diagram("rates", slow(signal), fast(signal)).simulate(1.0, step=0.01, progress=False)
     assert np.diff(run.t) == pytest.approx(0.01)
     n, x = len(block.g), block.start
     for k in range(20):

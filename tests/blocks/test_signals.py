@@ -1,6 +1,7 @@
 """Signals and calls as values: what they unpack into, how they are indexed, what completes in a notebook."""
 
 import inspect
+import re
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from loopwright.blocks import (
     Block,
     Constant,
+    Function,
     Gain,
     Input,
     Output,
@@ -200,3 +202,72 @@ def test_a_misspelt_port_offers_near_names():
 def test_a_source_names_its_wire():
     run = Diagram("d", Constant(value=2.0).named("two")).simulate(0.1, step=0.1, progress=False)
     assert run["two"].tolist() == [2.0, 2.0]
+
+
+# --- what can be done with numbers only -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("act", "instead"),
+    [
+        (lambda y: y**2, r"Function(lambda u: u**2)(u)"),
+        (lambda y: y**y, r"Function(np.power)(a, b)"),
+        (lambda y: 2.0**y, r"Function(lambda u: 2.0**u)(u)"),
+        (lambda y: np.ones(2) ** y, r"Function(lambda u: array([1., 1.])**u)(u)"),
+        (lambda y: 1.0 / y, r"Function(lambda u: 1.0 / u)(u)"),
+        (lambda y: y / y, r"Function(np.divide)(a, b)"),
+        (abs, r"Function(np.abs)(u)"),
+        (lambda y: y % 2.0, r"Function(lambda u: np.mod(u, …))(u)"),
+        (lambda y: y // 2.0, r"Function(lambda u: np.floor(u / …))(u)"),
+        (np.sin, r"np.sin can't be applied to a signal: its values come with the run. Use Function(np.sin)(u), or"),
+        (lambda y: np.hypot(y, 2.0), r"Function(np.hypot)(a, b)"),
+        (lambda y: np.hypot(2.0, y), r"Function(np.hypot)(a, b)"),
+        (lambda y: np.sin(y, out=np.zeros(1)), r"Function(np.sin)(u)"),
+    ],
+)
+def test_what_can_be_done_with_numbers_only_says_what_to_write_instead(act, instead):
+    block = Gain(gain=2.0, name="k")
+    call = block(1.0)
+    for signal in (call, call.y, block.y, Constant(value=1.0, name="k")):
+        with pytest.raises(WiringError, match=re.escape(instead)) as error:
+            act(signal)
+        assert error.value.block == "k"
+
+
+def test_what_an_error_says_to_write_can_be_built():
+    u, c = Constant(value=3.0), Constant(value=2.0)
+    made = [
+        Function(np.power)(u, c).named("power"),
+        Function(lambda u: u**2)(u).named("square"),
+        Function(lambda u: 2.0**u)(u).named("exp2"),
+        Function(lambda u: 1.0 / u)(u).named("inverse"),
+        Function(np.divide)(u, c).named("ratio"),
+        Function(np.abs)(-1.0 * u).named("size"),
+        Function(lambda u: np.mod(u, 2.0))(u).named("rest"),
+        Function(lambda u: np.floor(u / 2.0))(u).named("times"),
+        Function(lambda a, b: np.stack([a, b]))(u, c).named("pair"),
+    ]
+    run = Diagram("d", *made).simulate(1.0, step=1.0, progress=False)
+    found = {name: run[name][-1].tolist() for name in ("power", "square", "exp2", "inverse", "ratio", "size", "rest")}
+    assert found == {"power": 9, "square": 9, "exp2": 8, "inverse": 1 / 3, "ratio": 1.5, "size": 3, "rest": 1}
+    assert run["times"][-1] == 1
+    assert run["pair"][-1].tolist() == [3, 2]
+
+
+def test_arrays_and_numpys_numbers_work_with_signals_from_either_side():
+    a, w = Constant(value=(6.0, 8.0), name="a"), np.array([1.0, 2.0])
+    made = {
+        "sum": w + a, "difference": w - a, "other": a.y - w, "product": w * a, "scaled": np.float64(2.0) * a,
+        "added": np.add(a, w), "half": a / np.float64(2.0), "matrix": np.diag(w) @ a,
+    }  # fmt: skip
+    run = Diagram("d", *(signal.named(name) for name, signal in made.items())).simulate(1.0, step=1.0, progress=False)
+    x = np.array([6.0, 8.0])
+    want = {
+        "sum": w + x, "difference": w - x, "other": x - w, "product": w * x, "scaled": 2 * x,
+        "added": x + w, "half": x / 2, "matrix": w * x,
+    }  # fmt: skip
+    assert {name: run[name][-1].tolist() for name in made} == {name: value.tolist() for name, value in want.items()}
+    for act in (lambda: w > a.y, lambda: w <= a(), lambda: w == a.y, lambda: a.y != w):
+        with pytest.raises(WiringError, match="has no value to compare while the diagram is wired"):
+            act()
+    assert (w == a) is False  # a block is a value, and no array

@@ -676,6 +676,8 @@ def test_a_rate_that_is_not_finite_names_the_block_that_made_it_so():
         ({"atol": "x"}, "atol is 'x'; expected a number"),
         ({"rtol": "x"}, "rtol is 'x'; expected"),
         ({"max_step": "x"}, "max_step is 'x'; expected a positive number"),
+        ({"record": 3}, "d: found record=3; expected names of signals"),
+        ({"to": 3}, "d: found to=3; expected the path of a folder"),
     ],
 )
 def test_options_that_are_none_are_refused(options, words):

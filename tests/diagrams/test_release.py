@@ -160,10 +160,10 @@ def test_after_an_interruption(calls, file, monkeypatch):
     with pytest.raises(KeyboardInterrupt) as error:
         Diagram("d", resting(file)()).simulate(0.1, step=1e-3, progress=False)
     assert lives(calls) == [COMPLETE]
-    assert len(error.value.run.t) == 50
+    assert len(error.value.run.t) == 51  # the tick from which that step starts was recorded
     monkeypatch.undo()
     again = Diagram("d", resting(file)()).simulate(0.1, step=1e-3, progress=False)
-    assert np.array_equal(error.value.run.data, again.data[:50])
+    assert np.array_equal(error.value.run.data, again.data[:51])
 
 
 def test_a_plant_is_neither_loaded_nor_kept_without_a_run(calls, file):

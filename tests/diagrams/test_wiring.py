@@ -364,8 +364,12 @@ def test_a_float_sample_time_is_its_shortest_decimal():
 
 
 def test_no_clock_at_all():
-    with pytest.raises(SampleTimeError, match=r"no subsystem has a sample time.*step=1e-3"):
-        Diagram("d", Gain(gain=1)(Constant(value=1))).simulate(1.0, progress=False)
+    diagram = Diagram("d", Gain(gain=1)(Constant(value=1)))
+    assert len(diagram.simulate(1.0, progress=False).t) == 1001
+    with pytest.raises(SampleTimeError, match=r"^d: no subsystem has a sample time.*step=1e-3"):
+        diagram.simulation()
+    with pytest.raises(SampleTimeError, match=r"^d: no subsystem has a sample time.*step=1e-3"):
+        diagram.simulate(1.0, solver="rk4", progress=False)
 
 
 def test_two_rates_hold_between_their_ticks_and_never_drift():
