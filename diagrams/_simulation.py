@@ -164,8 +164,6 @@ class Simulation:
                 found.append((self.flat.log.slices[join(path, port)].start, path))
         return found
 
-    # --- life --------------------------------------------------------------------------------------------------------
-
     def __enter__(self) -> Simulation:
         if self._open is not None:
             raise not_open(self._open, self.diagram.name)
@@ -234,8 +232,6 @@ class Simulation:
     def stopped(self) -> Stopped | None:
         """The stop condition that has ended the run."""
         return self._stopped
-
-    # --- going on ----------------------------------------------------------------------------------------------------
 
     def advance(self, duration: float, *, progress: Any = None) -> None:
         """Go on for a duration in s, a multiple of the step between ticks.

@@ -1,6 +1,9 @@
 """Runs of the experiments and their independent solutions, each made once."""
 
+import os
 from functools import cache, lru_cache
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, and the tests run side by side
 
 import pytest
 
