@@ -89,14 +89,6 @@ def jump(flat: FlatDiagram) -> Any:
     return ca.Function("jump", [t, x, w, p, fired], [x_next], ["t", "x", "w", "p", "fired"], ["x_next"])
 
 
-def opening(flat: FlatDiagram) -> Any:
-    """Return ``(t, x, w, p) -> held``: what every box puts out at the start."""
-    t, x, w, p = flat.symbols()
-    done = Pass(flat, NONE, t, x, w, p, opened=True).run()
-    held = [done.held[name] for name in flat.held.slices]
-    return ca.Function("opening", [t, x, w, p], [ca.densify(ca.vertcat(*held)) if held else ca.MX(0, 1)])
-
-
 def loop_equations(flat: FlatDiagram, acting: frozenset[Clock]) -> Any:
     """Return ``(t, x, w, p) -> (r, J)``: what came round a loop less what was taken, and its derivative by that.
 

@@ -162,12 +162,6 @@ class FlatDiagram:
 
         return jump(self)
 
-    def opening(self) -> Any:
-        """Return the function ``(t, x, w, p) -> held``: what all boxes put out at the start, as if all acted."""
-        from ._between import opening
-
-        return opening(self)
-
     def loop_equations(self, acting: frozenset[Clock]) -> Any:
         """Return ``(t, x, w, p) -> (r, J)``: the residual of the algebraic loops at the values in x, and ∂r/∂values.
 
