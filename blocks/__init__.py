@@ -4,15 +4,8 @@ A block's equations are written once, as NumPy-style functions of (t, x, u), and
 compiled from there. Everything here is public; nothing here imports the rooms above.
 """
 
-from ._algebra import DeadZone, Gain, Maximum, Minimum, Product, Saturation, Sum
-from ._block import Block
-from ._compliance import AdmittanceFilter, ErrorDynamics
-from ._contact import HandProfile, SpringDamper, Wall
-from ._delays import Delay, PadeDelay, TransportDelay
-from ._discrete import Encoder, ForceSensor, Hold, UnitDelay
-from ._discretization import hold
-from ._environment import HandForce, PathSpring
-from ._errors import (
+from .core.block import Block
+from .core.errors import (
     AlgebraicLoopError,
     CompilerError,
     ConfirmationError,
@@ -37,26 +30,39 @@ from ._errors import (
     UnwiredInputError,
     WiringError,
 )
-from ._integrators import FilteredDerivative, Integrator, LimitedIntegrator, ResettableIntegrator
-from ._linear import DiscreteStateSpace, DiscreteTransferFunction, StateSpace, TransferFunction
-from ._logic import And, Compare, Counter, EdgeDetector, Latch, Not, Or, Switch
-from ._lookup_blocks import Lookup1D, Lookup2D
-from ._mechanics import PlanarModel
-from ._nonlinear import Backlash, Quantizer, RateLimiter, Relay
-from ._opaque import Function, PythonFunction
-from ._path_following import FeedbackLinearization, ForceProjection, PathProjection, PathTracking, TransverseTransform
-from ._paths import Circle, CubicSpline, Ellipse, Frame, Line, Path
-from ._pid import PID
-from ._ports import Event, Input, Output, State
-from ._requirements import Requirement, StopCondition
-from ._sampled_linear import FIR, IIR, DiscreteIntegrator, MovingAverage
-from ._signal_sources import BandLimitedNoise, Chirp, Clock, PiecewiseLinear, PulseTrain, Ramp, Recorded
-from ._signals import Call, Signal
-from ._sources import Constant, Pulse, Reference, Sine, SmoothStep, Step
-from ._state_machine import StateMachine
-from ._units import Unit, parse_unit
-from ._values import Array, Value, parameter
-from ._zero_pole import DiscreteZeroPoleGain, ZeroPoleGain
+from .core.ports import Event, Input, Output, State
+from .core.signals import Call, Signal
+from .core.units import Unit, parse_unit
+from .core.values import Array, Value, parameter
+from .library.algebra import DeadZone, Gain, Maximum, Minimum, Product, Saturation, Sum
+from .library.contact import HandProfile, SpringDamper, Wall
+from .library.delays import Delay, PadeDelay, TransportDelay
+from .library.filters import FIR, IIR, DiscreteIntegrator, MovingAverage
+from .library.functions import Function, PythonFunction
+from .library.generators import BandLimitedNoise, Chirp, Clock, PiecewiseLinear, PulseTrain, Ramp, Recorded
+from .library.integrators import FilteredDerivative, Integrator, LimitedIntegrator, ResettableIntegrator
+from .library.linear import DiscreteStateSpace, DiscreteTransferFunction, StateSpace, TransferFunction
+from .library.logic import And, Compare, Counter, EdgeDetector, Latch, Not, Or, Switch
+from .library.lookup import Lookup1D, Lookup2D
+from .library.nonlinear import Backlash, Quantizer, RateLimiter, Relay
+from .library.pid import PID
+from .library.requirements import Requirement, StopCondition
+from .library.sampled import Encoder, ForceSensor, Hold, UnitDelay
+from .library.sources import Constant, Pulse, Reference, Sine, SmoothStep, Step
+from .library.state_machine import StateMachine
+from .library.zero_pole import DiscreteZeroPoleGain, ZeroPoleGain
+from .path_following.compliance import AdmittanceFilter, ErrorDynamics
+from .path_following.environment import HandForce, PathSpring
+from .path_following.planar_model import PlanarModel
+from .path_following.transverse import (
+    FeedbackLinearization,
+    ForceProjection,
+    PathProjection,
+    PathTracking,
+    TransverseTransform,
+)
+from .paths import Circle, CubicSpline, Ellipse, Frame, Line, Path
+from .tracing.discretization import hold
 
 __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "AdmittanceFilter",

@@ -1,7 +1,8 @@
 """Diagrams: wiring, scheduling, simulation; linearization and margins; Fig. 3 and its experiments; the command line."""
 
-from . import experiments
-from ._admittance import (
+from .admittance.compliance_loop import AdmittanceLoop
+from .admittance.coupled import crossing_frequency, growth_rate, poles
+from .admittance.rendered import (
     Passivity,
     passivity,
     rendered_admittance,
@@ -9,35 +10,7 @@ from ._admittance import (
     rendered_system,
     target_admittance,
 )
-from ._admittance_loop import AdmittanceLoop
-from ._contract import BlockReport, check_block
-from ._control_values import Comparison, compare_with_control
-from ._coupled import crossing_frequency, growth_rate, poles
-from ._diagram import Diagram
-from ._disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
-from ._drawing import Drawing
-from ._flat import FlatDiagram
-from ._frequency_response import FrequencyResponse
-from ._layout import Layout
-from ._linearize import Linearization
-from ._margins import GainCrossover, Margins, PhaseCrossover, margins
-from ._number import Number
-from ._nyquist import NyquistCount, nyquist_count
-from ._operating_point import OperatingPoint
-from ._placement import SampledDesign, place, sampled_gains, sampled_poles
-from ._report_analysis import analyse
-from ._report_model import Plot, Report, Section, Table
-from ._run import Run, Snapshot
-from ._sensitivities import (
-    GangOfFour,
-    complementary,
-    delayed_hold,
-    delayed_hold_margin,
-    gang_of_four,
-    sensitivity,
-)
-from ._simulation import Simulation
-from ._stability_limits import (
+from .admittance.stability_limits import (
     StabilityLimit,
     StabilityMap,
     rule_of_thumb,
@@ -45,15 +18,43 @@ from ._stability_limits import (
     stability_map,
     stiffness_limits,
 )
-from ._state import RunState
-from ._stored import Occurrence, Stopped
-from ._structure import Frame, Wire
-from ._subsystem import Subsystem, subsystem
-from .fig3 import fig3
+from .contract.check_block import BlockReport, check_block
+from .diagram import Diagram
+from .drawing.svg import Drawing
+from .flat.flat_diagram import FlatDiagram
+from .flat.layout import Layout
+from .frequency.disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
+from .frequency.margins import GainCrossover, Margins, PhaseCrossover, margins
+from .frequency.number import Number
+from .frequency.nyquist import NyquistCount, nyquist_count
+from .frequency.pole_placement import SampledDesign, place, sampled_gains, sampled_poles
+from .frequency.python_control import Comparison, compare_with_control
+from .frequency.sensitivities import (
+    GangOfFour,
+    complementary,
+    delayed_hold,
+    delayed_hold_margin,
+    gang_of_four,
+    sensitivity,
+)
+from .linearization.linearize import Linearization
+from .linearization.operating_point import OperatingPoint
+from .measure.frequency_response import FrequencyResponse
+from .paper import experiments
+from .paper.fig3 import Channel, Rig, fig3
+from .report.analyse import analyse
+from .report.model import Plot, Report, Section, Table
+from .results.run import Run, Snapshot
+from .results.saved_state import RunState
+from .results.stored import Occurrence, Stopped
+from .simulation.simulation import Simulation
+from .wiring.structure import Frame, Wire
+from .wiring.subsystem import Subsystem, subsystem
 
 __all__ = [
     "AdmittanceLoop",
     "BlockReport",
+    "Channel",
     "Comparison",
     "Diagram",
     "DiskMargin",
@@ -74,6 +75,7 @@ __all__ = [
     "PhaseCrossover",
     "Plot",
     "Report",
+    "Rig",
     "Run",
     "RunState",
     "SampledDesign",

@@ -23,7 +23,7 @@ def first_example() -> str:
 def bode() -> Figure:
     """Return the Bode diagram of Fig. 3's loop across the path, with its margins marked."""
     from loopwright.diagrams import experiments, margins
-    from loopwright.diagrams._report_plots import bode
+    from loopwright.diagrams.report.plots import bode
 
     robot = experiments.compliance().diagram
     variants = {"continuous": robot.continuous(), "sampled_d0": robot}
@@ -38,7 +38,7 @@ def bode() -> Figure:
 def main(folder: Path) -> None:
     """Write the figures into a folder."""
     from loopwright.diagrams import experiments
-    from loopwright.diagrams._figures import plot_path
+    from loopwright.diagrams.paper.figures import plot_path
 
     folder.mkdir(parents=True, exist_ok=True)
     with chdir(folder):

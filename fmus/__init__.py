@@ -1,6 +1,12 @@
 """FMUs: plants written as Python equations and exported, and FMUs of anyone's as blocks."""
 
-from . import (
+from .archive.description import FmuDescription, FmuVariable, read_description
+from .calls.instance import FmuInstance, FmuState
+from .export.build import build_fmu, clear_cache
+from .export.from_block import build, model_spec
+from .export.model import ModelSpec, Variable
+from .export.python_fmu import build_python
+from .models import (
     bouncing_ball,
     dc_motor,
     gantry,
@@ -10,14 +16,8 @@ from . import (
     mass_spring_damper,
     scara,
 )
-from ._build import build_fmu, clear_cache
-from ._description_reading import FmuDescription, FmuVariable, read_description
-from ._export import build, model_spec
-from ._fmu import Fmu
-from ._instance import FmuInstance, FmuState
-from ._linearization import FmuLinearization
-from ._pythonfmu import build_python
-from ._spec import ModelSpec, Variable
+from .running.fmu import Fmu
+from .running.linearization import FmuLinearization
 
 __all__ = [
     "Fmu",

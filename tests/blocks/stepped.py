@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from loopwright.blocks._equations import initial_state, start_values
-from loopwright.blocks._symbols import bundle
-from loopwright.blocks._tracing import trace
+from loopwright.blocks.tracing.equations import initial_state, start_values
+from loopwright.blocks.tracing.symbols import bundle
+from loopwright.blocks.tracing.trace import trace
 
 
 class Alone:

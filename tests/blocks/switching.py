@@ -6,9 +6,9 @@ nothing fires, as `loopwright.blocks.Event` says it.
 
 import numpy as np
 
-from loopwright.blocks._equations import initial_state, start_values
-from loopwright.blocks._symbols import bundle
-from loopwright.blocks._tracing import trace
+from loopwright.blocks.tracing.equations import initial_state, start_values
+from loopwright.blocks.tracing.symbols import bundle
+from loopwright.blocks.tracing.trace import trace
 
 
 class Driven:

@@ -10,7 +10,7 @@ from scipy.linalg import solve_continuous_lyapunov
 from stepped import Alone, response
 
 from loopwright.blocks import Delay, Hold, PadeDelay, ParameterError, SampleTimeError, ShapeError, TransportDelay
-from loopwright.blocks._tracing import trace
+from loopwright.blocks.tracing.trace import trace
 
 RNG = np.random.default_rng(5)
 

@@ -21,9 +21,9 @@ from loopwright.blocks import (
     UnitDelay,
     parameter,
 )
-from loopwright.blocks._equations import initial_state, start_shapes
-from loopwright.blocks._symbols import bundle
-from loopwright.blocks._tracing import trace
+from loopwright.blocks.tracing.equations import initial_state, start_shapes
+from loopwright.blocks.tracing.symbols import bundle
+from loopwright.blocks.tracing.trace import trace
 from loopwright.diagrams import Diagram
 
 

@@ -24,8 +24,8 @@ from loopwright.blocks import (
     TraceError,
     parameter,
 )
-from loopwright.blocks._callbacks import raise_failure
-from loopwright.blocks._tracing import trace
+from loopwright.blocks.tracing.opaque_equations import raise_failure
+from loopwright.blocks.tracing.trace import trace
 from loopwright.diagrams import Diagram, subsystem
 
 

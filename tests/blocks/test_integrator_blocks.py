@@ -13,7 +13,7 @@ from loopwright.blocks import (
     ResettableIntegrator,
     ShapeError,
 )
-from loopwright.blocks._tracing import trace
+from loopwright.blocks.tracing.trace import trace
 
 RNG = np.random.default_rng(3)
 T = 0.05

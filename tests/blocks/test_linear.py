@@ -18,7 +18,7 @@ from loopwright.blocks import (
     TransferFunction,
     hold,
 )
-from loopwright.blocks._tracing import trace
+from loopwright.blocks.tracing.trace import trace
 
 RNG = np.random.default_rng(11)
 POINTS = [0.3j, 1.0 + 2.0j, -0.7 + 0.1j, 40.0j]

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator, RegularGridInterpo
 from switching import Driven
 
 from loopwright.blocks import GuardError, Lookup1D, Lookup2D, ParameterError, ShapeError
-from loopwright.blocks._symbols import bundle
+from loopwright.blocks.tracing.symbols import bundle
 
 RNG = np.random.default_rng(4)
 POINTS = np.array([-2.0, -0.5, 0.0, 1.0, 4.0])

@@ -16,9 +16,9 @@ from scipy.interpolate import PPoly
 from scipy.special import ellipeinc
 
 from loopwright.blocks import DefinitionError, ParameterError, PathDomainError, TraceError, parameter
-from loopwright.blocks._lookup import is_traced, jet, piecewise, wrap
-from loopwright.blocks._paths import UNLIMITED, Circle, CubicSpline, Ellipse, Line, Path
-from loopwright.blocks._paths_tables import _Contact
+from loopwright.blocks.library.piecewise import is_traced, jet, piecewise, wrap
+from loopwright.blocks.paths import UNLIMITED, Circle, CubicSpline, Ellipse, Line, Path
+from loopwright.blocks.paths.tables import _Contact
 
 
 class Bean(Path):

@@ -6,7 +6,7 @@ from scipy.linalg import expm
 from stepped import Alone, response
 
 from loopwright.blocks import PID, ParameterError
-from loopwright.blocks._tracing import trace
+from loopwright.blocks.tracing.trace import trace
 
 RNG = np.random.default_rng(21)
 FULL = {"kp": 3.0, "ki": 5.0, "kd": 0.4, "b": 0.7, "c": 0.2, "filter_time": 0.05}

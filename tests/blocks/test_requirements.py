@@ -7,7 +7,7 @@ import pytest
 from switching import Driven, at_ticks, in_time
 
 from loopwright.blocks import GuardError, ParameterError, Requirement, ShapeError, SimulationError, StopCondition
-from loopwright.blocks._symbols import bundle
+from loopwright.blocks.tracing.symbols import bundle
 
 T = 0.1
 

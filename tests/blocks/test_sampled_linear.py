@@ -6,7 +6,7 @@ from scipy import signal
 from stepped import Alone
 
 from loopwright.blocks import FIR, IIR, DiscreteIntegrator, MovingAverage, ParameterError, SampleTimeError
-from loopwright.blocks._tracing import trace
+from loopwright.blocks.tracing.trace import trace
 
 RNG = np.random.default_rng(9)
 U = RNG.standard_normal(80)

@@ -25,8 +25,8 @@ from loopwright.blocks import (
     SmoothStep,
     Step,
 )
-from loopwright.blocks._instants import left_of
-from loopwright.blocks._tracing import trace
+from loopwright.blocks.library.instants import left_of
+from loopwright.blocks.tracing.trace import trace
 from loopwright.diagrams import Diagram, subsystem
 
 

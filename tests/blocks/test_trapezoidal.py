@@ -8,8 +8,8 @@ from test_discretization import Pendulum, Rotor, states
 from test_linear_hold import network
 
 from loopwright.blocks import Block, Constant, GuardError, Input, NonFiniteError, SampleTimeError, State, hold
-from loopwright.blocks._lookup import piecewise
-from loopwright.blocks._tracing import trace
+from loopwright.blocks.library.piecewise import piecewise
+from loopwright.blocks.tracing.trace import trace
 
 
 def solved_by_iteration(f, x, t, h):

@@ -7,7 +7,7 @@ from scipy.signal import cheb1ap, ellipap, lfilter
 from stepped import Alone, response
 
 from loopwright.blocks import DiscreteZeroPoleGain, ParameterError, SampleTimeError, ZeroPoleGain
-from loopwright.blocks._zero_pole import sections
+from loopwright.blocks.library.zero_pole import sections
 
 SYSTEMS = [
     ([], [-1.0]),

@@ -9,7 +9,7 @@ import pytest
 from contact import FREE, MIDDLE, ROUGH, SMOOTH, deviation, diagram, loop, moored_start
 
 from loopwright.blocks import Circle, Ellipse, HandForce, OptionError, Step
-from loopwright.diagrams._admittance import (
+from loopwright.diagrams.admittance.rendered import (
     passivity,
     rendered_admittance,
     rendered_response,
@@ -203,7 +203,7 @@ def test_without_feed_forward_passivity_ends_where_the_polynomial_says(side):
 
 @pytest.mark.parametrize("name", LOOPS)
 def test_a_sampled_loop_is_not_passive_and_a_spring_at_that_frequency_is_the_limit(name):
-    from loopwright.diagrams._stability_limits import stability_limit
+    from loopwright.diagrams.admittance.stability_limits import stability_limit
 
     # where Y = jB, the spring k = −ω/B oscillates undamped with it; the aliases shift that by 1e-6
     model = loop(**LOOPS[name])

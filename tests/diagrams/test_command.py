@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import OptionError, PathDomainError
-from loopwright.diagrams import _cli, experiments
-from loopwright.diagrams._cli import main
-from loopwright.diagrams._figures import plot_experiment, plot_path
-from loopwright.diagrams._keynumbers import DEFINITIONS, key_numbers
-from loopwright.diagrams._plots import STYLE, save
+from loopwright.diagrams import experiments
+from loopwright.diagrams.cli import main as _cli
+from loopwright.diagrams.cli.main import main
+from loopwright.diagrams.paper.figures import plot_experiment, plot_path
+from loopwright.diagrams.paper.key_numbers import DEFINITIONS, key_numbers
+from loopwright.diagrams.results.plots import STYLE, save
 
 HEADER = (
     "t,eta[1],eta[2],xi[1],xi[2],position[1],position[2],velocity[1],velocity[2],force[1],force[2],"

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from lxml import etree
 
-from loopwright.diagrams import _cli_fmu
-from loopwright.diagrams._cli import main
-from loopwright.fmus import _summary, _validation
-from loopwright.fmus._build import _zip
-from loopwright.fmus._compiler import find_compiler, native_platform
+from loopwright.diagrams.cli import fmu as _cli_fmu
+from loopwright.diagrams.cli.main import main
+from loopwright.fmus.checks import summary as _summary
+from loopwright.fmus.checks import validation as _validation
+from loopwright.fmus.export.build import _zip
+from loopwright.fmus.export.compiler import find_compiler, native_platform
 
 LINUX = pytest.mark.skipif(
     native_platform() != "x86_64-linux", reason="makes broken libraries with Linux's own tools, for x86_64"

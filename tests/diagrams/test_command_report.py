@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from loopwright.blocks import ConfirmationError
-from loopwright.diagrams import _report_analysis
-from loopwright.diagrams._cli import _parser, main
-from loopwright.diagrams._number import Number
-from loopwright.diagrams._report_model import Report, Section
+from loopwright.diagrams.cli.main import _parser, main
+from loopwright.diagrams.frequency.number import Number
+from loopwright.diagrams.report import analyse as _report_analysis
+from loopwright.diagrams.report.model import Report, Section
 
 LOOP = """
 from loopwright.blocks import Gain, Integrator, Sine, Sum

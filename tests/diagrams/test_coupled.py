@@ -22,11 +22,12 @@ from contact import (
 )
 
 from loopwright.blocks import AdmittanceFilter, ConfirmationError, Ellipse, OptionError, ParameterError
-from loopwright.blocks._errors import UnknownNameError
-from loopwright.diagrams import _stability_limits, experiments
-from loopwright.diagrams._admittance_loop import AdmittanceLoop
-from loopwright.diagrams._coupled import closed_loop, growth_rate, growth_rate_by_control, poles
-from loopwright.diagrams._stability_limits import (
+from loopwright.blocks.core.errors import UnknownNameError
+from loopwright.diagrams import experiments
+from loopwright.diagrams.admittance import stability_limits as _stability_limits
+from loopwright.diagrams.admittance.compliance_loop import AdmittanceLoop
+from loopwright.diagrams.admittance.coupled import closed_loop, growth_rate, growth_rate_by_control, poles
+from loopwright.diagrams.admittance.stability_limits import (
     _brackets,
     rule_of_thumb,
     stability_limit,
@@ -34,7 +35,7 @@ from loopwright.diagrams._stability_limits import (
     stiffness_limits,
 )
 from loopwright.fmus import gantry_contact
-from loopwright.fmus.scara import nominal as scara
+from loopwright.fmus.models.scara import nominal as scara
 
 SIDE = pytest.mark.parametrize("side", ["par", "perp"])
 ELLIPSE = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))

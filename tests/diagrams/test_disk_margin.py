@@ -9,7 +9,6 @@ from loops import sampled_triple, triple
 from scipy.optimize import minimize
 
 from loopwright.blocks import ConfirmationError, ParameterError
-from loopwright.diagrams import _disk as disk
 from loopwright.diagrams import (
     complementary,
     delayed_hold,
@@ -21,6 +20,7 @@ from loopwright.diagrams import (
     mimo_disk_margin,
     sensitivity,
 )
+from loopwright.diagrams.frequency import disk as disk
 
 RANDOM = settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 SATELLITE = control.ss([[0, 10], [-10, 0]], np.eye(2), [[1, 10], [-10, 1]], 0)  # Doyle's spinning body, unit feedback

@@ -12,9 +12,9 @@ import pytest
 
 from loopwright.blocks import Gain, Integrator, OptionError, Sine, Sum
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams._drawing import draw
-from loopwright.diagrams._drawing_layout import Net, _draw, _Part, _tracks, arrange
-from loopwright.diagrams._drawing_order import Node, cut_loops
+from loopwright.diagrams.drawing.layout import Net, _draw, _Part, _tracks, arrange
+from loopwright.diagrams.drawing.order import Node, cut_loops
+from loopwright.diagrams.drawing.svg import draw
 from loopwright.fmus import Fmu, dc_motor
 
 SVG = "{http://www.w3.org/2000/svg}"

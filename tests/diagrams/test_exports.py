@@ -12,7 +12,8 @@ import xarray
 from scipy.io import loadmat
 
 from loopwright.blocks import OptionError, UnknownNameError
-from loopwright.diagrams import Layout, Run, Wire, _exports
+from loopwright.diagrams import Layout, Run, Wire
+from loopwright.diagrams.results import exports as _exports
 
 SHAPES = {"plant.position": (2,), "plant.mass": (2, 3), "box.pid.v": (), "box.e": ()}
 LAYOUT = Layout.of(SHAPES)

@@ -6,7 +6,7 @@ import pytest
 
 from loopwright.blocks import CubicSpline, Pulse
 from loopwright.diagrams import experiments
-from loopwright.fmus._compiler import compile_shared
+from loopwright.fmus.export.compiler import compile_shared
 
 SPLINE = CubicSpline(
     points=[(0.8, 0.5), (0.65, 0.63), (0.35, 0.62), (0.2, 0.5), (0.35, 0.37), (0.66, 0.38)], closed=True

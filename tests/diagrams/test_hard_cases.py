@@ -33,7 +33,7 @@ from loopwright.blocks import (
     parameter,
 )
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus.dc_motor import DcMotor
+from loopwright.fmus.models.dc_motor import DcMotor
 
 # --- bouncing ball -----------------------------------------------------------------------------------------------------
 

@@ -41,7 +41,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams._machine import Machine
+from loopwright.diagrams.simulation.workspace import Machine
 
 
 def two_rates(duration, **options):

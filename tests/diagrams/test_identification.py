@@ -8,8 +8,9 @@ import pytest
 from scipy.linalg import expm
 
 from loopwright.blocks import Constant, FmuError, Gain
-from loopwright.diagrams import Diagram, _identification, subsystem
-from loopwright.diagrams._identification import identified, realization
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.linearization import identification as _identification
+from loopwright.diagrams.linearization.identification import identified, realization
 from loopwright.fmus import Fmu, dc_motor, gantry, mass_spring_damper
 
 H = 1e-3

@@ -18,11 +18,10 @@ from loopwright.blocks import (
     UnitDelay,
     WiringError,
 )
-from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams._injection import injected
-from loopwright.diagrams._linear_parts import find_signal
-from loopwright.diagrams._waveforms import phasors_of, plan_of
-from loopwright.diagrams.fig3 import Channel, Rig, fig3
+from loopwright.diagrams import Channel, Diagram, Rig, fig3, subsystem
+from loopwright.diagrams.linearization.derivatives import find_signal
+from loopwright.diagrams.measure.injection import injected
+from loopwright.diagrams.measure.waveforms import phasors_of, plan_of
 from loopwright.fmus import Fmu, gantry, mass_spring_damper
 
 PATH = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))

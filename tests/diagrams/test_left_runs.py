@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Clock
-from loopwright.blocks._errors import OptionError
+from loopwright.blocks.core.errors import OptionError
 from loopwright.diagrams import Diagram, Run
 
 CLOCK = Diagram("clock", Clock().named("t"))

@@ -88,7 +88,7 @@ def test_away_from_an_equilibrium_the_transition_is_the_derivative_of_the_motion
 
 
 def names(lin):
-    from loopwright.diagrams._operating_point import names_of_states
+    from loopwright.diagrams.linearization.operating_point import names_of_states
 
     return names_of_states(lin.diagram.flatten(lin.point.base))
 

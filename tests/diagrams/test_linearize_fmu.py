@@ -18,8 +18,7 @@ from loopwright.blocks import (
     Reference,
     Sum,
 )
-from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.fig3 import Channel, Rig, fig3
+from loopwright.diagrams import Channel, Diagram, Rig, fig3, subsystem
 from loopwright.fmus import Fmu, dc_motor, gantry, mass_spring_damper
 
 T = 1e-3

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag, expm
 
 from loopwright.blocks import Constant, DiscreteStateSpace, Function, Gain, StateSpace
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams._operating_point import names_of_states
+from loopwright.diagrams.linearization.operating_point import names_of_states
 
 NEAR = 1e-10
 few = settings(max_examples=10, deadline=None)

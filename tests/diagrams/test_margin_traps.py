@@ -9,9 +9,9 @@ from loops import sampled_triple, triple
 
 from loopwright.blocks import ParameterError
 from loopwright.diagrams import compare_with_control, disk_margin, margins, nyquist_count, place
-from loopwright.diagrams._control_values import _Judge, compared
-from loopwright.diagrams._features import Features, scan
-from loopwright.diagrams._realization import Realization
+from loopwright.diagrams.frequency.features import Features, scan
+from loopwright.diagrams.frequency.python_control import _Judge, compared
+from loopwright.diagrams.frequency.realization import Realization
 
 T = 1e-3
 
@@ -216,6 +216,6 @@ def test_a_value_that_cannot_be_judged_does_not_end_the_comparison(monkeypatch):
 def test_margins_that_are_there_are_compared_without_a_second_reduction(monkeypatch):
     loop = triple(20.0)
     ours = margins(loop)
-    monkeypatch.setattr("loopwright.diagrams._control_values.margins", None)
+    monkeypatch.setattr("loopwright.diagrams.frequency.python_control.margins", None)
     found = compared(Realization.of(loop), ours, loop)
     assert {row.name for row in found} >= {"gain_margin_low", "phase_margin_deg"}

@@ -10,9 +10,9 @@ from loops import open_loops, sampled_triple, stabilized_loops, triple
 
 from loopwright.blocks import ConfirmationError, LoopwrightError, ParameterError
 from loopwright.diagrams import Number, margins, nyquist_count
-from loopwright.diagrams import _confirm as confirm
-from loopwright.diagrams._crossings import Scan
-from loopwright.diagrams._realization import Realization
+from loopwright.diagrams.frequency import confirm as confirm
+from loopwright.diagrams.frequency.crossings import Scan
+from loopwright.diagrams.frequency.realization import Realization
 
 RANDOM = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 
@@ -283,7 +283,7 @@ def test_a_wrong_peak_is_not_confirmed(wrong):
 
 @pytest.mark.parametrize("what", ["gain", "phase", "delay", "peak", "bandwidth"])
 def test_a_scan_that_goes_wrong_is_an_error(what, monkeypatch):
-    from loopwright.diagrams import _crossings
+    from loopwright.diagrams.frequency import crossings as _crossings
 
     def off(self):
         return [_crossings.Crossing(c.omega * 1.05, c.L * 1.05, c.slope, c.error) for c in real(self)]

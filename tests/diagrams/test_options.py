@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import OptionError
-from loopwright.diagrams import _cli, experiments
-from loopwright.diagrams._cli import main
-from loopwright.diagrams._options import LIMITS
-from loopwright.diagrams.experiments import EXPERIMENTS, compliance, force_tracking, path_following
+from loopwright.diagrams import experiments
+from loopwright.diagrams.cli import main as _cli
+from loopwright.diagrams.cli.main import main
+from loopwright.diagrams.paper.experiments import EXPERIMENTS, compliance, force_tracking, path_following
+from loopwright.diagrams.paper.options import LIMITS
 
 PROC = Path("/proc")
 LINUX = pytest.mark.skipif(not PROC.is_dir(), reason="needs a folder to which nobody can write")

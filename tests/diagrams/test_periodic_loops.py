@@ -5,10 +5,10 @@ import pytest
 import scipy.optimize
 
 from loopwright.blocks import PID, Constant, Gain, Integrator, TransferFunction
-from loopwright.blocks._errors import ConfirmationError, WiringError
+from loopwright.blocks.core.errors import ConfirmationError, WiringError
 from loopwright.diagrams import Diagram, margins, subsystem
-from loopwright.diagrams._linear_discrete import Model
-from loopwright.diagrams._linear_loops import confirm_closed
+from loopwright.diagrams.linearization.loops_over_a_period import confirm_closed
+from loopwright.diagrams.linearization.over_a_period import Model
 
 
 def offset(phase, gain=1.0, behind=False):

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from loopwright.blocks import ConfirmationError, ErrorDynamics, ParameterError
-from loopwright.diagrams import _placement as placement
 from loopwright.diagrams import delayed_hold, place, sampled_gains, sampled_poles
+from loopwright.diagrams.frequency import pole_placement as placement
 
 RANDOM = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
 

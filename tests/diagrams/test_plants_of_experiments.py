@@ -18,8 +18,8 @@ from loopwright.blocks import (
     parameter,
 )
 from loopwright.diagrams import experiments
-from loopwright.diagrams._cli import main
-from loopwright.diagrams.experiments import path_following
+from loopwright.diagrams.cli.main import main
+from loopwright.diagrams.paper.experiments import path_following
 from loopwright.fmus import Fmu, build, gantry
 
 

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import OptionError, SimulationError, UnknownNameError
-from loopwright.diagrams import Layout, Occurrence, Run, Stopped, Wire, _duration, _recorder
-from loopwright.diagrams._duration import check_memory
-from loopwright.diagrams._recorder import Recorder, select
-from loopwright.diagrams._stored import header
+from loopwright.diagrams import Layout, Occurrence, Run, Stopped, Wire
+from loopwright.diagrams.results import recorder as _recorder
+from loopwright.diagrams.results.recorder import Recorder, select
+from loopwright.diagrams.results.stored import header
+from loopwright.diagrams.simulation import duration as _duration
+from loopwright.diagrams.simulation.duration import check_memory
 
 LAYOUT = Layout.of({"a.y": (), "box.b.v": (2,), "box.c.z": ()})  # and two states
 WIRES = {"e": Wire("box.b", "v", 1), "box.w": Wire("a", "y")}
@@ -161,8 +163,8 @@ KILLED = """
 import os, signal, sys
 import numpy as np
 from loopwright.diagrams import Layout, Occurrence
-from loopwright.diagrams._recorder import Recorder
-from loopwright.diagrams._stored import header
+from loopwright.diagrams.results.recorder import Recorder
+from loopwright.diagrams.results.stored import header
 layout = Layout.of({"a.y": (), "b.v": (2,)})
 recorder = Recorder(3, to=sys.argv[1], header=header(diagram="d", layout=layout, wires={}, units={}, width=3))
 for k in range(20_000):
@@ -222,8 +224,8 @@ import resource, sys
 import numpy as np
 from loopwright.blocks import SimulationError
 from loopwright.diagrams import Layout
-from loopwright.diagrams._recorder import Recorder
-from loopwright.diagrams._stored import header
+from loopwright.diagrams.results.recorder import Recorder
+from loopwright.diagrams.results.stored import header
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_003, 100_003))  # in the middle of a row
 layout = Layout.of({"a.y": (), "b.v": (2,)})
 recorder = Recorder(3, to=sys.argv[1], header=header(diagram="d", layout=layout, wires={}, units={}, width=3))

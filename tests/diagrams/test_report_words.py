@@ -9,9 +9,9 @@ from scipy.optimize import brentq, minimize_scalar
 
 from loopwright.blocks import PID, Constant, Encoder, FmuError, Integrator, UnknownNameError
 from loopwright.diagrams import Diagram, analyse, subsystem
-from loopwright.diagrams._report_definitions import definition
-from loopwright.diagrams._report_html import to_html
-from loopwright.diagrams._report_terms import DEFINITIONS
+from loopwright.diagrams.report.definitions import definition
+from loopwright.diagrams.report.html import to_html
+from loopwright.diagrams.report.terms import DEFINITIONS
 from loopwright.fmus import Fmu, dc_motor
 
 T, KP, KI = 1e-3, 0.05, 2.0

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Constant, Gain, OptionError, Reference, Sine, UnitDelay, UnknownNameError
-from loopwright.diagrams import Diagram, Occurrence, Run, Stopped, _plots, _stored, subsystem
-from loopwright.diagrams._recorder import select
+from loopwright.diagrams import Diagram, Occurrence, Run, Stopped, subsystem
+from loopwright.diagrams.results import plots as _plots
+from loopwright.diagrams.results import stored as _stored
+from loopwright.diagrams.results.recorder import select
 
 
 @subsystem(sample_time=0.5, name="a")
@@ -68,8 +70,8 @@ def test_names_complete_in_a_notebook(run):
 def test_plots_of_a_run_need_nothing_of_the_experiments():
     tree = ast.parse(Path(_plots.__file__).read_text(encoding="utf-8"))
     modules = [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    assert "_run" in modules
-    assert not any(word in module for word in ("experiments", "_figures", "fig3") for module in modules)
+    assert "run" in modules
+    assert not any(word in module for word in ("experiments", "figures", "fig3", "paper") for module in modules)
 
 
 # --- selections ---------------------------------------------------------------------------------------------------------

@@ -8,9 +8,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from loopwright.blocks._errors import NonFiniteError, OptionError, SimulationError
-from loopwright.diagrams import _solvers_sundials
-from loopwright.diagrams._solvers import SOLVERS, Problem, make_solver
+from loopwright.blocks.core.errors import NonFiniteError, OptionError, SimulationError
+from loopwright.diagrams.solvers import cvode as _solvers_sundials
+from loopwright.diagrams.solvers.base import SOLVERS, Problem, make_solver
 
 FIXED = {"euler": 1, "heun": 2, "rk4": 4}
 VARIABLE = [name for name in SOLVERS if name not in FIXED]

@@ -27,7 +27,7 @@ from loopwright.blocks import (
     TransportDelay,
 )
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams._transport import Delays
+from loopwright.diagrams.simulation.transport_delays import Delays
 from loopwright.fmus import Fmu, mass_spring_damper
 
 

@@ -18,10 +18,9 @@ from loopwright.blocks import (
     UnitDelay,
     UnknownNameError,
 )
-from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.fig3 import Channel, fig3
+from loopwright.diagrams import Channel, Diagram, fig3, subsystem
 from loopwright.fmus import Fmu, gantry, mass_spring_damper
-from loopwright.fmus.mass_spring_damper import MassSpringDamper
+from loopwright.fmus.models.mass_spring_damper import MassSpringDamper
 
 PATH = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))
 

@@ -4,7 +4,7 @@ import pytest
 
 from exported import Instance, mass_spring_damper, pendulums
 from exported2 import Instance2
-from loopwright.fmus._build import build_fmu
+from loopwright.fmus.export.build import build_fmu
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.fmus._spec import Event, ModelSpec, Variable
+from loopwright.fmus.export.model import Event, ModelSpec, Variable
 
 M, D, K = 2.0, 0.5, 10.0
 

@@ -9,7 +9,7 @@ import fmpy.fmi2
 import numpy as np
 import pytest
 
-from loopwright.fmus._spec import Event, ModelSpec, Variable
+from loopwright.fmus.export.model import Event, ModelSpec, Variable
 
 
 class Instance2:

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from loopwright.blocks import CompilerError, FmuError
-from loopwright.fmus import _compiler, gantry
-from loopwright.fmus._compiler import Compiler, compile_shared
+from loopwright.fmus import gantry
+from loopwright.fmus.export import compiler as _compiler
+from loopwright.fmus.export.compiler import Compiler, compile_shared
 
 LINUX = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks processes up in /proc")
 
@@ -65,7 +66,7 @@ def test_a_compiler_that_does_not_end_is_stopped_with_its_children(tmp_path, spi
 def test_an_interrupt_ends_the_compiler(tmp_path, spinning):
     compiler, pids = spinning
     script = (
-        "import signal, sys; from pathlib import Path; from loopwright.fmus._compiler import Compiler, compile_shared\n"
+        "import signal, sys; from pathlib import Path; from loopwright.fmus.export.compiler import Compiler, compile_shared\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a background job begins with it ignored
         f"compile_shared({{'a.c': ''}}, Path({str(tmp_path / 'a.so')!r}), compiler=Compiler({compiler.command!r}, ''))"
     )

@@ -11,11 +11,11 @@ import pytest
 
 from exported import bouncing_ball, mass_spring_damper, pendulums, thermostat
 from loopwright.fmus import gantry
-from loopwright.fmus._build import build_fmu
-from loopwright.fmus._documentation import block_text, index_html
-from loopwright.fmus._export import build
-from loopwright.fmus._printing import equations, number
-from loopwright.fmus._spec import ModelSpec, Variable
+from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.equation_text import equations, number
+from loopwright.fmus.export.from_block import build
+from loopwright.fmus.export.html_page import block_text, index_html
+from loopwright.fmus.export.model import ModelSpec, Variable
 
 
 def page(path):

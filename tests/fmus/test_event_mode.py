@@ -4,7 +4,7 @@ import fmpy
 import pytest
 
 from exported import E, ball, bounces, bouncing_ball, counter, fails
-from loopwright.fmus._build import build_fmu
+from loopwright.fmus.export.build import build_fmu
 
 INTEGRATORS = (1, 2, 3)
 

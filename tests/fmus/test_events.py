@@ -9,9 +9,9 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from exported import E, G, ball, bouncing_ball, counter, heating, mass_spring_damper, relay, thermostat
-from loopwright.blocks._errors import DefinitionError, ParameterError
-from loopwright.fmus._build import build_fmu
-from loopwright.fmus._spec import Event, Variable
+from loopwright.blocks.core.errors import DefinitionError, ParameterError
+from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.model import Event, Variable
 
 INTEGRATORS = (1, 2, 3)
 

@@ -19,12 +19,13 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from exported import mass_spring_damper, pendulums, run
-from loopwright.blocks._errors import CompilerError, DefinitionError, FmuError, ParameterError, UnitError
-from loopwright.fmus import _build, _compiler
-from loopwright.fmus._build import build_fmu
-from loopwright.fmus._codegen import runtime
-from loopwright.fmus._compiler import TARGETS, compile_shared, find_compiler, native_platform
-from loopwright.fmus._spec import Variable
+from loopwright.blocks.core.errors import CompilerError, DefinitionError, FmuError, ParameterError, UnitError
+from loopwright.fmus.export import build as _build
+from loopwright.fmus.export import compiler as _compiler
+from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.c_code import runtime
+from loopwright.fmus.export.compiler import TARGETS, compile_shared, find_compiler, native_platform
+from loopwright.fmus.export.model import Variable
 
 # ---- the file ----
 

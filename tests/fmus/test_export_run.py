@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from exported import D, Instance, K, M, exact, explosive, fails, mass_spring_damper, pendulums, run
-from loopwright.fmus._build import build_fmu
+from loopwright.fmus.export.build import build_fmu
 
 # ---- the numbers ----
 

@@ -16,12 +16,13 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from exported import explosive, mass_spring_damper, pendulums, run
-from loopwright.blocks._errors import DefinitionError, FmuError
-from loopwright.fmus import _build, gantry
-from loopwright.fmus._build import build_fmu
-from loopwright.fmus._compiler import native_platform
-from loopwright.fmus._export import build
-from loopwright.fmus._spec import Variable
+from loopwright.blocks.core.errors import DefinitionError, FmuError
+from loopwright.fmus import gantry
+from loopwright.fmus.export import build as _build
+from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.compiler import native_platform
+from loopwright.fmus.export.from_block import build
+from loopwright.fmus.export.model import Variable
 
 
 def xml(path):

@@ -16,8 +16,8 @@ from scipy.linalg import expm
 
 from exported import D, Instance, K, M, bouncing_ball, mass_spring_damper, pendulums, thermostat
 from exported2 import E, G, Model, ball, fails2, flight, stiff
-from loopwright.fmus._build import build_fmu
-from loopwright.fmus._spec import ModelSpec, Variable
+from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.model import ModelSpec, Variable
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from exported import D, K, M, explosive, pendulums, run
 from exported2 import Instance2, fails2
-from loopwright.fmus._build import build_fmu
+from loopwright.fmus.export.build import build_fmu
 
 # ---- the numbers ----
 

@@ -25,7 +25,7 @@ from loopwright.fmus import (
     gantry_stiction,
     mass_spring_damper,
 )
-from loopwright.fmus._loading import LoadedFmu
+from loopwright.fmus.calls.loaded_library import LoadedFmu
 
 WAYS = [("model_exchange", True), ("co_simulation", True), ("model_exchange", False), ("co_simulation", False)]
 M, D, K = 2.0, 0.7, 30.0

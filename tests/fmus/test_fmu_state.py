@@ -2,7 +2,6 @@
 
 import ctypes
 import gc
-import importlib
 import os
 import pickle
 import shutil
@@ -14,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import loopwright.fmus
 from loopwright.blocks import FmuError, FmuFileError, FmuRuntimeError
 from loopwright.fmus import Fmu, gantry, read_description
-from loopwright.fmus._instance import FmuInstance
+from loopwright.fmus.calls.instance import FmuInstance
 
 T, N, CUT = 1e-3, 200, 77
 PLANTS = ("gantry", "gantry_contact", "gantry_stiction", "bouncing_ball")
@@ -75,7 +75,7 @@ class Opened:
 
 @pytest.fixture(scope="module", params=PLANTS)
 def loop(request, cache):
-    return Loop(request.param, importlib.import_module(f"loopwright.fmus.{request.param}").build())
+    return Loop(request.param, getattr(loopwright.fmus, request.param).build())
 
 
 @pytest.fixture(scope="module")

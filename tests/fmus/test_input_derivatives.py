@@ -11,8 +11,8 @@ from test_integrators import unbound
 
 from exported import _model, counter, driven, mass_spring_damper, van_der_pol
 from exported2 import fails2
-from loopwright.fmus._build import build_fmu
-from loopwright.fmus._spec import Variable
+from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.model import Variable
 
 RK4, DOPRI5, RODAS = INTEGRATORS = (1, 2, 3)
 

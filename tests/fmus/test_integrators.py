@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from exported import D, K, M, driven, exact, explosive, fails, mass_spring_damper, van_der_pol
-from loopwright.blocks._errors import DefinitionError, ParameterError
-from loopwright.fmus._build import build_fmu
+from loopwright.blocks.core.errors import DefinitionError, ParameterError
+from loopwright.fmus.export.build import build_fmu
 
 RK4, DOPRI5, RODAS = 1, 2, 3
 
@@ -238,7 +238,9 @@ def test_wrong_settings_are_refused(msd, instance):
 
 
 def test_rodas_needs_derivatives(monkeypatch):
-    monkeypatch.setattr("loopwright.fmus._codegen.symbolic", lambda spec: (_ for _ in ()).throw(RuntimeError("none")))
+    monkeypatch.setattr(
+        "loopwright.fmus.export.c_code.symbolic", lambda spec: (_ for _ in ()).throw(RuntimeError("none"))
+    )
     with pytest.raises(DefinitionError, match="no derivatives, which the integrator rodas needs"):
         build_fmu(mass_spring_damper(integrator="rodas", description="not in the cache"))
 

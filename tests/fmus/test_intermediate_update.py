@@ -23,7 +23,7 @@ from exported import (
     mass_spring_damper,
     thermostat,
 )
-from loopwright.fmus._build import build_fmu
+from loopwright.fmus.export.build import build_fmu
 
 RK4, DOPRI5, RODAS = INTEGRATORS = (1, 2, 3)
 

@@ -28,7 +28,7 @@ from exported import (
     thermostat,
     van_der_pol,
 )
-from loopwright.fmus._build import build_fmu
+from loopwright.fmus.export.build import build_fmu
 
 
 def vector(n, values=()):

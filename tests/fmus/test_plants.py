@@ -4,8 +4,6 @@ The equations are written here once more, with NumPy, from the docstrings; nothi
 what builds the FMU.
 """
 
-import importlib
-
 import fmpy
 import mpmath as mp
 import numpy as np
@@ -14,6 +12,7 @@ from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
+import loopwright.fmus
 from loopwright.blocks import FmuRuntimeError, ParameterError
 from loopwright.fmus import Fmu, gantry_stiction, scara
 
@@ -28,7 +27,7 @@ FREE = {"coulomb_scale": 0.0, "viscous_scale": 0.0, "gravity": 0.0}
 
 @pytest.fixture(scope="module")
 def build():
-    return lambda name, **options: importlib.import_module(f"loopwright.fmus.{name}").build(**options)
+    return lambda name, **options: getattr(loopwright.fmus, name).build(**options)
 
 
 def run(file, T, start=None, **inputs):

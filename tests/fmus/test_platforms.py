@@ -12,8 +12,8 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from exported import pendulums
-from loopwright.fmus._build import build_fmu
-from loopwright.fmus._compiler import TARGETS, native_platform
+from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.compiler import TARGETS, native_platform
 
 FOLDERS = {
     3: {name: name for name in TARGETS},
@@ -114,7 +114,7 @@ def test_the_native_binary_is_the_same_alone_and_among_others(everywhere):
 
 BUILD = """
 import sys, exported
-from loopwright.fmus._build import build_fmu
+from loopwright.fmus.export.build import build_fmu
 for fmi, arrays in ((3, True), (3, False), (2, True)):
     for make in (exported.mass_spring_damper, exported.pendulums):
         out = f"{sys.argv[1]}/{make.__name__}-{fmi}-{arrays}.fmu"

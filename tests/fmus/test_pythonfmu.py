@@ -17,8 +17,8 @@ from lxml import etree
 
 from loopwright.blocks import Block, DefinitionError, FmuError, Input, Output, State, parameter
 from loopwright.fmus import bouncing_ball, build_python
-from loopwright.fmus._summary import summarize
-from loopwright.fmus._validation import validate
+from loopwright.fmus.checks.summary import summarize
+from loopwright.fmus.checks.validation import validate
 
 # Slow: they load PythonFMU's library into this process, and its memory faults (see _python_slave.py) would take the
 # whole quick set with them.

@@ -15,7 +15,7 @@ import ctypes, pathlib, sys
 import fmpy, fmpy.fmi2, fmpy.fmi3
 from exported import Instance, bouncing_ball, mass_spring_damper, pendulums, thermostat, van_der_pol
 from exported2 import Instance2
-from loopwright.fmus._build import build_fmu
+from loopwright.fmus.export.build import build_fmu
 
 folder = pathlib.Path(sys.argv[1])
 

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from loopwright.blocks._errors import UnitError
-from loopwright.blocks._units import Unit, describe_mismatch, parse_unit, rate_of, same_unit
+from loopwright.blocks.core.errors import UnitError
+from loopwright.blocks.core.units import Unit, describe_mismatch, parse_unit, rate_of, same_unit
 
 # By hand, from the definitions of the SI units: (kg, m, s, A, K, mol, cd, rad), factor.
 KNOWN = {

@@ -1,0 +1,229 @@
+"""The base of all blocks."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from ..tracing.trapezoid import SOLVED
+from .docstrings import port_section, with_section
+from .errors import DefinitionError, GuardError, WiringError, near
+from .ports import Event, Input, Output, Port, State, check_port_names
+from .signals import (
+    Call,
+    Signal,
+    UnknownAttributeError,
+    Wireable,
+    as_signal,
+    bind,
+    check_name,
+    primary_outputs,
+)
+from .values import Value
+
+_ABSENT = frozenset({"output", "derivative", "update", "indicators", "jump", "guards", "initial", "constants"})
+_ABSENT |= {"inputs", "outputs", "states", "events"}
+
+
+class Block(Value, Wireable):
+    """A signal-flow block: parameters, ports, and equations that are written once.
+
+    A subclass declares ports and parameters and writes its equations as plain functions of ``(t, x, u)`` with NumPy's
+    names; the same functions are run, traced, differentiated and compiled::
+
+        class Lag(Block):
+            '''First-order lag: T₁ ẏ = u − y.'''
+
+            time_constant: float = parameter(unit="s", above=0.0)
+            u = Input()
+            y = State(output=True)
+
+            def derivative(self, t, x, u):
+                return (u.u - x.y) / self.time_constant
+
+    ``x`` and ``u`` are named tuples of the states and the inputs, in the order of declaration. A function returns one
+    value for one port (or state), else a tuple in the order of declaration. None of them may change its arguments or
+    depend on anything but them and the parameters. Vectors are built with ``np.stack``; branches with ``np.where``.
+
+    A block has continuous states if it has a ``derivative``, sampled ones if it has an ``update`` alone. A continuous
+    block in a sampled subsystem is discretized by the subsystem's method, unless it has an ``update`` of its own.
+    A continuous block may declare events and discrete states, which its ``jump`` changes. With an ``update`` as well it
+    stands in both kinds of frames: its events act in a continuous one, its ``update`` in a sampled one.
+
+    Equations (all optional; ``T`` may be declared as a last argument of ``output``, ``update`` and ``guards`` and is
+    then the sample time in s; declared as ``T=None`` it is None in a continuous frame)
+    ----------------------------------------------------------------------------------------------------------------
+    output(t, x, u)
+        The outputs that are not states.
+    derivative(t, x, u)
+        Time derivative of the states that are not discrete.
+    indicators(t, x, u)
+        One expression for each `Event`: it fires where the expression crosses zero.
+    jump(t, x, u, fired)
+        All states after an event; ``fired`` is a named tuple of 1 for the events that fire at this instant, 0 else.
+    update(t, x, u)
+        The states at the next tick.
+    guards(t, x, u)
+        Expressions by name that must stay positive, else the run stops with `guard_error`.
+    initial(u)
+        Initial states from the inputs at the start: plain Python, not traced.
+    constants(T, method)
+        Numbers computed from the parameters in plain Python, which the equations then read as attributes.
+    next_instant(t)
+        The next time strictly after t at which the outputs or their derivatives are not smooth, ``math.inf`` if there
+        is none: plain Python, not traced. A solver lands there, and takes its left limits just before; it is not asked
+        for in a sampled frame.
+
+    Parameters
+    ----------
+    name : str, optional
+        Name in the diagram; without one the class name in snake case, numbered where it repeats.
+    """
+
+    _keywords: ClassVar[frozenset[str]] = frozenset({"name"})
+    memory: ClassVar[bool] = False
+    """True where the states are only a warm start for the outputs, such as a projection's last foot point."""
+    opaque: ClassVar[bool] = False
+    """True where the equations are not traced: any Python, called with numbers, differentiated by differences."""
+    same_units: ClassVar[bool] = False
+    """True where all inputs must be in one unit, as in a sum."""
+    stops: ClassVar[str | None] = None
+    """Name of a scalar output that ends the run, normally, at the first instant at which it is above 0.5."""
+    transport: ClassVar[bool] = False
+    """True where, in continuous time, the output ``y`` is the input ``u`` a time ``delay`` ago, kept by the solver."""
+
+    inputs: ClassVar[Mapping[str, Input]] = {}
+    outputs: ClassVar[Mapping[str, Output | State]] = {}
+    states: ClassVar[Mapping[str, State]] = {}
+    events: ClassVar[Mapping[str, Event]] = {}
+    name: str | None = None
+    _hint: ClassVar[str | None] = None
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        check_port_names(cls)
+        super().__init_subclass__(**kwargs)
+        ports: dict[str, Port] = {}
+        for base in reversed(cls.__mro__):
+            for name, item in vars(base).items():
+                if isinstance(item, Port):
+                    ports[name] = item
+                else:
+                    ports.pop(name, None)
+        for clash in ports.keys() & cls.parameter_specs.keys():
+            raise DefinitionError("a port and a parameter share this name; rename one.", block=cls.__name__, port=clash)
+        for attribute in ("inputs", "outputs", "states", "events"):
+            chosen = {k: p for k, p in ports.items() if _is_kind(p, attribute)}
+            if not isinstance(getattr(cls, attribute), property):  # ports that follow from the parameters
+                setattr(cls, attribute, chosen)
+            cls.__doc__ = with_section(cls.__doc__ or "", attribute.capitalize(), port_section(chosen))
+        if isinstance(cls.inputs, Mapping):
+            for name, port in ports.items():
+                like = getattr(port, "like", None)
+                if like is not None and like not in cls.inputs:
+                    raise DefinitionError(
+                        f"found like={like!r}; expected an input of this block. {near(like, cls.inputs)}",
+                        block=cls.__name__,
+                        port=name,
+                    )
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        name = kwargs.get("name")
+        object.__setattr__(self, "name", None if name is None else check_name(name))
+        super().__init__(*args, **kwargs)
+
+    @property
+    def label(self) -> str:
+        """Name for messages and for numbering: the given one, else the class name in snake case."""
+        return self.name or self._hint or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(self).__name__).lower()
+
+    @property
+    def starts_from_inputs(self) -> bool:
+        """Whether the initial state is computed from the inputs at the start, by ``initial``."""
+        return hasattr(self, "initial")
+
+    def next_instant(self, t: float) -> float:
+        """Return the next time after t at which the outputs are not smooth in time: never, unless overridden."""
+        return math.inf
+
+    def time_scale(self) -> float:
+        """Return the time in s within which the outputs change by themselves, a tenth of a period say: any, by default.
+
+        In a continuous frame events are looked for as often, and no step of a solver is longer than five of them.
+        """
+        return math.inf
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a variant with some parameters (or the name) changed; it is another node."""
+        result = type(self)(**{**self.parameters, "name": self.name, **changes})
+        object.__setattr__(result, "_hint", self._hint)
+        return result
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Call:
+        """Wire the block: signals by position in the order of the inputs, or by keyword."""
+        return Call(self, bind(self, args, kwargs))
+
+    def named(self, *names: str) -> Call:
+        """Name the wires of the outputs of a block without inputs; see `Call.named`."""
+        return self().named(*names)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name in _ABSENT or name in self.parameter_specs:
+            raise AttributeError(name)  # what is not written is asked for often; the rest would come back here
+        if isinstance(port := getattr(type(self), name, None), Port):
+            return port.__get__(self)  # type: ignore[attr-defined]  # its own error: it is no signal
+        known = {*self.outputs, *self.parameter_specs}
+        raise UnknownAttributeError(f"it has no output or parameter {name!r}. {near(name, known)}", block=self.label)
+
+    def _signal(self) -> Signal:
+        if any(port.default is None for port in self.inputs.values()) or len(primary_outputs(self)) != 1:
+            return as_signal_error(self)
+        return Signal(self, primary_outputs(self)[0])
+
+    def __iter__(self) -> Iterator[Signal]:
+        names = primary_outputs(self)
+        if len(names) < 2 or any(port.default is None for port in self.inputs.values()):
+            return iter(self._signal())  # one signal, or none: its error says what to do
+        return iter([Signal(self, name) for name in names])
+
+    def __repr__(self) -> str:
+        text = super().__repr__()
+        return text if self.name is None else f"{text[:-1]}{', ' if text[-2] != '(' else ''}name={self.name!r})"
+
+    def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
+        """Return the error for a failed guard; ``u``, ``y``, ``x`` are named tuples of inputs, outputs, states then."""
+        if name == SOLVED:
+            return GuardError(
+                f"its trapezoidal step is not solved: after the last of Newton's steps a state is still about "
+                f"{-value:.3g} away. Take a smaller sample time, or another method."
+            )
+        return GuardError(
+            f"guard {name!r} is {value:.6g}; expected a positive value. Check what its inputs are: "
+            f"{', '.join(f'{k} = {np.asarray(v).tolist()}' for k, v in u._asdict().items())}."
+        )
+
+
+def _is_kind(port: Port, attribute: str) -> bool:
+    """Whether a port belongs among a class's inputs, outputs, states or events."""
+    if attribute == "outputs":
+        return isinstance(port, Output) or (isinstance(port, State) and port.output)
+    return isinstance(port, {"inputs": Input, "states": State, "events": Event}[attribute])
+
+
+def as_signal_error(block: Block) -> Signal:
+    """Raise the error of a block used as a signal that isn't one."""
+    outputs = ", ".join(primary_outputs(block)) or "none"
+    needed = [name for name, port in block.inputs.items() if port.default is None]
+    if needed:
+        raise WiringError(
+            f"a block is used as a signal before it is wired; call it first, or name an output ({outputs}): "
+            f"{block.label}({', '.join(f'{n}=…' for n in needed)}).",
+            block=block.label,
+        )
+    raise WiringError(f"it has not one output ({outputs}); name one.", block=block.label)
+
+
+__all__ = ["Block", "as_signal"]

@@ -1,0 +1,241 @@
+"""Ports: what a block declares of its inputs, outputs and states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+
+from .errors import DefinitionError
+from .units import parse_unit
+
+if TYPE_CHECKING:
+    from .block import Block
+    from .signals import Signal
+
+Shape = tuple[int, ...]
+Unit = str | tuple[str, ...] | None
+
+
+class Port:
+    """An input, an output or a state, declared on a block's class: ``position = Input(shape=(2,), unit="m")``.
+
+    Parameters
+    ----------
+    shape : tuple of int or None
+        Shape of the signal, ``()`` for a scalar. None takes any shape (an input), or that which the equations give (an
+        output).
+    unit : str, tuple of str or None
+        Unit as FMI spells it; a tuple gives one per entry. None: not declared, and not checked.
+    description : str
+        One line for people.
+    nominal : float, optional
+        Typical size, positive, in its unit: what tolerances of a solver are relative to.
+    minimum, maximum : float, optional
+        Range in its unit; an FMU refuses values outside.
+    """
+
+    def __init__(
+        self,
+        shape: Shape | None = (),
+        unit: Unit = None,
+        description: str = "",
+        name: str = "",
+        *,
+        nominal: float | None = None,
+        minimum: float | None = None,
+        maximum: float | None = None,
+    ):
+        self.shape, self.unit, self.description, self.name = shape, unit, description, name
+        self.nominal, self.minimum, self.maximum = nominal, minimum, maximum
+        for one in (unit,) if isinstance(unit, str) else unit or ():
+            parse_unit(one)
+        if nominal is not None and not nominal > 0:
+            raise DefinitionError(f"found nominal {nominal!r}; expected a positive number.")
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name  # checked once the class is made: Python wraps what is raised here in a RuntimeError
+
+    def __repr__(self) -> str:
+        unit = "" if self.unit is None else f", unit={self.unit!r}"
+        return f"{type(self).__name__}({self.name}, shape={self.shape}{unit})"
+
+
+_TAKEN = frozenset({"name", "inputs", "outputs", "states", "events", "replace", "parameters"})
+
+
+def check_port_names(cls: type) -> None:
+    """Refuse ports of a class whose names mean something else.
+
+    Raises
+    ------
+    DefinitionError
+        The name of an attribute of every block, T, or a name that begins with an underscore.
+    """
+    for name in (n for n, item in vars(cls).items() if isinstance(item, Port)):
+        if name == "T":
+            why, step = "in equations T is the sample time in s", "another name, such as temperature or T_1"
+        elif name in _TAKEN:
+            why, step = "every block has an attribute of that name", f"another name, such as {name}_1"
+        elif name.startswith("_"):
+            why, step = "names that begin with an underscore are private", f"{name.strip('_') or 'another name'}"
+        else:
+            continue
+        raise DefinitionError(f"a port can't be called {name!r}: {why}. Take {step}.", block=cls.__name__, port=name)
+
+
+class Input(Port):
+    """An input. With ``default`` it may stay unwired. It takes ``nominal``, ``minimum`` and ``maximum`` of `Port`."""
+
+    def __init__(
+        self,
+        shape: Shape | None = (),
+        unit: Unit = None,
+        description: str = "",
+        *,
+        default: Any = None,
+        name: str = "",
+        **limits: float | None,
+    ):
+        super().__init__(shape, unit, description, name, **limits)
+        self.default = None if default is None else np.asarray(default, dtype=float)
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        if instance is None:
+            return self
+        raise AttributeError(
+            f"{self.name!r} is an input of {instance!r}: it is wired by calling the block, and can't be read."
+        )
+
+
+class Output(Port):
+    """An output; read on a block it is a `Signal`.
+
+    Parameters
+    ----------
+    like : str, optional
+        Name of the input whose unit it takes over. The shape, where none is given, is what the equations give: a sum
+        of a scalar and a vector is a vector.
+    secondary : bool, optional
+        True for an output that is read by name only (``saturation.excess``): it is recorded as any other, but the
+        block's call neither unpacks into it nor stands for it.
+    """
+
+    def __init__(
+        self,
+        shape: Shape | None = (),
+        unit: Unit = None,
+        description: str = "",
+        *,
+        like: str | None = None,
+        secondary: bool = False,
+        name: str = "",
+        **limits: float | None,
+    ):
+        super().__init__(None if like and shape == () else shape, unit, description, name, **limits)
+        self.like, self.secondary = like, secondary
+
+    @overload
+    def __get__(self, instance: None, owner: type) -> Output: ...
+    @overload
+    def __get__(self, instance: Block, owner: type | None = None) -> Signal: ...
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        if instance is None:
+            return self
+        from .signals import Signal
+
+        return Signal(instance, self.name)
+
+
+class State(Port):
+    """A state: continuous with a `derivative`, sampled with an `update`.
+
+    Parameters
+    ----------
+    start : float, array_like, str or callable
+        Start value; a string names the parameter that holds it, a callable computes it from the block. It sets the
+        shape.
+    like : str, optional
+        Name of the input whose shape the state takes.
+    output : bool, optional
+        True when the state is an output as well, under the same name.
+    discrete : bool, optional
+        True for a state that is constant between events: only ``jump`` changes it.
+    """
+
+    def __init__(
+        self,
+        unit: Unit = None,
+        description: str = "",
+        *,
+        start: float | Any | str | Callable[[Any], Any] = 0.0,
+        like: str | None = None,
+        output: bool = False,
+        discrete: bool = False,
+        name: str = "",
+        **limits: float | None,
+    ):
+        super().__init__(None, unit, description, name, **limits)
+        self.start, self.like, self.output, self.discrete = start, like, output, discrete
+
+    def start_value(self, block: Block, shapes: Mapping[str, Shape]) -> np.ndarray:
+        """Return the start value on ``block``, with inputs of the given shapes, as a float64 array."""
+        start = self.start
+        if isinstance(start, str):
+            start = getattr(block, start)
+        elif callable(start):
+            start = start(block)
+        value = np.asarray(0.0 if start is None else start, dtype=float)
+        return np.array(np.broadcast_to(value, shapes[self.like])) if self.like else value
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        if instance is None:
+            return self
+        if self.output:
+            from .signals import Signal
+
+            return Signal(instance, self.name)
+        raise AttributeError(f"{self.name!r} is a state of {instance!r}: it lives in the run, not on the block.")
+
+
+class Event(Port):
+    """An event of a continuous block: one of its ``indicators`` crosses zero in a direction.
+
+    An indicator is in one of two domains, z > 0 or z ≤ 0. A change of domain in the declared direction fires the event,
+    and the block's ``jump`` gives the states after it. At the start domains are taken as they are, and nothing fires.
+
+    Parameters
+    ----------
+    direction : {"both", "rising", "falling"}
+        Rising is from z ≤ 0 to z > 0.
+    description : str
+        One line for people.
+    nominal : float
+        Typical size of the indicator, positive: what "close to zero" is measured by.
+    hysteresis : float
+        How far beyond zero, in the indicator's unit, it must go for the event to fire. It ends chattering, and is used
+        in diagrams; an exported FMU has its own.
+    """
+
+    def __init__(
+        self,
+        direction: str = "both",
+        description: str = "",
+        *,
+        nominal: float = 1.0,
+        hysteresis: float = 0.0,
+        name: str = "",
+    ):
+        super().__init__((), None, description, name, nominal=float(nominal))
+        self.hysteresis = float(hysteresis)
+        if not self.hysteresis >= 0.0:
+            raise DefinitionError(f"found hysteresis {hysteresis!r}; expected a number of zero or more.")
+        if direction not in ("both", "rising", "falling"):
+            raise DefinitionError(f"found direction {direction!r}; expected 'both', 'rising' or 'falling'.")
+        self.direction = direction
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        if instance is None:
+            return self
+        raise AttributeError(f"{self.name!r} is an event of {instance!r}: it happens in a run, and can't be read.")

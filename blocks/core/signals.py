@@ -1,0 +1,357 @@
+"""Signals and calls: wiring as values.
+
+``block(u)`` is a `Call`: the block with its inputs. It changes nothing. A `Signal` is one output port, or a part of
+one. Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` and ``*``.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterator
+from contextlib import suppress
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .errors import (
+    DoubleDriveError,
+    LoopwrightError,
+    ShapeError,
+    UnknownNameError,
+    UnwiredInputError,
+    WiringError,
+    near,
+)
+from .numpy_guard import NoNumber
+
+if TYPE_CHECKING:
+    from .block import Block
+
+recorder: ContextVar[list[Any] | None] = ContextVar("loopwright_calls", default=None)
+"""The calls made while a subsystem's function runs: a closing call whose result nobody uses still counts."""
+
+
+class Wireable(NoNumber):
+    """What can stand at the source end of a wire: a signal, a call, a block with one output."""
+
+    def _signal(self) -> Signal:
+        raise NotImplementedError
+
+    def __add__(self, other: Any) -> Signal:
+        return _sum(self, other, "++")
+
+    def __radd__(self, other: Any) -> Signal:
+        return _sum(other, self, "++")
+
+    def __sub__(self, other: Any) -> Signal:
+        return _sum(self, other, "+-")
+
+    def __rsub__(self, other: Any) -> Signal:
+        return _sum(other, self, "+-")
+
+    def __neg__(self) -> Signal:
+        from ..library.algebra import Sum  # it keeps the unit, which a gain would not
+
+        return hinted(Sum(signs="-"), f"minus_{_operand(self, 'constant')}")(self)._signal()
+
+    def __mul__(self, other: Any) -> Signal:
+        return _product(self, other)
+
+    def __rmul__(self, other: Any) -> Signal:
+        return _product(self, other)
+
+    def __rmatmul__(self, matrix: Any) -> Signal:
+        from ..library.algebra import Gain
+
+        return hinted(Gain(gain=matrix), f"gain_of_{_operand(self, 'constant')}")(self)._signal()
+
+    def __truediv__(self, other: Any) -> Signal:
+        if isinstance(other, Wireable):
+            raise WiringError(
+                "a signal can't be divided by a signal; use Function(np.divide)(a, b), or write a Block whose equation "
+                "does it.",
+                block=self._who(),
+            )
+        return self * (1.0 / np.asarray(other, dtype=float))
+
+    def __getitem__(self, index: int | slice) -> Signal:
+        return self._signal()[index]
+
+    def __iter__(self) -> Iterator[Signal]:  # without it Python would index from 0 on and never stop
+        return iter(self._signal())
+
+    def __dir__(self) -> list[str]:
+        return [*super().__dir__(), *(name for name in _outputs(self) if name.isidentifier())]
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return _outputs(self)
+
+
+class Wired(Wireable):
+    """A signal or a call: its values are those of a run, so nothing can be decided on it while wiring."""
+
+    __hash__ = object.__hash__
+
+    def _undecided(self, what: str) -> WiringError:
+        return WiringError(
+            f"{self!r} has no {what} while the diagram is wired: its values come with the run. Write the decision as a "
+            "block's equation, with np.where(…).",
+            block=self._who(),
+        )
+
+    def __bool__(self) -> bool:
+        raise self._undecided("truth value")
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, int | float | np.number | np.ndarray):
+            raise self._undecided("value to compare")
+        return self is other
+
+    def __lt__(self, other: object) -> bool:
+        raise self._undecided("value to compare")
+
+    __le__ = __gt__ = __ge__ = __lt__
+
+
+class Signal(Wired):
+    """One output port of a block, or a part of it.
+
+    Attributes
+    ----------
+    source : Block or frame input
+        Who makes it.
+    port : str
+        Output port.
+    index : int, slice or None
+        The part of the port.
+    wire : str or None
+        Name given by `named`.
+    call : Call or None
+        The call that it came from, where there was one.
+    """
+
+    __slots__ = ("call", "index", "port", "source", "wire")
+
+    def __init__(
+        self, source: Any, port: str, index: int | slice | None = None, wire: str | None = None, call: Any = None
+    ):
+        self.source, self.port, self.index, self.wire, self.call = source, port, index, wire, call
+
+    def _signal(self) -> Signal:
+        return self
+
+    def __getitem__(self, index: int | slice) -> Signal:
+        if self.index is not None:
+            raise WiringError("a part of a part of a signal; index the port once.", port=self.port)
+        return Signal(self.source, self.port, _index(index, self.port), None, self.call)
+
+    def __iter__(self) -> Iterator[Signal]:
+        who = getattr(self.source, "label", None)
+        raise WiringError("this is one signal and can't be unpacked; index it, as in y[0].", block=who, port=self.port)
+
+    def named(self, name: str) -> Signal:
+        """Name the wire: a log channel, and a point at which the loop can be opened.
+
+        The signal that is returned must be the one that is used on; it is the same port.
+        """
+        return Signal(self.source, self.port, self.index, check_name(name), self.call)
+
+    def __repr__(self) -> str:
+        part = "" if self.index is None else f"[{self.index}]"
+        return f"<signal {getattr(self.source, 'label', self.source)}.{self.port}{part}>"
+
+
+def _index(index: Any, port: str) -> int | slice:
+    """Return an index of plain integers, so that NumPy's integers wire (and compare) as Python's do."""
+
+    def integer(value: Any) -> int:
+        if isinstance(value, bool | np.bool_):
+            raise TypeError
+        return operator.index(value)
+
+    try:
+        if not isinstance(index, slice):
+            return integer(index)
+        return slice(*(None if i is None else integer(i) for i in (index.start, index.stop, index.step)))
+    except TypeError:
+        raise WiringError(
+            f"found the index {index!r}; expected an integer or a slice of integers, as in y[0] or y[:2].", port=port
+        ) from None
+
+
+def _outputs(source: Wireable) -> list[str]:
+    """Return the names that complete in a notebook; nothing where they can't be had, for completion never fails."""
+    with suppress(LoopwrightError):
+        if not isinstance(source, Signal):
+            return list(getattr(source.block if isinstance(source, Call) else source, "outputs", ()))
+    return []
+
+
+class Call(Wired):
+    """A block with its inputs: one node of a diagram."""
+
+    def __init__(
+        self, block: Block, wires: dict[str, Signal], names: tuple[str | None, ...] = (), origin: Call | None = None
+    ):
+        self.block, self.wires, self.names = block, wires, names
+        self.origin = self if origin is None else origin
+        if origin is None:
+            calls = recorder.get()
+            if calls is not None:
+                calls.append(self)
+
+    @property
+    def primary(self) -> list[str]:
+        """Names of the outputs that the call unpacks into."""
+        return primary_outputs(self.block)
+
+    def named(self, *names: str) -> Call:
+        """Name the wires of the outputs, in order (all of them)."""
+        if len(names) != len(self.primary):
+            raise WiringError(
+                f"{len(names)} names for {len(self.primary)} outputs ({', '.join(self.primary)}); give one each.",
+                block=self.block.label,
+            )
+        return Call(self.block, self.wires, tuple(check_name(name) for name in names), self.origin)
+
+    def _output(self, port: str) -> Signal:
+        wire = dict(zip(self.primary, self.names, strict=False)).get(port)
+        return Signal(self.block, port, None, wire, self)
+
+    def _signal(self) -> Signal:
+        if len(self.primary) != 1:
+            raise WiringError(
+                f"it has {len(self.primary)} outputs ({', '.join(self.primary)}), so the call is not one signal; "
+                f"unpack it, or name one: …{'.' + self.primary[0] if self.primary else ''}.",
+                block=self.block.label,
+            )
+        return self._output(self.primary[0])
+
+    def __iter__(self) -> Iterator[Signal]:
+        return iter([self._output(port) for port in self.primary])
+
+    def __getattr__(self, name: str) -> Signal:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        if name in self.block.outputs:
+            return self._output(name)
+        raise UnknownAttributeError(
+            f"it has no output {name!r}. {near(name, self.block.outputs)}", block=self.block.label
+        )
+
+    def __getitem__(self, index: Any) -> Signal:
+        return self._output(index) if isinstance(index, str) and index in self.block.outputs else self._signal()[index]
+
+    def __repr__(self) -> str:
+        return f"<call of {self.block.label}>"
+
+
+class UnknownAttributeError(UnknownNameError, AttributeError):
+    """An output that is not there, asked for as an attribute."""
+
+
+def primary_outputs(block: Block) -> list[str]:
+    """Return the outputs that a call of ``block`` unpacks into."""
+    return [name for name, port in block.outputs.items() if not getattr(port, "secondary", False)]
+
+
+def check_name(name: Any) -> str:
+    """Return ``name`` if it can name a block or a wire.
+
+    Raises
+    ------
+    WiringError
+        If it is no identifier (letters, digits, underscores).
+    """
+    if not (isinstance(name, str) and name.isidentifier()):
+        raise WiringError(f"found the name {name!r}; expected letters, digits and underscores, such as 'v_perp'.")
+    return name
+
+
+def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
+    """Return the signal that ``value`` stands for: a signal, a call or block with one output, or a number.
+
+    Raises
+    ------
+    WiringError
+        If it stands for none.
+    """
+    from ..library.sources import Constant
+
+    if isinstance(value, Wireable):
+        return value._signal()
+    if isinstance(value, int | float | np.number | np.ndarray | list | tuple) and not isinstance(value, bool):
+        try:
+            return Constant(value=value)._signal()
+        except ValueError:
+            pass
+    raise WiringError(
+        f"found {value!r}; expected a signal, a call, a block with one output, or numbers.", block=block, port=port
+    )
+
+
+def bind(block: Block, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Signal]:
+    """Match the arguments of a call with the block's inputs.
+
+    Raises
+    ------
+    UnwiredInputError, DoubleDriveError, UnknownNameError, WiringError
+        A required input left out, given twice, one that isn't there, too many.
+    """
+    inputs, who = block.inputs, block.label
+    if len(args) > len(inputs):
+        raise WiringError(f"{len(args)} signals for {len(inputs)} inputs ({', '.join(inputs) or 'none'}).", block=who)
+    given = dict(zip(inputs, args, strict=False))
+    for name, value in kwargs.items():
+        if name not in inputs:
+            raise UnknownNameError(f"it has no input {name!r}. {near(name, inputs)}", block=who)
+        if name in given:
+            raise DoubleDriveError("it is driven twice in one call, by position and by keyword.", block=who, port=name)
+        given[name] = value
+    missing = [name for name, port in inputs.items() if name not in given and port.default is None]
+    if missing:
+        raise UnwiredInputError(
+            f"nothing is wired to {', '.join(repr(m) for m in missing)}; expected {block.label}"
+            f"({', '.join(f'{name}=…' for name in inputs)}).",
+            block=who,
+            port=missing[0],
+        )
+    return {name: as_signal(value, block=who, port=name) for name, value in given.items()}
+
+
+def _operand(value: Any, default: str) -> str:
+    signal = value._signal() if isinstance(value, Wireable) else None
+    if signal is None:
+        return default
+    if signal.wire:
+        return signal.wire
+    outputs = getattr(signal.source, "outputs", ())
+    return signal.source.label if len(outputs) == 1 else signal.port
+
+
+def hinted(block: Block, hint: str) -> Block:
+    """Give a block that the library makes a name to be numbered where it repeats, and return it."""
+    object.__setattr__(block, "_hint", hint)
+    return block
+
+
+def _sum(left: Any, right: Any, signs: str) -> Signal:
+    from ..library.algebra import Sum
+
+    word = {"++": "plus", "+-": "minus"}[signs]
+    name = f"{_operand(left, 'constant')}_{word}_{_operand(right, 'constant')}"
+    return hinted(Sum(signs=signs), name)(left, right)._signal()
+
+
+def _product(left: Any, right: Any) -> Signal:
+    from ..library.algebra import Gain, Product
+
+    if isinstance(right, Wireable):
+        name = f"{_operand(left, 'constant')}_times_{_operand(right, 'constant')}"
+        return hinted(Product(), name)(left, right)._signal()
+    if not isinstance(right, int | float | np.number | np.ndarray) or np.ndim(right) > 1:
+        raise ShapeError(
+            "a signal is multiplied by a number, a vector or another signal; a matrix is applied as K @ signal."
+        )
+    return hinted(Gain(gain=right), f"gain_of_{_operand(left, 'constant')}")(left)._signal()

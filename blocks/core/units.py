@@ -1,0 +1,202 @@
+"""Unit strings, as FMI and Modelica write them, read into SI base units.
+
+The grammar is that of the Modelica specification (chapter 19), which FMI 3.0 (2.4.3, Units) leans on: factors joined
+by a dot (``N.s/m``), one ``/`` at most, a denominator of several factors in parentheses (``J/(kg.K)``), integer
+exponents with or without ``^`` (``m/s2``, ``m^2``, ``s-1``). A space or ``*`` between two factors is read as the dot.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+
+from .errors import UnitError, near
+
+#: The base units of an FMI ``<BaseUnit>`` element, in the order of `Unit.exponents`.
+BASE_UNITS = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit: ``value in base units = factor * value + offset`` (FMI 3.0, 2.4.3).
+
+    Parameters
+    ----------
+    text : str
+        As it was written.
+    exponents : tuple of int
+        Of kg, m, s, A, K, mol, cd, rad.
+    factor, offset : float
+        Conversion to base units.
+    """
+
+    text: str
+    exponents: tuple[int, int, int, int, int, int, int, int]
+    factor: float = 1.0
+    offset: float = 0.0
+
+    @property
+    def base_text(self) -> str:
+        """The dimension in base units, such as ``kg.m.s-2``; ``1`` if it has none."""
+        powers = [(b, n) for b, n in zip(BASE_UNITS, self.exponents, strict=True) if n]
+        return ".".join(base if n == 1 else f"{base}{n}" for base, n in powers) or "1"
+
+
+def _unit(factor: float = 1.0, offset: float = 0.0, **powers: int) -> Unit:
+    kg, m, s, A, K, mol, cd, rad = (powers.get(base, 0) for base in BASE_UNITS)
+    return Unit("", (kg, m, s, A, K, mol, cd, rad), factor, offset)
+
+
+# Units that take a prefix (k, m, µ, …), then those that don't.
+_PREFIXED = {
+    **{base: _unit(**{base: 1}) for base in ("m", "s", "A", "K", "mol", "cd", "rad")},
+    "g": _unit(1e-3, kg=1),
+    "N": _unit(kg=1, m=1, s=-2),
+    "Pa": _unit(kg=1, m=-1, s=-2),
+    "J": _unit(kg=1, m=2, s=-2),
+    "W": _unit(kg=1, m=2, s=-3),
+    "V": _unit(kg=1, m=2, s=-3, A=-1),
+    "Ohm": _unit(kg=1, m=2, s=-3, A=-2),
+    "Ω": _unit(kg=1, m=2, s=-3, A=-2),
+    "S": _unit(kg=-1, m=-2, s=3, A=2),
+    "C": _unit(s=1, A=1),
+    "F": _unit(kg=-1, m=-2, s=4, A=2),
+    "H": _unit(kg=1, m=2, s=-2, A=-2),
+    "Wb": _unit(kg=1, m=2, s=-2, A=-1),
+    "T": _unit(kg=1, s=-2, A=-1),
+    "Hz": _unit(s=-1),
+    "l": _unit(1e-3, m=3),
+    "bar": _unit(1e5, kg=1, m=-1, s=-2),
+}
+_PLAIN = {
+    "kg": _unit(kg=1),
+    "1": _unit(),
+    "%": _unit(0.01),
+    "deg": _unit(math.pi / 180, rad=1),
+    "°": _unit(math.pi / 180, rad=1),
+    "rev": _unit(2 * math.pi, rad=1),
+    "rpm": _unit(2 * math.pi / 60, rad=1, s=-1),
+    "min": _unit(60.0, s=1),
+    "h": _unit(3600.0, s=1),
+    "d": _unit(86400.0, s=1),
+    "degC": _unit(1.0, 273.15, K=1),
+    "°C": _unit(1.0, 273.15, K=1),
+}
+_PREFIXES = {"p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1}
+_PREFIXES |= {"k": 1e3, "M": 1e6, "G": 1e9}
+_FACTOR = re.compile(r"(1|[^\W\d_]+|%|°C?)(?:\^?([+-]?\d+))?")
+_NEXT = "Write it as FMI does: 'm/s2', 'N.s/m', 'J/(kg.K)', '1' for no dimension."
+
+
+def _symbol(symbol: str, text: str) -> Unit:
+    for table in (_PLAIN, _PREFIXED):
+        if symbol in table:
+            return table[symbol]
+    prefix, rest = symbol[:1], symbol[1:]
+    if prefix in _PREFIXES and rest in _PREFIXED:
+        base = _PREFIXED[rest]
+        return Unit("", base.exponents, base.factor * _PREFIXES[prefix])
+    hint = near(symbol, {**_PLAIN, **_PREFIXED})
+    raise UnitError(f"the unit {text!r} has an unknown symbol {symbol!r}. {hint} {_NEXT}")
+
+
+def _factors(part: str, text: str) -> list[tuple[Unit, int]]:
+    found = []
+    for word in re.split(r"[.·*\s]+", part.strip()):
+        match = _FACTOR.fullmatch(word)
+        if match is None:
+            raise UnitError(f"the unit {text!r} can't be read at {word!r}. {_NEXT}")
+        found.append((_symbol(match[1], text), int(match[2] or 1)))
+    return found
+
+
+@lru_cache(maxsize=1024)
+def parse_unit(text: str) -> Unit:
+    """Read a unit string.
+
+    Parameters
+    ----------
+    text : str
+        Such as ``"m/s2"``, ``"N.s/m"``, ``"kg.m2"``, ``"1"``.
+
+    Returns
+    -------
+    Unit
+
+    Raises
+    ------
+    UnitError
+        If it can't be read; the message says where, and how to write it.
+
+    Examples
+    --------
+    >>> parse_unit("N.s/m").base_text
+    'kg.s-1'
+    >>> parse_unit("mm").factor
+    0.001
+    """
+    top, slash, bottom = text.partition("/")
+    bottom = bottom.strip()
+    if slash and bottom.startswith("(") and bottom.endswith(")"):
+        bottom = bottom[1:-1]
+    elif slash and len(re.split(r"[.·*/\s]+", bottom)) > 1:
+        hint = "Put a denominator of several factors in parentheses: 'J/(kg.K)'."
+        raise UnitError(f"the unit {text!r} is ambiguous after '/'. {hint}")
+    factors = _factors(top, text) + [(unit, -power) for unit, power in (_factors(bottom, text) if slash else [])]
+    if len(factors) > 1 and any(unit.offset for unit, _ in factors):
+        raise UnitError(f"the unit {text!r} has a temperature with an offset as a factor. Use 'K' for differences.")
+    exponents = [sum(unit.exponents[i] * power for unit, power in factors) for i in range(len(BASE_UNITS))]
+    kg, m, s, A, K, mol, cd, rad = exponents
+    factor = math.prod(unit.factor**power for unit, power in factors)
+    offset = factors[0][0].offset if len(factors) == 1 else 0.0
+    return Unit(text, (kg, m, s, A, K, mol, cd, rad), factor, offset)
+
+
+def _read(unit: Unit | str) -> Unit:
+    return parse_unit(unit) if isinstance(unit, str) else unit
+
+
+def same_unit(a: Unit | str, b: Unit | str) -> bool:
+    """Whether a number in ``a`` means the same in ``b``: equal dimension, factor and offset."""
+    a, b = _read(a), _read(b)
+    close = math.isclose(a.factor, b.factor, rel_tol=1e-12) and math.isclose(a.offset, b.offset)
+    return close and a.exponents == b.exponents
+
+
+def describe_mismatch(a: Unit | str, b: Unit | str) -> str:
+    """Say how ``a`` (where a wire starts) differs from ``b`` (where it ends), and what to do.
+
+    Examples
+    --------
+    >>> describe_mismatch("mm", "m")
+    'mm and m differ by a factor of 0.001: put Gain(gain=0.001) between'
+    """
+    a, b = _read(a), _read(b)
+    if same_unit(a, b):
+        return f"{a.text} and {b.text} are the same"
+    if a.exponents != b.exponents:
+        both = f"{a.text} ({a.base_text}) and {b.text} ({b.base_text})"
+        return f"{both} are of different dimensions: check which ports are meant"
+    if not math.isclose(a.offset, b.offset):
+        return f"{a.text} and {b.text} differ by an offset of {a.offset - b.offset:.12g}: give both in {b.base_text}"
+    gain = f"{a.factor / b.factor:.12g}"
+    return f"{a.text} and {b.text} differ by a factor of {gain}: put Gain(gain={gain}) between"
+
+
+def rate_of(text: str) -> str:
+    """Write the unit of the time derivative: ``m`` gives ``m/s``, ``m/s`` gives ``m/s2``."""
+    if parse_unit(text).offset:
+        return "K/s"
+    top, slash, bottom = (part.strip() for part in text.partition("/"))
+    if not slash:
+        return f"{top}/s"
+    factors = re.split(r"[.·*\s]+", bottom.strip("()"))
+    for i, word in enumerate(factors):
+        if (match := re.fullmatch(r"s(?:\^?(\d+))?", word)) is not None:
+            factors[i] = f"s{int(match[1] or 1) + 1}"
+            break
+    else:
+        factors.append("s")
+    return f"{top}/{factors[0]}" if len(factors) == 1 else f"{top}/({'.'.join(factors)})"

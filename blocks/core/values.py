@@ -1,0 +1,343 @@
+"""Values: frozen objects whose parameters are their attributes.
+
+Blocks, paths and models are values. The constructor takes parameters and nothing else, `==` compares them,
+`replace` gives a variant, and pickling is that of a plain object.
+"""
+
+from __future__ import annotations
+
+import inspect
+import numbers
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from dataclasses import replace as replace_fields
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, dataclass_transform
+
+import numpy as np
+
+from .docstrings import ParameterSignature, parameter_section, with_section
+from .errors import DefinitionError, ParameterError, near
+from .frozen import freeze
+from .units import parse_unit
+
+if TYPE_CHECKING:
+    Array: TypeAlias = Any
+else:
+
+    class Array:
+        """A number or a NumPy array of floats; inside an equation that is being traced, its symbolic stand-in.
+
+        It stands in annotations only: ``mass: Array = parameter(…)``. Type checkers take it for ``Any``.
+        """
+
+
+_MISSING: Any = object()
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """What is declared of one parameter; made by `parameter`."""
+
+    default: Any = _MISSING
+    unit: str | None = None
+    description: str = ""
+    above: float | None = None
+    minimum: float | None = None
+    maximum: float | None = None
+    shape: tuple[int, ...] | None = None
+    structural: bool = False
+    kw_only: bool = True
+    tunable: bool = True
+    annotation: str = "Any"
+
+    @property
+    def required(self) -> bool:
+        """Whether the constructor must be given it."""
+        return self.default is _MISSING
+
+
+def parameter(
+    *,
+    default: Any = _MISSING,
+    unit: str | None = None,
+    description: str = "",
+    above: float | None = None,
+    minimum: float | None = None,
+    maximum: float | None = None,
+    shape: tuple[int, ...] | None = None,
+    structural: bool = False,
+    kw_only: bool = True,
+    tunable: bool = True,
+) -> Any:
+    """Declare a parameter of a value: ``mass: float = parameter(unit="kg", above=0.0)``.
+
+    Parameters
+    ----------
+    default : object, optional
+        The default; without one the parameter is required.
+    unit : str, optional
+        Unit, as FMI spells it (``"N.s/m"``).
+    description : str, optional
+        One line for people.
+    above, minimum, maximum : float, optional
+        Bounds that every entry must respect: strictly above, at least, at most.
+    shape : tuple of int, optional
+        Shape that a numeric value is broadcast to.
+    structural : bool, optional
+        True when the equations branch on the value in Python; it is then a constant of the trace and not a symbol.
+        Values that are no floats are structural by nature.
+    kw_only : bool, optional
+        False for the one defining object that may come first by position.
+    tunable : bool, optional
+        False when an FMU made from it must not change the value during a run (FMI's variability "fixed").
+
+    Raises
+    ------
+    UnitError
+        A unit that can't be read.
+    """
+    if unit is not None:
+        parse_unit(unit)
+    return ParameterSpec(default, unit, description, above, minimum, maximum, shape, structural, kw_only, tunable)
+
+
+@dataclass_transform(kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(parameter,))
+class Value:
+    """Base of everything that is given by its parameters: blocks, paths, models."""
+
+    parameter_specs: ClassVar[Mapping[str, ParameterSpec]] = {}
+    _keywords: ClassVar[frozenset[str]] = frozenset()  # constructor keywords that are no parameters (a block's name)
+    _content: ClassVar[Any] = None  # what else tells two values apart, such as the digest of a file
+    __signature__ = ParameterSignature()
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        specs = dict(cls.parameter_specs)
+        for name, annotation in inspect.get_annotations(cls).items():
+            text = annotation if isinstance(annotation, str) else _annotation_text(annotation)
+            if "ClassVar" in text or name.startswith("_") or name in cls._keywords:
+                continue
+            declared = cls.__dict__.get(name, _MISSING)
+            spec = declared if isinstance(declared, ParameterSpec) else ParameterSpec(default=declared)
+            if name in cls.__dict__:
+                delattr(cls, name)  # the instance attribute is the only one
+            specs[name] = replace_fields(spec, annotation=text, default=freeze(spec.default))
+        for name, declared in vars(cls).items():
+            if isinstance(declared, ParameterSpec):
+                raise DefinitionError(
+                    f"the parameter has no annotation; write {name}: float = parameter(…), or Array for a vector.",
+                    block=cls.__name__,
+                    port=name,
+                )
+        cls.parameter_specs = specs
+        written = cls.__dict__.get("__doc__") or f"{cls.__name__}."
+        cls.__doc__ = with_section(inspect.cleandoc(written), "Parameters", parameter_section(cls))
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        cls = type(self)
+        who = kwargs.get("name") or cls.__name__
+        positional = [name for name, spec in cls.parameter_specs.items() if not spec.kw_only]
+        if len(args) > len(positional):
+            allowed = f"only {', '.join(positional)} may come by position" if positional else "all go by keyword"
+            raise ParameterError(
+                f"{len(args)} positional arguments were given; {allowed}. "
+                f"Write {cls.__name__}({', '.join(f'{k}=…' for k in cls.parameter_specs)}).",
+                block=who,
+            )
+        for name, value in zip(positional, args, strict=False):
+            if name in kwargs:
+                raise ParameterError(
+                    "it is given twice, by position and by keyword; give it once.", block=who, port=name
+                )
+            kwargs[name] = value
+        for name in kwargs:
+            if name not in cls.parameter_specs and name not in cls._keywords:
+                raise ParameterError(
+                    f"{cls.__name__} has no parameter {name!r}. {near(name, cls.parameter_specs)}", block=who, port=name
+                )
+        for name, spec in cls.parameter_specs.items():
+            if name not in kwargs and spec.required:
+                unit = f" in {spec.unit}" if spec.unit else ""
+                raise ParameterError(
+                    f"it is required and was not given: {cls.__name__}({name}=…){unit}. {spec.description}",
+                    block=who,
+                    port=name,
+                )
+            object.__setattr__(self, name, convert(kwargs.get(name, spec.default), spec, who, name))
+        self.check()
+
+    def check(self) -> None:
+        """Check what concerns several parameters at once; override it and raise `ParameterError`."""
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Name and value of every parameter, in the order of declaration."""
+        return {name: self.__dict__[name] for name in type(self).parameter_specs}
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a variant with some parameters changed.
+
+        Raises
+        ------
+        ParameterError
+            For an unknown name or a value out of its bounds.
+        """
+        return type(self)(**{**self.parameters, **changes})
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for name in type(self).parameter_specs:  # a pickled array comes back writable
+            if name in state:
+                self.__dict__[name] = freeze(state[name])
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise ParameterError(
+            f"a {type(self).__name__} is a value and can't be changed; use .replace({name}=…) and keep the result.",
+            port=name,
+        )
+
+    def __delattr__(self, name: str) -> None:
+        self.__setattr__(name, None)
+
+    def __eq__(self, other: object) -> bool:
+        if type(self) is not type(other):
+            return NotImplemented
+        return bool(identity(self) == identity(other))
+
+    def __hash__(self) -> int:
+        return hash(identity(self))
+
+    def _is_default(self, name: str, value: Any) -> bool:
+        spec = type(self).parameter_specs[name]
+        return not spec.required and identity(value) == identity(convert(spec.default, spec, "", name))
+
+    def __repr__(self) -> str:
+        shown = (f"{n}={short(v)}" for n, v in self.parameters.items() if not self._is_default(n, v))
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+
+def identity(value: Any) -> Any:
+    """Return a hashable stand-in for a parameter value that is equal exactly when type and value are.
+
+    The type counts because equations may branch on it: ``1 == True``, but their traces differ.
+    """
+    if isinstance(value, Value):
+        return type(value), tuple((k, identity(v)) for k, v in value.parameters.items()), value._content
+    if isinstance(value, np.ndarray):
+        content = tuple(map(identity, value.flat)) if value.dtype == object else value.tobytes()
+        return np.ndarray, value.dtype.str, value.shape, content
+    if isinstance(value, Mapping):
+        return Mapping, frozenset((identity(k), identity(v)) for k, v in value.items())
+    if isinstance(value, list | tuple):
+        return type(value), tuple(identity(v) for v in value)
+    if isinstance(value, frozenset):
+        return frozenset, frozenset(identity(v) for v in value)
+    return type(value), value
+
+
+def short(value: Any) -> str:
+    """Write a parameter value in a few characters, numbers as people type them."""
+    if isinstance(value, np.ndarray):
+        return repr(value.tolist()) if value.size <= 12 else f"<{'×'.join(map(str, value.shape))} numbers>"
+    if isinstance(value, float) and value == int(value or 0) and abs(value) < 1e6:
+        return str(int(value))
+    return repr(value)
+
+
+def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
+    """Bring one parameter value into its stored form and check it against its declaration.
+
+    Numbers become float, sequences of numbers read-only float64 arrays, integers stay integers where the declaration
+    says ``int``. Mappings, lists and sets become read-only copies.
+
+    Raises
+    ------
+    ParameterError
+        Wrong kind, wrong shape, not finite, out of bounds, or nothing that can be hashed.
+    """
+
+    def bad(found: str, expected: str) -> ParameterError:
+        unit = f" in {spec.unit}" if spec.unit else ""
+        return ParameterError(
+            f"found {found}; expected {expected}{unit}. {spec.description}".rstrip(), block=who, port=name
+        )
+
+    kinds = _kinds(spec.annotation)
+    array = bool(kinds & {"Array", "ndarray", "NDArray"})
+    numeric = array or "float" in kinds
+    if value is None and ("None" in kinds or not numeric):
+        return None
+    for kind, accepted, word in (("bool", bool | np.bool_, "True or False"), ("str", str, "a text")):
+        if kinds - {"None"} == {kind} and not isinstance(value, accepted):
+            raise bad(repr(value), word)
+    if "int" in kinds and not numeric:
+        if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+            raise bad(repr(value), "an integer")
+        result: Any = int(value)
+    elif numeric and not isinstance(value, str | Value):
+        try:
+            result = np.array(value, dtype=float)
+        except (TypeError, ValueError):
+            raise bad(repr(value), "numbers") from None
+        if spec.shape is not None:
+            try:
+                result = np.array(np.broadcast_to(result, spec.shape))
+            except ValueError:
+                raise bad(f"shape {result.shape}", f"shape {spec.shape}") from None
+        elif result.ndim and not array:
+            raise bad(f"{result.size} numbers", "a single number")
+        if not np.all(np.isfinite(result)):
+            raise bad(repr(value), "finite numbers")
+    elif numeric:
+        raise bad(repr(value), "a number")
+    else:
+        return _frozen(value, bad)
+    for bound, holds, words in (
+        (spec.above, np.greater, "above"),
+        (spec.minimum, np.greater_equal, "at least"),
+        (spec.maximum, np.less_equal, "at most"),
+    ):
+        if bound is not None and not np.all(holds(result, bound)):
+            shown = short(result if np.ndim(result) else result.item() if isinstance(result, np.ndarray) else result)
+            raise bad(shown, f"a value {words} {bound:g}")
+    if isinstance(result, np.ndarray):
+        if result.ndim == 0:
+            return float(result)
+        result.flags.writeable = False
+    return result
+
+
+def _annotation_text(annotation: Any) -> str:
+    """Return an annotation as it is written; ``float | None`` and ``NDArray[…]`` have no name of their own."""
+    if isinstance(annotation, type):
+        return annotation.__name__
+    return re.sub(r"\b(?:\w+\.)+(?=\w)", "", str(annotation))
+
+
+@lru_cache(maxsize=1024)
+def _kinds(annotation: str) -> frozenset[str]:
+    """Return the alternatives of an annotation by their bare names: ``np.ndarray | None`` → ndarray, None."""
+    depth, parts = 0, [""]
+    for character in annotation:
+        depth += {"[": 1, "]": -1}.get(character, 0)
+        if character == "|" and not depth:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return frozenset(part.partition("[")[0].strip().rpartition(".")[2] for part in parts)
+
+
+def _frozen(value: Any, bad: Callable[[str, str], ParameterError]) -> Any:
+    """Return a read-only copy of a value that is no number."""
+    frozen = freeze(value)
+    try:
+        hash(identity(frozen))
+    except TypeError:  # it could be compared with nothing, and its trace not be found again
+        raise bad(
+            f"{short(value)} of type {type(value).__name__}, which can't be hashed",
+            "a number, a text, a tuple, a mapping, a function or an object that is hashable and never changes, such as "
+            "one of a @dataclass(frozen=True)",
+        ) from None
+    return frozen

@@ -1,0 +1,229 @@
+"""Algebraic blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.errors import ParameterError, ShapeError
+from ..core.ports import Input, Output
+from ..core.values import Array, parameter, short
+from .branching import Numbered, check_shapes, shape_of
+
+
+class Sum(Block):
+    """Sum with signs: y = ± u₁ ± u₂ ….
+
+    Inputs ``u1``, ``u2``, …, one for each sign, are of one shape and unit (a scalar goes with any); the output ``y``
+    has them too.
+
+    Raises
+    ------
+    ParameterError
+        Anything but plus and minus among the signs.
+    ShapeError
+        Inputs of different shapes, when the diagram is built.
+    """
+
+    same_units = True
+    signs: str = parameter(default="++", description="one + or - for each input")
+    y = Output(like="u1")
+
+    def check(self) -> None:
+        """Refuse anything but plus and minus signs."""
+        if not self.signs or set(self.signs) - {"+", "-"}:
+            raise ParameterError(
+                f"found {self.signs!r}; expected a + or - for each input, such as '+-'.", block=self.label, port="signs"
+            )
+
+    @property
+    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
+        """One input per sign."""
+        return {f"u{i}": Input(shape=None, name=f"u{i}") for i in range(1, len(self.signs) + 1)}
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the sum."""
+        check_shapes(**u._asdict())
+        total = u[0] if self.signs[0] == "+" else -u[0]
+        for sign, value in zip(self.signs[1:], u[1:], strict=True):
+            total = total + value if sign == "+" else total - value
+        return total
+
+
+class Gain(Block):
+    """Gain: y = k u, element by element, or the matrix product y = K u for a matrix K.
+
+    The output's unit is not declared: a gain may convert one.
+
+    Raises
+    ------
+    ParameterError
+        A gain of more than two dimensions.
+    ShapeError
+        An input with another number of entries than the vector or the matrix takes, when the diagram is built.
+    """
+
+    gain: Array = parameter(description="number, array of the signal's shape, or matrix")
+    u = Input(shape=None, description="what is multiplied, of any shape")
+    y = Output(shape=None, description="the product")
+
+    def check(self) -> None:
+        """Refuse a gain of more than two dimensions."""
+        if np.ndim(self.gain) > 2:
+            raise ParameterError(
+                f"found an array of shape {np.shape(self.gain)}; expected a number, a vector or a matrix.",
+                block=self.label,
+                port="gain",
+            )
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the product."""
+        gain, found = shape_of(self.gain), shape_of(u.u)
+        if len(gain) < 2:
+            check_shapes(gain=self.gain, u=u.u)
+        elif found[:1] != gain[1:]:
+            raise ShapeError(
+                f"found shape {found}; the gain is a matrix of {gain[0]} × {gain[1]} and takes {gain[1]} entries. "
+                "Take a part of the signal, or give another matrix.",
+                port="u",
+            )
+        return self.gain @ u.u if getattr(self.gain, "ndim", 0) == 2 else self.gain * u.u
+
+
+class Product(Block):
+    """Product, element by element: y = u₁ u₂.
+
+    Raises
+    ------
+    ShapeError
+        Inputs of different shapes (a scalar goes with any), when the diagram is built.
+    """
+
+    u1 = Input(shape=None, description="first factor, of any shape")
+    u2 = Input(shape=None, description="second factor, of the same shape or a scalar")
+    y = Output(shape=None, description="the product")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the product."""
+        check_shapes(**u._asdict())
+        return u.u1 * u.u2
+
+
+class Minimum(Numbered):
+    """Smallest of its inputs, element by element: y = min(u₁, u₂, …); NaN in any of them passes through.
+
+    Raises
+    ------
+    ShapeError
+        Inputs of different shapes (a scalar goes with any), when the diagram is built.
+    """
+
+    same_units = True
+    y = Output(like="u1", description="the smallest")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the smallest."""
+        return self.folded(u, lambda a, b: np.where(a < b, a, np.where(b <= a, b, a + b)))
+
+
+class Maximum(Numbered):
+    """Largest of its inputs, element by element: y = max(u₁, u₂, …); NaN in any of them passes through.
+
+    Raises
+    ------
+    ShapeError
+        Inputs of different shapes (a scalar goes with any), when the diagram is built.
+    """
+
+    same_units = True
+    y = Output(like="u1", description="the largest")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the largest."""
+        return self.folded(u, lambda a, b: np.where(a > b, a, np.where(b >= a, b, a + b)))
+
+
+class Limited(Block):
+    """Base of the blocks with limits: ±limit, or lower and upper ones, or one of them."""
+
+    limit: Array | None = parameter(
+        default=None, above=0.0, description="largest magnitude, a number or one for each element"
+    )
+    lower: Array | None = parameter(default=None, description="lower limit, in place of limit; None for none")
+    upper: Array | None = parameter(default=None, description="upper limit, in place of limit; None for none")
+    u = Input(shape=None, description="what is limited, of any shape")
+
+    def check(self) -> None:
+        """Refuse no limits, two kinds of limits, and limits that cross."""
+
+        def bad(text: str, port: str) -> ParameterError:
+            return ParameterError(text, block=self.label, port=port)
+
+        sides = {k: v for k, v in (("lower", self.lower), ("upper", self.upper)) if v is not None}
+        if (self.limit is None) == (not sides):
+            found = "no limit" if not sides else f"limit and {' and '.join(sides)}"
+            raise bad(
+                f"found {found}; expected limit=… for ±limit, or lower=… or upper=… or both. Give these.", "limit"
+            )
+        if len(sides) == 2:
+            check_shapes(**sides)
+            if np.any(np.asarray(self.lower) >= np.asarray(self.upper)):
+                raise bad(
+                    f"found lower={short(self.lower)} and upper={short(self.upper)}; expected lower below upper. "
+                    "Exchange them, or move one.",
+                    "lower",
+                )
+
+    def limited(self, u: Array) -> Array:
+        """Return u within the limits; NaN passes through."""
+        given = {k: v for k in ("limit", "lower", "upper") if (v := getattr(self, k)) is not None}
+        check_shapes(**given, u=u)
+        low, high = (self.lower, self.upper) if self.limit is None else (-self.limit, self.limit)
+        result = u if low is None else np.where(u < low, low, u)
+        return result if high is None else np.where(u > high, high, result)
+
+
+class Saturation(Limited):
+    """Saturation: y = u limited to ±limit, or to [lower, upper], element by element; NaN passes through.
+
+    The secondary output ``excess`` is what was cut off, u − y: zero exactly while no limit acts. It drives the
+    anti-windup of `ErrorDynamics`. Its kinks need no events.
+
+    Raises
+    ------
+    ParameterError
+        No limit, ``limit`` beside ``lower`` or ``upper``, or limits that cross.
+    ShapeError
+        Limits and a signal of different shapes, when the diagram is built.
+    """
+
+    y = Output(like="u", description="the limited signal")
+    excess = Output(like="u", secondary=True, description="what was cut off, u − y")
+
+    def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return the limited signal and what was cut off."""
+        y = self.limited(u.u)
+        return y, u.u - y
+
+
+class DeadZone(Limited):
+    """Dead zone: y = u − (u limited to ±limit, or to [lower, upper]), element by element; NaN passes through.
+
+    y is zero exactly within the limits, and rises from zero outside of them with slope 1. Its kinks need no events.
+
+    Raises
+    ------
+    ParameterError
+        No limit, ``limit`` beside ``lower`` or ``upper``, or limits that cross.
+    ShapeError
+        Limits and a signal of different shapes, when the diagram is built.
+    """
+
+    y = Output(like="u", description="what is beyond the limits")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return what is beyond the limits."""
+        return u.u - self.limited(u.u)

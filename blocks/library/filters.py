@@ -1,0 +1,274 @@
+"""Linear blocks that live in sampled subsystems: integrator and filters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Self
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.errors import ParameterError
+from ..core.ports import Input, Output, State
+from ..core.values import Array, parameter
+from .branching import truth
+from .delays import History, pushed
+from .integrators import check_limits, limited
+from .linear import section
+
+_WEIGHTS = {"forward": (0.0, 1.0), "backward": (1.0, 0.0), "trapezoidal": (0.5, 0.5)}
+
+
+class DiscreteIntegrator(Block):
+    """Discrete integrator: a sum that stands for an integral, by one of three rules, element by element.
+
+    ``forward`` y[k] = y[k − 1] + T u[k − 1], ``backward`` y[k] = y[k − 1] + T u[k], ``trapezoidal``
+    y[k] = y[k − 1] + T (u[k − 1] + u[k]) / 2; before the first tick the input counts as zero. With limits every sum is
+    limited, so that nothing winds up. At a rising edge of ``reset`` the sum goes on from ``initial_value``, or with
+    ``reset_to_input`` from the input ``value``, in this tick; a signal that is true at the start is no edge. The
+    secondary output ``before`` is the sum over the past ticks, before a reset, without feedthrough.
+
+    Raises
+    ------
+    ParameterError
+        Another rule, limits in the wrong order, or an ``initial_value`` outside of them.
+    SampleTimeError
+        In a continuous frame, when the diagram is built.
+    """
+
+    method: str = parameter(default="forward", description="'forward', 'backward' or 'trapezoidal'")
+    gain: float = parameter(default=1.0, description="factor of the input")
+    initial_value: Array = parameter(default=0.0, description="the sum at the start, a number or of the input's shape")
+    lower: float | None = parameter(default=None, description="lower limit of y; None: there is none")
+    upper: float | None = parameter(default=None, description="upper limit of y; None: there is none")
+    reset_to_input: bool = parameter(default=False, description="True adds the input value, which y is reset to")
+    u = Input(shape=None, description="what is integrated, of any shape")
+    reset = Input(default=0.0, description="logic: a rising edge resets")
+    value = Input(shape=None, description="what the sum is reset to; with reset_to_input only")
+    y = Output(shape=None, description="the integral")
+    before = Output(shape=None, secondary=True, description="the sum over the past ticks, before a reset in this one")
+    total = State(start="initial_value", like="u", description="the sum over the past ticks")
+    last = State(start=1.0, description="reset at the last tick")
+
+    def check(self) -> None:
+        """Refuse an unknown rule, and limits that the sum can't keep."""
+        if self.method not in _WEIGHTS:
+            raise ParameterError(
+                f"found {self.method!r}; expected one of {', '.join(map(repr, _WEIGHTS))}.",
+                block=self.label,
+                port="method",
+            )
+        check_limits(self, "initial_value")
+
+    @property
+    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
+        """The inputs; value where the sum is reset to an input."""
+        cls = type(self)
+        own = {"u": cls.u, "reset": cls.reset}
+        return {**own, "value": cls.value} if self.reset_to_input else own
+
+    def sums(self, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
+        """Return y and the sum that the next tick starts from."""
+        target = u.value if self.reset_to_input else self.initial_value
+        edge = truth(u.reset) * (1.0 - truth(x.last))
+        total = np.where(edge > 0.5, 0.0 * x.total + target, np.where(edge <= 0.5, x.total, edge))
+        now, then = _WEIGHTS[self.method]
+        area = self.gain * T * u.u
+        y = limited(total + now * area if now else total, self.lower, self.upper)
+        return y, limited(y + then * area if then else y, self.lower, self.upper)
+
+    def output(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
+        """Return the integral, and the sum over the past ticks."""
+        return self.sums(x, u, T)[0], x.total
+
+    def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
+        """Return the sum over this tick as well."""
+        return self.sums(x, u, T)[1], u.reset
+
+
+class FIR(Block):
+    """FIR filter: y[k] = c₀ u[k] + c₁ u[k − 1] + … + c_n u[k − n], of a scalar or, element by element, of a vector.
+
+    The inputs before the first are ``initial_value``; without one they are the first input.
+
+    Raises
+    ------
+    ParameterError
+        Fewer than two coefficients.
+    SampleTimeError
+        In a continuous frame, when the diagram is built.
+    """
+
+    coefficients: Array = parameter(description="c₀, c₁, …, at least two")
+    initial_value: Array | None = parameter(default=None, description="inputs before the first; None: the first input")
+    u = Input(shape=None, description="what is filtered, a scalar or a vector")
+    y = Output(shape=None, description="the filtered input")
+    line = History("taps", "initial_value", description="the last inputs, the oldest first, one row for each")
+
+    def check(self) -> None:
+        """Refuse what needs no memory."""
+        if np.ndim(self.coefficients) != 1 or len(self.coefficients) < 2:
+            raise ParameterError(
+                f"found {self.coefficients!r}; expected two coefficients or more. Use Gain for one.",
+                block=self.label,
+                port="coefficients",
+            )
+
+    @property
+    def taps(self) -> int:
+        """How many past inputs it needs."""
+        return len(self.coefficients) - 1
+
+    @property
+    def starts_from_inputs(self) -> bool:
+        """Whether `initial` reads the inputs."""
+        return self.initial_value is None
+
+    def initial(self, u: Any) -> Array:
+        """Return the state at the start."""
+        return np.stack([u.u] * self.taps)
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the weighted sum."""
+        return self.coefficients[0] * u.u + self.coefficients[1:][::-1] @ x.line
+
+    def update(self, t: Array, x: Any, u: Any) -> Array:
+        """Keep the input."""
+        return pushed(x.line, u.u)
+
+
+class MovingAverage(Block):
+    """Moving average: y[k] = (u[k] + u[k − 1] + … + u[k − n + 1]) / n, of a scalar or a vector.
+
+    It is summed anew in each tick, so no rounding error builds up. The inputs before the first are ``initial_value``;
+    without one they are the first input.
+
+    Raises
+    ------
+    SampleTimeError
+        In a continuous frame, when the diagram is built.
+    """
+
+    samples: int = parameter(minimum=2, description="number of samples in the average, n")
+    initial_value: Array | None = parameter(default=None, description="inputs before the first; None: the first input")
+    u = Input(shape=None, description="what is averaged, a scalar or a vector")
+    y = Output(like="u", description="the average of the last n inputs")
+    line = History("taps", "initial_value", description="the last inputs, the oldest first, one row for each")
+
+    @property
+    def taps(self) -> int:
+        """How many past inputs it needs."""
+        return self.samples - 1
+
+    @property
+    def starts_from_inputs(self) -> bool:
+        """Whether `initial` reads the inputs."""
+        return self.initial_value is None
+
+    def initial(self, u: Any) -> Array:
+        """Return the state at the start."""
+        return np.stack([u.u] * self.taps)
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the average."""
+        return (u.u + np.sum(x.line, axis=0)) / self.samples
+
+    def update(self, t: Array, x: Any, u: Any) -> Array:
+        """Keep the input."""
+        return pushed(x.line, u.u)
+
+
+class IIR(Block):
+    """IIR filter: Y(z) = (b₀ + b₁ z⁻¹ + …) / (a₀ + a₁ z⁻¹ + …) U(z), in SciPy's convention; it starts at rest.
+
+    With matrices each row of ``b`` and ``a`` is a section, and the sections follow one another: `from_sos` takes what
+    ``scipy.signal.butter(…, output="sos")`` and its like give. Realized in the transposed direct form II. Filters of
+    order 4 and more should come in sections: the coefficients of one long polynomial don't define them well.
+
+    Raises
+    ------
+    ParameterError
+        Coefficients that don't fit each other, or an a₀ of zero.
+    SampleTimeError
+        In a continuous frame, when the diagram is built.
+
+    Examples
+    --------
+    >>> IIR(b=[0.1], a=[1.0, -0.9])
+    IIR(b=[0.1], a=[1.0, -0.9])
+    """
+
+    b: Array = parameter(description="numerator in powers of 1/z, or one row for each section")
+    a: Array = parameter(description="denominator in powers of 1/z, or one row for each section")
+    u = Input(description="what is filtered")
+    y = Output(description="the filtered input")
+    x = State(start=lambda block: np.zeros(sum(block.orders)), description="states of the sections, one after another")
+
+    def check(self) -> None:
+        """Refuse coefficients that are no filter."""
+        shapes = np.shape(self.b), np.shape(self.a)
+        alike = len(shapes[0]) == len(shapes[1]) and shapes[0][:-1] == shapes[1][:-1]
+        if not alike or len(shapes[0]) not in (1, 2) or 0 in shapes[0] + shapes[1]:
+            raise ParameterError(
+                f"found b of shape {shapes[0]} and a of shape {shapes[1]}; expected two lists of coefficients, or two "
+                "matrices with one row for each section.",
+                block=self.label,
+                port="b",
+            )
+        if np.any(np.asarray(self.a)[..., 0] == 0):
+            raise ParameterError(
+                "found a first coefficient of zero; expected another number, by which all are divided. Leave leading "
+                "zeros out of b and a.",
+                block=self.label,
+                port="a",
+            )
+        if max(shapes[0][-1], shapes[1][-1]) < 2:
+            raise ParameterError("found one coefficient each; use Gain.", block=self.label, port="b")
+
+    @property
+    def orders(self) -> list[int]:
+        """The order of each section."""
+        rows = self.b.shape[0] if len(self.b.shape) == 2 else 1
+        return [max(self.b.shape[-1], self.a.shape[-1]) - 1] * rows
+
+    @classmethod
+    def from_sos(cls, sections: Any, *, name: str | None = None) -> Self:
+        """Return the filter of second-order sections as SciPy gives them: rows of b₀, b₁, b₂, a₀, a₁, a₂.
+
+        Raises
+        ------
+        ParameterError
+            An array of another shape.
+        """
+        rows = np.asarray(sections, dtype=float)
+        if rows.ndim != 2 or rows.shape[1] != 6 or not len(rows):
+            raise ParameterError(
+                f"found shape {rows.shape}; expected rows of six numbers, as scipy.signal.butter(…, output='sos') "
+                "gives.",
+                block=name or cls.__name__,
+                port="sections",
+            )
+        return cls(b=rows[:, :3], a=rows[:, 3:], name=name)
+
+    def cascade(self, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return the output and the next state."""
+        signal, parts, position = u.u, [], 0
+        several = len(self.b.shape) == 2
+        for i, n in enumerate(self.orders):
+            b, a = (_padded(c[i] if several else c, n + 1) for c in (self.b, self.a))
+            signal, part = section(b, a, x.x[position : position + n], signal)
+            parts.append(part)
+            position += n
+        return signal, np.concatenate(parts)
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the output."""
+        return self.cascade(x, u)[0]
+
+    def update(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the next state."""
+        return self.cascade(x, u)[1]
+
+
+def _padded(coefficients: Array, n: int) -> Array:
+    return np.concatenate([coefficients, np.zeros(n - coefficients.shape[0])])

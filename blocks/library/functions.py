@@ -1,0 +1,140 @@
+"""Functions as blocks: those that can be traced, and any Python callable."""
+
+from __future__ import annotations
+
+import inspect
+import operator
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.errors import ParameterError
+from ..core.ports import Input, Output, Shape
+from ..core.signals import Signal
+from ..core.values import Array, parameter
+
+
+class Function(Block):
+    """A NumPy-style function of its inputs, traced as the equations of every block: y = f(u₁, …).
+
+    ``Function(np.sin)(u)``, ``Function(lambda a, b: a * b)(a, b)``. The inputs are named after the function's arguments
+    (those that have a default are left alone), those of a NumPy function ``u``, or ``u1``, ``u2``, …. What can't be
+    traced is refused when the diagram is built; `PythonFunction` takes any. Two such blocks are equal where their
+    functions are one object. It can be pickled where the function can: where that has a name in a module. In a trace
+    ``np.minimum``, ``np.maximum`` and ``np.clip`` replace a NaN by their other argument: write ``np.where`` instead.
+
+    Raises
+    ------
+    ParameterError
+        No function, or one whose arguments can't be told.
+    TraceError
+        A function that can't be traced, or returns another number of values than ``results`` names, when the diagram
+        is built.
+    """
+
+    function: object = parameter(kw_only=False, description="the function, of one array for each input")
+    arguments: object = parameter(
+        default=None, description="names of the inputs, or shapes by name; None takes the function's own names"
+    )
+    results: object = parameter(
+        default="y",
+        description="name of the output, names in the order of the tuple returned, or shapes by name",
+    )
+
+    def check(self) -> None:
+        """Refuse what is no function, and names that can't be ports."""
+        if not callable(self.function):
+            raise self._refuse("function", repr(self.function), "a function, such as np.sin or lambda a, b: a * b")
+        for name in self.inputs.keys() & self.outputs.keys():
+            raise self._refuse("results", f"{name!r}, the name of an input too", "another name")
+
+    @property
+    def label(self) -> str:
+        """Name for messages and for numbering: the given one, else the function's."""
+        own = getattr(self.function, "__name__", "")
+        return self.name or self._hint or (own if own.isidentifier() else "function")
+
+    @property
+    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
+        """One input for each argument."""
+        named = self._arguments() if self.arguments is None else self.arguments
+        return {n: Input(shape, name=n) for n, shape in self._shapes("arguments", named).items()}
+
+    @property
+    def outputs(self) -> Mapping[str, Output]:  # type: ignore[override]
+        """One output for each result."""
+        return {n: Output(shape, name=n) for n, shape in self._shapes("results", self.results).items()}
+
+    def __getattr__(self, name: str) -> Any:
+        if not name.startswith("_") and "results" in self.__dict__ and name in self.outputs:
+            return Signal(self, name)
+        return super().__getattr__(name)
+
+    def output(self, t: Array, x: Any, u: Any) -> Any:
+        """Return what the function returns."""
+        return self.function(*u)  # type: ignore[operator]
+
+    def _refuse(self, port: str, found: str, expected: str) -> ParameterError:
+        return ParameterError(f"found {found}; expected {expected}.", block=self.label, port=port)
+
+    def _arguments(self) -> list[str]:
+        """Return the names of the function's arguments that have no default."""
+        function: Any = self.function
+        if isinstance(function, np.ufunc):
+            return ["u"] if function.nin == 1 else [f"u{i + 1}" for i in range(function.nin)]
+        try:
+            every = inspect.signature(function).parameters.values()
+        except (TypeError, ValueError):  # a function of C code
+            every = {}.values()
+        needed = [p for p in every if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
+        if not needed or any(p.kind in (p.VAR_POSITIONAL, p.KEYWORD_ONLY) for p in needed):
+            raise self._refuse(
+                "arguments", f"the function {self.label}, of which the number of arguments can't be told",
+                "names for the inputs, such as arguments=('a', 'b')",
+            )  # fmt: skip
+        return [p.name for p in needed]
+
+    def _shapes(self, parameter: str, given: Any) -> dict[str, Shape | None]:
+        """Return the names of ports with the shapes given, None where there is none."""
+        named = given if isinstance(given, Mapping) else dict.fromkeys([given] if isinstance(given, str) else given)
+        shapes: dict[str, Shape | None] = {}
+        for name, shape in named.items():
+            taken = hasattr(Block, str(name)) or name in type(self).parameter_specs
+            if taken or not str(name).isidentifier() or str(name).startswith("_"):
+                raise self._refuse(parameter, f"{name!r}", "names such as 'position', that no attribute of a block has")
+            try:
+                whole = (shape,) if isinstance(shape, int) else shape
+                shapes[str(name)] = None if whole is None else tuple(operator.index(n) for n in whole)
+            except TypeError:
+                raise self._refuse(
+                    parameter, f"{shape!r} as the shape of {name!r}", "one such as (3,), or () for a number"
+                ) from None
+        return shapes
+
+
+class PythonFunction(Function):
+    """Any Python callable of its inputs: y = f(u₁, …), evaluated as it is, with NumPy's numbers and arrays.
+
+    It may branch, loop, look things up and call foreign code, but should depend on nothing but its arguments: a solver
+    calls it more often than there are samples. Every output counts as fed through from every input. Its derivatives,
+    where a linearization or an implicit step asks for them, are central differences. It is not compiled, and not
+    exported to an FMU. An exception stops the run, as the cause of a `SimulationError` that names the block.
+
+    ``PythonFunction(f)(a, b)`` calls ``f(a, b)``. Where no shape is given for a result, f is called once, with positive
+    numbers, when the diagram is built; ``PythonFunction(f, results={"y": (3,)})`` is not. Time, where it is needed,
+    comes from a `Clock`. The block can be pickled where the function can.
+
+    Raises
+    ------
+    ParameterError
+        No function, or one whose arguments can't be told.
+    TraceError
+        A trial call that fails, or returns another number of values than ``results`` names, when the diagram is built.
+    """
+
+    opaque = True
+
+
+__all__ = ["Function", "PythonFunction"]

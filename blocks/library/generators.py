@@ -1,0 +1,307 @@
+"""Sources that are used as test signals: ramps, chirps, pulse trains, tables, noise, the clock.
+
+Times in s; a change at ``t0`` acts from the first instant t ≥ t0 on. What repeats is computed from the number of the
+period, never by adding up periods: period k begins at k times the period as it is written in decimals, at any t. An
+instant that is a few rounding errors before such an edge (1e-15 t) counts as the edge itself, so that with a period of
+0.1 s the tick at 0.3 s, which is less than three times the number nearest to 0.1, belongs to the fourth period.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from functools import lru_cache
+from typing import Any, Self
+
+import numpy as np
+
+from ..core.errors import ParameterError
+from ..core.ports import Output
+from ..core.values import Array, parameter
+from .instants import earliest, next_edge, period_of
+from .piecewise import piecewise
+from .sources import Source
+
+_HALF = 2.0**24  # counters are mixed in two halves: products of two such numbers are exact
+_ROUNDS = 10
+
+
+class Clock(Source):
+    """The time: y = t."""
+
+    unit: str | None = parameter(default="s", description="unit of the output")
+    y = Output(description="time")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the time."""
+        return t
+
+
+class Ramp(Source):
+    """A ramp: y = y₀ up to the start time t₀, y₀ + slope (t − t₀) from then on."""
+
+    slope: float = parameter(description="rate of change, per s")
+    start_time: float = parameter(default=0.0, unit="s", description="when it begins to rise, t₀")
+    initial_value: float = parameter(default=0.0, description="value before, y₀")
+    y = Output()
+
+    def instants(self) -> Array:
+        """Return its start."""
+        return np.array([self.start_time])
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the ramp."""
+        return self.initial_value + self.slope * np.where(t > self.start_time, t - self.start_time, 0.0)
+
+
+class Chirp(Source):
+    """A sine whose frequency runs from f₀ to f₁: y = A sin(φ₀ + φ(τ)) + bias, τ = t − t₀ within [0, D].
+
+    ``linear``: φ = 2π (f₀ τ + (f₁ − f₀) τ² / (2 D)), the frequency φ̇/2π = f₀ + (f₁ − f₀) τ/D. ``logarithmic``:
+    φ = 2π f₀ D / λ (exp(λ τ/D) − 1), λ = ln(f₁/f₀), the frequency f₀ exp(λ τ/D): equal times for equal ratios.
+    Before t₀ the phase is φ₀; after t₀ + D it goes on at the frequency f₁.
+
+    Raises
+    ------
+    ParameterError
+        Another sweep, or a logarithmic one from or to zero, or between equal frequencies.
+    """
+
+    amplitude: float = parameter(default=1.0, description="amplitude A")
+    start_frequency: float = parameter(unit="Hz", minimum=0.0, description="frequency at the start, f₀")
+    end_frequency: float = parameter(unit="Hz", minimum=0.0, description="frequency at the end, f₁")
+    duration: float = parameter(unit="s", above=0.0, description="how long the sweep takes, D")
+    sweep: str = parameter(default="linear", description="'linear' or 'logarithmic'")
+    start_time: float = parameter(default=0.0, unit="s", description="when it starts, t₀")
+    phase: float = parameter(default=0.0, unit="rad", description="phase at the start, φ₀")
+    bias: float = parameter(default=0.0, description="mean value")
+    y = Output()
+
+    def check(self) -> None:
+        """Refuse a sweep that is not defined."""
+        super().check()
+        if self.sweep not in ("linear", "logarithmic"):
+            raise ParameterError(
+                f"found {self.sweep!r}; expected 'linear' or 'logarithmic'.", block=self.label, port="sweep"
+            )
+        first, last = self.start_frequency, self.end_frequency
+        if self.sweep == "logarithmic" and (min(first, last) == 0.0 or first == last):
+            raise ParameterError(
+                f"found {first:g} and {last:g} Hz; expected two different frequencies above zero for a logarithmic "
+                "sweep. Take sweep='linear'.",
+                block=self.label,
+                port="start_frequency",
+            )
+
+    def instants(self) -> Array:
+        """Return where the sweep starts and ends."""
+        return np.array([self.start_time, self.start_time + self.duration])
+
+    def time_scale(self) -> float:
+        """Return a tenth of the shortest period."""
+        fastest = max(self.start_frequency, self.end_frequency)
+        return 0.1 / fastest if fastest else math.inf
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the sweep."""
+        first, last, D = self.start_frequency, self.end_frequency, self.duration
+        tau = np.where(t > self.start_time, t - self.start_time, 0.0)
+        after = np.where(tau > D, tau - D, 0.0)
+        tau = np.where(tau > D, D, tau)
+        if self.sweep == "linear":
+            turns = tau * (first + (last - first) * tau / (2.0 * D))
+        else:
+            rate = np.log(last / first) / D
+            turns = first * np.expm1(rate * tau) / rate
+        return self.amplitude * np.sin(2.0 * np.pi * (turns + last * after) + self.phase) + self.bias
+
+
+class PulseTrain(Source):
+    """Rectangular pulses: y = base + A from each edge t₀ + k P on, for the part ``duty`` of the period P; else base.
+
+    k = 0, 1, …; before t₀ it is at its base. Edges never drift: both lie where their decimals say, to 1e-15 t.
+
+    Raises
+    ------
+    ParameterError
+        A duty of 1 or more.
+    """
+
+    amplitude: float = parameter(default=1.0, description="height of the pulses, A")
+    period: float = parameter(unit="s", above=0.0, description="time from pulse to pulse, P")
+    duty: float = parameter(default=0.5, above=0.0, description="part of the period that a pulse lasts, below 1")
+    delay: float = parameter(default=0.0, unit="s", minimum=0.0, description="when the first pulse begins, t₀")
+    base: float = parameter(default=0.0, description="value between the pulses")
+    y = Output()
+
+    def check(self) -> None:
+        """Refuse pulses without an end."""
+        super().check()
+        if self.duty >= 1.0:
+            raise ParameterError(
+                f"found {self.duty:g}; expected a part of the period below 1. Take a Step for what does not end.",
+                block=self.label,
+                port="duty",
+            )
+
+    def next_instant(self, t: float) -> float:
+        """Return the next edge."""
+        period, delay, duty = (Fraction(repr(v)) for v in (self.period, self.delay, self.duty))
+        return next_edge(t, self.period, self.delay, float(delay + duty * period))
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the pulses."""
+        number, part, tolerance = period_of(t, self.period, self.delay)
+        high = np.where(number < 0.0, 0.0, np.where(part < self.duty - tolerance, 1.0, 0.0))
+        return self.base + self.amplitude * high
+
+
+class _Table(Source):
+    """Base of the sources that look values up."""
+
+    times: Array = parameter(unit="s", structural=True, description="times of the values, rising")
+    values: Array = parameter(structural=True, description="a value for each time: numbers, or a vector in each row")
+
+    def check(self) -> None:
+        """Refuse times that do not rise, and values that do not belong to them."""
+        super().check()
+        times, values = np.shape(self.times), np.shape(self.values)
+        if len(times) != 1 or not times[0] or np.any(np.diff(self.times) <= 0):
+            raise ParameterError(
+                f"found times of shape {times}; expected a list of rising times, one or more.",
+                block=self.label,
+                port="times",
+            )
+        if len(values) not in (1, 2) or values[0] != times[0]:
+            raise ParameterError(
+                f"found values of shape {values} for {times[0]} times; expected shape ({times[0]},), or "
+                f"({times[0]}, n) for vectors of n entries.",
+                block=self.label,
+                port="values",
+            )
+
+    def begins(self) -> np.ndarray:
+        """Return where the piece after each time begins."""
+        times: np.ndarray = self.times
+        return times
+
+    @property
+    def slopes(self) -> np.ndarray:
+        """Slopes between the times, one row each, for linear interpolation."""
+        columns = np.reshape(self.values, (len(self.times), -1))
+        result: np.ndarray = np.diff(columns, axis=0) / np.diff(self.times)[:, None]
+        return result
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the value at t: one piece before the first time, one after the last, and those between."""
+        columns = np.reshape(self.values, (len(self.times), -1))
+        still = np.zeros((1, columns.shape[1]))
+        coefficients = np.stack(
+            [np.concatenate([columns[:1], columns]), np.concatenate([still, self.slopes, still])], axis=2
+        )
+        span, times = 1.0 + np.abs(self.times[[0, -1]]), self.begins()
+        breaks = np.concatenate([[times[0] - span[0]], times, [times[-1] + span[1]]])
+        y = piecewise(breaks, coefficients, t)
+        return y if np.ndim(self.values) == 2 else y[0]
+
+
+class PiecewiseLinear(_Table):
+    """Straight lines through given points: y(times[i]) = values[i]; the first and the last value are held beyond them.
+
+    Raises
+    ------
+    ParameterError
+        Times that do not rise, or not one value for each.
+    """
+
+    def instants(self) -> Array:
+        """Return the times at which the slope changes."""
+        slopes = self.slopes
+        still = np.zeros((1, slopes.shape[1]))
+        changes = np.abs(np.diff(np.concatenate([still, slopes, still]), axis=0))
+        return self.times[np.any(changes > 1e-12 * np.max(np.abs(slopes), initial=0.0), axis=1)]
+
+
+class Recorded(_Table):
+    """Recorded data: y is interpolated between the samples; the first and the last value are held beyond them.
+
+    ``linear`` interpolates, ``previous`` holds each value until the next time, as a sampled signal does; the times may
+    be off by their rounding, as those of ``np.linspace`` are. A solver lands on every sample, in a continuous frame.
+
+    Raises
+    ------
+    ParameterError
+        Times that do not rise, not one value for each, or another interpolation.
+    """
+
+    interpolation: str = parameter(default="linear", description="'linear' or 'previous'")
+
+    def check(self) -> None:
+        """Refuse an interpolation that there is none of."""
+        super().check()
+        if self.interpolation not in ("linear", "previous"):
+            raise ParameterError(
+                f"found {self.interpolation!r}; expected 'linear' or 'previous'.",
+                block=self.label,
+                port="interpolation",
+            )
+
+    def begins(self) -> np.ndarray:
+        """Return the times, less their rounding where a value jumps."""
+        times: np.ndarray = self.times
+        return earliest(times) if self.interpolation == "previous" else times
+
+    @property
+    def slopes(self) -> np.ndarray:
+        """Slopes between the times, zero where values are held."""
+        return super().slopes * float(self.interpolation == "linear")
+
+    def instants(self) -> Array:
+        """Return the times of the samples."""
+        return self.times
+
+
+class BandLimitedNoise(Source):
+    """Normal noise with a white spectrum up to its band: a new independent value every ``sample_time`` T, held between.
+
+    y(t) = mean + √variance n(k), k = ⌊t/T⌋, n(k) standard normal. Its two-sided spectral density is
+    variance · T sinc²(f T): flat, in its unit squared per Hz, to 4 % up to f = 0.1/T. ``from_density`` takes that
+    density instead of the variance. n(k) is a function of k and ``seed`` alone (a counter is mixed by a Feistel network
+    in exact arithmetic, then Box and Muller's transform): the same in every run, from any t on, in any solver, however
+    often and in whatever order it is evaluated. It repeats after 2⁴⁸ values; |n| is at most 5.9.
+    """
+
+    sample_time: float = parameter(unit="s", above=0.0, description="how long each value is held, T")
+    variance: float = parameter(default=1.0, minimum=0.0, description="variance, in the unit squared")
+    mean: float = parameter(default=0.0, description="mean value")
+    seed: int = parameter(default=0, minimum=0, description="which noise: another seed gives an independent one")
+    y = Output()
+
+    @classmethod
+    def from_density(cls, *, density: float, sample_time: float, **parameters: Any) -> Self:
+        """Return noise of a two-sided spectral density, at low frequency, in its unit squared per Hz."""
+        return cls(variance=density / sample_time, sample_time=sample_time, **parameters)
+
+    def next_instant(self, t: float) -> float:
+        """Return when the next value comes."""
+        return next_edge(t, self.sample_time, 0.0)
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the value that is held at t."""
+        number, _, _ = period_of(t, self.sample_time, 0.0)
+        low, high = number, np.floor(number / _HALF)
+        low = low - _HALF * high
+        high = high - _HALF * np.floor(high / _HALF)
+        for key in _keys(self.seed):
+            v = low + key
+            v = v - _HALF * np.floor(v / _HALF)
+            v = high + np.floor(v * (2.0 * v + 1.0) / 4096.0)  # the middle bits of a product depend on all of v
+            high, low = low, v - _HALF * np.floor(v / _HALF)
+        radius = np.sqrt(-2.0 * np.log((high + 0.5) / _HALF))
+        return self.mean + np.sqrt(self.variance) * radius * np.cos(2.0 * np.pi * (low + 0.5) / _HALF)
+
+
+@lru_cache(maxsize=256)
+def _keys(seed: int) -> tuple[float, ...]:
+    """Return the keys of the rounds, of 24 bits each."""
+    return tuple(float(key >> 8) for key in np.random.SeedSequence(seed).generate_state(_ROUNDS))

@@ -1,0 +1,54 @@
+"""Instants at which something happens again and again, and what is left of an instant."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+
+from ..core.values import Array
+
+_TOLERANCE = 4.0 * float(np.finfo(float).eps)  # of t: t, the period and their ratio are rounded once each
+
+
+def left_of(t: float) -> float:
+    """Return a time just before t at which an edge at t has not come yet, in spite of the tolerance of `period_of`.
+
+    A solver takes the left limits of what is not smooth at t from there. The number before t would be too near.
+    """
+    return t - 4.0 * _TOLERANCE * abs(t)
+
+
+def is_before(a: float, b: float) -> bool:
+    """Whether a comes before b by more than the rounding of both: what is as near as that is one instant."""
+    return a < b - 2.0 * _TOLERANCE * abs(b) if b < math.inf else a < b
+
+
+def earliest(instants: Array) -> Array:
+    """Return the first times that count as the given instants: 2e-15 t before, as times may be off by their rounding.
+
+    Three times 0.1 is more than the tick at 0.3, and so are times of ``np.linspace``; both mean the tick.
+    """
+    return instants - 2.0 * _TOLERANCE * np.abs(instants)
+
+
+def period_of(t: Array, period: Array, delay: Array) -> tuple[Array, Array, Array]:
+    """Return the number of the period at t, the time since it began in periods, and the rounding of it."""
+    passed = (t - delay) / period
+    tolerance = _TOLERANCE * (np.abs(t) + np.abs(delay)) / period
+    number = np.floor(passed + tolerance)
+    return number, passed - number, tolerance
+
+
+def next_edge(t: float, period: float, *offsets: float) -> float:
+    """Return the first time after t that is one of the offsets plus k ≥ 0 periods, each number taken as decimal."""
+    exact = Fraction(repr(float(period)))
+    best = math.inf
+    for offset in offsets:
+        first = Fraction(repr(float(offset)))
+        k = max(math.floor((Fraction(t) - first) / exact), 0)
+        while float(first + k * exact) <= t:
+            k += 1
+        best = min(best, float(first + k * exact))
+    return best

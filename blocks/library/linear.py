@@ -1,0 +1,375 @@
+"""Linear systems: state space and transfer functions, in continuous and in discrete time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Self
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.errors import ParameterError
+from ..core.ports import Input, Output, State
+from ..core.values import Array, parameter
+from .python_control import (
+    SampleTimeOfFrame,
+    block_name,
+    check_names,
+    check_single,
+    check_system,
+    labels,
+    names_of,
+    sample_time_of,
+)
+
+Names = tuple[str, ...] | None
+
+
+def _ndim(value: Array) -> int:
+    return len(getattr(value, "shape", ()))  # np.ndim has no answer for what is being traced
+
+
+def _applied(matrix: Array, u: Array) -> Array:
+    """Return the product of a matrix and the input; one column belongs to a scalar."""
+    return matrix @ u if _ndim(u) else matrix * u
+
+
+class _StateSpace(Block):
+    """What state-space blocks of both kinds of time share."""
+
+    A: Array = parameter(description="system matrix, n × n")
+    B: Array = parameter(description="input matrix, n × m; n numbers make u a scalar")
+    C: Array = parameter(description="output matrix, p × n; n numbers make y a scalar")
+    D: Array = parameter(default=0.0, description="feedthrough, p × m without the dimensions that are scalars; 0: none")
+    initial_state: Array = parameter(default=0.0, description="x at the start, n numbers or one for all")
+    input_names: Names = parameter(default=None, description="names of the inputs, for python-control")
+    output_names: Names = parameter(default=None, description="names of the outputs, for python-control")
+    state_names: Names = parameter(default=None, description="names of the states, for python-control")
+    u = Input(shape=None, description="input: m numbers, or a scalar where B is one column")
+    y = Output(shape=None, description="output: p numbers, or a scalar where C is one row")
+    x = State(start=lambda block: np.broadcast_to(block.initial_state, (len(block.A),)), description="state")
+
+    def check(self) -> None:
+        """Refuse matrices that don't fit each other."""
+        n = np.shape(self.A)[0] if np.ndim(self.A) else 0
+        shapes: dict[str, tuple[bool, str]] = {
+            "A": (n > 0 and np.shape(self.A) == (n, n), "a square matrix, such as [[-2.0]] for one state"),
+            "B": (np.ndim(self.B) in (1, 2) and np.shape(self.B)[0] == n, f"{n} numbers, or a matrix of {n} rows"),
+            "C": (np.ndim(self.C) in (1, 2) and np.shape(self.C)[-1] == n, f"{n} numbers, or a matrix of {n} columns"),
+        }
+        if all(fits for fits, _ in shapes.values()):
+            wanted = np.shape(self.C)[:-1] + np.shape(self.B)[1:]
+            none = np.ndim(self.D) == 0 and self.D == 0
+            shapes["D"] = (np.shape(self.D) == wanted or none, f"shape {wanted}" if wanted else "a number")
+            shapes["initial_state"] = (np.shape(self.initial_state) in ((), (n,)), f"a number or {n} numbers")
+        for name, (fits, expected) in shapes.items():
+            if not fits:
+                raise ParameterError(
+                    f"found shape {np.shape(getattr(self, name))}; expected {expected}. Write the matrices as nested "
+                    "lists of rows.",
+                    block=self.label,
+                    port=name,
+                )
+        m, p = (int(np.prod(s, dtype=int)) for s in (np.shape(self.B)[1:], np.shape(self.C)[:-1]))
+        check_names(self, input_names=m, output_names=p, state_names=n)
+
+    @property
+    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
+        """U, of the shape that B takes."""
+        return {"u": Input(np.shape(self.B)[1:], None, type(self).u.description, name="u")}
+
+    @property
+    def outputs(self) -> Mapping[str, Output]:  # type: ignore[override]
+        """Y, of the shape that C gives."""
+        return {"y": Output(np.shape(self.C)[:-1], None, type(self).y.description, name="y")}
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return C x + D u."""
+        y = self.C @ x.x
+        if not _ndim(self.D) and (_ndim(y) or _ndim(u.u)):
+            return y
+        return y + _applied(self.D, u.u)
+
+    def advance(self, x: Any, u: Any) -> Array:
+        """Return A x + B u."""
+        return self.A @ x.x + _applied(self.B, u.u)
+
+    @classmethod
+    def _from_control(cls, system: Any, *, discrete: bool, name: str | None, **more: Any) -> Self:
+        dt = check_system(cls, system, "StateSpace", discrete=discrete)
+        if system.nstates == 0:
+            raise ParameterError(
+                "the system has no states; use Gain(gain=system.D).", block=cls.__name__, port="system"
+            )
+        B, C, D = (np.asarray(m, dtype=float) for m in (system.B, system.C, system.D))
+        B, D = (B[:, 0], D[:, 0]) if system.ninputs == 1 else (B, D)
+        C, D = (C[0], D[0]) if system.noutputs == 1 else (C, D)
+        if discrete:
+            more["dt"] = dt
+        return cls(A=system.A, B=B, C=C, D=D, name=block_name(system, name), **names_of(system), **more)
+
+    def _to_control(self, dt: float | bool) -> Any:
+        import control
+
+        n = len(self.A)
+        B, C = np.reshape(self.B, (n, -1)), np.reshape(self.C, (-1, n))
+        D = np.broadcast_to(0.0, (len(C), B.shape[1])) if np.ndim(self.D) == 0 and self.D == 0 else self.D
+        return control.ss(self.A, B, C, np.reshape(D, (len(C), B.shape[1])), dt, **labels(self))
+
+
+class StateSpace(_StateSpace):
+    """Linear system in state space: ẋ = A x + B u, y = C x + D u.
+
+    In a sampled frame it is discretized by the frame's method; ``exact`` is the zero-order hold.
+
+    Raises
+    ------
+    ParameterError
+        Matrices that don't fit each other, or names that are not as many as the signals.
+
+    Examples
+    --------
+    >>> StateSpace(A=[[0, 1], [-4, -0.4]], B=[0, 1], C=[1, 0], name="oscillator")
+    StateSpace(A=[[0.0, 1.0], [-4.0, -0.4]], B=[0.0, 1.0], C=[1.0, 0.0], name='oscillator')
+    """
+
+    def derivative(self, t: Array, x: Any, u: Any) -> Array:
+        """Return ẋ."""
+        return self.advance(x, u)
+
+    @classmethod
+    def from_control(cls, system: Any, *, initial_state: Any = 0.0, name: str | None = None) -> Self:
+        """Return the block of a `control.StateSpace` in continuous time; one input or output becomes a scalar.
+
+        It takes over the names of the signals, and the system's own where that is an identifier and none is given.
+
+        Raises
+        ------
+        ParameterError
+            No state space, or one in discrete time, or one without states.
+        """
+        return cls._from_control(system, discrete=False, name=name, initial_state=initial_state)
+
+    def to_control(self) -> Any:
+        """Return the `control.StateSpace`, with the names of its signals."""
+        return self._to_control(0)
+
+
+class DiscreteStateSpace(SampleTimeOfFrame, _StateSpace):
+    """Linear system in discrete time: x[k + 1] = A x[k] + B u[k], y[k] = C x[k] + D u[k].
+
+    Raises
+    ------
+    ParameterError
+        Matrices that don't fit each other, or names that are not as many as the signals.
+    SampleTimeError
+        In a continuous frame, or in one whose sample time is not ``dt``, when the diagram is built.
+    """
+
+    dt: float | None = parameter(
+        default=None, unit="s", above=0.0, structural=True, description="sample time that it holds for; None: any"
+    )
+
+    def update(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the next state."""
+        return self.advance(x, u)
+
+    @classmethod
+    def from_control(cls, system: Any, *, initial_state: Any = 0.0, name: str | None = None) -> Self:
+        """Return the block of a `control.StateSpace` in discrete time; one input or output becomes a scalar.
+
+        It takes over the names of the signals, and the system's own where that is an identifier and none is given.
+
+        Raises
+        ------
+        ParameterError
+            No state space, or one in continuous time, or one without states.
+        """
+        return cls._from_control(system, discrete=True, name=name, initial_state=initial_state)
+
+    def to_control(self) -> Any:
+        """Return the `control.StateSpace`, with the names of its signals."""
+        return self._to_control(sample_time_of(self))
+
+
+class _TransferFunction(Block):
+    """What transfer functions of both kinds of time share."""
+
+    numerator: Array = parameter(tunable=False, description="coefficients of the numerator, highest power first")
+    denominator: Array = parameter(tunable=False, description="coefficients of the denominator, highest power first")
+    input_names: Names = parameter(default=None, description="name of the input, for python-control")
+    output_names: Names = parameter(default=None, description="name of the output, for python-control")
+    u = Input(description="input")
+    y = Output(description="output")
+    x = State(start=lambda block: np.zeros(block.order), description="state, as many numbers as the order")
+
+    @property
+    def order(self) -> int:
+        """The degree of the denominator."""
+        return int(np.atleast_1d(self.denominator).shape[0]) - 1
+
+    @property
+    def states(self) -> Mapping[str, State]:  # type: ignore[override]
+        """X, unless the transfer function is a number."""
+        return {"x": type(self).x} if self.order else {}
+
+    def check(self) -> None:
+        """Refuse coefficients that are no proper transfer function."""
+        for name in ("numerator", "denominator"):
+            if np.ndim(getattr(self, name)) > 1 or np.size(getattr(self, name)) == 0:
+                raise ParameterError(
+                    f"found shape {np.shape(getattr(self, name))}; expected a number, or coefficients in one list, "
+                    "highest power first.",
+                    block=self.label,
+                    port=name,
+                )
+        a, b = np.atleast_1d(self.denominator), np.atleast_1d(self.numerator)
+        if a[0] == 0:
+            raise ParameterError(
+                f"found {a.tolist()}; expected a first coefficient that is not zero. Leave leading zeros out.",
+                block=self.label,
+                port="denominator",
+            )
+        if len(b) > len(a):
+            raise ParameterError(
+                f"found degree {len(b) - 1} over degree {len(a) - 1}; expected a proper transfer function. Add poles "
+                "(FilteredDerivative differentiates with one), or leave leading zeros out.",
+                block=self.label,
+                port="numerator",
+            )
+        check_names(self, input_names=1, output_names=1)
+
+    def coefficients(self) -> tuple[Array, Array]:
+        """Return numerator and denominator of equal length."""
+        a, b = np.atleast_1d(self.denominator), np.atleast_1d(self.numerator)
+        return np.concatenate([np.zeros(a.shape[0] - b.shape[0]), b]), a
+
+    @classmethod
+    def _from_control(cls, system: Any, *, discrete: bool, name: str | None) -> Self:
+        dt = check_system(cls, system, "TransferFunction", discrete=discrete)
+        check_single(cls, system)
+        a, b = (np.asarray(c[0][0], dtype=float) for c in (system.den, system.num))
+        more: dict[str, Any] = {"dt": dt} if discrete else {}
+        return cls(numerator=b, denominator=a, name=block_name(system, name), **names_of(system), **more)
+
+    def _to_control(self, dt: float | bool) -> Any:
+        import control
+
+        return control.tf(np.atleast_1d(self.numerator), np.atleast_1d(self.denominator), dt, **labels(self))
+
+
+class TransferFunction(_TransferFunction):
+    """Transfer function: Y(s) = (b₀ sᵐ + … + b_m) / (a₀ sⁿ + … + a_n) U(s), m ≤ n; it starts at rest.
+
+    Realized in controllable canonical form in the scaled frequency s / ω, ω = |a_l / a₀|^(1 / l) with the last
+    coefficient a_l that is not zero: the geometric mean of the magnitudes of the poles that are not zero. So
+    coefficients and states are of one size where the poles are. Where they are many decades apart, or many and close
+    together, the coefficients themselves don't define them well: `ZeroPoleGain` is better then.
+
+    Raises
+    ------
+    ParameterError
+        No proper transfer function.
+
+    Examples
+    --------
+    >>> TransferFunction(numerator=2.0, denominator=[0.1, 1.0])
+    TransferFunction(numerator=2, denominator=[0.1, 1.0])
+    """
+
+    def check(self) -> None:
+        """Refuse what is not proper; find the coefficient that sets the scale."""
+        super().check()
+        object.__setattr__(self, "_last", int(np.flatnonzero(np.atleast_1d(self.denominator))[-1]))
+
+    def scaled(self) -> tuple[Array, Array, Array]:
+        """Return ω, and the coefficients of numerator and denominator in s / ω, by a₀."""
+        b, a = self.coefficients()
+        last: int = self.__dict__["_last"]  # known by which coefficients are zero, so the same in every equal trace
+        w = np.abs(a[last] / a[0]) ** (1.0 / last) if last else 1.0 + 0.0 * a[0]
+        factors = [1.0 / a[0]]
+        for _ in range(self.order):
+            factors.append(factors[-1] / w)
+        scale = np.stack(factors)
+        return w, b * scale, a * scale
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the output."""
+        _, b, a = self.scaled()
+        return b[0] * u.u + ((b[1:] - b[0] * a[1:])[::-1] @ x.x if self.order else 0.0)
+
+    def derivative(self, t: Array, x: Any, u: Any) -> Array:
+        """Return ẋ: a chain of integrators, the last driven by what is left of the input."""
+        w, _, a = self.scaled()
+        return w * np.concatenate([x.x[1:], np.stack([u.u - a[1:][::-1] @ x.x])])
+
+    @classmethod
+    def from_control(cls, system: Any, *, name: str | None = None) -> Self:
+        """Return the block of a `control.TransferFunction` in continuous time, of one input and one output.
+
+        It takes over the names of the signals, and the system's own where that is an identifier and none is given.
+
+        Raises
+        ------
+        ParameterError
+            No transfer function, or one in discrete time, or one of several inputs or outputs.
+        """
+        return cls._from_control(system, discrete=False, name=name)
+
+    def to_control(self) -> Any:
+        """Return the `control.TransferFunction`, with the names of its signals."""
+        return self._to_control(0)
+
+
+class DiscreteTransferFunction(SampleTimeOfFrame, _TransferFunction):
+    """Transfer function: Y(z) = (b₀ zᵐ + … + b_m) / (a₀ zⁿ + … + a_n) U(z), m ≤ n; it starts at rest.
+
+    Realized in the transposed direct form II. For filters in powers of 1/z there is `IIR`, for sharp ones in sections.
+
+    Raises
+    ------
+    ParameterError
+        No proper transfer function.
+    SampleTimeError
+        In a continuous frame, or in one whose sample time is not ``dt``, when the diagram is built.
+    """
+
+    dt: float | None = parameter(
+        default=None, unit="s", above=0.0, structural=True, description="sample time that it holds for; None: any"
+    )
+
+    def output(self, t: Array, x: Any, u: Any, T: Array) -> Array:
+        """Return the output."""
+        b, a = self.coefficients()
+        return section(b, a, x.x, u.u)[0] if self.order else b[0] / a[0] * u.u
+
+    def update(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the next state."""
+        b, a = self.coefficients()
+        return section(b, a, x.x, u.u)[1]
+
+    @classmethod
+    def from_control(cls, system: Any, *, name: str | None = None) -> Self:
+        """Return the block of a `control.TransferFunction` in discrete time, of one input and one output.
+
+        It takes over the names of the signals, and the system's own where that is an identifier and none is given.
+
+        Raises
+        ------
+        ParameterError
+            No transfer function, or one in continuous time, or one of several inputs or outputs.
+        """
+        return cls._from_control(system, discrete=True, name=name)
+
+    def to_control(self) -> Any:
+        """Return the `control.TransferFunction`, with the names of its signals."""
+        return self._to_control(sample_time_of(self))
+
+
+def section(b: Array, a: Array, x: Array, u: Array) -> tuple[Array, Array]:
+    """Return output and next state of b / a (in powers of 1/z, equal lengths) in the transposed direct form II.
+
+    y = (b₀ u + x₁) / a₀ and x_i⁺ = x_{i+1} + b_i u − a_i y, x_{n+1} = 0.
+    """
+    y = (b[0] * u + x[0]) / a[0]
+    return y, np.concatenate([x[1:], np.zeros(1)]) + b[1:] * u - a[1:] * y

@@ -1,0 +1,200 @@
+"""Lookup tables of one and two inputs, as blocks."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.errors import GuardError, ParameterError, ShapeError, near
+from ..core.ports import Input, Output
+from ..core.values import Array, parameter
+from .branching import shape_of
+from .piecewise import bilinear, piecewise
+
+_BEYOND = ("hold", "extrapolate", "error")
+_SLACK = 1e-9  # part of the table's range by which an input may be outside through rounding
+
+
+def _choice(block: Block, name: str, known: tuple[str, ...]) -> None:
+    value = getattr(block, name)
+    if value not in known:
+        text = f"found {value!r}; expected {', '.join(map(repr, known[:-1]))} or {known[-1]!r}. {near(value, known)}"
+        raise ParameterError(text, block=block.label, port=name)
+
+
+def _breakpoints(block: Block, name: str) -> int:
+    """Return how many breakpoints there are, and refuse what can't be any."""
+    points = np.asarray(getattr(block, name))
+    if points.ndim != 1 or points.size < 2 or np.any(np.diff(points) <= 0):
+        text = f"found {points.tolist()!r}"[:200]
+        raise ParameterError(
+            f"{text}; expected at least two numbers that rise. Sort them, with their values, and leave out repeated "
+            "ones.",
+            block=block.label,
+            port=name,
+        )
+    return points.size
+
+
+def _held(points: np.ndarray, u: Array) -> Array:
+    """Return u within the ends of the table; NaN passes through."""
+    low, high = float(points[0]), float(points[-1])
+    return np.where(u < low, low, np.where(u > high, high, u))
+
+
+def _margins(points: np.ndarray, name: str, u: Array) -> dict[str, Array]:
+    """Return, for every entry of u, its distance from the table's ends, positive within."""
+    slack = _SLACK * float(points[-1] - points[0])
+    entries = {f"{name}[{i}]": u[i] for i in range(shape_of(u)[0])} if shape_of(u) else {name: u}
+    low, high = float(points[0]) - slack, float(points[-1]) + slack
+    return {
+        f"{entry} {side}": margin
+        for entry, value in entries.items()
+        for side, margin in (("below", value - low), ("above", high - value))
+    }
+
+
+def _outside(name: str, points: dict[str, np.ndarray], u: Any) -> GuardError:
+    """Return the error of an input beyond the table."""
+    entry, side = name.rsplit(" ", 1)
+    port, _, index = entry.partition("[")
+    value = np.ravel(getattr(u, port))[int(index.rstrip("]") or 0) if index else 0]
+    ends = points[port]
+    return GuardError(
+        f"found {entry} = {value:.9g}, {side} the table's range; expected {ends[0]:g} to {ends[-1]:g}. Extend the "
+        "table, or give beyond='hold' or beyond='extrapolate'.",
+        port=port,
+    )
+
+
+class Lookup1D(Block):
+    """Table of one input: y = f(u), f through the points (breakpoints[i], values[i]).
+
+    ``interpolation`` is "linear", "cubic" (a spline, twice continuously differentiable, not-a-knot at its ends) or
+    "monotone" (a cubic that rises and falls only where the points do, once differentiable). Beyond the ends the
+    last value is held, the end piece continued, or the run stopped: ``beyond`` is "hold", "extrapolate" or "error".
+
+    The values may be vectors, one row for each breakpoint; a vector u is looked up element by element. NaN passes
+    through. Derivatives of a trace are exact, and a kink needs no event. For a table over time take `PiecewiseLinear`
+    or `Recorded`: a solver lands on their times, while it may step over a short peak of a table that reads a `Clock`.
+
+    Raises
+    ------
+    ParameterError
+        Breakpoints that do not rise, another number of values, an unknown choice.
+    ShapeError
+        A vector u with vectors as values, or an u of two dimensions, when the diagram is built.
+    GuardError
+        In a run, where u leaves the table, with beyond="error".
+    """
+
+    _hint = "lookup_1d"
+    breakpoints: Array = parameter(structural=True, description="values of u, rising")
+    values: Array = parameter(structural=True, description="values of y there; with several columns y is a vector")
+    interpolation: str = parameter(default="linear", description="'linear', 'cubic' or 'monotone'")
+    beyond: str = parameter(default="hold", description="beyond the ends: 'hold', 'extrapolate' or 'error'")
+    u = Input(shape=None, description="the argument: a scalar, or a vector of them")
+    y = Output(shape=None, description="the value looked up")
+
+    def check(self) -> None:
+        """Refuse tables that are none."""
+        _choice(self, "interpolation", ("linear", "cubic", "monotone"))
+        _choice(self, "beyond", _BEYOND)
+        n, shape = _breakpoints(self, "breakpoints"), np.shape(self.values)
+        if len(shape) not in (1, 2) or shape[0] != n:
+            raise ParameterError(
+                f"found shape {shape} for {n} breakpoints; expected ({n},), or ({n}, columns). Give one value, or one "
+                "row, for each breakpoint.",
+                block=self.label,
+                port="values",
+            )
+
+    @cached_property
+    def _coefficients(self) -> np.ndarray:
+        """Coefficients (pieces, columns, powers), the lowest power first."""
+        points = np.asarray(self.breakpoints)
+        values = np.asarray(self.values).reshape(len(points), -1)
+        if self.interpolation == "linear":
+            slopes = np.diff(values, axis=0) / np.diff(points)[:, None]
+            return np.stack([values[:-1], slopes], axis=2)
+        from scipy.interpolate import CubicSpline, PchipInterpolator  # imported late: scipy takes its time
+
+        made = (CubicSpline if self.interpolation == "cubic" else PchipInterpolator)(points, values).c
+        return np.ascontiguousarray(made[::-1].transpose(1, 2, 0))
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the value."""
+        shape, columns = shape_of(u.u), np.ndim(self.values) == 2
+        if len(shape) > (0 if columns else 1):
+            expected = "a scalar, for its values are vectors" if columns else "a scalar or a vector"
+            raise ShapeError(f"found shape {shape}; expected {expected}. Look up one part at a time, u[0].", port="u")
+        inside = u.u if self.beyond == "extrapolate" else _held(self.breakpoints, u.u)
+        entries = [inside[i] for i in range(shape[0])] if shape else [inside]
+        found = [piecewise(self.breakpoints, self._coefficients, entry) for entry in entries]
+        if columns:
+            return found[0]
+        return np.stack([value[0] for value in found]) if shape else found[0][0]
+
+    def guards(self, t: Array, x: Any, u: Any) -> dict[str, Array]:
+        """Return the distances from the ends where leaving the table is an error."""
+        return _margins(self.breakpoints, "u", u.u) if self.beyond == "error" else {}
+
+    def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
+        """Return the error that names the input and the table's range."""
+        return _outside(name, {"u": self.breakpoints}, u)
+
+
+class Lookup2D(Block):
+    """Table of two inputs, bilinear: y = f(u₁, u₂), f through the points (rows[i], columns[j], values[i, j]).
+
+    Beyond the edges the nearest value of the edge is held, the outermost cell continued, or the run stopped:
+    ``beyond`` is "hold", "extrapolate" or "error". NaN passes through. Derivatives of a trace are exact.
+
+    Raises
+    ------
+    ParameterError
+        Breakpoints that do not rise, values of another shape, an unknown choice.
+    GuardError
+        In a run, where an input leaves the table, with beyond="error".
+    """
+
+    _hint = "lookup_2d"
+    rows: Array = parameter(structural=True, description="values of u₁, rising")
+    columns: Array = parameter(structural=True, description="values of u₂, rising")
+    values: Array = parameter(structural=True, description="values of y: one row for each u₁, one column for each u₂")
+    beyond: str = parameter(default="hold", description="beyond the edges: 'hold', 'extrapolate' or 'error'")
+    u1 = Input(description="argument along the rows' breakpoints")
+    u2 = Input(description="argument along the columns' breakpoints")
+    y = Output(description="the value looked up")
+
+    def check(self) -> None:
+        """Refuse tables that are none."""
+        _choice(self, "beyond", _BEYOND)
+        expected = (_breakpoints(self, "rows"), _breakpoints(self, "columns"))
+        if np.shape(self.values) != expected:
+            raise ParameterError(
+                f"found shape {np.shape(self.values)}; expected {expected}, a row for each of rows and a column for "
+                "each of columns. Give the transpose, or other breakpoints.",
+                block=self.label,
+                port="values",
+            )
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the value."""
+        a, b = u.u1, u.u2
+        if self.beyond != "extrapolate":
+            a, b = _held(self.rows, a), _held(self.columns, b)
+        return bilinear(self.rows, self.columns, self.values, a, b)
+
+    def guards(self, t: Array, x: Any, u: Any) -> dict[str, Array]:
+        """Return the distances from the edges where leaving the table is an error."""
+        if self.beyond != "error":
+            return {}
+        return _margins(self.rows, "u1", u.u1) | _margins(self.columns, "u2", u.u2)
+
+    def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
+        """Return the error that names the input and the table's range."""
+        return _outside(name, {"u1": self.rows, "u2": self.columns}, u)

@@ -1,0 +1,272 @@
+"""The PID controller."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.errors import ParameterError
+from ..core.ports import Event, Input, Output, State
+from ..core.values import Array, parameter
+from ..tracing.discretization import hold
+from .integrators import check_limits, limited
+
+_WAYS = ("back_calculation", "clamping", "none")
+
+
+class PID(Block):
+    """PID controller with two degrees of freedom, filtered derivative, output limits and anti-windup.
+
+    In parallel form (`ideal` takes the other one), after Åström and Hägglund, *Advanced PID Control* (2006):
+    u = v limited to [lower, upper], v = P + I + D, with
+
+    - P = kp (b r − y), İ = ki (r − y) + a, D = kd ẋ_f, T_f ẋ_f = c r − y − x_f;
+    - a = (u − v) / T_t, back-calculation. With ``tracking`` it is (actual − v) / T_t: the input ``actual`` is what the
+      actuator, or another controller that is in charge, really does;
+    - or clamping: İ = 0 while v is beyond a limit and ki (r − y) drives it further.
+
+    The integral gain stands under the integral, so changing it makes no bump. In a sampled frame P, D and the limits
+    are those of the tick, I[k + 1] = I[k] + T ki (r − y) + (1 − α)(u − v), and the filter and α (the factor by which a
+    lag of time constant T_t decays in T) go by the frame's method: ``exact`` is right for inputs that are held. In a
+    continuous frame clamping is a matter of events; the integral goes on once v is inside by ``clearance``, a share of
+    the range, so that it doesn't chatter.
+
+    It starts with x_f = c r − y, so D = 0, and with I = 0 or, without a bump, so that u is ``initial_output``. With
+    ``tracking`` it looks at no input at the start, since ``actual`` depends on it: x_f = 0 and I = ``initial_output``.
+
+    Raises
+    ------
+    ParameterError
+        A gain without the time that it needs, limits in the wrong order, or anti-windup that can't work.
+
+    Examples
+    --------
+    >>> PID.ideal(gain=2.0, integral_time=0.5, derivative_time=0.1, lower=-1, upper=1)
+    PID(kp=2, ki=4, kd=0.2, filter_time=0.01, lower=-1, upper=1)
+    """
+
+    kp: float = parameter(description="proportional gain")
+    ki: float = parameter(default=0.0, description="integral gain, in 1/s times the unit of kp")
+    kd: float = parameter(default=0.0, description="derivative gain, in s times the unit of kp")
+    b: float = parameter(default=1.0, description="weight of the set-point in P")
+    c: float = parameter(default=0.0, description="weight of the set-point in D")
+    filter_time: float | None = parameter(
+        default=None, unit="s", above=0.0, description="time constant of the derivative's filter, T_f; None: no D"
+    )
+    lower: float | None = parameter(default=None, description="lower limit of u; None: there is none")
+    upper: float | None = parameter(default=None, description="upper limit of u; None: there is none")
+    anti_windup: str = parameter(default="back_calculation", description=f"one of {', '.join(map(repr, _WAYS))}")
+    tracking_time: float | None = parameter(
+        default=None, unit="s", above=0.0, description="time constant of back-calculation, T_t; None: kp / ki"
+    )
+    tracking: bool = parameter(default=False, description="True adds the input actual")
+    clearance: float = parameter(default=1e-3, above=0.0, description="share of the range that ends clamping")
+    initial_output: float | None = parameter(default=None, description="u at the start; None: the integral is zero")
+    r = Input(description="set-point")
+    y = Input(description="measured value")
+    actual = Input(description="what the actuator does, in the unit of u; with tracking only")
+    u = Output(description="control signal")
+    excess = Output(secondary=True, description="what the limits cut off, v − u")
+    integral = State(start=lambda block: block.initial_output or 0.0, description="I")
+    filtered = State(description="x_f; with filter_time")
+    clamped = State(discrete=True, description="1 while the integral is held; with clamping")
+    clamp = Event("rising", "v is beyond a limit and the integral drives it further; with clamping")
+    release = Event("rising", "that is over; with clamping")
+    filter_decay: ClassVar[Array]  # computed by constants
+    filter_gain: ClassVar[Array]
+    tracking_share: ClassVar[Array]
+
+    @classmethod
+    def ideal(
+        cls,
+        *,
+        gain: float,
+        integral_time: float | None = None,
+        derivative_time: float = 0.0,
+        ratio: float = 10.0,
+        **more: Any,
+    ) -> Self:
+        """Return the controller in ideal form, K (b r − y + ∫(r − y)/T_i + T_d d/dt (c r − y)).
+
+        Parameters
+        ----------
+        gain : float
+            K.
+        integral_time, derivative_time : float
+            T_i (None: no integral) and T_d in s.
+        ratio : float
+            N = T_d / T_f, 2 to 20; T_f filters the derivative.
+        **more
+            The other parameters of `PID`, and its name.
+        """
+        if derivative_time:
+            more = {"kd": gain * derivative_time, "filter_time": derivative_time / ratio, **more}
+        return cls(kp=gain, ki=0.0 if integral_time is None else gain / integral_time, **more)
+
+    def to_control(self) -> Any:
+        """Return the linear part as a `control.StateSpace` from r and y to u, with the block's name.
+
+        Without limits, anti-windup and tracking (``actual`` is taken to be u), in continuous time, from rest. A
+        controller without ki has no integral in it, one without kd no filter.
+        """
+        import control
+
+        lag = np.inf if self.filter_time is None else self.filter_time
+        A, B = np.diag([0.0, -1.0 / lag]), np.array([[self.ki, -self.ki], [self.c / lag, -1.0 / lag]])
+        C, D = np.array([[1.0, -self.kd / lag]]), np.array([[self.kp * self.b, -self.kp]])
+        D = D + self.kd / lag * np.array([[self.c, -1.0]])
+        kept = [i for i, gain in enumerate((self.ki, self.kd)) if gain]
+        states = [("integral", "filtered")[i] for i in kept]
+        names: dict[str, Any] = {"inputs": ["r", "y"], "outputs": ["u"], "states": states, "name": self.name}
+        return control.ss(A[np.ix_(kept, kept)], B[kept], C[:, kept], D, 0, **names)
+
+    def check(self) -> None:
+        """Refuse what can't work."""
+
+        def refuse(port: str, text: str) -> None:
+            raise ParameterError(text, block=self.label, port=port)
+
+        if self.kd and self.filter_time is None:
+            refuse("filter_time", "a derivative must be filtered; give filter_time, for instance kd / (10 kp) in s.")
+        if self.anti_windup not in _WAYS:
+            refuse("anti_windup", f"found {self.anti_windup!r}; expected one of {', '.join(map(repr, _WAYS))}.")
+        check_limits(self, None if self.tracking else "initial_output")
+        if self.clamps and (self.lower is None or self.upper is None):
+            refuse("anti_windup", "clamping needs both limits; give lower and upper, or use 'back_calculation'.")
+        if self.tracking and self.anti_windup != "back_calculation":
+            refuse("anti_windup", f"found {self.anti_windup!r}; tracking works by 'back_calculation'. Leave it out.")
+        if self.tracks and self.tracking_time is None and self.ki and not self.kp / self.ki > 0:
+            refuse(
+                "tracking_time", f"kp / ki is {self.kp / self.ki:g} s; expected a positive time. Give tracking_time."
+            )
+
+    @property
+    def has_limits(self) -> bool:
+        """Whether the output is limited."""
+        return self.lower is not None or self.upper is not None
+
+    @property
+    def clamps(self) -> bool:
+        """Whether the integral is clamped."""
+        return self.anti_windup == "clamping" and self.has_limits
+
+    @property
+    def tracks(self) -> bool:
+        """Whether there is back-calculation."""
+        return self.anti_windup == "back_calculation" and (self.has_limits or self.tracking)
+
+    @property
+    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
+        """Set-point, measured value, and what the actuator does where it is tracked."""
+        cls = type(self)
+        return {"r": cls.r, "y": cls.y, **({"actual": cls.actual} if self.tracking else {})}
+
+    @property
+    def states(self) -> Mapping[str, State]:  # type: ignore[override]
+        """The integral; the filter's state and the clamp where there are these."""
+        cls = type(self)
+        more = {"filtered": cls.filtered} if self.filter_time is not None else {}
+        return {"integral": cls.integral, **more, **({"clamped": cls.clamped} if self.clamps else {})}
+
+    @property
+    def events(self) -> Mapping[str, Event]:  # type: ignore[override]
+        """Those of the clamp, where there is one."""
+        return {"clamp": type(self).clamp, "release": type(self).release} if self.clamps else {}
+
+    @property
+    def starts_from_inputs(self) -> bool:
+        """Whether `initial` reads the inputs."""
+        return not self.tracking and (len(self.states) > 1 or self.initial_output is not None)
+
+    def initial(self, u: Any) -> tuple[float, ...] | float:
+        """Return the states at the start."""
+        proportional = self.kp * (self.b * u.r - u.y)
+        integral = 0.0 if self.initial_output is None else self.initial_output - proportional
+        start = {"integral": integral, "filtered": self.c * u.r - u.y}
+        start["clamped"] = float(self.clamps and self.outward(proportional + integral, u) > 0.0)
+        made = tuple(float(start[name]) for name in self.states)
+        return made if len(made) > 1 else made[0]
+
+    def tracking_rate(self) -> Array:
+        """Return 1 / T_t."""
+        return self.ki / self.kp if self.tracking_time is None else 1.0 / self.tracking_time
+
+    def constants(self, T: float, method: str) -> dict[str, float]:
+        """Return what the filter and back-calculation make of one sample."""
+        made = {}
+        if self.filter_time is not None:
+            decay, gain = hold(np.array([[-1.0 / self.filter_time]]), T, method)
+            made = {"filter_decay": float(decay[0, 0]), "filter_gain": float(gain[0, 0])}
+        if self.tracks:
+            rate = self.tracking_rate() if self.ki or self.tracking_time is not None else 0.0
+            made["tracking_share"] = 1.0 - float(hold(np.array([[-rate]]), T, method)[0][0, 0])
+        return made
+
+    def unlimited(self, x: Any, u: Any) -> Array:
+        """Return v."""
+        v = self.kp * (self.b * u.r - u.y) + x.integral
+        if self.filter_time is None:
+            return v
+        return v + self.kd * (self.c * u.r - u.y - x.filtered) / self.filter_time
+
+    def outward(self, v: Array, u: Any) -> Array:
+        """Return how far v is beyond the limit towards which the integral drives."""
+        rate = self.ki * (u.r - u.y)
+        return np.where(rate > 0.0, v - self.upper, np.where(rate < 0.0, self.lower - v, -self.span()))
+
+    def span(self) -> Array:
+        """Return the range of the output."""
+        low: Any = self.lower
+        return self.upper - low
+
+    def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return u and what was cut off."""
+        v = self.unlimited(x, u)
+        cut = limited(v, self.lower, self.upper)
+        return cut, v - cut
+
+    def correction(self, x: Any, u: Any) -> Array:
+        """Return what back-calculation goes by: the true control signal less v."""
+        v = self.unlimited(x, u)
+        return (u.actual if self.tracking else limited(v, self.lower, self.upper)) - v
+
+    def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, ...] | Array:
+        """Return the rates of the integral and the filter."""
+        rate = self.ki * (u.r - u.y)
+        if self.tracks:
+            rate = rate + self.tracking_rate() * self.correction(x, u)
+        if self.clamps:
+            rate = np.where(x.clamped > 0.5, 0.0, rate)
+        if self.filter_time is None:
+            return rate
+        return rate, (self.c * u.r - u.y - x.filtered) / self.filter_time
+
+    def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return how far v is beyond a limit, and how far inside."""
+        beyond, held = self.outward(self.unlimited(x, u), u), x.clamped > 0.5
+        span = self.span()
+        return np.where(held, -span, beyond), np.where(held, -beyond - self.clearance * span, -span)
+
+    def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[Array, ...]:
+        """Hold the integral, or let it go on."""
+        clamped = np.where(fired.clamp > 0.5, 1.0, np.where(fired.release > 0.5, 0.0, x.clamped))
+        return (*x[:-1], clamped)
+
+    def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, ...] | Array:
+        """Return the states at the next tick."""
+        step = T * self.ki * (u.r - u.y)
+        new: dict[str, Array] = {}
+        if self.tracks:
+            step = step + self.tracking_share * self.correction(x, u)
+        if self.clamps:
+            new["clamped"] = np.where(self.outward(self.unlimited(x, u), u) > 0.0, 1.0, 0.0)
+            step = np.where(new["clamped"] > 0.5, 0.0, step)
+        new["integral"] = x.integral + step
+        if self.filter_time is not None:
+            goal = (self.c * u.r - u.y) / self.filter_time
+            new["filtered"] = self.filter_decay * x.filtered + self.filter_gain * goal
+        made = tuple(new[name] for name in self.states)
+        return made if len(made) > 1 else made[0]

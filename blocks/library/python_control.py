@@ -1,0 +1,155 @@
+"""Linear systems from python-control, and back. It takes over a second to import: only when it is asked for."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.errors import ParameterError, SampleTimeError
+
+
+def check_system(cls: type[Block], system: Any, kind: str, *, discrete: bool) -> float | None:
+    """Refuse what is no system of this kind and time; return the sample time of a discrete one.
+
+    Parameters
+    ----------
+    cls : type
+        Block that is to be made.
+    system : object
+        What was given.
+    kind : {"StateSpace", "TransferFunction"}
+        Class of python-control that is expected.
+    discrete : bool
+        Whether it must be in discrete time. A system with an unspecified time, ``dt=None``, may be either.
+
+    Raises
+    ------
+    ParameterError
+        Another class, or the other kind of time.
+    """
+    import control
+
+    wanted = getattr(control, kind)
+    if not isinstance(system, wanted):
+        other = isinstance(system, control.StateSpace | control.TransferFunction)
+        step = f"Convert it: control.{'ss' if kind == 'StateSpace' else 'tf'}(system)." if other else "Give one."
+        raise ParameterError(
+            f"found a {type(system).__name__}; expected a control.{kind}. {step}", block=cls.__name__, port="system"
+        )
+    dt = system.dt
+    if dt is not None and (dt == 0) == discrete:
+        found, expected = ("continuous", "discrete") if discrete else ("discrete", "continuous")
+        other_class = cls.__name__.removeprefix("Discrete") if discrete else f"Discrete{cls.__name__}"
+        step = f"Use {other_class}" + (", or sample it: control.sample_system(system, T)." if discrete else ".")
+        raise ParameterError(
+            f"found a system in {found} time (dt={dt!r}); expected {expected} time. {step}",
+            block=cls.__name__,
+            port="system",
+        )
+    return None if dt is None or dt is True or dt == 0 else float(dt)
+
+
+def names_of(system: Any) -> dict[str, tuple[str, ...]]:
+    """Return the names that were given to a system's signals, without those that python-control makes up."""
+    found = {"input_names": system.input_labels, "output_names": system.output_labels}
+    if hasattr(system, "state_labels"):
+        found["state_names"] = system.state_labels
+    return {k: tuple(v) for k, v in found.items() if not all(re.fullmatch(r"[uyx]\[\d+\]", name) for name in v)}
+
+
+def block_name(system: Any, name: str | None) -> str | None:
+    """Return the given name, else the system's where it can name a block; one that was made up, ``sys[0]``, can't."""
+    return system.name if name is None and system.name.isidentifier() else name
+
+
+def check_single(cls: type[Block], system: Any) -> None:
+    """Refuse a transfer function of several inputs or outputs.
+
+    Raises
+    ------
+    ParameterError
+        Not one of each.
+    """
+    if system.ninputs != 1 or system.noutputs != 1:
+        raise ParameterError(
+            f"found {system.ninputs} inputs and {system.noutputs} outputs; expected one each. Take one entry, "
+            "system[0, 0], or use the state space: control.ss(system).",
+            block=cls.__name__,
+            port="system",
+        )
+
+
+def labels(block: Any) -> dict[str, Any]:
+    """Return the keywords of python-control's constructors for the names that a block holds."""
+    found = {
+        "inputs": block.input_names,
+        "outputs": block.output_names,
+        "states": getattr(block, "state_names", None),
+        "name": block.name,
+    }
+    return {k: v if isinstance(v, str) else list(v) for k, v in found.items() if v is not None}
+
+
+def sample_time_of(block: Any) -> float | bool:
+    """Return ``dt`` of a discrete block as python-control spells it: True where it is not given."""
+    return True if block.dt is None else block.dt
+
+
+def check_names(block: Any, **numbers: int) -> None:
+    """Refuse names of signals that are not as many as the signals.
+
+    Raises
+    ------
+    ParameterError
+        Another number of names.
+    """
+    for parameter, n in numbers.items():
+        names = getattr(block, parameter)
+        if names is not None and len(names) != n:
+            raise ParameterError(
+                f"found {len(names)} names ({', '.join(map(str, names))}); expected {n}. Give one for each.",
+                block=block.label,
+                port=parameter,
+            )
+
+
+class SampleTimeOfFrame:
+    """For blocks with a parameter ``dt``: it must be the sample time of the frame that the block stands in."""
+
+    dt: Any
+    label: Any
+
+    def constants(self, T: float, method: str) -> dict[str, Any]:
+        """Compare the sample times where numbers are made for one."""
+        if T != 1.0:  # tracing asks with 1 s, whatever the frame's is
+            self.check_rate(T)
+        return {}
+
+    def check_rate(self, T: float) -> None:
+        """Compare the sample times when the diagram is built."""
+        if self.mismatch(T):
+            raise SampleTimeError(self._message(T), block=self.label, port="dt")
+
+    def mismatch(self, T: float) -> bool:
+        """Whether ``T`` is another sample time; both may carry a rounding error."""
+        return self.dt is not None and not np.isclose(self.dt, T, rtol=1e-9, atol=0.0)
+
+    def guards(self, t: Any, x: Any, u: Any, T: Any) -> dict[str, Any]:
+        """Compare them in the run as well, should the sample time have changed since."""
+        return {} if self.dt is None else {"sample_time": 1e-9 - np.abs(T / self.dt - 1.0)}
+
+    def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> Any:
+        """Say that the sample times differ."""
+        from ..core.errors import GuardError
+
+        return GuardError(self._message(None), block=self.label, port="dt")
+
+    def _message(self, T: float | None) -> str:
+        stands = "another one" if T is None else f"one of {T:.9g} s"
+        return (
+            f"it holds for a sample time of {self.dt:.9g} s, and its frame has {stands}. Sample the continuous system "
+            "with the frame's, set the frame's sample_time, or give dt=None if it is meant for any."
+        )

@@ -1,0 +1,163 @@
+"""What a run must keep to, and when it ends: requirements and stop conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.errors import GuardError, ParameterError, near
+from ..core.ports import Event, Input, Output, State
+from ..core.values import Array, parameter
+from .branching import single, truth
+
+
+class StopCondition(Block):
+    """Stop condition: the run ends, normally, at the first instant at which u is true (above 0.5).
+
+    In a continuous frame that instant is found as an event, in a sampled one it is the tick. What varies continuously
+    goes through `Compare` first.
+    """
+
+    stops = "stopped"
+    u = Input(description="logic signal that ends the run")
+    stopped = Output(description="1 from the end of the run on, 0 before")
+    met = State(discrete=True, description="1 once u was true")
+    reach = Event("rising", "the condition becomes true")
+
+    def initial(self, u: Any) -> Array:
+        """Return whether it is true at the start."""
+        return truth(np.asarray(u.u))
+
+    def output(self, t: Array, x: Any, u: Any, T: Array = None) -> Array:
+        """Return whether the run ends."""
+        return x.met if T is None else truth(u.u)
+
+    def update(self, t: Array, x: Any, u: Any) -> Array:
+        """Keep whether it was true."""
+        return truth(u.u)
+
+    def indicators(self, t: Array, x: Any, u: Any) -> Array:
+        """Return how far u is above 0.5."""
+        return u.u - 0.5
+
+    def jump(self, t: Array, x: Any, u: Any, fired: Any) -> Array:
+        """Return whether it was true."""
+        return np.where(fired.reach > 0.5, 1.0, x.met)
+
+
+class Requirement(Block):
+    """Requirement on a signal, checked while the diagram runs, with the time at which it broke.
+
+    ::
+
+        Requirement("the contact force stays below 50 N", upper=50.0)(force)
+        Requirement("the robot is at rest when it is released", on_violation="record")(holds)
+
+    With ``lower`` or ``upper`` every entry of u must stay within these bounds, which may be reached. Without both, u is
+    a logic signal that must stay true (above 0.5).
+
+    With ``on_violation="error"`` the run stops when it is violated, with an error that names the requirement, the
+    block, the time and the value. With ``"record"`` it goes on: ``violated`` is 1 from the first violation on, and
+    ``violated_at`` is its time. In a continuous frame that time is found as an event.
+
+    Raises
+    ------
+    GuardError
+        In a run, when the requirement is violated.
+    ParameterError
+        An empty text, another kind of violation, or bounds that cross.
+    ShapeError
+        A vector in a continuous frame, when the diagram is built.
+    """
+
+    requirement: str = parameter(kw_only=False, description="the requirement in words")
+    lower: float | None = parameter(default=None, description="smallest value allowed")
+    upper: float | None = parameter(default=None, description="largest value allowed")
+    on_violation: str = parameter(default="error", description="'error' stops the run, 'record' lets it go on")
+    u = Input(shape=None, description="what is watched: a quantity, or a logic signal that must stay true")
+    violated = Output(description="1 from the first violation on, 0 before")
+    violated_at = Output(unit="s", description="time of the first violation, −1 before")
+    broken = State(discrete=True, description="1 from the first violation on")
+    when = State(unit="s", start=-1.0, discrete=True, description="time of the first violation, −1 before")
+    below = Event("rising", "the signal falls below what is required")
+    above = Event("rising", "the signal rises above what is required")
+
+    def check(self) -> None:
+        """Refuse an empty text, an unknown reaction, and bounds that cross."""
+        kinds = ("error", "record")
+        if not self.requirement.strip():
+            text = "found no text; expected the requirement in words, for the report of its violation. Write it."
+            raise ParameterError(text, block=self.label, port="requirement")
+        if self.on_violation not in kinds:
+            text = f"found {self.on_violation!r}; expected 'error' or 'record'. {near(self.on_violation, kinds)}"
+            raise ParameterError(text, block=self.label, port="on_violation")
+        if self.lower is not None and self.upper is not None and self.lower > self.upper:
+            text = f"found lower={self.lower:g} above upper={self.upper:g}; expected it at or below. Exchange them."
+            raise ParameterError(text, block=self.label, port="lower")
+
+    @property
+    def events(self) -> Mapping[str, Event]:  # type: ignore[override]
+        """One for each side that is limited; a logic signal can only fall."""
+        low = {"below": type(self).below} if self.lower is not None or self.upper is None else {}
+        return low | ({"above": type(self).above} if self.upper is not None else {})
+
+    def margins(self, u: Array) -> tuple[Array, ...]:
+        """Return how far u is below and above what is allowed; negative within, one for each event."""
+        if self.lower is None and self.upper is None:
+            return (0.5 - u,)
+        low = () if self.lower is None else (self.lower - u,)
+        return low if self.upper is None else (*low, u - self.upper)
+
+    def excess(self, u: Array) -> Array:
+        """Return the sum of all violations, zero if there are none; NaN passes through."""
+        if self.lower is None and self.upper is None:
+            return np.sum(1.0 - truth(u))
+        return sum(np.sum(np.where(m > 0.0, m, np.where(m <= 0.0, 0.0, m))) for m in self.margins(u))
+
+    def initial(self, u: Any) -> tuple[Array, Array]:
+        """Return whether it is violated at the start."""
+        broken = float(self.excess(np.asarray(u.u)) > 0.0)
+        return np.asarray(broken), np.asarray(broken - 1.0)
+
+    def output(self, t: Array, x: Any, u: Any, T: Array = None) -> tuple[Array, Array]:
+        """Return whether and when it was violated."""
+        if T is None:
+            return x.broken, x.when
+        now = self.excess(u.u)
+        broken = np.where(x.broken > 0.5, 1.0, np.where(now > 0.0, 1.0, now))
+        return broken, np.where(x.broken > 0.5, x.when, np.where(now > 0.0, t, now - 1.0))
+
+    def update(self, t: Array, x: Any, u: Any, T: Array = None) -> tuple[Array, Array]:
+        """Keep both."""
+        return self.output(t, x, u, T)
+
+    def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, ...] | Array:
+        """Return how far u is below and above what is allowed."""
+        values = self.margins(single(u.u, "u"))
+        return values if len(values) > 1 else values[0]
+
+    def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[Array, Array]:
+        """Return both after an event."""
+        now = sum(fired) > 0.5
+        return np.where(now, 1.0, x.broken), np.where(x.broken > 0.5, x.when, np.where(now, t, x.when))
+
+    def guards(self, t: Array, x: Any, u: Any) -> dict[str, Array]:
+        """Return what must stay positive where a violation is an error."""
+        if self.on_violation == "record":
+            return {}
+        excess = self.excess(u.u)
+        return {"requirement": np.where(excess > 0.0, -excess, 1.0 + excess)}
+
+    def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
+        """Return the error that names the requirement and the value."""
+        found = np.asarray(u.u).tolist()
+        bounds = [f"at least {self.lower:g}"] if self.lower is not None else []
+        bounds += [f"at most {self.upper:g}"] if self.upper is not None else []
+        expected = " and ".join(bounds) or "true (above 0.5)"
+        return GuardError(
+            f"the requirement {self.requirement!r} is violated: found u = {found}; expected {expected}. Look at what "
+            "led to it in error.run, or give on_violation='record' to let the run go on."
+        )

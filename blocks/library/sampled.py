@@ -1,0 +1,113 @@
+"""Blocks that live in sampled subsystems."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.ports import Input, Output, State
+from ..core.values import Array, parameter
+
+
+class UnitDelay(Block):
+    """Delay by one sample: y[k] = u[k − 1].
+
+    The first output is ``initial_value``; without one it is the first input itself, so that u[0] acts in both of the
+    first two ticks.
+
+    Raises
+    ------
+    ShapeError
+        An ``initial_value`` of another shape than the input's, when the diagram is built; a number fits any.
+    """
+
+    initial_value: Array | None = parameter(default=None, description="first output; None takes the first input")
+    u = Input(shape=None, description="what is delayed, of any shape")
+    y = Output(like="u", description="the input one tick ago")
+    last = State(start="initial_value", like="u", description="the last input")
+
+    @property
+    def starts_from_inputs(self) -> bool:
+        """Whether `initial` reads the inputs."""
+        return self.initial_value is None
+
+    def initial(self, u: Any) -> Array:
+        """Return the state at the start."""
+        return u.u
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the last input."""
+        return x.last
+
+    def update(self, t: Array, x: Any, u: Any) -> Array:
+        """Keep the input."""
+        return u.u
+
+
+class Hold(Block):
+    """Zero-order hold: y = u at the ticks of its frame, held between them.
+
+    It brings a signal into the rate of the subsystem that it stands in, and says so in the drawing.
+
+    Raises
+    ------
+    SampleTimeError
+        In a continuous frame, when the diagram is built.
+    """
+
+    u = Input(shape=None, description="what is sampled, of any shape")
+    y = Output(like="u", description="the input at the last tick")
+
+    def output(self, t: Array, x: Any, u: Any, T: Array) -> Array:
+        """Return the input."""
+        return u.u
+
+
+class Encoder(Block):
+    """Position encoder: quantized positions, velocities by differences.
+
+    p = Δ ⌊position / Δ + ½⌋, v = (p[k] − p[k − 1]) / T; at the first tick v is the true velocity. Its derivative is
+    zero almost everywhere: it linearizes to zero. Part of the rig (docs/experiments.md), not of the paper.
+
+    Raises
+    ------
+    SampleTimeError
+        In a continuous frame, when the diagram is built.
+    """
+
+    quantum: float = parameter(unit="m", above=0.0, description="smallest step of the position, Δ")
+    position = Input(shape=None, description="true position")
+    velocity = Input(shape=None, description="true velocity, used at the first tick only")
+    measured_position = Output(like="position", description="p, whole quanta")
+    measured_velocity = Output(like="velocity", description="v, whole quanta per tick")
+    last = State(like="position", description="last measured position")
+    running = State(description="0 before the first tick, then 1")
+
+    def output(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
+        """Return the measured position and velocity."""
+        p = self.quantum * np.floor(u.position / self.quantum + 0.5)
+        return p, np.where(x.running > 0.5, (p - x.last) / T, u.velocity)
+
+    def update(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+        """Keep the measured position."""
+        return self.quantum * np.floor(u.position / self.quantum + 0.5), 1.0 + 0.0 * t
+
+
+class ForceSensor(Block):
+    """Force sensor between the robot and its tool: the tool's inertia acts on it (E25).
+
+    F = force + contact force − m_tool · acceleration; the gravity part is tared. At t = 0 the acceleration counts as
+    zero, since no force has acted yet.
+    """
+
+    tool_mass: float = parameter(default=0.0, unit="kg", minimum=0.0, description="mass on the far side of the sensor")
+    force = Input(shape=(2,), unit="N", description="external force on the robot")
+    acceleration = Input(shape=(2,), unit="m/s2", description="acceleration at the end of the last step")
+    contact_force = Input(shape=(2,), unit="N", default=(0.0, 0.0), description="force of a contact inside the plant")
+    measured = Output(shape=(2,), unit="N", description="F, what the sensor shows")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the measured force."""
+        return u.force + u.contact_force - self.tool_mass * np.where(t > 0.0, u.acceleration, 0.0)

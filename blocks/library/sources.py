@@ -1,0 +1,234 @@
+"""Sources that are given by a few numbers. Times in s; a change at ``t0`` acts from the first instant t ≥ t0 on.
+
+Times may be off by their rounding: an instant that is less than 2e-15 t before a change counts as the change itself, so
+that a step at ``3 * 0.1`` acts at the tick at 0.3 s.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.errors import ParameterError, UnitError
+from ..core.ports import Output, Unit
+from ..core.units import parse_unit, rate_of
+from ..core.values import Array, parameter
+from .instants import earliest
+
+
+def smooth_step(
+    t: Array, start_time: Array, duration: Array, initial: Array, final: Array
+) -> tuple[Array, Array, Array]:
+    """Return the 7th-order smooth step with its two time derivatives.
+
+    s = r₀ + (r₁ − r₀)(35 z⁴ − 84 z⁵ + 70 z⁶ − 20 z⁷), z = (t − t₀)/D clipped to [0, 1]; s, ṡ, s̈ and the third
+    derivative are continuous.
+    """
+    z = (t - start_time) / duration
+    z = np.where(z < 0.0, 0.0, np.where(z > 1.0, 1.0, z))
+    rise = final - initial
+    value = initial + rise * z**4 * (35.0 - z * (84.0 - z * (70.0 - 20.0 * z)))
+    rate = rise / duration * 140.0 * z**3 * (1.0 - z) ** 3
+    acceleration = rise / duration**2 * 420.0 * z**2 * (1.0 - z) ** 2 * (1.0 - 2.0 * z)
+    return value, rate, acceleration
+
+
+class Source(Block):
+    """Base of the sources: one output, ``y``, in the unit that the parameter ``unit`` declares.
+
+    Where y holds a value with its first two time derivatives, ``unit`` is that of the value.
+    """
+
+    unit: str | None = parameter(default=None, description="unit of the output, where it is to be checked")
+    y = Output(shape=None)
+
+    def check(self) -> None:
+        """Refuse a unit that can't be read."""
+        if self.unit is not None and not isinstance(self.unit, str):
+            raise ParameterError(
+                f"found {self.unit!r}; expected a unit as FMI spells it, such as 'm/s2'.", block=self.label, port="unit"
+            )
+        try:
+            parse_unit(self.unit or "1")
+        except UnitError as error:
+            error.at(block=self.label, port="unit")
+            raise
+
+    @property
+    def outputs(self) -> dict[str, Output]:  # type: ignore[override]
+        """The output in the declared unit."""
+        declared, unit = type(self).y, self.unit
+        each: Unit = unit
+        if unit is not None and declared.shape == (3,):
+            each = (unit, rate_of(unit), rate_of(rate_of(unit)))
+        return {"y": Output(declared.shape, each, declared.description, name="y")}
+
+    def instants(self) -> Array:
+        """Return the times at which the output or its derivatives are not smooth, in any order: none."""
+        return np.zeros(0)
+
+    def next_instant(self, t: float) -> float:
+        """Return the first of `instants` after t, without one that t counts as."""
+        times = np.ravel(self.instants())
+        return float(np.min(times[earliest(times) > t], initial=math.inf))
+
+
+class Constant(Source):
+    """A constant number or array."""
+
+    value: Array = parameter(description="number or array")
+
+    @property
+    def outputs(self) -> dict[str, Output]:  # type: ignore[override]
+        """The output in the declared unit, of the value's shape."""
+        return {"y": Output(shape=np.shape(self.value), unit=self.unit, name="y")}
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the constant."""
+        return self.value
+
+
+class Reference(Source):
+    """A constant reference that comes with its time derivatives: y = (value, rate, acceleration)."""
+
+    value: float = parameter(kw_only=False, description="the value held")
+    y = Output(shape=(3,), description="value and its first two time derivatives, which are zero")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the value and two zeros."""
+        return np.stack([self.value + 0.0 * t, 0.0 * t, 0.0 * t])
+
+
+class SmoothStep(Source):
+    """A reference made of 7th-order smooth steps, with its first two time derivatives.
+
+    y = (r, ṙ, r̈), r running through ``levels``: from ``levels[i]`` to ``levels[i + 1]`` from ``start_times[i]`` on,
+    within ``durations[i]`` seconds.
+    """
+
+    levels: Array = parameter(description="values between the steps, one more than there are steps")
+    start_times: Array = parameter(unit="s", description="when each step starts, rising")
+    durations: Array = parameter(unit="s", above=0.0, description="how long each step takes")
+    y = Output(shape=(3,), description="value, rate, acceleration")
+
+    def check(self) -> None:
+        """Refuse steps that overlap and lists of unequal length."""
+        super().check()
+        levels, starts, durations = (np.atleast_1d(v) for v in (self.levels, self.start_times, self.durations))
+        if not len(levels) - 1 == len(starts) == len(durations):
+            raise ParameterError(
+                f"found {len(levels)} levels, {len(starts)} start times and {len(durations)} durations; expected one "
+                "start time and one duration for each step between two levels.",
+                block=self.label,
+                port="levels",
+            )
+        if np.any(starts[1:] < (starts + durations)[:-1]):
+            raise ParameterError(
+                "a step starts before the one before it has ended; move start_times apart.",
+                block=self.label,
+                port="start_times",
+            )
+
+    def instants(self) -> Array:
+        """Return where each step starts and ends."""
+        starts = np.atleast_1d(self.start_times)
+        return np.concatenate([starts, starts + self.durations])
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the sum of all steps."""
+        levels, starts, durations = self.levels, np.atleast_1d(self.start_times), np.atleast_1d(self.durations)
+        value, rate, acceleration = levels[0] + 0.0 * t, 0.0 * t, 0.0 * t
+        for i in range(len(levels) - 1):
+            rise = levels[i + 1] - levels[i]
+            v, r, a = smooth_step(t, starts[i], durations[i], 0.0 * t, rise)
+            value, rate, acceleration = value + v, rate + r, acceleration + a
+        return np.stack([value, rate, acceleration])
+
+
+class Step(Source):
+    """Steps: y is ``initial_value``, and ``values[i]`` from ``times[i]`` on.
+
+    The times may be off by their rounding: a step at ``3 * 0.1`` acts at the tick at 0.3 s.
+    """
+
+    times: Array = parameter(unit="s", description="when it steps, rising; a number or several")
+    values: Array = parameter(description="the value from then on, one for each time")
+    initial_value: float = parameter(default=0.0, description="value before the first step")
+    y = Output()
+
+    def check(self) -> None:
+        """Refuse lists of unequal length and times that do not rise."""
+        super().check()
+        if np.shape(self.times) != np.shape(self.values) or np.any(np.diff(np.atleast_1d(self.times)) <= 0):
+            raise ParameterError(
+                f"found times {self.times!r} and values {self.values!r}; expected rising times, one value each.",
+                block=self.label,
+                port="times",
+            )
+
+    def instants(self) -> Array:
+        """Return when it steps."""
+        return np.atleast_1d(self.times)
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the value at t."""
+        y = self.initial_value + 0.0 * t
+        for time, value in zip(np.atleast_1d(self.times), np.atleast_1d(self.values), strict=True):
+            y = np.where(t >= earliest(time), value, y)
+        return y
+
+
+class Pulse(Source):
+    """A smooth pulse: up at the start, down towards the end, each a 7th-order step over ``rise_time``.
+
+    y = A [smooth(t; t₀, r) − smooth(t; t₁ − r, r)].
+    """
+
+    start_time: float = parameter(unit="s", description="when it begins to rise")
+    end_time: float = parameter(unit="s", description="when it is over")
+    amplitude: float = parameter(description="height")
+    rise_time: float = parameter(default=0.2, unit="s", above=0.0, description="how long each flank takes")
+    y = Output()
+
+    def check(self) -> None:
+        """Refuse a pulse that is shorter than its two flanks."""
+        super().check()
+        if self.end_time - self.start_time < 2 * self.rise_time * (1 - 1e-12):
+            raise ParameterError(
+                f"found {self.end_time - self.start_time:g} s between start and end; expected at least the two flanks, "
+                f"{2 * self.rise_time:g} s. Move end_time or shorten rise_time.",
+                block=self.label,
+                port="end_time",
+            )
+
+    def instants(self) -> Array:
+        """Return where its flanks start and end."""
+        first, last, rise = self.start_time, self.end_time, self.rise_time
+        return np.array([first, first + rise, last - rise, last])
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the pulse."""
+        up = smooth_step(t, self.start_time, self.rise_time, 0.0, 1.0)[0]
+        down = smooth_step(t, self.end_time - self.rise_time, self.rise_time, 0.0, 1.0)[0]
+        return self.amplitude * (up - down)
+
+
+class Sine(Source):
+    """Sine wave: y = A sin(2π f t + φ) + bias."""
+
+    amplitude: float = parameter(default=1.0, description="amplitude")
+    frequency: float = parameter(unit="Hz", minimum=0.0, description="frequency")
+    phase: float = parameter(default=0.0, unit="rad", description="phase at t = 0")
+    bias: float = parameter(default=0.0, description="mean value")
+    y = Output()
+
+    def time_scale(self) -> float:
+        """Return a tenth of a period."""
+        return 0.1 / self.frequency if self.frequency else math.inf
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the sine."""
+        return self.amplitude * np.sin(2.0 * np.pi * self.frequency * t + self.phase) + self.bias

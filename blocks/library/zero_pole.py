@@ -1,0 +1,267 @@
+"""Linear systems given by zeros, poles and gain: realized as a cascade of real sections of at most second order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.errors import ParameterError
+from ..core.ports import Input, Output, State
+from ..core.values import Array, parameter
+from .linear import Names, section
+from .python_control import (
+    SampleTimeOfFrame,
+    block_name,
+    check_names,
+    check_single,
+    check_system,
+    labels,
+    names_of,
+    sample_time_of,
+)
+
+Numbers = tuple[complex, ...]
+
+
+def real_factors(roots: Sequence[complex]) -> list[list[complex]]:
+    """Return roots in groups of real polynomials: conjugate pairs, and real roots one by one.
+
+    Raises
+    ------
+    ValueError
+        A complex root whose conjugate is missing.
+    """
+    rest = sorted((complex(r) for r in roots), key=lambda r: (r.real, abs(r.imag), r.imag))
+    groups: list[list[complex]] = []
+    while rest:
+        root = rest.pop()
+        close = 1e-9 * abs(root)
+        if abs(root.imag) <= 1e-14 * abs(root):
+            groups.append([complex(root.real)])
+            continue
+        partner = min(rest, key=lambda r: abs(r - root.conjugate()), default=None)
+        if partner is None or abs(partner - root.conjugate()) > close:
+            raise ValueError(f"{root} without its conjugate")
+        rest.remove(partner)
+        mean = 0.5 * (root + partner.conjugate())
+        groups.append([mean, mean.conjugate()])
+    return groups
+
+
+def sections(zeros: Sequence[complex], poles: Sequence[complex]) -> list[tuple[list[complex], list[complex]]]:
+    """Return zeros and poles in pairs for sections, each of as many zeros as poles at most.
+
+    Real poles are joined in the order of their size, so that at most one section is of first order. Each pair of
+    complex zeros, then each real one, goes to the section with the nearest pole that has room.
+    """
+    groups = real_factors(poles)
+    reals = sorted((g[0] for g in groups if len(g) == 1), key=abs)
+    joined = [g for g in groups if len(g) == 2]
+    joined += [reals[i : i + 2] for i in range(0, len(reals), 2)]
+    made: list[tuple[list[complex], list[complex]]] = [([], sorted(p, key=abs)) for p in joined]
+    for group in sorted(real_factors(zeros), key=len, reverse=True):
+        room = [m for m in made if len(m[0]) + len(group) <= len(m[1])]
+        nearest = min(room, key=lambda m: min(abs(p - group[0]) for p in m[1]))
+        nearest[0].extend(group)
+    return made
+
+
+def _polynomial(roots: Sequence[complex]) -> np.ndarray:
+    return np.atleast_1d(np.real(np.poly(np.array(roots, dtype=complex))))
+
+
+def _unfit(roots: Any) -> str | None:
+    """Return what is wrong with roots, None if they are those of a real polynomial."""
+    try:
+        if not np.all(np.isfinite([complex(r) for r in roots])):
+            return ""
+        real_factors(roots)
+    except (TypeError, ValueError) as error:
+        return f": {error}" if str(error).endswith("conjugate") else ""
+    return None
+
+
+class _ZeroPoleGain(Block):
+    """What both kinds of time share."""
+
+    zeros: Numbers = parameter(default=(), structural=True, description="zeros; complex ones in conjugate pairs")
+    poles: Numbers = parameter(structural=True, description="poles, at least one; complex ones in conjugate pairs")
+    gain: float = parameter(default=1.0, description="factor k")
+    input_names: Names = parameter(default=None, description="name of the input, for python-control")
+    output_names: Names = parameter(default=None, description="name of the output, for python-control")
+    u = Input(description="input")
+    y = Output(description="output")
+    x = State(start=lambda block: np.zeros(len(block.poles)), description="states of the sections, one after another")
+
+    def check(self) -> None:
+        """Refuse zeros and poles that are no real, proper transfer function."""
+        for name in ("zeros", "poles"):
+            found = getattr(self, name)
+            why = _unfit(found)
+            if why is not None:
+                raise ParameterError(
+                    f"found {found!r}{why}; expected a list of finite numbers, complex ones in conjugate pairs, such "
+                    "as [-1+2j, -1-2j].",
+                    block=self.label,
+                    port=name,
+                )
+        if not len(self.poles) or len(self.zeros) > len(self.poles):
+            raise ParameterError(
+                f"found {len(self.zeros)} zeros and {len(self.poles)} poles; expected a pole, and no more zeros than "
+                "poles. Add poles, or use Gain where there are none.",
+                block=self.label,
+                port="poles",
+            )
+        check_names(self, input_names=1, output_names=1)
+
+    def factors(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return numerator and denominator of each section, monic and of equal length."""
+        made = []
+        for zeros, poles in sections(self.zeros, self.poles):
+            b, a = _polynomial(zeros), _polynomial(poles)
+            made.append((np.concatenate([np.zeros(len(a) - len(b)), b]), a))
+        return made
+
+    def cascade(self, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return the output and what the sections make of their states."""
+        signal, parts, position, gain = u.u, [], 0, 1.0
+        for b, a in self.factors():
+            state = x.x[position : position + len(a) - 1]
+            signal, part, factor = self.one(b, a, state, signal)
+            parts.append(part)
+            position += len(a) - 1
+            gain *= factor
+        return self.gain * gain * signal, np.concatenate(parts)
+
+    def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
+        """Return output and advance of one section, and the factor that its output is short of."""
+        raise NotImplementedError
+
+    @classmethod
+    def _from_control(cls, system: Any, *, discrete: bool, name: str | None) -> Self:
+        dt = check_system(cls, system, "TransferFunction", discrete=discrete)
+        check_single(cls, system)
+        b, a = (np.trim_zeros(np.asarray(c[0][0], dtype=float), "f") for c in (system.num, system.den))
+        more: dict[str, Any] = {"dt": dt} if discrete else {}
+        return cls(
+            zeros=tuple(complex(z) for z in np.roots(b)),
+            poles=tuple(complex(p) for p in np.roots(a)),
+            gain=b[0] / a[0] if len(b) else 0.0,
+            name=block_name(system, name),
+            **names_of(system),
+            **more,
+        )
+
+    def _to_control(self, dt: float | bool) -> Any:
+        import control
+
+        return control.zpk(list(self.zeros), list(self.poles), self.gain, dt, **labels(self))
+
+
+class ZeroPoleGain(_ZeroPoleGain):
+    """Zeros, poles and gain: Y(s) = k (s − z₁) … (s − z_m) / ((s − p₁) … (s − p_n)) U(s), m ≤ n; it starts at rest.
+
+    Realized as a cascade of real sections of second order, each in its own scaled frequency, zeros beside the nearest
+    poles, and its numerator scaled to coefficients of at most 1; what that leaves is put into the gain. So the poles
+    are kept to rounding, however close or far apart. Zeros and poles are fixed in the trace; the gain
+    is a parameter.
+
+    Raises
+    ------
+    ParameterError
+        Complex zeros or poles without their conjugates, or more zeros than poles.
+
+    Examples
+    --------
+    >>> ZeroPoleGain(poles=[-1 + 5j, -1 - 5j], gain=26.0)
+    ZeroPoleGain(poles=((-1+5j), (-1-5j)), gain=26)
+    """
+
+    def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
+        """Return output and ẋ of a section in controllable canonical form in s / ω."""
+        n = len(a) - 1
+        w = abs(a[2]) ** 0.5 if n == 2 and a[2] else abs(a[1]) or 1.0
+        powers = w ** -np.arange(n + 1.0)
+        a, b = a * powers, b * powers
+        factor = float(np.abs(b).max())
+        b = b / factor
+        rate = w * np.concatenate([x[1:], np.stack([u - a[1:][::-1] @ x])])
+        return b[0] * u + (b[1:] - b[0] * a[1:])[::-1] @ x, rate, factor
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the output."""
+        return self.cascade(x, u)[0]
+
+    def derivative(self, t: Array, x: Any, u: Any) -> Array:
+        """Return ẋ."""
+        return self.cascade(x, u)[1]
+
+    @classmethod
+    def from_control(cls, system: Any, *, name: str | None = None) -> Self:
+        """Return the block of a `control.TransferFunction` in continuous time, of one input and one output.
+
+        python-control keeps polynomials: zeros and poles are their roots, so several at one place come apart. It takes
+        over the names of the signals, and the system's own where that is an identifier and none is given.
+
+        Raises
+        ------
+        ParameterError
+            No transfer function, or one in discrete time, one of several inputs or outputs, or without poles.
+        """
+        return cls._from_control(system, discrete=False, name=name)
+
+    def to_control(self) -> Any:
+        """Return the `control.TransferFunction`, with the names of its signals: its polynomials, multiplied out."""
+        return self._to_control(0)
+
+
+class DiscreteZeroPoleGain(SampleTimeOfFrame, _ZeroPoleGain):
+    """Zeros, poles and gain: Y(z) = k (z − z₁) … (z − z_m) / ((z − p₁) … (z − p_n)) U(z), m ≤ n; it starts at rest.
+
+    Realized as a cascade of real sections of second order in the transposed direct form II, zeros beside the nearest
+    poles. Zeros and poles are fixed in the trace; the gain is a parameter.
+
+    Raises
+    ------
+    ParameterError
+        Complex zeros or poles without their conjugates, or more zeros than poles.
+    SampleTimeError
+        In a continuous frame, or in one whose sample time is not ``dt``, when the diagram is built.
+    """
+
+    dt: float | None = parameter(
+        default=None, unit="s", above=0.0, structural=True, description="sample time that it holds for; None: any"
+    )
+
+    def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
+        """Return output and next state of a section."""
+        return (*section(b, a, x, u), 1.0)
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the output."""
+        return self.cascade(x, u)[0]
+
+    def update(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the next state."""
+        return self.cascade(x, u)[1]
+
+    @classmethod
+    def from_control(cls, system: Any, *, name: str | None = None) -> Self:
+        """Return the block of a `control.TransferFunction` in discrete time, of one input and one output.
+
+        python-control keeps polynomials: zeros and poles are their roots, so several at one place come apart. It takes
+        over the names of the signals, and the system's own where that is an identifier and none is given.
+
+        Raises
+        ------
+        ParameterError
+            No transfer function, or one in continuous time, one of several inputs or outputs, or without poles.
+        """
+        return cls._from_control(system, discrete=True, name=name)
+
+    def to_control(self) -> Any:
+        """Return the `control.TransferFunction`, with the names of its signals: its polynomials, multiplied out."""
+        return self._to_control(sample_time_of(self))

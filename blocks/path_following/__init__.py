@@ -1,0 +1,1 @@
+"""Blocks of the paper: transverse coordinates, compliance, environments and planar models."""

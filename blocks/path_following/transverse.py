@@ -1,0 +1,356 @@
+"""Path following by transverse feedback linearization: section III of Flixeder, Glück, Böck, Kugi (2014).
+
+Numbers in parentheses are the paper's equations, E1 to E27 its errata (docs/paper.md). F is the force on the robot, t
+and n the unit tangent and normal (to the left), κ the signed curvature (the paper's φ′), κ_s its derivative with
+respect to the arc length, q = 1 − κ ξ₁.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.errors import GuardError, ParameterError, PathDomainError
+from ..core.ports import Input, Output, State
+from ..core.values import Array, parameter, short
+from ..paths import Path, limited
+from .planar_model import PlanarModel
+
+_NEWTON = 4  # iterations a tick: from 1 mm off, three reach the last digit
+_CONVERGED = 1e-9  # largest remaining Newton step, as a part of the path's parameter range
+
+
+def expect_path(block: Block) -> None:
+    """Refuse a ``path`` that is none.
+
+    Raises
+    ------
+    ParameterError
+        Anything but a `Path`.
+    """
+    path = block.parameters["path"]
+    if not isinstance(path, Path):
+        hint = " The path comes first, then the model." if isinstance(path, PlanarModel) else ""
+        raise ParameterError(
+            f"found {short(path)}; expected a Path, such as Ellipse(semi_axes=(0.3, 0.15)).{hint}",
+            block=block.label,
+            port="path",
+        )
+
+
+def expect_model(block: Block, model: Any) -> None:
+    """Refuse a ``model`` that is none.
+
+    Raises
+    ------
+    ParameterError
+        Anything but a `PlanarModel`.
+    """
+    if not isinstance(model, PlanarModel):
+        raise ParameterError(
+            f"found {short(model)}; expected a PlanarModel, such as gantry.nominal.", block=block.label, port="model"
+        )
+
+
+class PathTracking(Block):
+    """Base of blocks that follow the foot point of a position on a path.
+
+    At the start the foot point is the global arg min of (4); from then on Newton's method on (6) starts from the last
+    one, so that θ counts laps (E17). The state ``foot`` is the last foot point, nothing else.
+
+    Raises
+    ------
+    ParameterError
+        A ``path`` that is none, when the block is made.
+    PathDomainError
+        In a run, where the path's coordinates end: q below ``minimum_q``, at or beyond the medial axis, beyond an end
+        of an open path, or where the foot point jumps within one tick (E18).
+    """
+
+    memory = True
+    path: Path = parameter(kw_only=False, description="the path")
+    minimum_q: float = parameter(default=0.05, minimum=0.0, description="smallest allowed q = 1 − κ ξ₁")
+    position = Input(shape=(2,), unit="m", description="position y in the plane")
+    foot = State(description="last path parameter")
+
+    def check(self) -> None:
+        """Refuse a path that is none."""
+        expect_path(self)
+
+    def initial(self, u: Any) -> float:
+        """Return the global arg min of (4), in [0, period); a rounding error before the seam counts as after it."""
+        theta = float(self.path.project(np.asarray(u.position)))
+        period = self.path.period
+        if period is None:
+            return theta
+        theta -= period * np.floor(theta / period)
+        return float(theta - period if theta > period * (1.0 - 1e-6) else theta)
+
+    def foot_point(self, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return the path parameter θ̂ of the foot point, from (6), and Newton's remaining step."""
+        theta, residual = self.path.newton(x.foot, u.position, _NEWTON)
+        return theta, residual
+
+    def update(self, t: Array, x: Any, u: Any) -> Array:
+        """Keep the foot point as the next start."""
+        return self.foot_point(x, u)[0]
+
+    def guards(self, t: Array, x: Any, u: Any) -> dict[str, Array]:
+        """Return what must stay positive for the coordinates to be valid."""
+        theta, residual = self.foot_point(x, u)
+        frame = self.path.frame(theta)
+        xi = frame.normal @ (u.position - frame.sigma)
+        left, right = self.path.reach(theta)
+        low, high = self.path.domain or (0.0, self.path.period or 1.0)
+        checks = {
+            "newton": _CONVERGED * (high - low) - np.abs(residual),
+            "q": 1.0 - frame.curvature * xi - self.minimum_q,
+            "left": left - xi,
+            "right": right + xi,
+        }
+        if self.path.period is not None:  # half a lap off, the lap would be a guess
+            checks["lap"] = 0.5 * self.path.period - np.abs(theta - x.foot)
+        if self.path.domain is not None:
+            slack = 1e-12 * (high - low)
+            checks |= {"start": theta - low + slack, "end": high - theta + slack}
+        return checks
+
+    def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
+        """Return the `PathDomainError` with position, θ, ξ and the local reach; ``x`` tells how far the foot jumped."""
+        position = np.asarray(u.position)
+        theta = float(self.path.project(position))
+        frame = self.path.frame(theta)
+        xi = float(frame.normal @ (position - frame.sigma))
+        q = 1.0 - float(frame.curvature) * xi
+        left, right = self.path.reach(theta)
+        reach = limited(float(left if xi > 0 else right))
+        if name in ("start", "end"):
+            beyond = abs(float(frame.tangent @ (position - frame.sigma)))
+            where = "before the start" if name == "start" else "beyond the end"
+            why = f"it is {beyond:.3g} m {where} of the open path"
+        elif name in ("left", "right"):
+            why = "it is at or beyond the medial axis, where the nearest point of the path is not unique"
+        elif name == "q" and q <= self.minimum_q:
+            why = f"q = 1 − κ ξ = {q:.4g} is below {self.minimum_q:g}"
+        else:
+            why = (
+                f"the foot point jumped{self._jump(theta, x)}: the position moved too far within one tick, or it is "
+                "near the medial axis"
+            )
+        shown = "unlimited" if np.isinf(reach) else f"{reach:.6g} m"
+        error = PathDomainError(
+            f"position {position.tolist()} m has no valid path coordinates: {why}. Nearest foot point θ = {theta:.6g}, "
+            f"ξ = {xi:.6g} m, local reach on that side {shown}. Start nearer to the path, or limit what "
+            f"drives it off."
+        )
+        error.position, error.theta, error.xi, error.reach = tuple(position.tolist()), theta, xi, reach
+        return error
+
+    def _jump(self, theta: float, x: Any) -> str:
+        """Say how far the nearest foot point is from the last one, where that is known."""
+        if x is None or not np.all(np.isfinite(x.foot)):
+            return ""
+        apart = float(np.ravel(x.foot)[0]) - theta
+        period = self.path.period
+        if period is not None:
+            apart -= period * np.floor(apart / period + 0.5)
+        way = float(self.path.arc_length(theta + apart)) - float(self.path.arc_length(theta))
+        return f" by {abs(way):.3g} m along the path"
+
+
+class PathProjection(PathTracking):
+    """Projection of a position onto the path: θ̂ = arg min ‖y − σ̂(θ̂)‖, (4), tracked through (6).
+
+    The secondary output ``q`` is 1 − κ ξ₁, which scales tangential motion off the path.
+
+    Raises
+    ------
+    ParameterError, PathDomainError
+        As `PathTracking`.
+    """
+
+    theta = Output(description="path parameter θ̂ of the foot point, counted over laps (E17)")
+    q = Output(description="1 − κ ξ₁", secondary=True)
+
+    def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return θ̂ and q."""
+        theta, _ = self.foot_point(x, u)
+        frame = self.path.frame(theta)
+        return theta, 1.0 - frame.curvature * (frame.normal @ (u.position - frame.sigma))
+
+
+class TransverseTransform(Block):
+    """Coordinate transform (7): η = (arc length, its rate), ξ = (signed distance to the path, its rate).
+
+    η₁ = g(θ̂), (5), lifted over laps (E17); ξ₁ = nᵀ(y − σ); η₂ = tᵀẏ / q; ξ₂ = nᵀẏ.
+
+    Inputs are ``theta``, the path parameter θ̂ of the foot point, then ``position`` and ``velocity``: without a model
+    the output y = h(x_c) and its rate; with one x_c and x_v, and y = h(x_c), ẏ = dh x_v, (3).
+
+    Raises
+    ------
+    ParameterError
+        A path or a model that is none, when the block is made.
+    """
+
+    path: Path = parameter(kw_only=False, description="the path")
+    model: PlanarModel | None = parameter(
+        default=None, kw_only=False, description="output map h, where it is not identity"
+    )
+    eta = Output(shape=(2,), unit=("m", "m/s"), description="tangential state η")
+    xi = Output(shape=(2,), unit=("m", "m/s"), description="transversal state ξ")
+
+    def check(self) -> None:
+        """Refuse a path or a model that is none."""
+        expect_path(self)
+        if self.model is not None:
+            expect_model(self, self.model)
+
+    @property
+    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
+        """θ̂, and position and velocity in the model's coordinates."""
+        return {"theta": Input(name="theta"), **_measured(self.model)}
+
+    def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return η and ξ."""
+        y, dy = (u.position, u.velocity) if self.model is None else self.model.output_map(u.position, u.velocity)
+        f = self.path.frame(u.theta)
+        xi1 = f.normal @ (y - f.sigma)
+        eta2 = f.tangent @ dy / (1.0 - f.curvature * xi1)
+        return np.stack([self.path.arc_length(u.theta), eta2]), np.stack([xi1, f.normal @ dy])
+
+
+class ForceProjection(Block):
+    """Force in the path frame, (13): F∥ = tᵀF, F⊥ = nᵀF, with F the force on the robot (E6).
+
+    Raises
+    ------
+    ParameterError
+        A path that is none, when the block is made.
+    """
+
+    path: Path = parameter(kw_only=False, description="the path")
+    theta = Input(description="path parameter of the foot point")
+    force = Input(shape=(2,), unit="N", description="measured force on the robot")
+    f_par = Output(unit="N", description="tangential part F∥")
+    f_perp = Output(unit="N", description="transversal part F⊥")
+
+    def check(self) -> None:
+        """Refuse a path that is none."""
+        expect_path(self)
+
+    def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
+        """Return F∥ and F⊥."""
+        f = self.path.frame(u.theta)
+        return f.tangent @ u.force, f.normal @ u.force
+
+
+class FeedbackLinearization(Block):
+    """Input-output feedback linearization (10): makes η̈₁ = v∥ and ξ̈₁ = v⊥, (11).
+
+    With J = [nᵀ; tᵀ/q] the rates of (ξ₁, η₁) are J ẏ, and (9) reads ÿ~ = b + D_u (u + dhᵀF), D_u = J dh G_v (E2, E3).
+    Solved for the motor force, J⁻¹ = [n, q t] in closed form (E4 orders v):
+
+        u = (dh G_v)⁻¹ { n (v⊥ + κ q η₂²) + t (q v∥ − 2 κ η₂ ξ₂ − κ_s ξ₁ η₂²) − dh f_v − (dh)˙ x_v } − dhᵀ F.
+
+    For any fully actuated planar model with ẋ_v = f_v + G_v (u + dhᵀ F), y = h(x_c); the gantry is the case h =
+    identity. The measured force F on the robot is cancelled with the sign of E6.
+
+    Inputs are ``theta``, θ̂ of the foot point; ``position`` x_c and ``velocity`` x_v in the model's coordinates;
+    ``force`` F on the robot; ``v_par`` and ``v_perp``, the wanted η̈₁ and ξ̈₁. The output ``motor_force`` is u in the
+    model's unit.
+
+    Raises
+    ------
+    ParameterError
+        A path or a model that is none, or a model without f_v or G_v, when the block is made.
+    GuardError
+        In a run, where |det(dh G_v)| falls to ``minimum_determinant``.
+    """
+
+    path: Path = parameter(kw_only=False, description="the path")
+    model: PlanarModel = parameter(kw_only=False, description="model that is inverted: f_v, G_v, h")
+    minimum_determinant: float = parameter(
+        default=1e-9, minimum=0.0, description="smallest |det(dh G_v)|: below it the model can't be inverted"
+    )
+
+    @property
+    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
+        """θ̂, the model's position and velocity, the force on the robot, v∥ and v⊥."""
+        return {
+            "theta": Input(name="theta"),
+            **_measured(self.model),
+            "force": Input(shape=(2,), unit="N", name="force"),
+            "v_par": Input(unit="m/s2", name="v_par"),
+            "v_perp": Input(unit="m/s2", name="v_perp"),
+        }
+
+    @property
+    def outputs(self) -> Mapping[str, Output]:  # type: ignore[override]
+        """The motor force in the model's unit."""
+        return {"motor_force": Output(shape=(2,), unit=self.model.input_unit, name="motor_force")}
+
+    @property
+    def motor_force(self) -> Any:
+        """The motor force as a signal."""
+        from ..core.signals import Signal
+
+        return Signal(self, "motor_force")
+
+    def check(self) -> None:
+        """Refuse a path or a model that is none, and a model without its equations."""
+        expect_path(self)
+        expect_model(self, self.model)
+        for name, text in (("f_v", "f_v(x_c, x_v)"), ("G_v", "G_v(x_c)")):
+            if getattr(type(self.model), name) is getattr(PlanarModel, name):
+                raise ParameterError(
+                    f"{type(self.model).__name__} has no {text}; expected a PlanarModel that defines it, equation (2). "
+                    "Write it.",
+                    block=self.label,
+                    port="model",
+                )
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the motor force."""
+        model, x_c, x_v = self.model, u.position, u.velocity
+        y, dy = model.output_map(x_c, x_v)
+        f = self.path.frame(u.theta)
+        xi1 = f.normal @ (y - f.sigma)
+        q = 1.0 - f.curvature * xi1
+        eta2, xi2 = f.tangent @ dy / q, f.normal @ dy
+        along_n = u.v_perp + f.curvature * q * eta2**2
+        along_t = q * u.v_par - 2.0 * f.curvature * eta2 * xi2 - f.curvature_rate * xi1 * eta2**2
+        wanted = f.normal * along_n + f.tangent * along_t
+        dh, dh_rate = model.dh(x_c), model.dh_rate(x_c, x_v)
+        free = dh @ model.f_v(x_c, x_v) + dh_rate @ x_v
+        return _solve(dh @ model.G_v(x_c), wanted - free) - dh.T @ u.force
+
+    def guards(self, t: Array, x: Any, u: Any) -> dict[str, Array]:
+        """Return the margin to a singular model."""
+        A = self.model.dh(u.position) @ self.model.G_v(u.position)
+        return {"determinant": np.abs(A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]) - self.minimum_determinant}
+
+    def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
+        """Return the error of a model that can't be inverted where it is."""
+        return GuardError(
+            f"|det(dh G_v)| of {type(self.model).__name__} is {value + self.minimum_determinant:.6g} at the position "
+            f"{np.asarray(u.position).tolist()} {self.model.coordinate_unit}; expected more than minimum_determinant = "
+            f"{self.minimum_determinant:g}, as it is inverted there. Keep away from singular positions, or correct G_v."
+        )
+
+
+def _measured(model: PlanarModel | None) -> dict[str, Input]:
+    unit = "m" if model is None else model.coordinate_unit
+    return {
+        "position": Input(shape=(2,), unit=unit, description="y, or x_c of the model", name="position"),
+        "velocity": Input(shape=(2,), unit=f"{unit}/s", description="its rate", name="velocity"),
+    }
+
+
+def _solve(A: Array, b: Array) -> Array:
+    """Solve a 2 × 2 system in closed form."""
+    det = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+    return np.stack([A[1, 1] * b[0] - A[0, 1] * b[1], A[0, 0] * b[1] - A[1, 0] * b[0]]) / det

@@ -1,0 +1,397 @@
+"""The base of all paths. Equation numbers are those of Flixeder, Glück, Böck and Kugi (2014).
+
+Conventions: t is the unit tangent, n the unit normal (t turned by +90°), κ the signed curvature, κ_s its derivative
+with respect to arc length; ξ is positive to the left of the path.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..core.errors import DefinitionError, ParameterError, PathDomainError
+from ..core.values import Array, Value
+from ..library.piecewise import piecewise, wrap
+from . import tables
+from .tables import UNLIMITED
+
+__all__ = ["UNLIMITED", "Frame", "Path"]
+
+
+class Frame(NamedTuple):
+    """The moving frame of a path at one parameter θ.
+
+    Attributes
+    ----------
+    sigma : array, shape (2,)
+        The point σ(θ), m.
+    tangent : array, shape (2,)
+        Unit tangent t = σ′/‖σ′‖.
+    normal : array, shape (2,)
+        Unit normal n, t turned by +90°.
+    speed : float
+        ‖σ′‖, m per unit of θ.
+    curvature : float
+        Signed curvature κ (the paper's φ′), 1/m; positive where the path turns left.
+    curvature_rate : float
+        κ_s, derivative of κ with respect to arc length, 1/m².
+    """
+
+    sigma: Array
+    tangent: Array
+    normal: Array
+    speed: Array
+    curvature: Array
+    curvature_rate: Array
+
+
+class Path(Value):
+    """A regular planar path σ(θ), closed or open, with what path following needs to know of it.
+
+    A subclass gives `sigma` and either `period` (a closed path) or `domain` (an open one); all the rest follows, and
+    is overridden where there is a closed form. An open path must go straight on beyond its ends, at the speed it has
+    there::
+
+        class Bean(Path):
+            '''σ(θ) = R (cos θ + e cos 2θ, sin θ).'''
+
+            radius: float = parameter(unit="m", above=0.0)
+            bend: float = parameter(default=0.3)
+            period = 2.0 * np.pi
+
+            def sigma(self, theta, order=0):
+                turn = order * np.pi / 2.0  # differentiating turns by a quarter
+                y = np.cos(theta + turn) + self.bend * 2.0**order * np.cos(2.0 * theta + turn)
+                return self.radius * np.stack([y, np.sin(theta + turn)])
+
+    The path must not meet itself (its reach is next to nothing there), and its σ′ must not vanish (E19).
+
+    All methods take a parameter θ as a number, as an array of N numbers (vectors then have the shape (2, N)) or, unless
+    they say that they are NumPy only, as a traced scalar.
+    """
+
+    # --- what a subclass gives ----------------------------------------------------------------------------------------
+
+    def sigma(self, theta: Array, order: int = 0) -> Array:
+        """Return the point σ(θ), m, or its derivative of the given order (0 to 3) with respect to θ.
+
+        Parameters
+        ----------
+        theta : float, array or traced scalar
+            Path parameter.
+        order : int, optional
+            Order of the derivative, 0 to 3.
+
+        Returns
+        -------
+        array, shape (2,) or (2, N)
+        """
+        raise self._undefined("sigma(theta, order)")
+
+    @property
+    def period(self) -> float | None:
+        """Period of a closed path in θ; None for an open one."""
+        return None
+
+    @property
+    def domain(self) -> tuple[float, float] | None:
+        """First and last θ of an open path; None for a closed one."""
+        return None
+
+    @property
+    def knots(self) -> np.ndarray:
+        """Parameters between which σ is smooth, the ends included."""
+        if self.period is not None:
+            return np.array([0.0, self.period])
+        if self.domain is None:
+            raise self._undefined("period and no domain")
+        return np.array(self.domain)
+
+    def _undefined(self, what: str) -> DefinitionError:
+        return DefinitionError(f"found no {what}; expected a path to define it. Write it.", block=type(self).__name__)
+
+    @cached_property
+    def closed(self) -> bool:
+        """Whether the path is a closed curve."""
+        return self.period is not None
+
+    # --- geometry -----------------------------------------------------------------------------------------------------
+
+    def derivatives(self, theta: Array, highest: int = 3) -> tuple[Array, ...]:
+        """Return σ(θ) and its derivatives up to the order ``highest``."""
+        return tuple(self.sigma(theta, order) for order in range(highest + 1))
+
+    def frame(self, theta: Array) -> Frame:
+        """Return the moving frame at θ.
+
+        t = σ′/‖σ′‖, n = R t, κ = (x′y″ − y′x″)/‖σ′‖³ and
+        κ_s = [(x′y‴ − y′x‴) ‖σ′‖² − 3 (x′y″ − y′x″) σ′ᵀσ″]/‖σ′‖⁶ (κ is φ′ below equation (8)).
+        """
+        s0, s1, s2, s3 = self.derivatives(theta, 3)
+        squared = s1[0] * s1[0] + s1[1] * s1[1]
+        speed = np.sqrt(squared)
+        tangent = s1 / speed
+        turning = s1[0] * s2[1] - s1[1] * s2[0]
+        change = s1[0] * s3[1] - s1[1] * s3[0]
+        stretch = s1[0] * s2[0] + s1[1] * s2[1]
+        return Frame(
+            sigma=s0,
+            tangent=tangent,
+            normal=np.stack([-tangent[1], tangent[0]]),
+            speed=speed,
+            curvature=turning / (squared * speed),
+            curvature_rate=(change * squared - 3.0 * turning * stretch) / (squared * squared * squared),
+        )
+
+    # --- arc length ---------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _arc(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Breaks, coefficients and total of the tabulated arc length; an open path's continuations included."""
+        breaks, coefficients, total = tables.integral(lambda theta: np.hypot(*self.sigma(theta, 1)), self.knots)
+        if self.period is None:
+            span = breaks[-1] - breaks[0]
+            v0, v1 = np.hypot(*self.sigma(breaks[[0, -1]], 1))
+            ends = np.zeros((2, 1, coefficients.shape[2]))
+            ends[:, 0, :2] = [[-v0 * span, v0], [total, v1]]
+            breaks = np.concatenate([[breaks[0] - span], breaks, [breaks[-1] + span]])
+            coefficients = np.concatenate([ends[:1], coefficients, ends[1:]])
+        return breaks, coefficients, total
+
+    @property
+    def length(self) -> float:
+        """Length of the whole path, m."""
+        return self._arc[2]
+
+    def arc_length(self, theta: Array) -> Array:
+        """Return the arc length η₁ = g(θ) = ∫ ‖σ′‖ dθ from the path's start, equation (5), m.
+
+        Laps count: η₁(θ + period) = η₁(θ) + length.
+        """
+        breaks, coefficients, total = self._arc
+        if self.period is None:
+            return piecewise(breaks, coefficients, theta)[0]
+        lap, rest = wrap(theta, 0.0, self.period)
+        return lap * total + piecewise(breaks, coefficients, rest)[0]
+
+    def parameter_at(self, s: Array) -> Array:
+        """Return the parameter θ at the arc length s, the inverse of `arc_length`; laps count. NumPy only.
+
+        Parameters
+        ----------
+        s : float or array
+            Arc length η₁, m.
+        """
+        s = np.asarray(s, dtype=float)
+        if self.period is not None:
+            lap, rest = wrap(s, 0.0, self.length)
+            theta = tables.invert(self, rest) + lap * self.period
+        else:
+            inside = np.clip(s, 0.0, self.length)
+            theta = tables.invert(self, inside)
+            theta = theta + (s - inside) / np.hypot(*self.sigma(theta, 1))
+        return theta if theta.ndim else float(theta)
+
+    @cached_property
+    def sampling(self) -> tuple[np.ndarray, np.ndarray]:
+        """Parameters so dense that searches start from them, and their arc lengths; the ends included."""
+        theta = tables.grid(self)
+        lengths = np.asarray(self.arc_length(theta))
+        lengths[-1] = self.length
+        return theta, lengths
+
+    @cached_property
+    def sampled(self) -> np.ndarray:
+        """The points at the sampled parameters, shape (2, N)."""
+        return np.asarray(self.sigma(self.sampling[0]))
+
+    # --- neighbourhood ------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _reach(self) -> tuple[np.ndarray, np.ndarray]:
+        return tables.reach_table(self)
+
+    def reach(self, theta: Array) -> tuple[Array, Array]:
+        """Return how far one may go from σ(θ) along +n and along −n while σ(θ) stays the unique nearest point, m.
+
+        Along +n this is the least |Δ|²/(2 nᵀΔ) over all points σ(θ) + Δ of the path with nᵀΔ > 0, and 1/κ in the limit
+        Δ → 0: the distance to the medial axis, which is never beyond the evolute. `UNLIMITED` stands for no limit.
+        A tabulated reach errs on the small side, by at most about 2 %.
+        """
+        breaks, coefficients = self._reach
+        if self.period is not None:
+            theta = wrap(theta, 0.0, self.period)[1]
+        else:
+            first, last = breaks[0], breaks[-1]
+            theta = np.where(theta < first, first, np.where(theta > last, last, theta))
+        inverse = piecewise(breaks, coefficients, theta)
+        return 1.0 / inverse[0], 1.0 / inverse[1]
+
+    def project(self, y: Array) -> Array:
+        """Return the parameter of the point of the path nearest to y, equation (4). NumPy only.
+
+        This is the global arg min: never a merely local one. For an open path the ends are candidates.
+
+        Parameters
+        ----------
+        y : array, shape (2,) or (2, N)
+            Position, m.
+
+        Returns
+        -------
+        float or array
+            θ within one period, or within the domain.
+
+        Raises
+        ------
+        ParameterError
+            A position of another shape.
+        """
+        y = tables.positions(self, y)
+        theta = np.array([tables.nearest(self, column) for column in y.reshape(2, -1).T])
+        return self._lapped(theta).reshape(y.shape[1:]) if y.ndim > 1 else float(self._lapped(theta)[0])
+
+    def _lapped(self, theta: Array) -> Array:
+        """Return θ within [0, period)."""
+        if self.period is None:
+            return theta
+        theta = np.mod(theta, self.period)
+        return np.where(theta >= self.period, 0.0, theta)
+
+    def newton(self, theta: Array, y: Array, iterations: int) -> tuple[Array, Array]:
+        """Improve θ towards a root of (y − σ(θ))ᵀσ′(θ) = 0, equation (6), by Newton's method.
+
+        Parameters
+        ----------
+        theta : float, array or traced scalar
+            Where to start.
+        y : array, shape (2,) or (2, N)
+            Position, m.
+        iterations : int
+            How many steps are done, always.
+
+        Returns
+        -------
+        theta : float, array or traced scalar
+            The improved parameter; it isn't wrapped to one period.
+        residual : float, array or traced scalar
+            |Δθ| of the step that would come next.
+        """
+        for _ in range(iterations):
+            theta = theta + self._newton_step(theta, y)
+        return theta, np.abs(self._newton_step(theta, y))
+
+    def _newton_step(self, theta: Array, y: Array) -> Array:
+        s0, s1, s2 = self.derivatives(theta, 2)
+        d0, d1 = y[0] - s0[0], y[1] - s0[1]
+        return (d0 * s1[0] + d1 * s1[1]) / (s1[0] * s1[0] + s1[1] * s1[1] - d0 * s2[0] - d1 * s2[1])
+
+    # --- from path coordinates back to the plane ----------------------------------------------------------------------
+
+    def to_plane(self, eta: Array, xi: Array) -> Array:
+        """Return the position y = σ(θ) + n ξ₁ with θ = g⁻¹(η₁), the inverse of (7). NumPy only.
+
+        Parameters
+        ----------
+        eta : float or array
+            Arc length η₁, m.
+        xi : float or array
+            Distance to the left of the path ξ₁, m.
+
+        Returns
+        -------
+        array, shape (2,) or (2, N)
+
+        Raises
+        ------
+        PathDomainError
+            ξ₁ is at or beyond the reach of the path there, η₁ is beyond an end of an open path, or one is not finite.
+        """
+        return self._placed(eta, xi)[0]
+
+    def to_state(self, eta: Array, xi: Array) -> tuple[Array, Array]:
+        """Return position y and velocity ẏ = q η₂ t + ξ₂ n, q = 1 − κ ξ₁, the inverse of (7). NumPy only.
+
+        Parameters
+        ----------
+        eta : pair of float or array
+            Arc length η₁, m, and its rate η₂, m/s.
+        xi : pair of float or array
+            Distance to the left ξ₁, m, and its rate ξ₂, m/s.
+
+        Raises
+        ------
+        PathDomainError
+            As `to_plane`.
+        """
+        position, frame = self._placed(eta[0], xi[0])
+        q = 1.0 - frame.curvature * xi[0]
+        return position, q * eta[1] * frame.tangent + xi[1] * frame.normal
+
+    def _placed(self, eta: Array, xi: Array) -> tuple[Array, Frame]:
+        eta, xi = np.broadcast_arrays(np.asarray(eta, dtype=float), np.asarray(xi, dtype=float))
+        for name, given in (("eta", eta), ("xi", xi)):
+            if not np.all(np.isfinite(given)):
+                raise PathDomainError(
+                    f"found {name} = {given[~np.isfinite(given)].flat[0]:g} m; expected finite path coordinates."
+                )
+        theta = self.parameter_at(eta)
+        frame = self.frame(theta)
+        position = frame.sigma + frame.normal * xi
+        left, right = self.reach(theta)
+        limit = np.where(xi >= 0.0, left, right)
+        beyond = (eta < 0.0) | (eta > self.length) if self.period is None else np.zeros(eta.shape, dtype=bool)
+        wrong = beyond | ~(np.abs(xi) < limit)
+        if np.any(wrong):
+            first = tuple(np.argwhere(wrong)[0])
+            raise self._domain_error(
+                eta=float(eta[first]),
+                xi=float(xi[first]),
+                theta=float(np.asarray(theta)[first]),
+                limit=float(np.broadcast_to(limit, eta.shape)[first]),
+                position=tuple(position[(slice(None), *first)].tolist()),
+                beyond=bool(beyond[first]),
+            )
+        return position, frame
+
+    def _domain_error(
+        self, *, eta: float, xi: float, theta: float, limit: float, position: tuple[float, ...], beyond: bool
+    ) -> PathDomainError:
+        if beyond:
+            end, by = ("end", eta - self.length) if eta > 0.0 else ("start", -eta)
+            text = (
+                f"found eta = {eta:.6g} m, {by:.3g} m beyond its {end}; expected 0 to {self.length:.6g} m, the length "
+                f"of the open {type(self).__name__}. Stay between its ends, or lengthen the path."
+            )
+            limit = tables.limited(limit)
+        else:
+            side, sign = ("left", "") if xi >= 0.0 else ("right", "-")
+            text = (
+                f"found xi = {xi:.6g} m at eta = {eta:.6g} m (theta = {theta:.6g}); expected less than {limit:.6g} m "
+                f"to the {side} of the {type(self).__name__} there: beyond the medial axis another point of it is "
+                f"nearer. Stay closer to the path (xi inside {sign}{limit:.6g} m), or choose a path that bends less."
+            )
+        error = PathDomainError(text)
+        error.position, error.theta, error.xi, error.reach = position, theta, xi, limit
+        return error
+
+    # --- the value ----------------------------------------------------------------------------------------------------
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle the parameters only; tables are built again when first needed."""
+        return self.parameters
+
+
+def check_order(path: Path, order: int) -> int:
+    """Refuse an order of differentiation that isn't 0, 1, 2 or 3.
+
+    Raises
+    ------
+    ParameterError
+        Any other order.
+    """
+    if order not in (0, 1, 2, 3):
+        raise ParameterError(f"found order {order!r}; expected 0, 1, 2 or 3.", block=type(path).__name__, port="sigma")
+    return order

@@ -1,0 +1,1 @@
+"""Equations of blocks as CasADi functions, and their discretization."""

@@ -1,0 +1,63 @@
+"""How a continuous block advances over one sample when its inputs are held."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from ..core.errors import SampleTimeError
+
+Method = Literal["exact", "forward", "semi_implicit", "trapezoidal"]
+METHODS = ("exact", "forward", "semi_implicit", "trapezoidal")
+
+
+def check_method(method: str) -> None:
+    """Raise `SampleTimeError` unless ``method`` names a discretization."""
+    if method not in METHODS:
+        raise SampleTimeError(f"found the method {method!r}; expected one of {', '.join(METHODS)}.")
+
+
+def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return Ad and Φ of x(t + T) = Ad x + Φ g for ẋ = A x + g with g held over T.
+
+    Parameters
+    ----------
+    A : (n, n) ndarray
+        System matrix.
+    T : float
+        Sample time in s.
+    method : {"exact", "forward", "semi_implicit", "trapezoidal"}
+        ``exact`` is the zero-order hold, Ad = exp(A T) and Φ = ∫₀ᵀ exp(A s) ds. ``forward`` is forward Euler.
+        ``semi_implicit`` is Euler with the states renewed from the last to the first, each with those already renewed:
+        for (position, velocity) the velocity first, then the position with the new velocity. ``trapezoidal`` is
+        Ad = (I − A T/2)⁻¹ (I + A T/2) and Φ = T (I − A T/2)⁻¹, of second order: x(t + T) = x + T/2 (ẋ(t) + ẋ(t + T)).
+        With g held it is not Tustin's method, which averages g over both ends.
+
+    Raises
+    ------
+    SampleTimeError
+        Another method, or a trapezoidal step whose I − A T/2 is singular.
+    """
+    check_method(method)
+    n = len(A)
+    eye = np.eye(n)
+    if method == "forward":
+        return eye + T * A, T * eye
+    if method == "semi_implicit":
+        upper = np.triu(A, 1)
+        solve = np.linalg.inv(eye - T * upper)
+        return solve @ (eye + T * (A - upper)), T * solve
+    if method == "trapezoidal":
+        try:
+            solve = np.linalg.inv(eye - T / 2 * A)
+        except np.linalg.LinAlgError:
+            raise SampleTimeError(
+                f"the trapezoidal step of {T:g} s has no solution: a pole is at 2/T = {2 / T:g} 1/s. Take a smaller "
+                "sample time, or method='exact'."
+            ) from None
+        return solve @ (eye + T / 2 * A), T * solve
+    from scipy.linalg import expm
+
+    both = expm(np.block([[A, eye], [np.zeros((n, 2 * n))]]) * T)
+    return both[:n, :n], both[:n, n:]

@@ -1,0 +1,287 @@
+"""What a block's equations must look like and what they must return, checked before anything is made of it."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import linecache
+from collections.abc import Mapping
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from casadi import ArrayInterface
+
+from ..core.block import Block
+from ..core.errors import DefinitionError, LoopwrightError, ShapeError, TraceError
+from ..core.ports import Port, Shape, State
+from ..library.functions import Function
+from .symbols import flat_column, size
+
+_ARGUMENTS = {
+    "output": ("t", "x", "u"),
+    "derivative": ("t", "x", "u"),
+    "update": ("t", "x", "u"),
+    "guards": ("t", "x", "u"),
+    "indicators": ("t", "x", "u"),
+    "jump": ("t", "x", "u", "fired"),
+    "initial": ("u",),
+    "constants": ("T", "method"),
+    "next_instant": ("t",),
+}
+_SAMPLED = ("output", "update", "guards")  # may take T besides
+
+
+def check_definition(block: Block) -> None:
+    """Refuse equations that are no functions of the arguments they get, and ports that hide them.
+
+    Raises
+    ------
+    DefinitionError
+        A port that is named like an equation, or like an attribute that every block has.
+    TraceError
+        An equation with other arguments.
+    """
+    cls = type(block)
+    ports: dict[str, Port] = {**block.inputs, **block.states, **block.outputs, **block.events}
+    for name in ports:
+        hides = isinstance(inspect.getattr_static(cls, name, None), Port)  # ports made by a property hide nothing
+        if hides and (name in _ARGUMENTS or hasattr(Block, name)):
+            what = "an equation" if name in _ARGUMENTS else "an attribute of every block"
+            raise DefinitionError(f"a port can't be called {name!r}, the name of {what}; rename the port.", port=name)
+    for what, names in _ARGUMENTS.items():
+        function = getattr(block, what, None)
+        if function is None:
+            continue
+        last = ", and T where the sample time is needed" if what in _SAMPLED else ""
+        expected = f"expected {what}(self, {', '.join(names)}){last}"
+        if not callable(function):
+            raise TraceError(f"its {what} is {_named(function)}; {expected}. Define it as a function.")
+        try:
+            signature = inspect.signature(function)
+            given = {"T": None} if what in (*_SAMPLED, "derivative") and "T" in signature.parameters else {}
+            signature.bind(*names, **given)
+        except (TypeError, ValueError):
+            written = str(inspect.signature(getattr(cls, what))).partition(" ->")[0]
+            raise TraceError(f"found {what}{written}; {expected}. Give it these arguments.") from None
+
+
+def takes_update(block: Block, sampled: bool) -> bool:
+    """Whether the states advance by ``update``: in a sampled frame, else where nothing else advances them."""
+    if not hasattr(block, "update"):
+        return False
+    return sampled or not (hasattr(block, "derivative") or (block.events and not block.memory))
+
+
+def untraceable(error: Exception, block: Block, what: str) -> str:
+    """Say which line of the user's equations an operation failed on."""
+    # by the code's own file, which a notebook's cell and a script have too; helpers beside the equation count as well
+    written: Any = block.function if isinstance(block, Function) else getattr(type(block), what)
+    equation: Any = inspect.unwrap(written)
+    while isinstance(equation, functools.partial):
+        equation = equation.func
+    if not hasattr(equation, "__code__"):  # an object that can be called
+        equation = type(equation).__call__
+    file = getattr(getattr(equation, "__code__", None), "co_filename", None)
+    line, step = "", error.__traceback__
+    while step is not None:
+        if step.tb_frame.f_code.co_filename == file:
+            code = linecache.getline(file, step.tb_lineno).strip()
+            line = f" in line {step.tb_lineno} of {file}" + (f", {code!r}" if code else "")
+        step = step.tb_next
+    text = f"its {what} can't be traced{line}: {type(error).__name__}: {error}."
+    if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
+        return f"{text} Correct the equation there."
+    arguments, instead = (
+        ("its arguments", ", or PythonFunction, which is not traced")
+        if isinstance(block, Function)
+        else ("(t, x, u)", "")
+    )
+    return (
+        f"{text} Use NumPy functions of {arguments}: np.where for branches, np.stack for vectors, np.sqrt and not "
+        f"math.sqrt{instead}."
+    )
+
+
+def _named(value: Any) -> str:
+    """Say in words what an equation returned."""
+    if value is None:
+        return "nothing"
+    shape = _shape(value)
+    if isinstance(value, ArrayInterface | np.ndarray | float | int | np.number):
+        return f"an array of shape {shape}" if shape else "a single value"
+    if isinstance(value, list | tuple | Mapping):
+        keys = f" ({', '.join(map(str, value))})" if isinstance(value, Mapping) and value else ""
+        return f"a {type(value).__name__} of {len(value)}{keys}"
+    return f"a {type(value).__name__}" if not isinstance(value, str) else repr(value)
+
+
+def _shape(value: Any) -> Shape | None:
+    """Return the shape of a traced value or of numbers, None for anything else."""
+    if isinstance(value, ArrayInterface):
+        return tuple(value.shape)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # symbols in a list
+        return None
+    return array.shape if array.dtype.kind in "biuf" else None
+
+
+def parts_of(result: Any, names: list[str], what: str) -> list[Any]:
+    """Return the values of an equation, one for each name.
+
+    Raises
+    ------
+    TraceError
+        It returned nothing, or not as many values as there are names.
+    """
+    if result is None and names:
+        raise TraceError(f"its {what} returned nothing; expected {_expected(names)}. End it with a return.")
+    if len(names) == 1:
+        return [result]
+    if isinstance(result, list | tuple) and len(result) == len(names):
+        return list(result)
+    raise TraceError(
+        f"its {what} returned {_named(result)}; expected {_expected(names)}. Write return {', '.join(names)}."
+    )
+
+
+def _expected(names: list[str]) -> str:
+    return f"the value of {names[0]}" if len(names) == 1 else f"a tuple of {len(names)}: {', '.join(names)}"
+
+
+def split(result: Any, declared: Mapping[str, Shape | None], what: str) -> tuple[dict[str, Any], dict[str, Shape]]:
+    """Match what an equation returned with the ports declared: columns, and shapes.
+
+    Raises
+    ------
+    TraceError, ShapeError
+        Not one value for each port, or one that is no array of the declared shape.
+    """
+    made, shapes = {}, {}
+    names = list(declared)
+    for name, part in zip(names, parts_of(result, names, what), strict=True):
+        made[name], shapes[name] = _column(part, declared[name], name, what)
+    return made, shapes
+
+
+def _column(part: Any, expected: Shape | None, name: str, what: str) -> tuple[Any, Shape]:
+    shape = _shape(part)
+    if shape is None:
+        n = len(part) if isinstance(part, list | tuple) else 0
+        wanted = (
+            "a number or an array" if expected is None else f"a value of shape {expected}" if expected else "one value"
+        )
+        if isinstance(part, Mapping):
+            step = "Return the value itself."
+        elif n > 1 or (n and expected):
+            step = "Build a vector with np.stack: return np.stack([…])."
+        elif n:
+            step = "Return the value itself, without brackets or a comma behind it."
+        else:
+            step = "Compute it with NumPy functions of t, x and u."
+        raise TraceError(f"its {what} returned {_named(part)} for {name}; expected {wanted}. {step}", port=name)
+    if expected is not None and shape != expected:
+        if len(expected) == 1 and size(shape) == 1:
+            step = f"Return a vector: np.stack([…]) of {expected[0]}."
+        else:
+            step = "Return another one, or declare this shape."
+        raise ShapeError(f"its {what} gives shape {shape}; expected {expected} as declared. {step}", port=name)
+    flat = flat_column(part)
+    if flat.numel() != size(shape):
+        raise ShapeError(f"its {what} gives {flat.numel()} entries for shape {shape}; index it explicitly.", port=name)
+    return ca.densify(flat), shape
+
+
+def guards_of(result: Any) -> dict[str, Any]:
+    """Return the guards' scalar columns by name.
+
+    Raises
+    ------
+    TraceError, ShapeError
+        No dictionary, or an expression that is no scalar.
+    """
+    if not isinstance(result, Mapping) or not all(isinstance(name, str) for name in result):
+        raise TraceError(
+            f"its guards returned {_named(result)}; expected a dictionary of expressions by name, which must stay "
+            "positive, such as {'margin': 1.0 - x.y}. Return one."
+        )
+    made = {}
+    for name, value in result.items():
+        shape = _shape(value)
+        if shape != ():
+            raise ShapeError(
+                f"its guard {name!r} is {_named(value)}; expected a scalar. Take np.min of it, or name each entry."
+            )
+        made[name] = flat_column(value)
+    return made
+
+
+def start_values(block: Block, shapes: Mapping[str, Shape]) -> dict[str, np.ndarray]:
+    """Return the start value of every state, for inputs of the given shapes.
+
+    Raises
+    ------
+    DefinitionError
+        A start or a ``like`` that names nothing, or a start that is no number.
+    ShapeError
+        A start value that doesn't fit the input whose shape the state takes.
+    """
+    values = {}
+    for name, port in block.states.items():
+        if port.like is not None and port.like not in shapes:
+            raise DefinitionError(
+                f"found like={port.like!r}; expected an input: {', '.join(shapes) or 'there are none'}.", port=name
+            )
+        if isinstance(port.start, str) and port.start not in block.parameters and not hasattr(block, port.start):
+            known = ", ".join(block.parameters) or "there are none"
+            raise DefinitionError(
+                f"found start={port.start!r}; expected a number or the name of a parameter: {known}.", port=name
+            )
+        try:
+            values[name] = port.start_value(block, shapes)
+        except LoopwrightError:
+            raise
+        except (TypeError, ValueError) as error:
+            given = getattr(block, port.start, None) if isinstance(port.start, str) else port.start
+            shape = _shape(given)
+            if port.like is None or shape is None:
+                raise DefinitionError(
+                    f"found start={given!r} ({error}); expected numbers. Give a number, a vector or a parameter.",
+                    port=name,
+                ) from error
+            raise ShapeError(
+                f"found a start value of shape {shape}; expected a number, or shape {shapes[port.like]} as the input "
+                f"{port.like!r} has. Give one of these.",
+                port=port.start if isinstance(port.start, str) else name,
+            ) from error
+    return values
+
+
+def start_shapes(block: Block) -> list[Shape]:
+    """Return the shapes that the start values have by themselves, whatever the inputs' shapes are."""
+    shapes = []
+    for port in block.states.values():
+        alone = State(start=port.start)
+        shapes.append(tuple(alone.start_value(block, {}).shape))
+    return shapes
+
+
+def initial_state(block: Any, states: Mapping[str, Shape], u: Any) -> np.ndarray:
+    """Return the state that ``initial`` computes from the inputs ``u``, flat.
+
+    Raises
+    ------
+    TraceError, ShapeError
+        Not one value for each state, or one of another shape.
+    """
+    names = list(states)
+    columns = [np.zeros(0)]
+    for name, part in zip(names, parts_of(block.initial(u), names, "initial"), strict=True):
+        shape = _shape(part)
+        if shape is None:
+            raise TraceError(f"its initial returned {_named(part)} for {name}; expected numbers.", port=name)
+        if size(shape) != size(states[name]):
+            raise ShapeError(f"its initial gives shape {shape}; expected {states[name]}, as the state has.", port=name)
+        columns.append(np.ravel(np.asarray(part, dtype=float)))
+    return np.concatenate(columns)

@@ -1,0 +1,75 @@
+"""Symbols and columns: CasADi's values with NumPy's interface, and back."""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from casadi import ArrayInterface
+
+from ..core.errors import ShapeError
+from ..core.ports import Shape
+
+
+def size(shape: Shape) -> int:
+    """Return the number of entries of a shape."""
+    return int(np.prod(shape, dtype=int))
+
+
+@lru_cache(maxsize=4096)
+def _tuple_type(kind: str, names: tuple[str, ...]) -> Any:
+    return namedtuple(kind, names)
+
+
+def bundle(kind: str, values: Mapping[str, Any]) -> Any:
+    """Return a named tuple of states, inputs or outputs, as equations get it."""
+    return _tuple_type(kind, tuple(values))(*values.values())
+
+
+def expanded(function: Any) -> Any:
+    """Return the function in scalar (SX) operations, each done once, or as it is where it looks up tables."""
+    try:
+        scalar = function.expand()
+    except RuntimeError:
+        return function
+    arguments = scalar.sx_in()
+    return ca.Function(function.name(), arguments, ca.cse(scalar.call(arguments)))
+
+
+def with_values(block: Any, values: Mapping[str, Any]) -> Any:
+    """Return a copy of ``block`` whose attributes are replaced, without going through its constructor."""
+    copy = object.__new__(type(block))
+    copy.__dict__.update(block.__dict__)
+    nested: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        head, _, rest = name.partition(".")
+        if rest:
+            nested.setdefault(head, {})[rest] = value
+        else:
+            copy.__dict__[name] = value
+    for head, inner in nested.items():
+        copy.__dict__[head] = with_values(block.__dict__[head], inner)
+    return copy
+
+
+def wrap(flat: Any, shape: Shape) -> Any:
+    """Give a flat CasADi column NumPy's interface, in C order."""
+    if shape == ():
+        return ArrayInterface(flat, ndim=0)
+    if len(shape) == 1:
+        return ArrayInterface(flat.T, ndim=1)
+    if len(shape) == 2:
+        return ArrayInterface(ca.reshape(flat, shape[1], shape[0]).T, ndim=2)
+    raise ShapeError(f"found a signal of shape {shape}; expected at most two dimensions.")
+
+
+def flat_column(value: Any) -> Any:
+    """Return a traced value (or plain numbers) as a CasADi column in C order."""
+    if isinstance(value, ArrayInterface):
+        inner = value.to_casadi()
+        return ca.vec(inner.T) if value.ndim == 2 else ca.vec(inner)
+    return ca.MX(ca.DM(np.ravel(np.asarray(value, dtype=float))))

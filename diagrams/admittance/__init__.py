@@ -1,0 +1,1 @@
+"""Admittance that an environment feels, and coupled stability."""

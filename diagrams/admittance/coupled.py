@@ -1,0 +1,148 @@
+"""The compliance loop coupled to an environment: poles and growth rate (`compliance_loop` derives the model).
+
+The robot and its environment, a mass m_e, a damper b_e and a spring k_e, make one closed loop. Its growth rate σ is the
+largest real part of its poles, ln|z|/T for those of a sampled loop; it is stable where σ < 0.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.values import Array
+from .compliance_loop import AdmittanceLoop, Linear, check_environment, held
+
+
+def closed_loop(loop: AdmittanceLoop, **environment: Any) -> Array:
+    """Return the system matrix of the coupled loop, continuous or over one sample.
+
+    ``environment`` as in `poles`. Where the continuous equations have no solution, because the force that is fed back
+    through the acceleration would turn its sign, the matrix is NaN.
+    """
+    if loop.implementation == "ideal":
+        return _ideal(loop, **environment)
+    n = len(loop.directions)
+    plant, K = loop.plant_matrices(**environment), loop.controller_matrices
+    if loop.implementation == "sampled":
+        P = held(plant, loop.sample_time, n)
+    else:
+        P = Linear(plant.A, plant.B[..., :n], plant.C, plant.D[..., :n])
+    F = np.eye(n) - K.D @ P.D
+    bad = np.linalg.det(F) <= 0.0
+    F_inv = np.linalg.inv(np.where(bad[..., None, None], np.eye(n), F))
+    on_x, on_k = F_inv @ K.D @ P.C, F_inv @ K.C  # u = on_x x + on_k x_k
+    A = np.concatenate(
+        [
+            np.concatenate([P.A + P.B @ on_x, P.B @ on_k], axis=-1),
+            np.concatenate([K.B @ (P.C + P.D @ on_x), K.A + K.B @ P.D @ on_k], axis=-1),
+        ],
+        axis=-2,
+    )
+    return np.where(bad[..., None, None], np.nan, A)
+
+
+def _ideal(
+    loop: AdmittanceLoop, stiffness: Array = 0.0, damping: Array = 0.0, mass: Array = 0.0, tool_mass: Any = None
+) -> Array:
+    check_environment(stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
+    a, q = loop.admittance, loop.scale
+    tool = loop.tool_mass if tool_mass is None else tool_mass
+    k, b, m, tool = np.broadcast_arrays(*(np.asarray(v, dtype=float) for v in (stiffness, damping, mass, tool)))
+    A = np.zeros((*k.shape, 2, 2))
+    inertia = a.mass + q * (m + tool)
+    A[..., 0, 1] = 1.0
+    A[..., 1, 0], A[..., 1, 1] = -(a.stiffness + q * k) / inertia, -(a.effective_damping + q * b) / inertia
+    return A
+
+
+def poles(
+    loop: AdmittanceLoop,
+    *,
+    stiffness: Array = 0.0,
+    damping: Array = 0.0,
+    mass: Array = 0.0,
+    tool_mass: Array | None = None,
+) -> Array:
+    """Return the poles of the coupled loop, s in 1/s or z.
+
+    Parameters
+    ----------
+    loop : AdmittanceLoop
+        Robot and controller.
+    stiffness, damping, mass : float or array
+        The environment: k_e in N/m, b_e in N s/m, m_e in kg. Arrays are broadcast.
+    tool_mass : float or array, optional
+        Instead of the loop's own, kg.
+
+    Returns
+    -------
+    ndarray
+        The poles along the last axis. The pure drift of a coupled direction that has neither environment nor stiffness
+        is left out.
+    """
+    A = closed_loop(loop, stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
+    solvable = np.isfinite(A).all(axis=(-1, -2))
+    values: Any = np.linalg.eigvals(np.where(solvable[..., None, None], A, 0.0))
+    values = np.where(solvable[..., None], values, np.nan)
+    drift = 0 if loop.implementation == "ideal" else loop.drifting
+    if drift:
+        rest = 1.0 if loop.implementation == "sampled" else 0.0
+        order = np.argsort(np.abs(values - rest), axis=-1)
+        values = np.take_along_axis(values, order, axis=-1)[..., drift:]
+    return values
+
+
+def growth_rate(loop: AdmittanceLoop, **environment: Any) -> Array:
+    """Return σ in 1/s: the coupled loop grows like exp(σ t), and is stable where σ < 0.
+
+    Parameters
+    ----------
+    loop : AdmittanceLoop
+        Robot and controller.
+    **environment
+        As `poles` takes it; arrays are broadcast.
+
+    Returns
+    -------
+    float or ndarray
+        Infinite where the continuous equations have no solution.
+    """
+    values = rates(loop, poles(loop, **environment))
+    sigma = np.where(np.isnan(values).any(axis=-1), np.inf, np.max(values.real, axis=-1))
+    return float(sigma) if np.ndim(sigma) == 0 else sigma
+
+
+def rates(loop: AdmittanceLoop, values: Array) -> Array:
+    """Return poles in 1/s; those of a sampled loop by s = ln z/T."""
+    if loop.implementation != "sampled":
+        return values
+    return np.log(np.where(np.abs(values) < 1e-300, 1e-300, values)) / loop.sample_time
+
+
+def crossing_frequency(loop: AdmittanceLoop, **environment: Any) -> float:
+    """Return the frequency of the fastest growing pole, rad/s."""
+    values = rates(loop, poles(loop, **environment))
+    return float(abs(values[np.argmax(values.real)].imag))
+
+
+def growth_rate_by_control(loop: AdmittanceLoop, **environment: float) -> float:
+    """Return the growth rate from python-control's discretization and feedback of plant and controller."""
+    import control
+
+    n = len(loop.directions)
+    P, K = loop.plant_matrices(**environment), loop.controller_matrices
+    if loop.implementation == "continuous":
+        if np.linalg.det(np.eye(n) - K.D @ P.D[:, :n]) <= 0.0:
+            return float("inf")
+        plant = control.ss(P.A, P.B[:, :n], P.C, P.D[:, :n])
+        values = control.feedback(plant, control.ss(*K), sign=1).poles()
+    else:
+        T = loop.sample_time
+        sampled = control.sample_system(control.ss(P.A, P.B[:, :n], P.C, np.zeros((3 * n, n))), T, method="zoh")
+        last = control.ss(np.zeros((n, n)), np.eye(n), P.D[:, :n], np.zeros((3 * n, n)), T)
+        values = control.feedback(sampled + last, control.ss(*K, T), sign=1).poles()
+    if loop.drifting:
+        rest = 0.0 if loop.implementation == "continuous" else 1.0
+        values = values[np.argsort(np.abs(values - rest))][loop.drifting :]
+    return float(np.max(rates(loop, values).real))

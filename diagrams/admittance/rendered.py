@@ -1,0 +1,251 @@
+"""Target and rendered admittance of one direction, and what its real part says about passivity.
+
+An admittance is velocity over force, Y(jω) = V/F in m/(N s), with the velocity in m/s: off the path, that along it is q
+times the rate of η (E22). The target is that of the admittance filter,
+
+    Y(s) = q s/(m s² + d s + k),
+
+the rendered one that of the whole loop of `compliance_loop`, from a force F on the tool to the velocity ṗ. In a
+sampled loop F(t) = e^{jωt} acts in continuous time; the motor force is a staircase, and Y is the fundamental of the
+velocity, the part at ω itself: the mean of ṗ(t) e^{−jωt} over one sample, from the steady state of the sampled loop and
+the exact motion of the plant under the held motor force and F in between. The aliases of ω are not in Y.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import OptionError
+from ...blocks.core.values import Array
+from .compliance_loop import AdmittanceLoop, held
+from .coupled import closed_loop
+
+CONTINUOUS = "Re Y(jω) ≥ 0 at all frequencies and no unstable pole is passivity of this linear model, and of it alone."
+SAMPLED = (
+    "Y is the fundamental of a sampled loop: Re Y(jω) < 0 disproves passivity; Re Y(jω) ≥ 0 doesn't prove it, as the "
+    "aliases of a motion carry power too."
+)
+OFF_PATH = (
+    " Off the path the force that is conjugate to the rate of η is q F∥ (E22): driven by F∥, the admittance is not "
+    "passive in motions that change q, whatever Re Y says at one point."
+)
+_LOWEST = 1e-2  # rad/s, from where is scanned
+_HIGHEST = 1e5
+_ROUNDED = 1e-10  # of |Y|: smaller real parts are rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Passivity:
+    """The sign of the real part of a rendered admittance.
+
+    Attributes
+    ----------
+    frequency : float
+        First frequency in rad/s at which Re Y changes to negative; infinite where it doesn't on the scan.
+    intervals : tuple of pairs of float
+        Frequencies from where to where Re Y is negative, rad/s; the last may end with the scan.
+    scanned : tuple of float
+        From where to where was scanned; up to the Nyquist frequency π/T where the loop is sampled.
+    stable : bool
+        Whether the loop alone, without environment, has no pole that grows.
+    caveat : str
+        What the sign means here, and what it doesn't.
+    tolerance : float
+        Relative error of the frequencies.
+    """
+
+    frequency: float
+    intervals: tuple[tuple[float, float], ...]
+    scanned: tuple[float, float]
+    stable: bool
+    caveat: str
+    tolerance: float = 1e-9
+
+
+def target_admittance(loop: AdmittanceLoop, omega: Array) -> Array:
+    """Return the admittance that is asked for, m/(N s), at frequencies in rad/s."""
+    s, a = 1j * np.asarray(omega, dtype=float), loop.admittance
+    return loop.scale * s / (a.mass * s * s + a.effective_damping * s + a.stiffness)
+
+
+def rendered_admittance(loop: AdmittanceLoop, omega: Array) -> Array:
+    """Return the admittance that the environment feels, m/(N s).
+
+    Parameters
+    ----------
+    loop : AdmittanceLoop
+        Robot and controller.
+    omega : float or array
+        Frequencies in rad/s, below the Nyquist frequency π/T where the loop is sampled.
+
+    Raises
+    ------
+    OptionError
+        A frequency that is not positive, or not below the Nyquist frequency.
+    """
+    w = np.asarray(omega, dtype=float)
+    top = math.pi / loop.sample_time if loop.implementation == "sampled" else math.inf
+    if not np.all((w > 0.0) & (w < top)):
+        raise OptionError(
+            f"found frequencies from {np.min(w):g} to {np.max(w):g} rad/s; expected them positive"
+            f"{f', below the Nyquist frequency {top:.6g} rad/s' if top < math.inf else ''}.",
+            port="omega",
+        )
+    if loop.implementation == "ideal":
+        return _ideal(loop, w)
+    return _continuous(loop, w) if loop.implementation == "continuous" else _sampled(loop, w)
+
+
+def rendered_system(loop: AdmittanceLoop) -> Any:
+    """Return the rendered admittance as a `control.StateSpace`, from the force F to the velocity ṗ.
+
+    A sampled loop gives the discrete system from a force that is held over each sample to the velocity at the ticks,
+    which contains the aliases; `rendered_response` gives the fundamental.
+    """
+    import control
+
+    names: dict[str, Any] = {"inputs": [f"F_{loop.side}"], "outputs": [f"velocity_{loop.side}"], "name": "admittance"}
+    if loop.implementation == "ideal":
+        a, q, tool = loop.admittance, loop.scale, loop.tool_mass
+        return control.ss(
+            closed_loop(loop), [[0.0], [1.0 / (a.mass + q * tool)]], [[0.0, q]], 0.0, states=["e", "e_rate"], **names
+        )
+    n, i = len(loop.directions), _index(loop)
+    plant, K = loop.plant_matrices(), loop.controller_matrices
+    B = plant.B[:, [n + i]]
+    if loop.implementation == "continuous":
+        D_u, D_F = plant.D[:, :n], plant.D[:, [n + i]]
+        F_inv = np.linalg.inv(np.eye(n) - K.D @ D_u)
+        u = F_inv @ K.D @ D_F
+        B_all = np.vstack([B + plant.B[:, :n] @ u, K.B @ (D_F + D_u @ u)])
+        A, dt, states = closed_loop(loop), 0.0, _state_names(loop)
+    else:
+        dt = loop.sample_time
+        push = control.sample_system(control.ss(plant.A, B, np.eye(2 * n), np.zeros((2 * n, 1))), dt, method="zoh").B
+        at_once = np.zeros((3 * n, 1))
+        at_once[2 * n + i] = 1.0
+        # what the tool's acceleration shows of F is that of the last sample: F is kept as a state
+        later = _driven(loop, np.zeros((2 * n, 1)), plant.D[:, [n + i]] - at_once)
+        A = np.block([[closed_loop(loop), later], [np.zeros((1, len(later) + 1))]])
+        B_all, states = np.vstack([_driven(loop, push, at_once), [[1.0]]]), [*_state_names(loop), f"F_{loop.side}_last"]
+    C = np.zeros((1, len(A)))
+    C[0, n + i] = 1.0
+    return control.ss(A, B_all, C, 0.0, dt, states=states, **names)
+
+
+def rendered_response(loop: AdmittanceLoop, omega: Array) -> Any:
+    """Return the rendered admittance as `control.FrequencyResponseData`; see `rendered_admittance`."""
+    import control
+
+    w = np.asarray(omega, dtype=float)
+    return control.frd(rendered_admittance(loop, w), w, inputs=[f"F_{loop.side}"], outputs=[f"velocity_{loop.side}"])
+
+
+def passivity(
+    loop: AdmittanceLoop, *, low: float = _LOWEST, high: float | None = None, per_decade: int = 200
+) -> Passivity:
+    """Return where the real part of the rendered admittance is negative.
+
+    Parameters
+    ----------
+    loop : AdmittanceLoop
+        Robot and controller.
+    low, high : float, optional
+        From where to where to scan, rad/s; the second by default the Nyquist frequency, or 1e5 rad/s.
+    per_decade : int, optional
+        Points of the scan.
+
+    Raises
+    ------
+    OptionError
+        As `rendered_admittance`.
+    """
+    from scipy.optimize import brentq
+
+    sampled = loop.implementation == "sampled"
+    top = (math.pi / loop.sample_time * (1.0 - 1e-9) if sampled else _HIGHEST) if high is None else high
+    grid = np.geomspace(low, top, max(8, math.ceil(per_decade * math.log10(top / low)) + 1))
+
+    def sine(w: Array) -> Array:
+        Y = rendered_admittance(loop, w)
+        return Y.real / np.abs(Y) + _ROUNDED
+
+    positive = sine(grid) >= 0.0
+
+    def edge(i: int) -> float:
+        return math.exp(brentq(lambda y: float(sine(math.exp(y))), *np.log(grid[i : i + 2]), xtol=1e-13))
+
+    edges = ([] if positive[0] else [low]) + [edge(int(i)) for i in np.flatnonzero(positive[1:] != positive[:-1])]
+    if len(edges) % 2:
+        edges.append(top)
+    poles = np.linalg.eigvals(closed_loop(loop))
+    stable = bool(np.all(np.abs(poles) <= 1.0 + 1e-9) if sampled else np.all(poles.real <= 1e-6))
+    return Passivity(
+        frequency=edges[0] if edges else math.inf,
+        intervals=tuple(zip(edges[::2], edges[1::2], strict=True)),
+        scanned=(low, top),
+        stable=stable,
+        caveat=(SAMPLED if sampled else CONTINUOUS) + (OFF_PATH if loop.side == "par" and loop.q != 1.0 else ""),
+    )
+
+
+def _index(loop: AdmittanceLoop) -> int:
+    return loop.directions.index(loop.side)
+
+
+def _ideal(loop: AdmittanceLoop, w: Array) -> Array:
+    s, a, q = 1j * w, loop.admittance, loop.scale
+    return q * s / ((a.mass + q * loop.tool_mass) * s * s + a.effective_damping * s + a.stiffness)
+
+
+def _continuous(loop: AdmittanceLoop, w: Array) -> Array:
+    system = rendered_system(loop)
+    eye = np.eye(len(system.A))
+    x = np.linalg.solve(1j * w[..., None, None] * eye - system.A, system.B.astype(complex))
+    return (system.C @ x)[..., 0, 0]
+
+
+def _driven(loop: AdmittanceLoop, push: Array, force: Array) -> Array:
+    """Return how the sampled loop's states take what F moves in one sample, and what the sensor shows of it at once."""
+    n, K = len(loop.directions), loop.controller_matrices
+    P = held(loop.plant_matrices(), loop.sample_time, n)
+    u = K.D @ force
+    moved = np.concatenate([push, np.zeros((*push.shape[:-2], n, 1))], axis=-2)
+    on_k = np.broadcast_to(K.B @ force, (*push.shape[:-2], len(K.A), 1))
+    return np.concatenate([moved + P.B @ u, on_k], axis=-2)
+
+
+def _sampled(loop: AdmittanceLoop, w: Array) -> Array:
+    from scipy.linalg import expm
+
+    n, i, T = len(loop.directions), _index(loop), loop.sample_time
+    plant, K = loop.plant_matrices(), loop.controller_matrices
+    x, every = 2 * n, 3 * n + 1
+    # (p, ṗ), the held u and F = e^{jωt} as one system, seen from a frame that turns with F, and its mean over a sample
+    turning = np.zeros((*w.shape, 2 * every, 2 * every), dtype=complex)
+    turning[..., :x, :x] = plant.A
+    turning[..., :x, x : x + n] = plant.B[:, :n]
+    turning[..., :x, x + n] = plant.B[:, n + i]
+    turning[..., every - 1, every - 1] = 1j * w
+    turning[..., :every, :every] -= 1j * w[..., None, None] * np.eye(every)
+    turning[..., :every, every:] = np.eye(every) / T
+    turned = expm(turning * T)
+    z = np.exp(1j * w * T)[..., None, None]
+    push, mean = z * turned[..., :x, every - 1 : every], turned[..., :every, every:]
+    shown = plant.D[:, [n + i]]
+    A = closed_loop(loop)
+    states = np.linalg.solve(z * np.eye(len(A)) - A, _driven(loop, push, shown))
+    y = held(plant, T, n).C @ states[..., : 3 * n, :] + shown
+    u = K.C @ states[..., 3 * n :, :] + K.D @ y
+    now = np.concatenate([states[..., :x, :], u, np.ones((*w.shape, 1, 1))], axis=-2)
+    return (mean @ now)[..., n + i, 0]
+
+
+def _state_names(loop: AdmittanceLoop) -> list[str]:
+    kinds = ["p", "velocity", *(["last_force"] if loop.implementation == "sampled" else []), "integral", "e", "e_rate"]
+    kinds += [f"computed_{j + 1}" for j in range(loop.delay if loop.implementation == "sampled" else 0)]
+    return [f"{kind}_{side}" for kind in kinds for side in loop.directions]

@@ -1,0 +1,355 @@
+"""What a diagram is analysed with: operating points and linear models, as methods of `Diagram`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .drawing.svg import Drawing
+    from .linearization.linearize import Linearization
+    from .linearization.operating_point import OperatingPoint
+    from .measure.frequency_response import FrequencyResponse
+    from .report.model import Report
+
+
+class Analysis:
+    """The methods of `Diagram` that analyse it."""
+
+    def operating_point(
+        self: Any, t: float = 0.0, *, states: Mapping[str, Any] | None = None, **options: Any
+    ) -> OperatingPoint:
+        """Run to a time, and return everything that a linear model at that instant depends on.
+
+        Parameters
+        ----------
+        t : float
+            Time in s, a tick.
+        states : mapping, optional
+            Values of states of blocks and FMUs that are given, by path: ``{"plant.position": 0.2}``. Signals, and the
+            FMUs' outputs, are then what follows from them.
+        **options
+            How to run: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step`` and ``start`` of `simulate`.
+
+        Raises
+        ------
+        UnknownNameError
+            A state that isn't there.
+        """
+        if states:
+            from .linearization.trim import given
+
+            return given(self, t, states, options)
+        from .linearization.operating_point import at_time
+
+        return at_time(self, t, options)
+
+    def trim(
+        self: Any,
+        free: Mapping[str, Any] | Iterable[str] | None = None,
+        targets: Mapping[str, Any] | None = None,
+        *,
+        rates: Mapping[str, Any] | None = None,
+        fixed: Iterable[str] = (),
+        at: Any = None,
+        tolerance: float = 1e-9,
+        **options: Any,
+    ) -> OperatingPoint:
+        """Find an operating point: the states and parameters at which signals have given values, and all is at rest.
+
+        Every state of a block or an FMU is unknown, unless it is fixed, and is asked to stay: rates are zero, sampled
+        states repeat. The equations are solved by least squares within bounds, with the exact derivatives of the
+        diagram and the linear models of its FMUs. A state that nothing determines stays near where the search begins.
+
+        Parameters
+        ----------
+        free : mapping of str to (low, high), or list of str, optional
+            Parameters that may change, by the paths of `replace`, with their bounds in their units, or None:
+            ``{"force.value": (-10, 10)}``. An FMU's are ``"plant.start.mass"``. A state that is named here gets bounds.
+        targets : mapping, optional
+            Values that signals are to have, by the names of wires or ports: ``{"position": 0.2}``.
+        rates : mapping, optional
+            Rates of states in their unit per second that are not zero, by path; None where any rate will do.
+        fixed : list of str, optional
+            States that keep the value with which the search begins.
+        at : OperatingPoint, Snapshot or float, optional
+            Where the search begins, as in `linearize`; also the time at which sources are taken, and what discrete
+            states and enabled boxes are. Without it, the start.
+        tolerance : float
+            Largest residual of an equation, relative to 1 + the size of what it belongs to.
+        **options
+            How to run to where the search begins, as in `operating_point`; ``step`` is needed where only an FMU steps.
+
+        Returns
+        -------
+        OperatingPoint
+            With ``parameters``, the values found, and ``residuals``, what is left of each equation by name. `linearize`
+            takes it with its parameters, ``simulate(…, start=point)`` runs from it.
+
+        Raises
+        ------
+        SimulationError
+            If no such point is found; the message has the largest residuals, and the parameters at a bound.
+        UnknownNameError, OptionError, ParameterError
+            A name that isn't there, bounds or values that don't fit, a parameter that can't change.
+        FmuError
+            An FMU without a linear model.
+
+        Examples
+        --------
+        >>> from loopwright.blocks import Constant, Integrator
+        >>> from loopwright.diagrams import Diagram
+        >>> level, inflow = Integrator(name="level"), Constant(value=1.0, name="inflow")
+        >>> tank = Diagram("tank", level(inflow - 0.5 * level.y))
+        >>> point = tank.trim(free={"inflow.value": (0, 10)}, targets={"level.y": 3.0})
+        >>> round(point.parameters["inflow.value"], 12)
+        1.5
+        """
+        from .linearization.trim import trim
+
+        return trim(self, free, targets, rates=rates, fixed=fixed, at=at, tolerance=tolerance, **options)
+
+    def linearize(
+        self: Any,
+        point: Any = None,
+        *,
+        inputs: str | Iterable[str] = (),
+        outputs: str | Iterable[str] = (),
+        openings: str | Iterable[str] = (),
+        plants: str | None = None,
+        **options: Any,
+    ) -> Linearization:
+        """Return the linear model of this very diagram at an operating point.
+
+        It is continuous where everything is continuous. With sampled subsystems it is discrete, over one base period
+        or, with several rates, their least common one; hold, delay and the time between ticks are exact. What it does
+        not follow, such as a quantizer or an event within the period, is said in its ``notes``.
+
+        Parameters
+        ----------
+        point : OperatingPoint, Snapshot or float, optional
+            Where: ``run.at(t)``, a time in s, `operating_point`, `trim`; the start without it.
+        inputs : str or list of str
+            Wires or ports at which a signal is injected: added to what the consumers get; over a period it is held.
+        outputs : str or list of str
+            Wires or ports that are measured: what the block puts out, ahead of an injection there.
+        openings : str or list of str
+            Wires that are cut behind the port, for all its consumers, which get its value at the operating point: that
+            stays what it is.
+        plants : {"equations", "step", "identified"}, optional
+            How an FMU's step is linearized: by its equations' Jacobian and a matrix exponential, right at an
+            equilibrium; by differences of the step itself; or from its pulse responses from rest, without its states.
+            Without it the first at an equilibrium, else the second, and the third where the FMU allows neither.
+        **options
+            How to run to the operating point, where it is a time: see `operating_point`. With ``step`` a diagram that
+            is continuous but for an FMU is linearized over its communication step.
+
+        Returns
+        -------
+        Linearization
+            With `Linearization.system`, a `control.StateSpace` with names, and the loops: ``.loop("v_perp")``.
+
+        Raises
+        ------
+        UnknownNameError
+            A signal that isn't there.
+        WiringError
+            An opening at which nothing is wired, or a transport delay in continuous time.
+        FmuError
+            An FMU that can't be linearized; the error says what it lacks.
+        """
+        from .linearization.linearize import linearize
+
+        return linearize(self, point, inputs=inputs, outputs=outputs, openings=openings, plants=plants, **options)
+
+    def linearize_batch(
+        self: Any,
+        points: Iterable[Any] = (None,),
+        variants: Iterable[Mapping[str, Any]] = ({},),
+        **options: Any,
+    ) -> list[Linearization]:
+        """Return the linear models at several operating points and with several parameters.
+
+        Parameters
+        ----------
+        points : iterable
+            Operating points, as `linearize` takes them. A time, or an instant of a run, is run to with each variant
+            anew; an `OperatingPoint` is taken as it is, with the variant's parameters.
+        variants : iterable of mapping
+            What `replace` changes: ``[{"controller.pid_par.poles": (-30, -30, -30)}, …]``.
+        **options
+            As for `linearize`.
+
+        Returns
+        -------
+        list of Linearization
+            All points of the first variant, then those of the second one, and so on; ``found.diagram`` is the variant.
+
+        Raises
+        ------
+        LoopwrightError
+            As `linearize` and `replace`; the message says with which variant, and at which point.
+        """
+        from .linearization.linearize import batch
+
+        return batch(self, points, variants, **options)
+
+    def report(
+        self: Any,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        pdf: bool = False,
+        json: bool = False,
+        **options: Any,
+    ) -> Report:
+        """Analyse the diagram for design, and write the report; see docs/reports.md.
+
+        Parameters
+        ----------
+        path : path, optional
+            File to write, ``.html``; without it nothing is written. A notebook shows what is returned.
+        pdf, json : bool
+            Write ``.pdf`` (which needs ``pip install 'loopwright[pdf]'``) and ``.json`` beside it, too.
+        **options
+            What `loopwright.diagrams.report.analyse.analyse` takes, such as ``point`` and ``loops``.
+
+        Returns
+        -------
+        Report
+            Its sections, and ``.numbers()`` by dotted path.
+
+        Raises
+        ------
+        OptionError
+            A path that does not end in ``.html``, or a PDF without the library that makes it.
+        ConfirmationError
+            A number that its independent confirmation does not bear out.
+        """
+        from .report.analyse import analyse
+        from .report.figures import with_drawing
+        from .report.files import check_files, write_report
+
+        check_files(path, pdf=pdf, json=json)
+        made = with_drawing(analyse(self, **options), self)
+        write_report(made, path, pdf=pdf, json=json)
+        return made
+
+    def draw(
+        self: Any,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        box: str = "",
+        closed: bool | Iterable[str] | None = None,
+    ) -> Drawing:
+        """Draw the diagram itself: blocks, boxes with their rates, wires with their names, FMUs marked.
+
+        Signals run from left to right; what closes a loop runs back below. Nothing but Python is needed.
+
+        Parameters
+        ----------
+        path : path, optional
+            File to write, ``.svg``.
+        box : str
+            Path of the subsystem whose inside is drawn; the whole diagram without it.
+        closed : bool or list of str, optional
+            Subsystems that are drawn closed: all of them, or those of the list. Without it all are open, in a diagram
+            of more than 40 blocks closed.
+
+        Returns
+        -------
+        Drawing
+            A notebook shows it; ``.svg`` is its text.
+
+        Raises
+        ------
+        OptionError
+            No such subsystem, or a file that is no ``.svg``.
+
+        Examples
+        --------
+        >>> from loopwright.blocks import Gain, Sine
+        >>> from loopwright.diagrams import Diagram
+        >>> Diagram("demo", Gain(gain=2)(Sine(frequency=1))).draw().svg[:4]
+        '<svg'
+        """
+        from .drawing.svg import Drawing, draw
+
+        drawing = Drawing(draw(self, box=box, closed=closed))
+        if path is not None:
+            drawing.save(path)
+        return drawing
+
+    def _repr_svg_(self: Any) -> str:
+        return str(self.draw().svg)
+
+    def frequency_response(
+        self: Any,
+        wire: str,
+        frequencies: Any,
+        *,
+        amplitude: float,
+        kind: str = "sine",
+        at: Any = 0.0,
+        outputs: str | Iterable[str] = (),
+        windows: int = 40,
+        agreement: float = 1e-6,
+        **options: Any,
+    ) -> FrequencyResponse:
+        """Measure a frequency response on the running diagram: a test signal d is added at a wire.
+
+        With v what the wire's port puts out, and u = v + d what all its consumers get, S = u/d, T = −v/d and L = −v/u,
+        which is what `Linearization.sensitivity`, `complementary` and `loop` say of the same wire. All are sampled
+        where the linear model is, at the ticks of the least common period of what is sampled, and d is held between
+        them; in a diagram that is continuous throughout, d is continuous. So the phasors are those of what is sampled:
+        a plant's velocity, read at 1 kHz, holds the aliased ripple of the controller's hold, and its fundamental in
+        continuous time is another by 1e-4 to 1e-3.
+
+        The signal is ramped in; then windows of whole periods follow until two agree. Sources go on meanwhile: take a
+        diagram whose references stand still, or a time from which on they do, and look at ``moved``.
+
+        Parameters
+        ----------
+        wire : str
+            A wire or port, or an entry of it, ``"motor_force[0]"``. Of one with several entries, each is excited in a
+            run of its own, and the responses are matrices.
+        frequencies : array_like
+            In rad/s. They are moved by less than half a sample in a window, so that whole periods fit into it.
+        amplitude : float
+            Largest value of the test signal, in the wire's unit: small enough that nothing saturates.
+        kind : {"sine", "multisine", "chirp"}
+            One sine after the other; all at once, with Schroeder's phases; a linear sweep over their range, repeated.
+        at : OperatingPoint, Snapshot or float
+            Where: `trim`, ``run.at(t)``, or a time in s that is run to first.
+        outputs : str or list of str
+            Further signals to be measured: `FrequencyResponse.response`, from the test signal to them.
+        windows : int
+            Most windows that are waited for.
+        agreement : float
+            Relative difference of two windows at which a frequency is done.
+        **options
+            How to run, as in `operating_point`. A continuous diagram is run with rtol = 1e-9, atol = 1e-12, and sampled
+            16 times in a period of the highest frequency, if nothing else is said.
+
+        Returns
+        -------
+        FrequencyResponse
+            ``S``, ``T``, ``L`` and ``response`` as `control.FrequencyResponseData`, with the estimate's own
+            ``uncertainty`` and ``distortion``; ``compare(linearization)`` is the largest relative deviation from a
+            linear model.
+
+        Raises
+        ------
+        UnknownNameError
+            A signal that isn't there.
+        WiringError
+            A port that nothing is wired to.
+        OptionError
+            Frequencies that are not positive or too high for the samples, no amplitude, an unknown kind.
+        """
+        from .measure.frequency_response import frequency_response
+
+        return frequency_response(
+            self, wire, frequencies, amplitude=amplitude, kind=kind, at=at, outputs=outputs, windows=windows,
+            agreement=agreement, **options,
+        )  # fmt: skip

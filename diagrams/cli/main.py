@@ -1,0 +1,354 @@
+"""The command line, ``loopwright``.
+
+Exit status: 0 done, 1 a run or a build failed (what a run recorded is written) or an FMU has problems, 2 wrong usage,
+130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import json
+import math
+import os
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from inspect import signature
+from pathlib import Path
+from tempfile import TemporaryFile
+from types import MappingProxyType
+from typing import Any
+
+from ...blocks.core.errors import FmuError, FmuFileError, LoopwrightError, OptionError, near
+from ...fmus.models import gantry
+from ..paper.experiments import DEFAULTS, EXPERIMENTS, Experiment
+from ..paper.key_numbers import DEFINITIONS, key_numbers
+from ..results.run import Run
+from .fmu import COMMANDS, add_commands
+from .report import add_report, report_command
+from .text import fit as _fit
+from .text import say as _say
+
+SIGNALS = (
+    "eta",
+    "xi",
+    "position",
+    "velocity",
+    "force",
+    "motor_force",
+    "v_par",
+    "v_perp",
+    "theta",
+    "q",
+    "eta_p",
+    "xi_p",
+)
+"""Signals of the CSV file, in order."""
+
+_INTERRUPTED = "interrupted"
+_WORDS: Mapping[str, bool | None] = MappingProxyType(
+    {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False, "none": None, "null": None}
+)
+_SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0), "m/s2": ("m/s²", 1.0)}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit status.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        The arguments; those of the process without it.
+    """
+    parser = _parser()
+    try:
+        arguments = parser.parse_args(argv)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    if arguments.command is None:
+        parser.print_help(sys.stderr)
+        return 2
+    try:
+        return {**COMMANDS, "report": report_command}.get(arguments.command, _run)(arguments)
+    except OptionError as error:
+        _say(f"loopwright: error: {error}", sys.stderr)
+        return 2
+    except BrokenPipeError:  # the reader of a pipe, such as head, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it ends
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="loopwright", description="Block diagrams and co-simulation for control engineers."
+    )
+    parser.add_argument("--version", action="version", version=f"loopwright {_version()}")
+    commands = parser.add_subparsers(dest="command", metavar="command")
+    width = max(len(name) for name in DEFINITIONS)
+    run = commands.add_parser(
+        "run",
+        help="run the experiments of the paper",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Run experiments of the paper: A path following, B compliance, C hand guiding, D force tracking.\n"
+        "Writes the samples (A.csv), the key numbers (A.json, SI units) and two figures (A_path, A_signals;\n"
+        ".png and .svg) of each, in place of an earlier run's. A run that fails writes what it recorded, and why it\n"
+        'failed ("error" in A.json); one that recorded nothing writes nothing, and an earlier run\'s files stay.',
+        epilog="options (--option), with their defaults:\n  "
+        + "\n  ".join(_option_lines())
+        + "\n  An option that only some experiments have is given to those.\n\nkey numbers:\n"
+        + "\n".join(f"  {name:{width}}  [{unit}] {text}" for name, (unit, text) in DEFINITIONS.items())
+        + '\n  In A.json a number that there is none of is null; "never" lists the settling times without end.\n\n'
+        "exit status:\n  0    done\n  1    a run failed, or a plant could not be built\n"
+        "  2    wrong usage; nothing was run\n"
+        "  130  interrupted (Ctrl-C); what was recorded until then is written",
+    )
+    run.add_argument("letters", nargs="*", metavar="LETTER", help="A, B, C, D, also as A,B or AB; all four without one")
+    run.add_argument("--out", metavar="DIR", default="out", help="folder for the files (default: out)")
+    run.add_argument("--plant", metavar="FILE.fmu", help="another plant in place of the gantry")
+    run.add_argument(
+        "--option",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        dest="options",
+        help="an option of the experiments; repeat it for several",
+    )
+    add_report(commands)
+    add_commands(commands)
+    return parser
+
+
+def _version() -> str:
+    try:
+        return version("loopwright")
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
+# --- what is asked for ----------------------------------------------------------------------------------------------
+
+
+def _known(letter: str) -> dict[str, Any]:
+    """Return the options of an experiment with their defaults."""
+    own = {p.name: p.default for p in signature(EXPERIMENTS[letter]).parameters.values() if p.kind is p.KEYWORD_ONLY}
+    limits = ("velocity_limit", "acceleration_limit") if letter == "A" else ()  # it has no admittance to limit
+    return {name: value for name, value in {**DEFAULTS, **own}.items() if name not in limits}
+
+
+def _option_lines() -> Iterable[str]:
+    for name, value in {name: value for letter in EXPERIMENTS for name, value in _known(letter).items()}.items():
+        if name not in ("plant", "path"):
+            owners = [letter for letter in EXPERIMENTS if name in _known(letter)]
+            only = "" if len(owners) == len(EXPERIMENTS) else f"  ({', '.join(owners)} only)"
+            yield f"{name}={value}{only}"
+
+
+def _letters(given: Sequence[str]) -> list[str]:
+    """Return the experiments that are meant: ``A B``, ``A,B`` and ``AB`` alike."""
+    pieces = [piece.strip() for text in given for piece in text.split(",")]
+    for piece in pieces:
+        if (not piece and len(pieces) == 1) or any(letter not in EXPERIMENTS for letter in piece.upper()):
+            raise OptionError(f"there is no experiment {piece!r}. Known: {', '.join(EXPERIMENTS)}.")
+    return list(dict.fromkeys("".join(pieces).upper())) or list(EXPERIMENTS)
+
+
+def _options(arguments: argparse.Namespace) -> dict[str, Any]:
+    options: dict[str, Any] = {}
+    for text in arguments.options:
+        name, equals, value = text.partition("=")
+        name = name.strip().replace("-", "_")
+        if not equals or not name:
+            raise OptionError(f"found --option {text!r}; expected NAME=VALUE, such as --option delay=1.")
+        if name == "path":
+            raise OptionError(
+                "a path can't be given on the command line; take Python: "
+                "loopwright.diagrams.experiments.path_following(path=…).simulate().",
+                port="--option path",
+            )
+        if name in options:
+            raise OptionError("it is given twice; give it once.", port=f"--option {name}")
+        options[name] = _value(value.strip())
+    if arguments.plant is not None:
+        if "plant" in options:
+            raise OptionError("the plant is given twice; give it once.", port="--plant")
+        options["plant"] = arguments.plant
+    return options
+
+
+def _value(text: str) -> Any:
+    """Read a word of `_WORDS`, or a Python or JSON literal; anything else is text."""
+    if text.lower() in _WORDS:
+        return _WORDS[text.lower()]
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        return text
+
+
+def _share(letters: Sequence[str], options: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Give every experiment the options that it has."""
+    for name in options:
+        owners = [letter for letter in EXPERIMENTS if name in _known(letter)]
+        without = [letter for letter in letters if letter not in owners]
+        if not owners:
+            known = {name for letter in EXPERIMENTS for name in _known(letter)} - {"path"}
+            raise OptionError(f"no experiment has such an option. {near(name, known)}", port=f"--option {name}")
+        if len(without) == len(letters):
+            raise OptionError(
+                f"{_and(without)} can't take it; an option of {_and(owners)} only.",
+                port=f"--option {name}",
+            )
+        if without:
+            have = "has" if len(owners) == 1 else "have"
+            _say(f"{', '.join(without)}: without {name}, which only {_and(owners)} {have}.", sys.stderr)
+    return {letter: {k: v for k, v in options.items() if k in _known(letter)} for letter in letters}
+
+
+def _and(letters: Sequence[str]) -> str:
+    """Write A; A and B; A, B and C."""
+    *first, last = letters
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def _folder(name: str) -> Path:
+    """Make the folder, and find out whether files can be written there."""
+    folder = Path(name).expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OptionError(f"the folder {name!r} can't be made: {error}. Name another one.", port="--out") from error
+    try:
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OptionError(
+            f"nothing can be written to the folder {name!r}: {error}. Name another one.", port="--out"
+        ) from error
+    return folder
+
+
+# --- running --------------------------------------------------------------------------------------------------------
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    """Build all experiments first, so that wrong usage is found before anything runs; then run them."""
+    letters = _letters(arguments.letters)
+    chosen = _share(letters, _options(arguments))
+    try:
+        if any(options.get("plant") is None for options in chosen.values()):
+            gantry.build(notify=lambda line: _say(line, sys.stderr))
+        experiments = [EXPERIMENTS[letter](**options) for letter, options in chosen.items()]
+    except LoopwrightError as error:
+        _say(f"loopwright: error: {error}", sys.stderr)
+        return 1 if isinstance(error, FmuError) and not isinstance(error, FmuFileError) else 2
+    folder = _folder(arguments.out)
+    table: dict[str, dict[str, float | None]] = {}
+    written: list[list[str]] = []
+    failed: dict[str, str] = {}
+    for experiment in experiments:
+        letter = experiment.letter
+        run, problem = _simulate(experiment)
+        if run is not None and len(run.t):
+            _say(f"{letter}: {run.t[-1]:g} s simulated in {run.elapsed:.2f} s", sys.stderr)
+        if problem is not None:
+            failed[letter] = problem
+            _say(f"loopwright: experiment {letter} failed: {problem}", sys.stderr)
+        if run is None or not len(run.t):
+            _say(f"{letter}: nothing was recorded, so nothing is written{_kept(letter, folder)}.", sys.stderr)
+            if problem == _INTERRUPTED:
+                break
+            continue
+        try:
+            numbers, names = _write(experiment, run, problem, folder)
+        except OSError as error:
+            failed[letter] = f"its files can't be written: {error}"
+            _say(f"loopwright: experiment {letter}: {failed[letter]}", sys.stderr)
+            continue
+        table[letter] = numbers
+        written.append(names)
+        if problem == _INTERRUPTED:
+            break
+    _print_table(table, failed)
+    if written:
+        _say(f"Written to {folder}:")
+    for names in written:
+        _say(f"  {'  '.join(names)}")
+    return 130 if _INTERRUPTED in failed.values() else int(bool(failed))
+
+
+def _simulate(experiment: Experiment) -> tuple[Run | None, str | None]:
+    """Run an experiment; return what it recorded and, where it failed, why."""
+    try:
+        return experiment.simulate(), None
+    except LoopwrightError as error:
+        return getattr(error, "run", None), str(error)
+    except KeyboardInterrupt as interrupt:
+        return getattr(interrupt, "run", None), _INTERRUPTED
+
+
+def _write(
+    experiment: Experiment, run: Run, problem: str | None, folder: Path
+) -> tuple[dict[str, float | None], list[str]]:
+    """Write all files of a run; return its key numbers and the files' names. Older files of the experiment go."""
+    from ..paper.figures import plot_experiment, plot_path
+    from ..results.plots import save
+
+    letter = experiment.letter
+    for file in _files(letter, folder):
+        file.unlink(missing_ok=True)
+    numbers = key_numbers(experiment, run)
+    content: dict[str, Any] = {n: v if v is None or math.isfinite(v) else None for n, v in numbers.items()}
+    content["never"] = [n for n, v in numbers.items() if v is not None and not math.isfinite(v)]
+    if problem is not None:
+        content["error"] = problem
+    run.to_csv(folder / f"{letter}.csv", *SIGNALS)
+    names = [f"{letter}.csv", f"{letter}.json"]
+    (folder / names[1]).write_text(
+        json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
+    for name, plot in (("path", plot_path), ("signals", plot_experiment)):
+        names += [file.name for file in save(plot(experiment, run), folder / f"{letter}_{name}")]
+    return numbers, names
+
+
+def _files(letter: str, folder: Path) -> list[Path]:
+    """Return every file that a run of an experiment writes."""
+    figures = (f"_{kind}.{form}" for kind in ("path", "signals") for form in ("png", "svg"))
+    return [folder / f"{letter}{ending}" for ending in (".csv", ".json", *figures)]
+
+
+def _kept(letter: str, folder: Path) -> str:
+    """Say that an earlier run's files stay, where there are some."""
+    return f"; the files of an earlier run stay in {folder}" if any(f.exists() for f in _files(letter, folder)) else ""
+
+
+# --- printing -------------------------------------------------------------------------------------------------------
+
+
+def _print_table(table: Mapping[str, Mapping[str, float | None]], failed: Mapping[str, str]) -> None:
+    """Print the key numbers, one column for each experiment."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    if not table:
+        return
+    shown = Table(box=box.SIMPLE_HEAD, pad_edge=False, highlight=False)
+    shown.add_column("key number", no_wrap=True)
+    shown.add_column("unit", no_wrap=True)
+    for letter in table:
+        shown.add_column(f"{letter} failed" if letter in failed else letter, justify="right", no_wrap=True)
+    for name, (unit, _) in DEFINITIONS.items():
+        label, factor = ("", 1.0) if name == "real_time_factor" else _SHOWN.get(unit, (unit, 1.0))
+        values = [_number(numbers[name], factor) for numbers in table.values()]
+        if set(values) != {"-"}:
+            shown.add_row(name, _fit(label, sys.stdout), *values)
+    console = Console(file=sys.stdout, width=None if sys.stdout.isatty() else 80, highlight=False)
+    console.print(shown)
+
+
+def _number(value: float | None, factor: float) -> str:
+    if value is None:
+        return "-"
+    return f"{value * factor:.4g}" if math.isfinite(value) else "never"

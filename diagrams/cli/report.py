@@ -1,0 +1,171 @@
+"""The command ``loopwright report``."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from ...blocks.core.errors import DefinitionError, FmuError, FmuFileError, LoopwrightError, OptionError, near
+from ...fmus.models import gantry
+from ..diagram import Diagram
+from ..paper.experiments import EXPERIMENTS, Experiment
+from .text import say
+from .user_models import user_file
+
+DEFAULT = "B"
+"""The experiment whose Fig. 3 is taken: both admittances are in it."""
+
+
+def add_report(commands: Any) -> None:
+    """Add the command to the parser of `main`."""
+    report = commands.add_parser(
+        "report",
+        help="analyse a diagram and write a design report",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Analyse a diagram for design: operating points, poles, margins of its loops, admittance and\n"
+        "coupled stability, each number confirmed by an independent computation; and write it as one HTML page.\n\n"
+        "WHAT is an experiment of the paper (A, B, C or D; B without one: Fig. 3 with both admittances)\n"
+        "or FILE.py:NAME, a diagram of yours, or a function without arguments that returns one.",
+        epilog="options of the experiments: as in loopwright run --help\n\n"
+        "exit status:\n  0    done\n  1    the analysis failed, or a plant could not be built; nothing is written\n"
+        "  2    wrong usage; nothing was analysed\n  130  interrupted (Ctrl-C); nothing is written",
+    )
+    report.add_argument("what", nargs="?", metavar="WHAT", help="A, B, C, D, or FILE.py:NAME")
+    report.add_argument("--out", metavar="FILE.html", help="the page (default: fig3.html, or the diagram's name)")
+    report.add_argument("--pdf", action="store_true", help="the same as PDF beside it (pip install 'loopwright[pdf]')")
+    report.add_argument("--json", action="store_true", help="all numbers as JSON beside it")
+    report.add_argument("--plant", metavar="FILE.fmu", help="another plant in place of the gantry")
+    report.add_argument(
+        "--option",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        dest="options",
+        help="an option of the experiment, such as delay=1; repeat it for several",
+    )
+
+
+def report_command(arguments: argparse.Namespace) -> int:
+    """Make the diagram, analyse it, write the files; return the exit status."""
+    from ..report.files import check_files, write_report
+
+    what = arguments.what or DEFAULT
+    with contextlib.ExitStack() as open_file:
+        try:
+            diagram, experiment = open_file.enter_context(_subject(what, arguments))
+        except OptionError:
+            raise
+        except LoopwrightError as error:
+            say(f"loopwright: error: {error}", sys.stderr)
+            return 1 if isinstance(error, FmuError) and not isinstance(error, FmuFileError) else 2
+        out = arguments.out or (f"{diagram.name}.html" if arguments.what else "fig3.html")
+        check_files(out, pdf=arguments.pdf, json=arguments.json)
+        began = time.perf_counter()
+        try:
+            with _progress(diagram.name) as tell:
+                report = _analysed(diagram, experiment, tell)
+        except LoopwrightError as error:
+            say(f"loopwright: error: {error}", sys.stderr)
+            return 1
+        except KeyboardInterrupt:
+            say("loopwright: interrupted; nothing is written.", sys.stderr)
+            return 130
+        say(f"{diagram.name}: {len(report.numbers())} numbers in {time.perf_counter() - began:.1f} s", sys.stderr)
+        try:
+            files = write_report(report, out, pdf=arguments.pdf, json=arguments.json)
+        except OSError as error:
+            say(f"loopwright: error: the report can't be written: {error}. Name another file.", sys.stderr)
+            return 1
+    say(f"Written: {'  '.join(map(str, files))}")
+    return 0
+
+
+def _analysed(diagram: Diagram, experiment: Experiment | None, tell: Callable[[str], None]) -> Any:
+    from ..report.analyse import analyse
+    from ..report.figures import with_drawing
+
+    return with_drawing(analyse(diagram, experiment=experiment, progress=tell), diagram)
+
+
+@contextlib.contextmanager
+def _progress(name: str) -> Iterator[Callable[[str], None]]:
+    """Show on a terminal which section is being made, and since when."""
+    if not sys.stderr.isatty():
+        yield lambda key: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(f"{name}: analysing", total=None)
+        yield lambda key: progress.update(task, description=f"{name}: {key.replace('_', ' ')}")
+
+
+# --- what is analysed -----------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _subject(what: str, arguments: argparse.Namespace) -> Iterator[tuple[Diagram, Experiment | None]]:
+    """Yield the diagram, and its experiment where it is one."""
+    if ".py" in what:
+        for name, given in (("--option", arguments.options), ("--plant", arguments.plant)):
+            if given:
+                raise OptionError("it is for experiments; set it in the file.", port=name)
+        with user_file(what, port="WHAT") as (module, path, name):
+            found = _diagram(vars(module), str(path), path.name, name)
+            yield (found.diagram, found) if isinstance(found, Experiment) else (found, None)
+        return
+    experiment = _experiment(what, arguments)
+    yield experiment.diagram, experiment
+
+
+def _experiment(what: str, arguments: argparse.Namespace) -> Experiment:
+    from .main import _options, _share
+
+    letter = what.upper()
+    if letter not in EXPERIMENTS:
+        raise OptionError(
+            f"found {what!r}; expected one of {', '.join(EXPERIMENTS)}, or FILE.py:NAME, such as loop.py:diagram.",
+            port="WHAT",
+        )
+    options = _share([letter], _options(arguments))[letter]
+    if options.get("plant") is None:
+        gantry.build(notify=lambda line: say(line, sys.stderr))
+    return EXPERIMENTS[letter](**options)
+
+
+def _diagram(names: dict[str, Any], who: str, file: str, name: str) -> Diagram | Experiment:
+    """Return what a name of a user's file stands for."""
+    known = [key for key, value in names.items() if isinstance(value, Diagram | Experiment)]
+    if not name:
+        if len(known) == 1:
+            return names[known[0]]  # type: ignore[no-any-return]
+        example = f" Write {file}:{known[0]}." if known else f" Write {file}:NAME."
+        raise OptionError(f"expected FILE.py:NAME. Its diagrams: {', '.join(known) or 'none'}.{example}", block=who)
+    if name not in names:
+        hint = near(name, known) if known else "There is no Diagram in it."
+        raise OptionError(f"there is no {name!r} in it. {hint}", block=who)
+    found = names[name]
+    if callable(found) and not isinstance(found, Diagram | Experiment | type):
+        try:
+            found = found()
+        except LoopwrightError:
+            raise
+        except Exception as error:
+            raise DefinitionError(
+                f"{name}() fails: {type(error).__name__}: {error}. Give a diagram, or a function without arguments "
+                "that returns one.",
+                block=who,
+            ) from error
+    if not isinstance(found, Diagram | Experiment):
+        raise OptionError(
+            f"found {type(found).__name__} for {name!r}; expected a Diagram. Its diagrams: "
+            f"{', '.join(known) or 'none'}.",
+            block=who,
+        )
+    return found

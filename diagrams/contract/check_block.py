@@ -1,0 +1,221 @@
+"""The contract of a block, checked: `check_block`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.block import Block
+from ...blocks.core.errors import DefinitionError, LoopwrightError, OptionError, SampleTimeError, ShapeError, near
+from ...blocks.core.ports import Shape
+from ...blocks.tracing.trace import trace
+from .events import check_events, check_smooth, instants
+from .exercise import Bench, Exercise, frame_text, points
+from .runs import check_run
+from .traces import check_derivatives, check_feedthrough, check_guards, check_shapes, check_trace, swallowed
+from .values import check_ports, check_purity, check_values
+
+
+@dataclass(frozen=True)
+class BlockReport:
+    """What `check_block` has found out about a block that keeps its contract.
+
+    Attributes
+    ----------
+    block : str
+        Name of the block.
+    frames : mapping
+        For "sampled" and "continuous": "checked", or why the block refuses to stand in such a frame.
+    checks : mapping
+        What was checked, with numbers, by "frame: rule" or by rule.
+    feedthrough : mapping
+        By frame, the pairs (input, output) that show when the input is changed.
+    unseen : mapping
+        By frame, the pairs that the trace has and that never showed: blocks are ordered as if they did.
+    swallowed : mapping
+        By frame, the pairs that show for numbers but never for NaN, as with ``np.where(u > 0.0, 1.0, 0.0)``.
+    quiet : tuple of str
+        Events that never fired, in the exercise and in the run.
+    """
+
+    block: str
+    frames: Mapping[str, str]
+    checks: Mapping[str, str]
+    feedthrough: Mapping[str, frozenset[tuple[str, str]]] = field(default_factory=dict)
+    unseen: Mapping[str, frozenset[tuple[str, str]]] = field(default_factory=dict)
+    swallowed: Mapping[str, frozenset[tuple[str, str]]] = field(default_factory=dict)
+    quiet: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        lines = [f"{self.block} keeps the contract of a block."]
+        lines += [f"  {frame} frame: {text}" for frame, text in self.frames.items()]
+        lines += [f"  {what}: {text}" for what, text in self.checks.items()]
+        for frame, pairs in self.unseen.items():
+            lines += [f"  {frame}: {y} depends on {u} in the trace, and never did" for u, y in sorted(pairs)]
+        for frame, pairs in self.swallowed.items():
+            lines += [f"  {frame}: {y} is a number where {u} is NaN" for u, y in sorted(pairs)]
+        lines += [f"  event {name}: never fired" for name in self.quiet]
+        return "\n".join(lines)
+
+
+def check_block(
+    block: Block,
+    inputs: Mapping[str, Any] | None = None,
+    *,
+    shapes: Mapping[str, Shape] | None = None,
+    sample_time: float = 0.01,
+    ticks: int = 100,
+    seed: int = 0,
+    frames: Iterable[str] = (),
+) -> BlockReport:
+    """Check that a block keeps the contract of blocks, the library's or one of your own.
+
+    - Values: pickling and ``replace`` give an equal block, a changed parameter another one.
+    - Ports: units can be read and are as many as entries; what ``like`` names is there.
+    - Purity: the same arguments give the same results, are unchanged, and nothing is kept on the block.
+    - Shapes, and the traced results: as NumPy's, at random points; the derivatives of the trace as differences are.
+    - Feedthrough: no output changes with an input that the trace doesn't show.
+    - Smoothness in a continuous frame: outputs and rates jump only at `next_instant` and where an indicator of an event
+      changes its sign. Indicators are finite, and jumps at one instant come to an end.
+    - Runs in a sampled and in a continuous frame (where the block allows it): a saved state, pickled, goes on as the
+      straight run does, bit for bit.
+
+    An FMU, and a transport delay, have no equations to look at: their values, ports and runs are checked.
+
+    Parameters
+    ----------
+    block : Block
+        The block.
+    inputs : mapping, optional
+        For each input by name: a range ``(low, high)``, or a signal (a source of its own). Without one it is what the
+        port declares as minimum and maximum, else three times its nominal value to both sides.
+    shapes : mapping, optional
+        Shapes of inputs that take any; scalars without it.
+    sample_time : float
+        Sample time of the sampled frame, and time between samples in the continuous one, in s.
+    ticks : int
+        Length of the runs in sample times, at least 4.
+    seed : int
+        Seed of points and signals.
+    frames : list of str, optional
+        "sampled", "continuous" or both, in which the block must stand; without it those that it does not refuse.
+
+    Returns
+    -------
+    BlockReport
+        What was checked; ``print`` it.
+
+    Raises
+    ------
+    DefinitionError
+        A rule that is not kept: what was found, what was expected, what to do. A `TraceError`, `ShapeError` or
+        `UnitError` where it is of this kind.
+    SimulationError
+        A run of the block that stopped; other ranges of its inputs may be needed.
+
+    Examples
+    --------
+    >>> from loopwright.blocks import Saturation
+    >>> from loopwright.diagrams import check_block
+    >>> report = check_block(Saturation(limit=1.0), shapes={"u": (2,)})
+    >>> report.frames
+    {'sampled': 'checked', 'continuous': 'checked'}
+    """
+    if not isinstance(block, Block):
+        raise DefinitionError(
+            f"found {block!r}; expected a block, such as Gain(gain=2). Give an object, not its class."
+        )
+    checks = {"values": check_values(block)}
+    exercise = Exercise.of(block, inputs or {}, shapes or {}, sample_time, ticks, seed)
+    checks["ports"] = check_ports(block)
+    announced = instants(block, exercise.duration)
+    checks["next_instant"] = f"{len(announced)} within {exercise.duration:g} s"
+    found = _Findings(exercise, announced, checks)
+    wanted = _wanted(frames)
+    refused = [error for sampled in wanted if (error := found.frame(sampled)) is not None]
+    if refused and (frames or len(refused) == len(wanted)):
+        raise refused[0]
+    return found.report()
+
+
+def _wanted(frames: Iterable[str]) -> list[bool]:
+    """Return which kinds of frames are wanted: sampled True, continuous False."""
+    names = [frame_text(sampled) for sampled in (True, False)]
+    for name in (given := list(frames)):
+        if name not in names:
+            raise OptionError(
+                f"found {name!r}; expected 'sampled' or 'continuous'. {near(name, names)}",
+                block="check_block",
+                port="frames",
+            )
+    return [sampled for sampled in (True, False) if not given or frame_text(sampled) in given]
+
+
+class _Findings:
+    """What is found about a block, frame by frame."""
+
+    def __init__(self, exercise: Exercise, announced: list[float], checks: dict[str, str]):
+        self.exercise, self.announced, self.checks = exercise, announced, checks
+        self.frames: dict[str, str] = {}
+        self.feedthrough: dict[str, frozenset[tuple[str, str]]] = {}
+        self.unseen: dict[str, frozenset[tuple[str, str]]] = {}
+        self.swallowed: dict[str, frozenset[tuple[str, str]]] = {}
+        self.quiet: set[str] = set()
+
+    def frame(self, sampled: bool) -> LoopwrightError | None:
+        """Check the block in a frame of one kind; return the error with which it refuses to stand there."""
+        exercise, kind, checks = self.exercise, frame_text(sampled), self.checks
+        block = exercise.block
+        if block.transport or hasattr(block, "instantiate"):
+            self.run(sampled)
+            return None
+        rng = np.random.default_rng([exercise.seed, 20140])
+        equations = check_purity(exercise, sampled, list(points(exercise, rng, 6)))
+        try:
+            traced = trace(block, exercise.shapes, sampled=sampled, cache={})
+        except (SampleTimeError, ShapeError) as error:
+            vector = any(exercise.shapes.values())
+            if isinstance(error, ShapeError) and (sampled or not block.events or not vector):
+                raise
+            self.frames[kind] = str(error)
+            return error
+        bench = Bench(exercise, sampled, traced)
+        checks[f"{kind}: purity"] = f"{equations} equations"
+        check_shapes(bench)
+        checks[f"{kind}: trace"] = f"as NumPy to {check_trace(bench):.1e}, at {len(bench.points)} points"
+        checks[f"{kind}: derivatives"] = f"as differences to {check_derivatives(bench):.1e}"
+        measured, unseen = check_feedthrough(bench)
+        self.feedthrough[kind], self.unseen[kind] = frozenset(measured), frozenset(unseen)
+        self.swallowed[kind] = frozenset(swallowed(bench, measured))
+        checks[f"{kind}: feedthrough"] = f"{len(measured)} pairs, {len(unseen)} more in the trace"
+        if guards := check_guards(bench):
+            checks[f"{kind}: guards"] = str(guards)
+        if not sampled:
+            checks[f"{kind}: smooth"] = f"{check_smooth(bench, self.announced)} intervals"
+            fired, self.quiet = check_events(bench)
+            if block.events:
+                checks[f"{kind}: events"] = f"{fired} fired in small steps"
+        self.run(sampled)
+        return None
+
+    def run(self, sampled: bool) -> None:
+        """Check a run in a frame of one kind."""
+        kind = frame_text(sampled)
+        text, fired = check_run(self.exercise, sampled)
+        self.quiet -= fired
+        self.checks[f"{kind}: run"], self.frames[kind] = text, "checked"
+
+    def report(self) -> BlockReport:
+        """Return what was found."""
+        return BlockReport(
+            self.exercise.block.label,
+            self.frames,
+            self.checks,
+            self.feedthrough,
+            self.unseen,
+            self.swallowed,
+            tuple(sorted(self.quiet)),
+        )

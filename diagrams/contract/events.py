@@ -1,0 +1,208 @@
+"""The rules that a block keeps in continuous time: instants, smoothness in between, and events; see `check_block`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ...blocks.core.block import Block
+from ...blocks.tracing.symbols import bundle
+from .exercise import Bench, Point
+from .values import broken
+
+_INSTANTS = 200  # asked for at most
+_SAME_INSTANT = 100  # jumps that may follow each other at one instant
+_FINENESS = 13  # refinements of an interval by 8, each
+
+
+def instants(block: Block, end: float) -> list[float]:
+    """Return the instants up to an end that a block announces, after checking that they rise."""
+    found: list[float] = []
+    t = 0.0
+    while len(found) < _INSTANTS:
+        following = block.next_instant(t)
+        good = isinstance(following, int | float) and following > t and block.next_instant(t) == following
+        if not good:
+            raise broken(
+                "next_instant",
+                f"next_instant({t!r}) gave {following!r}; expected a later time, the same at every call, or math.inf. "
+                "Return the first one strictly after t.",
+                block,
+            )
+        between = t + 0.5 * (min(following, end) - t)
+        if following <= end and block.next_instant(between) != following:
+            raise broken(
+                "next_instant",
+                f"next_instant({t!r}) gave {following!r}, but next_instant({between!r}) "
+                f"{block.next_instant(between)!r}; expected the same one from all times before it. Return the first "
+                "one strictly after t.",
+                block,
+            )
+        if following > end:
+            break
+        found.append(float(following))
+        t = float(following)
+    return found
+
+
+def check_smooth(bench: Bench, announced: list[float]) -> int:
+    """Look for jumps that nothing announces, in a continuous frame, and return how many intervals were searched."""
+    if bench.sampled or not (bench.traced.outputs or bench.traced.states) or bench.block.memory:
+        return 0
+    searched = 0
+    edges = np.unique([0.0, *announced[:24], bench.exercise.duration])
+    function = bench.traced.function
+    symbols = function.mx_in()
+    *outputs, rates, _ = function.call(symbols)
+    rows = [*outputs, *([rates] if bench.traced.advance == "derivative" else [])]
+    if not bench.block.opaque:
+        rows.append(ca.jacobian(ca.vertcat(*outputs), symbols[0]))
+    in_time = ca.Function("in_time", symbols, [ca.densify(ca.vertcat(*rows))])
+    rest = bench.points[1].columns()[1:]
+    for left, right in pairwise(edges):
+        margin = 1e-6 * (right - left)
+
+        def time(s: Any, first: float = left + margin, span: float = right - left - 2.0 * margin) -> Any:
+            return first + s * span
+
+        def along(s: np.ndarray, time: Any = time) -> np.ndarray:
+            return np.array(in_time.call([time(s)[None], *rest, bench.p])[0])
+
+        def domains(s: float, time: Any = time) -> tuple[bool, ...]:
+            return _domains(bench, [time(s), *rest])
+
+        where = _jump(along, domains)
+        searched += 1
+        if where is not None:
+            raise broken(
+                "next_instant",
+                f"its outputs, or their rates, jump at t = {time(where):.9g} s, and next_instant does not announce it; "
+                "expected smooth outputs between instants. Return this time from next_instant, or make it an Event.",
+                bench.block,
+            )
+    return searched + _search_signals(bench)
+
+
+def _search_signals(bench: Bench) -> int:
+    """Look for jumps of outputs and rates along straight lines between two points, in inputs and continuous states."""
+    shown = len(bench.traced.outputs) + (bench.traced.advance == "derivative")
+    pairs = list(zip(bench.points[1:11], bench.points[2:12], strict=True))
+    for number, (one, other) in enumerate(pairs):
+        u = {n: other.u[n] for n in bench.exercise.ranges}
+        for name in bench.exercise.signals:  # as near as two of its samples
+            i = int(np.searchsorted(bench.exercise.times, one.t))
+            u[name] = bench.exercise.samples[name][min(i + 1, len(bench.exercise.times) - 1)]
+        x = {n: v if bench.block.states[n].discrete else other.x[n] for n, v in one.x.items()}
+        ends = [one.columns(), Point(one.t, x if number % 2 else one.x, {n: u[n] for n in one.u}, one.fired).columns()]
+
+        def at(s: Any, ends: Any = ends) -> list[Any]:
+            return [
+                ends[0][0],
+                *(np.outer(a, 1.0 - s) + np.outer(b, s) for a, b in zip(*(e[1:] for e in ends), strict=True)),
+            ]
+
+        def along(s: np.ndarray) -> np.ndarray:
+            found = [v for v in bench.in_trace(at(s))[:shown] if v.size]
+            return np.vstack([np.broadcast_to(v, (len(v), len(s))) for v in found]) if found else np.zeros((0, len(s)))
+
+        where = _jump(along, lambda s: _domains(bench, at(np.array([s]))))
+        if where is not None:
+            near = [[float(f"{v:.6g}") for v in np.ravel(part)] for part in at(np.array([where]))[1:]]
+            shown_at = dict(zip(("x", *one.u), near, strict=True))
+            raise broken(
+                "events",
+                f"in a continuous frame its outputs or derivatives jump at {shown_at} and "
+                "no indicator crosses zero there; expected every discontinuity to be an event. Declare an Event "
+                "with this indicator, and keep the branch in a State(discrete=True).",
+                bench.block,
+            )
+    return len(pairs)
+
+
+def _domains(bench: Bench, columns: list[Any]) -> tuple[bool, ...]:
+    return () if bench.traced.indicators is None else tuple(bench.extra("indicators", columns) > 0.0)
+
+
+def _jump(along: Callable[[np.ndarray], np.ndarray], domains: Callable[[float], Any]) -> float | None:
+    """Return where in [0, 1] a row of a function jumps without a change of domains, or None.
+
+    The part with the largest change is refined: there a smooth function changes less and less, one that jumps as much.
+    """
+    grid = np.linspace(0.0, 1.0, 65)
+    coarse = along(grid)
+    for row in range(len(coarse)):
+        s, values = grid, coarse[row]
+        if not np.all(np.isfinite(values)):
+            continue
+        scale = 1.0 + np.max(np.abs(values))
+        first = np.max(np.abs(np.diff(values))) / scale
+        for _ in range(_FINENESS):
+            change = np.abs(np.diff(values)) / scale
+            i = int(np.argmax(change))
+            if not change[i] > 1e-3 * first or not change[i] > 1e-7:
+                break
+            s = np.linspace(s[i], s[i + 1], 9)
+            values = along(s)[row]
+        else:
+            low, high = max(s[0] - 1e-7, 0.0), min(s[-1] + 1e-7, 1.0)
+            if domains(low) == domains(high):
+                return float(s[-1])
+    return None
+
+
+# --- events -----------------------------------------------------------------------------------------------------------
+
+
+def check_events(bench: Bench) -> tuple[int, set[str]]:
+    """Go along the exercise in small steps, let events jump, and return how many fired, and which never did."""
+    block, exercise = bench.block, bench.exercise
+    if bench.traced.indicators is None:
+        return 0, set()
+    names, kinds = list(block.events), [port.direction for port in block.events.values()]
+    x, shown = bench.points[0].columns()[1], np.zeros(len(names), dtype=int)
+    if block.starts_from_inputs:
+        first = {n: np.asarray(v) for n, v in exercise.inputs_at(0).items()}
+        x = np.concatenate([np.ravel(v) for v in _as_tuple(block.initial(bundle("u", first)), len(block.states))])
+    above = None
+    h = exercise.times[1]
+    for i, t in enumerate(exercise.times):
+        inputs = [np.ravel(v) for v in exercise.inputs_at(i).values()]
+        for count in range(_SAME_INSTANT + 1):
+            z = bench.extra("indicators", [t, x, *inputs])
+            if not np.all(np.isfinite(z)):
+                bad = names[int(np.argmin(np.isfinite(z)))]
+                raise broken(
+                    "events",
+                    f"its indicator is {z.tolist()} at t = {t:.6g} s, x = {x.tolist()}; expected finite numbers. "
+                    "Guard the operation that fails with np.where.",
+                    block,
+                    bad,
+                )
+            now = z > 0.0
+            above = now if above is None else above
+            changes = {"both": now != above, "rising": now & ~above, "falling": above & ~now}
+            fired = np.array([changes[kind][j] for j, kind in enumerate(kinds)])
+            above = now
+            if not fired.any():
+                break
+            if count == _SAME_INSTANT:
+                again = ", ".join(n for n, f in zip(names, fired, strict=True) if f)
+                raise broken(
+                    "events",
+                    f"at t = {t:.6g} s its events go on firing ({again}), {count} times at one instant; expected a "
+                    "jump after which nothing fires. Let it lead to a state in which the indicator stays where it is.",
+                    block,
+                )
+            shown += fired
+            x = bench.extra("jump", [t, x, *inputs], fired.astype(float))
+        if bench.traced.advance == "derivative":
+            x = x + h * np.ravel(bench.in_trace([t, x, *inputs])[len(bench.traced.outputs)])
+    return int(shown.sum()), {n for n, count in zip(names, shown, strict=True) if not count}
+
+
+def _as_tuple(value: Any, count: int) -> tuple[Any, ...]:
+    return (value,) if count == 1 else tuple(value)

@@ -1,0 +1,233 @@
+"""The rules that a block keeps as a value: parameters, ports, and equations that are pure; see `check_block`."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import pickle
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.block import Block
+from ...blocks.core.errors import DefinitionError, LoopwrightError, UnitError
+from ...blocks.core.units import parse_unit
+from ...blocks.tracing.symbols import bundle, size, with_values
+from .exercise import Exercise, Point, numbers_of
+
+
+def broken(rule: str, text: str, block: Block, port: str | None = None, kind: Any = DefinitionError) -> LoopwrightError:
+    """Return the error for a rule that is not kept."""
+    error: LoopwrightError = kind(f"{rule}: {text}", block=block.label, port=port)
+    return error
+
+
+def check_values(block: Block) -> str:
+    """Check equality, pickling and ``replace``, and return what was done."""
+    same = block.replace()
+    if same != block or hash(same) != hash(block):
+        raise broken(
+            "values",
+            f"replace() without changes gave {same!r}, which is not equal to {block!r}; expected an equal block. Leave "
+            "the constructor and == as they are, and check parameters in check().",
+            block,
+        )
+    try:
+        copy = pickle.loads(pickle.dumps(block))
+        pickled = "pickled"
+    except Exception as error:  # an object's pickling may raise anything
+        culprit = next((n for n, v in block.parameters.items() if not _can_be_pickled(v)), None)
+        if culprit is None:
+            raise broken(
+                "values",
+                f"it can't be pickled ({type(error).__name__}: {error}); expected a value that can. Define its class "
+                "at the top of a module, and keep nothing on it but parameters.",
+                block,
+            ) from error
+        copy, pickled = block, f"not pickled, since its {culprit} can't be"
+    if copy != block or vars(copy).keys() != vars(block).keys():
+        raise broken(
+            "values",
+            f"pickled and read back it is {copy!r} with the attributes {sorted(vars(copy))}; expected {block!r} with "
+            f"{sorted(vars(block))}. Keep nothing on it but parameters.",
+            block,
+        )
+    changed = [name for name in block.parameters if _check_replace(block, name)]
+    return f"{pickled}; {len(changed)} of {len(block.parameters)} parameters replaced"
+
+
+def _can_be_pickled(value: Any) -> bool:
+    try:
+        pickle.dumps(value)
+    except Exception:
+        return False
+    return True
+
+
+def _check_replace(block: Block, name: str) -> bool:
+    """Change one parameter and change it back; return whether it could be."""
+    old = block.parameters[name]
+    for value in _others(old):
+        if np.array_equal(value, old):
+            continue
+        try:
+            variant = block.replace(**{name: value})
+        except LoopwrightError:  # out of bounds, or it doesn't fit the other parameters
+            continue
+        if not np.array_equal(variant.parameters[name], value) or variant == block:
+            raise broken(
+                "values",
+                f"replace({name}={value!r}) gave {variant!r}, and it {'equals' if variant == block else 'is not'} what "
+                f"was asked for; expected another block with this value. Don't change parameters in the constructor.",
+                block,
+                name,
+            )
+        if variant.replace(**{name: old}) != block:
+            raise broken(
+                "values",
+                f"replace({name}={value!r}) and back gave {variant.replace(**{name: old})!r}; expected {block!r}. Let "
+                "no parameter depend on another one.",
+                block,
+                name,
+            )
+        return True
+    return False
+
+
+def _others(value: Any) -> list[Any]:
+    """Return other values of a parameter, of which one may be allowed."""
+    if isinstance(value, bool):
+        return [not value]
+    if isinstance(value, int):
+        return [value + 1, value - 1]
+    if isinstance(value, float | np.ndarray):
+        return [1.25 * value + 0.0 if np.any(value) else value + 0.5, 0.75 * value, value + 0.125, value - 0.125]
+    return []
+
+
+def check_ports(block: Block) -> str:
+    """Check what the ports declare, and return how many there are."""
+    kinds = {"inputs": block.inputs, "outputs": block.outputs, "states": block.states, "events": block.events}
+    count = 0
+    for kind, ports in kinds.items():
+        if [*ports] != [*getattr(block, kind)]:
+            raise broken(
+                "ports", f"its {kind} are {[*ports]}, then {[*getattr(block, kind)]}; expected the same.", block
+            )
+        for name, port in ports.items():
+            count += 1
+            if port.name != name:
+                raise broken(
+                    "ports",
+                    f"it stands under {name!r} and calls itself {port.name!r}; expected one name. Give name={name!r}.",
+                    block,
+                    name,
+                )
+            like = getattr(port, "like", None)
+            if like is not None and like not in block.inputs:
+                raise broken(
+                    "ports",
+                    f"found like={like!r}; expected an input: {', '.join(block.inputs) or 'there are none'}. Name one.",
+                    block,
+                    name,
+                )
+            units = (port.unit,) if isinstance(port.unit, str) else port.unit or ()
+            for unit in units:
+                parse_unit(unit)
+            if isinstance(port.unit, tuple) and port.shape is not None and len(units) != size(port.shape):
+                raise broken(
+                    "units",
+                    f"found {len(units)} units for shape {port.shape}; expected one for each entry, or one for all. "
+                    "Give as many.",
+                    block,
+                    name,
+                    UnitError,
+                )
+    return f"{count}"
+
+
+# --- purity -----------------------------------------------------------------------------------------------------------
+
+
+def check_purity(exercise: Exercise, sampled: bool, places: list[Point]) -> int:
+    """Evaluate every equation several times, and return how many there are."""
+    block = exercise.block
+    T = exercise.sample_time if sampled else math.nan
+    shadow = with_values(block, numbers_of(block, T, "exact"))
+    first = [_evaluate_all(shadow, point, T if sampled else None) for point in places]
+    before = _attributes(shadow)  # what is computed once and kept is there after the first time
+    for number, point in enumerate(places):
+        for what, value in _evaluate_all(shadow, point, T if sampled else None).items():
+            if first[number].get(what, value) != value:
+                raise broken(
+                    "purity",
+                    f"its {what} gives other values when it is called again with the same arguments ({point}); "
+                    "expected the same ones. Let it depend on nothing but (t, x, u) and parameters; what a block "
+                    "remembers is a State.",
+                    block,
+                )
+        after = _attributes(shadow)
+        changed = sorted(n for n in before.keys() | after.keys() if before.get(n) != after.get(n))
+        if changed:
+            raise broken(
+                "purity",
+                f"its attribute {changed[0]!r} was changed by its equations; expected none to change. A block is a "
+                "value: keep it in a State.",
+                block,
+            )
+    return len(set().union(*first))
+
+
+def _evaluate_all(block: Any, point: Point, T: float | None) -> dict[str, bytes]:
+    """Return what every equation gives, as bytes; what can't be computed here is left to the trace."""
+    result = {}
+    for what in ("output", "derivative", "update", "guards", "indicators", "jump", "initial"):
+        if not hasattr(block, what) or (what == "update" and T is None):
+            continue
+        t, x, u, fired = point.arguments()
+        given = [bundle("x", x), bundle("u", u)]
+        arguments = [given[1]] if what == "initial" else [t, *given]
+        if what == "jump":
+            arguments.append(bundle("fired", fired))
+        timed = T is not None and "T" in inspect.signature(getattr(block, what)).parameters
+        try:
+            with np.errstate(all="ignore"):
+                found = getattr(block, what)(*arguments, **({"T": np.float64(T)} if timed else {}))
+        except LoopwrightError:
+            continue
+        except Exception:  # what fails is left to the trace
+            continue
+        _expect_unchanged(block, what, point, x, u)
+        result[what] = _bytes(found)
+    return result
+
+
+def _expect_unchanged(block: Block, what: str, point: Point, x: dict[str, Any], u: dict[str, Any]) -> None:
+    for name, given, now in [*((n, point.x[n], v) for n, v in x.items()), *((n, point.u[n], v) for n, v in u.items())]:
+        if not np.array_equal(np.asarray(given), np.asarray(now), equal_nan=True):
+            raise broken(
+                "purity",
+                f"its {what} changes its argument {name!r} from {np.asarray(given).tolist()} to "
+                f"{np.asarray(now).tolist()}; expected it unchanged. Return new values: y = u + 1, not u += 1.",
+                block,
+                name,
+            )
+
+
+def _bytes(value: Any) -> bytes:
+    if isinstance(value, dict):
+        return b"".join(str(k).encode() + _bytes(v) for k, v in value.items())
+    if isinstance(value, tuple | list):
+        return b"|".join(map(_bytes, value))
+    return np.asarray(value).tobytes()
+
+
+def _attributes(block: Any) -> dict[str, Any]:
+    """Return what tells whether an attribute has changed, by name."""
+    result = {}
+    for name, value in vars(block).items():
+        try:
+            result[name] = pickle.dumps(value)
+        except Exception:  # an object's pickling may raise anything
+            result[name] = id(value)  # type: ignore[assignment]
+    return result

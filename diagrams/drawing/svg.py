@@ -1,0 +1,393 @@
+"""The drawing of a diagram, as SVG, made from the diagram itself."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...blocks.core.errors import OptionError, near
+from ...blocks.library.algebra import Sum
+from ..wiring.structure import Structure, Wire
+from .layout import Net, arrange
+from .order import Node
+from .shapes import BORDER, GREY, INK, NAME, PLANT, WIRE, line, rect, seconds, text_at, width
+
+if TYPE_CHECKING:
+    from ..diagram import Diagram
+
+MANY = 40
+"""Blocks above which boxes are drawn closed unless told otherwise."""
+
+HEADER, MARGIN, PIN, STUB = 24.0, 14.0, 18.0, 14.0
+TINTS = ("#eaf2fb", "#e6f5ec", "#f3ecfa", "#fdebec", "#e8f4f6", "#f6f2e2")
+"""Of sampled boxes, one for each sample time."""
+
+
+class Drawing:
+    """A diagram's drawing; a notebook shows it.
+
+    Attributes
+    ----------
+    svg : str
+        The drawing.
+    """
+
+    def __init__(self, svg: str):
+        self.svg = svg
+
+    def _repr_svg_(self) -> str:
+        return self.svg
+
+    def __repr__(self) -> str:
+        return f"<drawing, {len(self.svg)} characters of SVG>"
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write it to a file, ``.svg``."""
+        file = Path(path)
+        if file.suffix.lower() != ".svg":
+            raise OptionError(f"found {str(path)!r}; a drawing is written as SVG: name it {file.stem}.svg.")
+        file.write_text(self.svg, encoding="utf-8")
+        return file
+
+
+def draw(diagram: Diagram, *, box: str = "", closed: bool | Iterable[str] | None = None) -> str:
+    """Return the drawing of a diagram, or of the inside of one of its boxes, as SVG.
+
+    Parameters
+    ----------
+    box : str
+        Path of the subsystem whose inside is drawn; the whole diagram without it.
+    closed : bool or list of str, optional
+        Boxes that are drawn closed, all or some; without it all of them in a diagram of more than 40 blocks.
+    """
+    table = diagram._table
+    boxes = [path for path in table.frames if path]
+    shut = _closed(table, box, closed, who=diagram.name)
+    if box not in table.frames:
+        raise OptionError(f"there is no subsystem {box!r}. {near(box, boxes)}", block=diagram.name, port="box")
+    return _Picture(table, shut - {box}).page(box, box or diagram.name)
+
+
+def _closed(table: Structure, box: str, closed: bool | Iterable[str] | None, *, who: str) -> set[str]:
+    boxes = {path for path in table.frames if path}
+    if closed is None:
+        inside = [p for p, frame in table.frame_of.items() if not box or frame == box or frame.startswith(box + ".")]
+        closed = len(inside) > MANY
+    if isinstance(closed, bool):
+        return boxes if closed else set()
+    shut = {closed} if isinstance(closed, str) else set(closed)
+    for path in sorted(shut - boxes):
+        raise OptionError(f"there is no subsystem {path!r}. {near(path, boxes)}", block=who, port="closed")
+    return shut
+
+
+class _Picture:
+    """A drawing in the making."""
+
+    def __init__(self, table: Structure, closed: set[str]):
+        self.table = table
+        self.closed = closed
+        rates = sorted({f.sample_time for f in table.frames.values() if f.sample_time is not None})
+        self.tints = {rate: TINTS[i % len(TINTS)] for i, rate in enumerate(rates)}
+        self.nets: dict[str, dict[tuple[str, str], list[tuple[str, str]]]] = {path: {} for path in table.frames}
+        self.parts: dict[str, int | slice] = {}  # what of a wire an input takes, by "block port"
+        self.ins: dict[str, list[str]] = {}
+        self.outs: dict[str, list[str]] = {}
+        self.names: dict[tuple[str, str], list[str]] = {}
+        for name, wire in table.names.items():
+            short = name.rpartition(".")[2]
+            if short not in self.names.setdefault((wire.block, wire.port), []):
+                self.names[wire.block, wire.port].append(short)
+        for (path, port), wire in table.wires.items():
+            self._thread(wire, table.frame_of[path], path, port)
+        for box, wire in table.controls.items():
+            self._thread(wire, box.rpartition(".")[0], box, f"{wire.block} {wire.port} control")
+        for source in self.names:
+            self.nets[table.frame_of[source[0]]].setdefault((source[0], source[1]), [])
+            self._pin(self.outs, *source)
+
+    def _thread(self, wire: Wire, frame: str, item: str, port: str) -> None:
+        """Lead a wire from its block through the borders of boxes to a consumer in a frame."""
+        key = f"{wire.block} {wire.port}"
+        here = self.table.frame_of[wire.block]
+        end = (wire.block, wire.port)
+        self._pin(self.outs, *end)
+        while not (here == frame or not here or frame.startswith(here + ".")):
+            self._join(here, end, (f">{here}", key))
+            end, here = (here, key), here.rpartition(".")[0]
+            self._pin(self.outs, *end)
+        for box in self._between(here, frame):
+            self._join(here, end, (box, key))
+            self._pin(self.ins, box, key)
+            end, here = (f"<{box}", key), box
+        self._join(here, end, (item, port))
+        self._pin(self.ins, item, port)
+        if wire.index is not None:
+            self.parts[f"{item} {port}"] = wire.index
+
+    @staticmethod
+    def _between(outer: str, inner: str) -> list[str]:
+        parts = inner.split(".") if inner else []
+        start = len(outer.split(".")) if outer else 0
+        return [".".join(parts[: i + 1]) for i in range(start, len(parts))]
+
+    def _join(self, frame: str, source: tuple[str, str], sink: tuple[str, str]) -> None:
+        sinks = self.nets[frame].setdefault(source, [])
+        if sink not in sinks:
+            sinks.append(sink)
+
+    @staticmethod
+    def _pin(pins: dict[str, list[str]], item: str, pin: str) -> None:
+        if pin not in pins.setdefault(item, []):
+            pins[item].append(pin)
+
+    # --- layout -----------------------------------------------------------------------------------------------------
+
+    def page(self, frame: str, title: str) -> str:
+        """Return the whole SVG."""
+        body, w, h, pins = self._inside(frame)
+        left, right, top, border = MARGIN, MARGIN, MARGIN, ""
+        if frame:  # its border, and the names of the pins on it
+            texts = {name: (side, text) for side, names in enumerate(self._pin_texts(frame)) for name, text in names}
+            wide = [max((width(text, 9) for side, text in texts.values() if side == i), default=0.0) for i in (0, 1)]
+            left, right, top = left + wide[0] + 16 + MARGIN, right + wide[1] + 16 + MARGIN, top + HEADER
+            border = self._border(frame, -MARGIN, -HEADER, w + 2 * MARGIN, h + HEADER + MARGIN)
+            for pin in pins:
+                name = pin.key.split(" ", 1)[1]
+                start, end = (-MARGIN - 14, 0.0) if pin.side < 0 else (pin.x, w + MARGIN + 14)
+                anchor, at = ("end", start - 4) if pin.side < 0 else ("", end + 4)
+                border += line([(start, pin.y), (end, pin.y)])
+                border += text_at(at, pin.y + 3, texts[name][1], 9, anchor=anchor, fill=NAME, italic=True)
+        w, h = w + left + right, h + top + 2 * MARGIN
+        about = f"Block diagram of {title}: {len(self.table.blocks)} blocks."
+        return (
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{w:g}" height="{h:g}" viewBox="0 0 {w:g} {h:g}" '
+            f'role="img" font-family="Helvetica, Arial, sans-serif" font-size="10" fill="{INK}">\n'
+            f"<title>{escape(about)}</title>\n"
+            f'<g transform="translate({left:g} {top:g})">\n{border}{body}</g>\n</svg>\n'
+        )
+
+    def _inside(self, frame: str) -> tuple[str, float, float, list[Node]]:
+        """Lay a frame out; return its drawing, its size, and the pins on its border."""
+        table = self.table
+        items = [p for p, f in table.frame_of.items() if f == frame]
+        boxes = [p for p in table.frames if p and p.rpartition(".")[0] == frame]
+        drawn: dict[str, tuple[str, list[Node]]] = {}
+        nodes = []
+        for path in [*items, *boxes]:
+            if path in table.blocks:
+                nodes.append(self._block(path))
+            elif path in self.closed:
+                nodes.append(self._shut(path))
+            else:
+                body, w, h, pins = self._inside(path)
+                node = Node(path, max(w + 2 * MARGIN, width(self._header(path), 10, True) + 20), h + HEADER + MARGIN)
+                node.ins = {p.key[len(path) + 2 :]: p.y + HEADER for p in pins if p.side < 0}
+                node.outs = {p.key[len(path) + 2 :]: p.y + HEADER for p in pins if p.side > 0}
+                self._control_pins(node)
+                drawn[path] = (body, pins)
+                nodes.append(node)
+            nodes[-1].plant = self._has_plant(path)
+        borders = []
+        if frame:
+            borders = [
+                Node(f"<{frame} {n}", 0, 0, {}, {n: 0.0}, -1) for n in self.ins.get(frame, []) if " control" not in n
+            ]
+            borders += [Node(f">{frame} {n}", 0, 0, {n: 0.0}, {}, 1) for n in self.outs.get(frame, [])]
+        nets = []
+        for (item, pin), sinks in self.nets[frame].items():
+            source = (f"{item} {pin}", pin) if item.startswith("<") else (item, pin)
+            ends = [(f"{i} {p}", p) if i.startswith(">") else (i, p) for i, p in sinks]
+            name = self._written(item, pin, ends)
+            label = (width(name, 9) + 10 if name else 0.0) + max(
+                (14.0 for i, p in sinks if f"{i} {p}" in self.parts), default=0.0
+            )
+            nets.append(Net(f"{item} {pin}", source, ends, label))
+        w, h = arrange([*borders, *nodes], nets)
+        out = [self._wire(net) for net in nets]
+        out += [self._item(node, drawn.get(node.key)) for node in nodes]
+        out += [self._label(net, nodes) for net in nets]
+        return "".join(out), w, h, borders
+
+    def _control_pins(self, node: Node) -> None:
+        extra = [n for n in self.ins.get(node.key, []) if n.endswith(" control")]
+        for name in extra:
+            node.ins[name] = HEADER / 2
+
+    def _has_plant(self, path: str) -> bool:
+        return any(
+            hasattr(b, "instantiate") for p, b in self.table.blocks.items() if p == path or p.startswith(path + ".")
+        )
+
+    def _name(self, item: str, pin: str) -> str:
+        """Return the names of a wire as written where it begins, in a frame."""
+        block, port = (item, pin) if item in self.table.blocks else tuple(pin.split(" ", 1))
+        return ", ".join(self.names.get((block, port), []))
+
+    def _written(self, item: str, pin: str, sinks: list[tuple[str, str]]) -> str:
+        """Return what is written at a wire; one that only leaves the box is named outside."""
+        if item.startswith("<") or (sinks and all(i.startswith(">") for i, _ in sinks)):
+            return ""
+        return self._name(item, pin)
+
+    def _pin_texts(self, path: str) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
+        """Return pins and their texts, inputs and outputs, in the order in which they stand."""
+        ins, outs = self.ins.get(path, []), self.outs.get(path, [])
+        block = self.table.blocks.get(path)
+        if block is None:
+
+            def text(pin: str) -> str:
+                made, port = pin.split(" ", 1)
+                if pin.endswith(" control"):
+                    return {"enabled": "enable", "triggered": "trigger"}[self.table.frames[path].control]
+                alone = len(self.table.blocks[made].outputs) == 1
+                return self._name(made, port) or (made.rpartition(".")[2] if alone else port)
+
+            return [(n, text(n)) for n in ins], [(n, text(n)) for n in outs]
+        declared_in, declared_out = list(block.inputs), list(block.outputs)
+        ins, outs = sorted(ins, key=declared_in.index), sorted(outs, key=declared_out.index)
+        if isinstance(block, Sum):
+            return [(n, block.signs[declared_in.index(n)].replace("-", "−")) for n in ins], [(n, "") for n in outs]
+        plain_in, plain_out = len(declared_in) == 1, len(declared_out) == 1
+        return [(n, "" if plain_in else n) for n in ins], [(n, "" if plain_out else n) for n in outs]
+
+    def _block(self, path: str) -> Node:
+        ins, outs = self._pin_texts(path)
+        title, kind = self._titles(path)
+        if isinstance(self.table.blocks[path], Sum):
+            rows = max(len(ins), 1)
+            node = Node(path, 34.0, max(rows * 16.0 + 4, 30.0))
+            top, pitch = node.height / 2 - (rows - 1) * 8.0, 16.0
+        else:
+            texts = width(title, 10.5, True), width(kind, 8.5)
+            rows = max(len(ins), len(outs), 1)
+            sides = max((width(t, 8.5) for _, t in ins), default=0) + max((width(t, 8.5) for _, t in outs), default=0)
+            named = any(t for _, t in [*ins, *outs])
+            node = Node(path, max(*texts, sides + 16) + 18, (34.0 if named else 22.0) + rows * PIN if named else 40.0)
+            top, pitch = (34.0 + PIN / 2, PIN) if named else (20.0, PIN)
+        node.ins = {n: top + i * pitch for i, (n, _) in enumerate(ins)}
+        node.outs = {n: top + i * pitch for i, (n, _) in enumerate(outs)}
+        if isinstance(self.table.blocks[path], Sum):
+            node.outs = dict.fromkeys(node.outs, round(node.height / 2))
+        return node
+
+    def _shut(self, path: str) -> Node:
+        ins, outs = self._pin_texts(path)
+        rows = max(len(ins), len(outs), 1)
+        sides = max((width(t, 8.5) for _, t in ins), default=0) + max((width(t, 8.5) for _, t in outs), default=0)
+        node = Node(path, max(width(self._header(path), 10, True), sides + 16) + 24, 40.0 + rows * PIN)
+        node.ins = {n: 40.0 + i * PIN for i, (n, _) in enumerate(ins)}
+        node.outs = {n: 40.0 + i * PIN for i, (n, _) in enumerate(outs)}
+        return node
+
+    def _titles(self, path: str) -> tuple[str, str]:
+        block = self.table.blocks[path]
+        kind = type(block).__name__
+        if hasattr(block, "instantiate"):
+            kind = f"FMU {Path(str(block.file)).name}"
+            kind = kind if len(kind) < 36 else kind[:33] + "…"
+        return path.rpartition(".")[2], kind
+
+    def _header(self, path: str) -> str:
+        frame = self.table.frames[path]
+        texts = [path.rpartition(".")[2]]
+        if frame.sample_time is not None:
+            texts.append(f"every {seconds(frame.sample_time)}")
+        if frame.offset:
+            texts.append(f"from {seconds(frame.offset)}")
+        if frame.delay:
+            texts.append(f"delay {frame.delay} sample{'s' if frame.delay > 1 else ''}")
+        if frame.control:
+            texts.append(f"{frame.control}, {frame.when}")
+        return " · ".join(texts)
+
+    # --- drawing ----------------------------------------------------------------------------------------------------
+
+    def _item(self, node: Node, inner: tuple[str, list[Node]] | None) -> str:
+        path, x, y, w, h = node.key, node.x, node.y, node.width, node.height
+        if path in self.table.blocks:
+            return self._block_shape(node)
+        out = [self._border(path, x, y, w, h)]
+        if inner is None:
+            out.append(self._pin_marks(node))
+            return "".join(out)
+        body, pins = inner
+        out.append(f'<g transform="translate({x + MARGIN:g} {y + HEADER:g})">\n{body}</g>\n')
+        for pin in pins:  # from the border to where the inside begins
+            at = y + HEADER + pin.y
+            a, b = (x, x + MARGIN) if pin.side < 0 else (x + MARGIN + pin.x, x + w)
+            out.append(line([(a, at), (b, at)]))
+        return "".join(out)
+
+    def _border(self, path: str, x: float, y: float, w: float, h: float) -> str:
+        """Return a box without what is in it."""
+        rate = self.table.rate(path)
+        tint = self.tints[rate] if rate is not None else "#f5f6f7"
+        name, *rest = self._header(path).split(" · ")
+        more = f'<tspan fill="{GREY}" font-weight="normal"> · {escape(" · ".join(rest))}</tspan>' if rest else ""
+        dash = ' stroke-dasharray="5 3"' if self.table.frames[path].control else ""
+        return (
+            f'<g><title>{escape(path)}</title><rect x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" rx="5" '
+            f'fill="{tint}" stroke="{BORDER}"{dash}/>\n'
+            f'<text x="{x + 10:g}" y="{y + 16:g}" font-weight="bold">{escape(name)}{more}</text></g>\n'
+        )
+
+    def _block_shape(self, node: Node) -> str:
+        path, x, y, w, h = node.key, node.x, node.y, node.width, node.height
+        block = self.table.blocks[path]
+        title, kind = self._titles(path)
+        plant = hasattr(block, "instantiate")
+        middle = x + w / 2
+        out = [f"<g><title>{escape(path)}: {escape(kind)}</title>"]
+        if isinstance(block, Sum):
+            out.append(rect(x, y, w, h, "#ffffff", 12))
+            out.append(text_at(middle + 4, y + h / 2 + 5, "Σ", 14, anchor="middle"))
+        else:
+            out.append(rect(x, y, w, h, PLANT if plant else "#ffffff", 3, 1.4 if plant else 1))
+            if plant:
+                out.append(rect(x + 2.5, y + 2.5, w - 5, h - 5, "none", 2, 0.7))
+            named = any(t for pins in self._pin_texts(path) for _, t in pins)
+            top = y + (16 if named else h / 2 - 2.5)
+            out.append(text_at(middle, top, title, 10.5, anchor="middle", bold=True))
+            out.append(text_at(middle, top + 11.5, kind, 8.5, anchor="middle", fill=GREY))
+        out.append(self._pin_marks(node) + "</g>\n")
+        return "".join(out)
+
+    def _pin_marks(self, node: Node) -> str:
+        out = []
+        ins, outs = self._pin_texts(node.key)
+        for name, text in ins:
+            out.append(text_at(node.x + 6, node.y + node.ins[name] + 3, text, 8.5, fill=GREY) if text else "")
+        for name, text in outs:
+            at = node.x + node.width - 6
+            out.append(text_at(at, node.y + node.outs[name] + 3, text, 8.5, anchor="end", fill=GREY) if text else "")
+        return "".join(out)
+
+    def _wire(self, net: Net) -> str:
+        out = [line(*net.runs)] if net.runs else []
+        out += [f'<circle cx="{x:g}" cy="{y:g}" r="2.2" fill="{WIRE}"/>\n' for x, y in net.dots]
+        return "".join(out)
+
+    def _label(self, net: Net, nodes: list[Node]) -> str:
+        """Write a wire's name behind its source, arrows and parts ahead of its sinks."""
+        out = []
+        by_key = {node.key: node for node in nodes}
+        source = by_key.get(net.source[0])
+        if source is not None:
+            x, y = source.x + source.width, source.y + source.outs[net.source[1]]
+            name = self._written(*net.source, net.sinks)
+            if name:
+                out.append(text_at(x + 5, y - 3.5, name, 9, fill=NAME, italic=True))
+        for item, pin in net.sinks:
+            if item in by_key:
+                node = by_key[item]
+                x, y = node.x, node.y + node.ins[pin]
+                out.append(f'<path d="M{x:g} {y:g}l-6.5 -3v6z" fill="{WIRE}"/>\n')
+                part = self.parts.get(f"{item} {pin}")
+                if part is not None:
+                    text = f"[{part.start or ''}:{part.stop or ''}]" if isinstance(part, slice) else f"[{part}]"
+                    out.append(text_at(x - 8, y - 3.5, text, 8, anchor="end", fill=GREY))
+        return "".join(out)

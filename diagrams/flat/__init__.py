@@ -1,0 +1,1 @@
+"""A whole diagram as functions of (t, x, w, p)."""

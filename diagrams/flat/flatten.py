@@ -1,0 +1,188 @@
+"""Flattening: a checked diagram becomes one vector of states, and functions of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from fractions import Fraction
+
+import numpy as np
+
+from ...blocks.core.errors import SampleTimeError
+from ...blocks.core.ports import Shape
+from ...blocks.tracing.symbols import size
+from ..wiring.check import Checked
+from ..wiring.evaluation_order import evaluation_order
+from ..wiring.structure import Structure, join
+from .flat_diagram import FlatDiagram
+from .layout import Clock, FlatEvent, Layout
+
+
+def flatten(
+    table: Structure, checked: Checked, step: Fraction | None = None, *, name: str = "", solve: bool = False
+) -> FlatDiagram:
+    """Flatten a checked diagram.
+
+    Parameters
+    ----------
+    step : Fraction, optional
+        Seconds between two ticks; required where there is no other clock.
+    name : str
+        The diagram's name, for errors.
+    solve : bool
+        Whether algebraic loops are to be solved.
+
+    Raises
+    ------
+    AlgebraicLoopError
+        Ports that depend on each other within a tick, or at the start.
+    SampleTimeError
+        No sample time anywhere, a step that does not divide one.
+    """
+    base, clocks = _clocks(table, step, name)
+    traced, blocks = checked.traced, table.blocks
+    paths = sorted(traced)
+    order = evaluation_order(table, traced, solve=solve)
+    start_order = evaluation_order(table, traced, start=True, solve=solve)
+    events = tuple(_events(table, checked))
+    between = bool(events) or any(traced[path].advance == "derivative" for path in paths)
+    between = between or any(block.transport and path not in traced for path, block in blocks.items())
+    gated = {path: table.gates(table.frame_of[path]) for path in paths}
+
+    states = Layout.of({path: (sum(size(s) for s in traced[path].states.values()),) for path in paths})
+    position = states.total
+
+    def lay(shapes: Mapping[str, Shape]) -> Layout:
+        nonlocal position
+        layout = Layout.of(shapes, position)
+        position += layout.total
+        return layout
+
+    def is_held(path: str) -> bool:
+        clock = clocks.get(table.frame_of[path])
+        return bool(gated[path]) or (clock is not None and (between or clock != Clock()))
+
+    held = lay({join(p, q): s for p in paths if is_held(p) for q, s in traced[p].outputs.items()})
+    gates = lay(dict.fromkeys(sorted(table.controls), ()))
+    resets = [p for p in paths if any(table.frames[g].when == "reset" for g in gated[p]) and states.shapes[p][0]]
+    starts = lay({path: states.shapes[path] for path in resets})
+    torn = dict.fromkeys(sorted({*order.torn, *start_order.torn}))
+    loops = lay({join(*port): traced[port[0]].outputs[port[1]] for port in torn})
+
+    stepped = sorted(path for path in blocks if path not in traced)
+    plant_outputs = Layout.of({join(p, q): checked.shapes[p, q] for p in stepped for q in blocks[p].outputs})
+    plant_inputs = Layout.of(
+        {
+            join(p, q): _input_shape(table, checked, p, q)
+            for p in stepped
+            for q in blocks[p].inputs
+            if (p, q) in table.wires
+        }
+    )
+    packed = {path: traced[path].pack(blocks[path], _period(table, path)) for path in paths}
+    log_shapes = dict(plant_outputs.shapes) | {join(p, q): s for p in paths for q, s in traced[p].outputs.items()}
+    start_values = [
+        np.ravel(port.start_value(blocks[path], traced[path].inputs))
+        for path in paths
+        for port in blocks[path].states.values()
+    ]
+    ports = {join(*port): port for port in checked.shapes} | {join(*port): port for port in table.wires}
+    return FlatDiagram(
+        table=table,
+        checked=checked,
+        base=base,
+        clocks=clocks,
+        states=states,
+        held=held,
+        gates=gates,
+        starts=starts,
+        loops=loops,
+        plant_outputs=plant_outputs,
+        plant_inputs=plant_inputs,
+        parameters=Layout.of({path: v.shape for path, v in packed.items()}),
+        log=Layout.of(log_shapes),
+        continuous=_continuous(checked, table, states),
+        events=events,
+        x0=np.concatenate([*start_values, np.zeros(position - states.total)]),
+        p=np.concatenate([*packed.values(), np.zeros(0)]),
+        order=order,
+        start_order=start_order,
+        ports=ports,
+    )
+
+
+def _input_shape(table: Structure, checked: Checked, path: str, port: str) -> Shape:
+    declared = table.blocks[path].inputs[port].shape
+    if declared is not None:
+        return declared
+    wire = table.wires[path, port]
+    shape = checked.shapes[wire.block, wire.port]
+    return shape if wire.index is None else np.empty(shape)[wire.index].shape
+
+
+def _continuous(checked: Checked, table: Structure, states: Layout) -> np.ndarray:
+    """Return the entries of x that a solver integrates."""
+    found: list[int] = []
+    for path, where in states.slices.items():
+        trace = checked.traced[path]
+        if trace.advance != "derivative":
+            continue
+        position = where.start
+        for name, shape in trace.states.items():
+            n = size(shape)
+            if not table.blocks[path].states[name].discrete:
+                found += range(position, position + n)
+            position += n
+    return np.array(found, dtype=int)
+
+
+def _events(table: Structure, checked: Checked) -> Iterator[FlatEvent]:
+    """Yield the events of all blocks and boxes in continuous frames, by path."""
+    for path in sorted([*checked.traced, *table.controls]):
+        if path in table.controls:
+            if table.is_event(path):
+                frame = table.frames[path]
+                edge = "both" if frame.control == "enabled" else frame.when
+                yield FlatEvent(path, {"enabled": "enable", "triggered": "trigger"}[frame.control], edge, 0.0, True)
+            continue
+        trace = checked.traced[path]
+        if trace.indicators is not None:
+            for name, event in table.blocks[path].events.items():
+                yield FlatEvent(path, name, event.direction, getattr(event, "hysteresis", 0.0), False)
+
+
+def _period(table: Structure, path: str) -> float:
+    frame = table.frame_of[path]
+    if table.triggered(frame) is not None:
+        return math.nan
+    rate = table.rate(frame)
+    return math.nan if rate is None else float(rate)
+
+
+def _clocks(table: Structure, step: Fraction | None, name: str) -> tuple[Fraction, dict[str, Clock]]:
+    """Return the seconds between two ticks, and the ticks of every frame that is sampled."""
+    found = {path: clock for path in table.frames if (clock := table.clock(path)) is not None}
+    used = {c.path: c for c in found.values()}
+    base = step
+    if base is None:
+        if not used:
+            raise SampleTimeError(
+                "no subsystem has a sample time, so there is no clock. Give simulate(…, step=1e-3), or a "
+                "@subsystem(sample_time=1e-3).",
+                block=name or None,
+            )
+        times = [t for c in used.values() for t in (c.sample_time, c.offset) if t]
+        base = Fraction(math.gcd(*(r.numerator * (10**9 // r.denominator) for r in times)), 10**9)
+    for frame in used.values():
+        for what, time in (("sample time", frame.sample_time), ("offset", frame.offset)):
+            if time is not None and (time / base).denominator != 1:
+                raise SampleTimeError(
+                    f"its {what} {float(time):g} s is no multiple of the step {float(base):g} s; choose a step that "
+                    f"divides it.",
+                    block=frame.path or name or None,
+                )
+    return base, {
+        path: Clock(int(c.sample_time / base), int(c.offset / base))
+        for path, c in found.items()
+        if c.sample_time is not None
+    }

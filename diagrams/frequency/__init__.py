@@ -1,0 +1,1 @@
+"""Margins, Nyquist, disks and pole placement of linear systems."""

@@ -1,0 +1,171 @@
+"""Where a loop's frequency response has its features: poles and zeros, and a grid that sees them all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .realization import Realization
+
+PER_DECADE = 40
+SIDES = np.array([-10, -3, -1, -0.3, 0.0, 0.3, 1, 3, 10])
+GAP = 2e-9  # relative distance that a scan keeps from a pole or zero on the axis
+
+
+@dataclass(frozen=True)
+class AxisPole:
+    """A pole on the limit of stability.
+
+    Parameters
+    ----------
+    omega : float
+        Its frequency, rad/s, not negative.
+    multiplicity : int
+        How many coincide.
+    scatter : float
+        How far its computed eigenvalues lie apart, rad/s.
+    """
+
+    omega: float
+    multiplicity: int
+    scatter: float
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Poles and zeros of a loop in the s plane: those on the axis in clusters, and the others."""
+
+    axis_poles: tuple[AxisPole, ...]
+    poles: np.ndarray
+    axis_zeros: tuple[AxisPole, ...]
+    zeros: np.ndarray
+    closed: np.ndarray
+
+    @classmethod
+    def of(cls, r: Realization) -> Features:
+        """Find them by eigenvalues."""
+        axis_poles, poles = clusters(r, np.linalg.eigvals(r.A), r.scale)
+        zeros = transmission_zeros(r)
+        axis_zeros, zeros = clusters(r, zeros, max(r.scale, float(np.abs(zeros).max(initial=0.0))))
+        try:
+            closed = r.logarithm(r.eigenvalues())
+        except np.linalg.LinAlgError:
+            closed = np.zeros(0)
+        return cls(axis_poles, poles, axis_zeros, zeros, closed[np.isfinite(closed)])
+
+    def unstable_poles(self) -> int:
+        """Return the number of open-loop poles beyond the limit of stability, those on it not counted."""
+        return int(np.sum(self.poles.real > 0))
+
+    def sizes(self) -> np.ndarray:
+        """Return the magnitudes of all that is not at s = 0, sorted, rad/s."""
+        points = [np.abs(self.poles), np.abs(self.zeros), np.abs(self.closed)]
+        on_axis = [a.omega for a in (*self.axis_poles, *self.axis_zeros)]
+        sizes = np.concatenate([*points, on_axis])
+        sizes = np.sort(sizes[sizes > 0])
+        floor = 1e-12 * sizes[-1] if len(sizes) else 0.0
+        return sizes[sizes > floor]
+
+    def points(self) -> np.ndarray:
+        """Return all points near which the response bends."""
+        return np.concatenate([self.poles, self.zeros, self.closed])
+
+
+def clusters(r: Realization, p: np.ndarray, scale: float) -> tuple[tuple[AxisPole, ...], np.ndarray]:
+    """Split poles into those on the limit of stability, gathered, and the others, both as s.
+
+    m coinciding poles are computed with a scatter of ε^(1/m); their mean is accurate to ε.
+    """
+    left, found = list(np.asarray(p, dtype=complex)), []
+    for m in range(min(len(left), 8), 0, -1):
+        radius = 10 * scale * 1e-15 ** (1 / m)
+        again = True
+        while again and len(left) >= m:
+            again = False
+            for middle in left:
+                near = sorted(range(len(left)), key=lambda k: abs(left[k] - middle))[:m]
+                group = np.array([left[k] for k in near])
+                mean = group.mean()
+                spread = float(np.max(np.abs(group - mean)))
+                if spread <= radius and abs(r.growth(mean)) <= 1e-11 * scale:
+                    left = [value for k, value in enumerate(left) if k not in near]
+                    found.append((complex(mean), m, spread))
+                    again = True
+                    break
+    axis = []
+    for mean, m, spread in found:
+        s = complex(r.logarithm(np.array(mean)))
+        omega = abs(s.imag)
+        rate = 1 / r.dt if r.dt else 1.0
+        if omega <= 1e-9 * scale * rate + 3 * spread * rate:
+            omega = 0.0
+        if r.dt and abs(omega - r.nyquist) <= 1e-9 * r.nyquist:
+            omega = r.nyquist
+        if s.imag >= 0 or omega in (0.0, r.nyquist):
+            axis.append(AxisPole(omega, m, max(spread, 1e-15 * scale) * rate))
+    rest = r.logarithm(np.array(left, dtype=complex))
+    return tuple(sorted(axis, key=lambda a: a.omega)), rest[np.isfinite(rest)]
+
+
+def transmission_zeros(r: Realization) -> np.ndarray:
+    """Return the zeros of a loop with one channel, in the plane of p."""
+    from scipy.linalg import eig
+
+    n = r.order
+    if not n or len(r.D) != 1:
+        return np.zeros(0)
+    b, c = np.linalg.norm(r.B) or 1.0, np.linalg.norm(r.C) or 1.0
+    pencil = np.block([[r.A, r.B / b], [r.C / c, r.D / (b * c)]])
+    alpha, beta = eig(pencil, np.diag([1.0] * n + [0.0]), right=False, homogeneous_eigvals=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        zeros = alpha / beta
+    return np.asarray(zeros[np.isfinite(zeros) & (np.abs(zeros) < 1e6 * max(r.scale, 1e-300))])
+
+
+def scan(r: Realization, features: Features, *, delay: float = 0.0) -> list[np.ndarray]:
+    """Return frequencies in rad/s dense enough to see every feature, cut at poles and zeros on the axis.
+
+    40 a decade, more around poles and zeros in proportion to their distance from the axis, then bisected until the
+    response, with a further delay in s, turns by less than 0.15 rad and changes by less than 0.3 in its logarithm.
+    """
+    sizes = features.sizes()
+    low, high = (sizes[0] / 1e4, sizes[-1] * 1e4) if len(sizes) else (1e-3, 1e3)
+    if r.dt:
+        high = r.nyquist
+    low = min(low, high / 10)
+    on_axis = (*features.axis_poles, *features.axis_zeros)
+    low = max([low, *(30 * a.scatter for a in on_axis if a.omega == 0.0)])
+    low = min(low, high / 10)
+    grid = [np.geomspace(low, high, max(2, int(PER_DECADE * np.log10(high / low))))]
+    for s in features.points():
+        grid.append(abs(s.imag) + abs(s.real) * SIDES)
+        grid.append(abs(s) * (1 + 0.1 * np.arange(-3, 4)))
+    close = 10.0 ** np.arange(-8, 0)
+    grid.extend(a.omega * (1 + np.concatenate([-close, close])) for a in on_axis)
+    omega = np.concatenate(grid)
+    omega = np.unique(omega[(omega >= low) & (omega <= high)])
+    cuts = sorted({a.omega for a in on_axis if low < a.omega})
+    segments, start = [], low
+    for cut in [*cuts, np.inf]:
+        end = cut * (1 - GAP) if np.isfinite(cut) else high
+        inside = omega[(omega > start) & (omega < min(end, high))]
+        if start < min(end, high):
+            segments.append(_refine(r, np.array([start, *inside, min(end, high)]), delay))
+        start = cut * (1 + GAP)
+    return segments
+
+
+def _refine(r: Realization, omega: np.ndarray, delay: float) -> np.ndarray:
+    for _ in range(14):
+        L, _ = r.response(omega)
+        L = L * np.exp(-1j * omega * delay)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.log(L[1:] / L[:-1])
+        coarse = ~((np.abs(step.real) < 0.3) & (np.abs(step.imag) < 0.15)) & (np.diff(omega) > 1e-12 * omega[1:])
+        if delay:  # a delay turns without end; where |L| is small that does not matter
+            coarse &= np.maximum(np.abs(L[1:]), np.abs(L[:-1])) > 0.3
+        if not coarse.any() or len(omega) > 40_000:
+            break
+        omega = np.sort(np.concatenate([omega, np.sqrt(omega[1:] * omega[:-1])[coarse]]))
+    return omega

@@ -1,0 +1,161 @@
+"""Encirclements of −1 by the Nyquist curve, counted by its winding and confirmed by eigenvalues."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import ConfirmationError, ParameterError
+from .features import Features, scan
+from .realization import Realization
+
+
+@dataclass(frozen=True)
+class NyquistCount:
+    """The Nyquist criterion Z = N + P, counted.
+
+    Parameters
+    ----------
+    encirclements : int
+        N: clockwise encirclements of −1, by the winding of 1 + L along the contour, poles on it passed on the right.
+    open_loop : int
+        P: open-loop poles beyond the limit of stability.
+    closed_loop : int
+        Z = N + P: closed-loop poles beyond it, as the eigenvalues say as well.
+    """
+
+    encirclements: int
+    open_loop: int
+    closed_loop: int
+
+
+def nyquist_count(loop: Any, *, delay: int = 0) -> NyquistCount:
+    """Return the clockwise encirclements of −1, confirmed by the eigenvalues of open and closed loop.
+
+    Parameters
+    ----------
+    loop : control.StateSpace
+        Loop transfer function L with one channel, S = 1/(1 + L).
+    delay : int
+        Whole samples of delay in series with it.
+
+    Raises
+    ------
+    ConfirmationError
+        If the winding and the eigenvalues disagree.
+
+    Examples
+    --------
+    >>> import control
+    >>> nyquist_count(control.ss(control.tf([2.0], [1.0, -1.0])))
+    NyquistCount(encirclements=-1, open_loop=1, closed_loop=0)
+    """
+    r = Realization.of(loop, delay=delay)
+    return count(r, Features.of(r))
+
+
+def count(r: Realization, features: Features) -> NyquistCount:
+    """Return the count for a realization."""
+    eigenvalues, open_loop = r.unstable(), features.unstable_poles()
+    n = winding(r, features)
+    if n + open_loop != eigenvalues:
+        raise ConfirmationError(
+            f"found {n} clockwise encirclements of −1 and {open_loop} unstable open-loop poles, but {eigenvalues} "
+            "unstable eigenvalues of the closed loop; expected Z = N + P. A closed-loop pole may lie on the limit of "
+            "stability: look at closed_loop_poles.",
+            block="nyquist",
+        )
+    return NyquistCount(n, open_loop, eigenvalues)
+
+
+def winding(r: Realization, features: Features, *, delay: float = 0.0) -> int:
+    """Return the clockwise encirclements of 0 by 1 + L e^(−sτ) along the limit of stability.
+
+    A sampled loop takes a delay τ of whole samples.
+
+    The upper half of the contour is followed, the lower one is its mirror image. Around poles on the axis it takes
+    half-circles to the right, smaller than the distance to any other pole or closed-loop pole.
+    """
+    if len(r.D) != 1:
+        raise ParameterError(f"found a loop of {len(r.D)} channels; expected one. Open one wire.", block="nyquist")
+    if delay and not r.dt and abs(r.D[0, 0]) >= 1:
+        raise ParameterError(
+            f"found |D| = {abs(r.D[0, 0]):.6g}; expected less than 1 where a delay is counted.", block="nyquist"
+        )
+    path = _contour(r, features, delay)
+    total, last = 0.0, 0j
+    for s in path:
+        values = _follow(r, s, delay)
+        if last:
+            total += float(np.angle(values[0] / last))
+        total += float(np.sum(np.angle(values[1:] / values[:-1])))
+        last = values[-1]
+    if not r.dt:  # along the arc at infinity
+        total += float(np.angle((1.0 if delay else 1 + r.D[0, 0]) / last))
+    turns = -total / np.pi
+    if abs(turns - round(turns)) > 1e-3:
+        raise ConfirmationError(
+            f"the winding of 1 + L is {turns:.6f} half turns; expected a whole number. A closed-loop pole may lie on "
+            "the limit of stability: look at closed_loop_poles.",
+            block="nyquist",
+        )
+    return round(turns)
+
+
+def _contour(r: Realization, features: Features, delay: float) -> list[np.ndarray]:
+    segments = scan(r, features, delay=delay)
+    others = np.concatenate([features.poles, features.closed, features.zeros])
+    spots = [a.omega for a in features.axis_poles]
+    top = segments[-1][-1]
+    if delay and not r.dt:  # beyond the last sample with |L| ≥ 0.95 nothing turns around 0
+        every = np.concatenate(segments)
+        large = np.flatnonzero(np.abs(r.response(every)[0]) >= 0.95)
+        top = every[min(large[-1] + 1, len(every) - 1)] if len(large) else every[0]
+    arcs = []
+    for a in features.axis_poles:
+        at = 1j * a.omega
+        apart = [abs(at - s) for s in others] + [abs(a.omega - w) for w in spots if w != a.omega]
+        apart += [a.omega or np.inf, (r.nyquist - a.omega) or np.inf, 0.3 / r.dt if r.dt else np.inf]
+        radius = 0.3 * min(apart)
+        if not np.isfinite(radius):
+            radius = segments[0][0]
+        turn = np.linspace(-np.pi / 2, np.pi / 2, 64 * (1 + a.multiplicity) + 1)
+        if a.omega == 0.0:
+            turn = turn[turn >= 0]
+        if a.omega == r.nyquist:
+            turn = turn[turn <= 0]
+        arcs.append((a.omega, radius, at + radius * np.exp(1j * turn)))
+    first = 0.0 if not any(w == 0.0 for w, *_ in arcs) else None
+    omega = np.concatenate([[] if first is None else [first], *segments])
+    for w, radius, _ in arcs:
+        omega = omega[np.abs(omega - w) > radius]
+    omega = omega[omega <= top]
+    path, start = [], -np.inf
+    for w, _, arc in arcs:
+        line = omega[(omega > start) & (omega < w)]
+        path += [1j * line] if len(line) else []
+        path.append(arc)
+        start = w
+    line = omega[omega > start]
+    return path + ([1j * line] if len(line) else [])
+
+
+def _follow(r: Realization, s: np.ndarray, delay: float) -> np.ndarray:
+    """Return 1 + L along points, bisected until it turns by less than 0.5 rad from one to the next."""
+    for _ in range(30):
+        L, _ = r.values(s)
+        f = 1 + L * np.exp(-s * delay)
+        if np.any(f == 0):
+            raise ConfirmationError(
+                "1 + L vanishes on the contour: a closed-loop pole lies on the limit of stability. Look at "
+                "closed_loop_poles.",
+                block="nyquist",
+            )
+        coarse = np.abs(np.angle(f[1:] / f[:-1])) > 0.5
+        if not coarse.any() or len(s) > 100_000:
+            break
+        between = 0.5 * (s[1:] + s[:-1])[coarse]
+        s = np.insert(s, np.flatnonzero(coarse) + 1, between)
+    return f

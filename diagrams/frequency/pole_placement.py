@@ -1,0 +1,396 @@
+"""Pole placement: state feedback, and the gains of a sampled PID loop around a chain of integrators."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import factorial
+from typing import Any, Literal
+
+import numpy as np
+
+from ...blocks.core.errors import ConfirmationError, ParameterError
+
+Integral = Literal["forward", "backward", "trapezoidal"]
+AGREE = 1e-6  # of the largest coefficient of the scaled characteristic polynomials
+
+
+def place(A: Any, B: Any, poles: Sequence[complex]) -> np.ndarray:
+    """Return K with which A − B K has given poles, multiple ones included.
+
+    Distinct poles, or as many coinciding as there are inputs, are placed by SciPy; a single input by Ackermann's
+    formula; more coinciding poles by dealing them out to chains of integrators, one an input (Brunovsky), or where
+    pairs do not fit in, by a feedback that makes one input reach all states (Heymann) and Ackermann. Found and asked
+    poles are compared as characteristic polynomials: multiple
+    eigenvalues scatter.
+
+    Parameters
+    ----------
+    A, B : array_like
+        Continuous or sampled system, controllable.
+    poles : sequence of complex
+        As many as states, complex ones in conjugate pairs.
+
+    Raises
+    ------
+    ParameterError
+        If the number of poles or the pairs are wrong, or the system is not controllable.
+    ConfirmationError
+        If the polynomials differ: the problem is too ill-conditioned.
+
+    Examples
+    --------
+    >>> place([[0, 1], [0, 0]], [[0], [1]], [-2, -2])
+    array([[4., 4.]])
+    """
+    A, B = np.atleast_2d(np.asarray(A, dtype=float)), np.asarray(B, dtype=float)
+    B = B[:, None] if B.ndim == 1 else B
+    wanted = np.asarray(poles, dtype=complex)
+    n = len(A)
+    if A.shape != (n, n) or B.shape[0] != n or wanted.shape != (n,):
+        raise ParameterError(
+            f"found A {A.shape}, B {B.shape} and {wanted.size} poles; expected (n, n), (n, m) and n poles.",
+            block="place",
+        )
+    for name, values in (("A", A), ("B", B), ("poles", wanted)):
+        if not np.isfinite(values).all():
+            raise ParameterError(
+                "found NaN or infinity; expected finite numbers. Look at the operating point of the model.",
+                block="place",
+                port=name,
+            )
+    polynomial = _real_polynomial(wanted)
+    rank = int(np.linalg.matrix_rank(B))
+    multiplicity = max(int(np.sum(np.abs(wanted - p) < 1e-9 * (1 + abs(p)))) for p in wanted)
+    if rank > 1 and multiplicity <= rank:
+        from scipy.signal import place_poles
+
+        _controllable(A, B)
+        with (
+            warnings.catch_warnings()
+        ):  # it warns that the most robust choice is not reached: the poles are checked below
+            warnings.simplefilter("ignore")
+            K = place_poles(A, B, wanted).gain_matrix
+    elif B.shape[1] == 1:
+        _controllable(A, B)
+        K = _ackermann(A, B, polynomial)
+    else:
+        _controllable(A, B)
+        K = _chains(A, B, wanted)
+        if K is None or _difference(np.poly(A - B @ K), polynomial, float(np.linalg.norm(A))) > AGREE:
+            K = _heymann(A, B, polynomial)
+    _confirm_polynomial(np.poly(A - B @ K), polynomial, "place", float(np.linalg.norm(A)))
+    return np.asarray(K)
+
+
+def _real_polynomial(poles: np.ndarray) -> np.ndarray:
+    """Return the coefficients of the polynomial with these roots, multiplied out pairwise so that they are real."""
+    c = np.poly(poles)
+    size = np.poly(-np.abs(poles))
+    if np.any(np.abs(np.imag(c)) > 1e-9 * np.abs(size) + 1e-300):
+        raise ParameterError(
+            f"found the poles {list(poles)!r}; expected complex ones in conjugate pairs.", block="place", port="poles"
+        )
+    return np.asarray(np.real(c))
+
+
+def _controllable(A: np.ndarray, B: np.ndarray) -> None:
+    n, scale = len(A), np.linalg.norm(A) + 1e-300
+    for value in np.linalg.eigvals(A):
+        pencil = np.hstack([(A - value * np.eye(n)) / scale, B / (np.linalg.norm(B) + 1e-300)])
+        if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-12:
+            raise ParameterError(
+                f"found a mode at {value:.6g} that no input reaches; expected a controllable system. Leave the mode "
+                "out, or place the others on a reduced model.",
+                block="place",
+            )
+
+
+def _ackermann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarray:
+    """Return eₙᵀ [B, AB, …]⁻¹ p(A), the states and time scaled so that the matrix is well-conditioned."""
+    from scipy.linalg import matrix_balance
+
+    n = len(A)
+    _, (d, _) = matrix_balance(A, permute=False, separate=True)
+    size = np.linalg.norm(A * d / d[:, None]) or 1.0
+    M, b = A * d / d[:, None] / size, B / d[:, None]
+    reached = np.hstack([np.linalg.matrix_power(M, k) @ b for k in range(n)])
+    value = np.zeros((n, n))
+    for k, c in enumerate(polynomial):
+        value = value @ M + c / size**k * np.eye(n)
+    row = np.linalg.solve(reached.T, np.eye(n)[-1])
+    return np.asarray((row @ value * size / d)[None, :])
+
+
+def _chains(A: np.ndarray, B: np.ndarray, poles: np.ndarray) -> np.ndarray | None:
+    """Return K that gives each of Brunovsky's chains of integrators its own poles; None if pairs don't fit in.
+
+    With the last rows qᵢ of the chains, K = [qᵢ A^(κᵢ−1) B]⁻¹ [qᵢ pᵢ(A)]: Ackermann's formula, chain by chain.
+    """
+    n, m = len(A), B.shape[1]
+    columns: list[list[np.ndarray]] = [[] for _ in range(m)]
+    basis = np.zeros((n, 0))
+    growing, power = list(range(m)), B / np.linalg.norm(B, axis=0).clip(1e-300)
+    while growing and basis.shape[1] < n:
+        for i in list(growing):
+            rest = power[:, i] - basis @ (basis.T @ power[:, i])
+            rest = rest - basis @ (basis.T @ rest)
+            if np.linalg.norm(rest) <= 1e-9 * np.linalg.norm(power[:, i]):
+                growing.remove(i)
+                continue
+            columns[i].append(power[:, i])
+            basis = np.hstack([basis, (rest / np.linalg.norm(rest))[:, None]])
+        power = A @ power
+    lengths = [len(c) for c in columns if c]
+    shared = _share(poles, lengths)
+    if basis.shape[1] < n or shared is None:
+        return None
+    ends = np.linalg.inv(np.column_stack([v for c in columns for v in c]))[np.cumsum(lengths) - 1]
+    reach, feedback = [], []
+    for q, k, group in zip(ends, lengths, shared, strict=True):
+        value = np.zeros((n, n))
+        for c in _real_polynomial(np.array(group)):
+            value = value @ A + c * np.eye(n)
+        reach.append(q @ np.linalg.matrix_power(A, k - 1) @ B)
+        feedback.append(q @ value)
+    return np.asarray(np.linalg.pinv(np.array(reach)) @ np.array(feedback))
+
+
+def _share(poles: np.ndarray, lengths: list[int]) -> list[list[complex]] | None:
+    """Deal poles out to chains of given lengths, in their order, pairs together; None if that can't be."""
+    groups: list[list[complex]] = [[] for _ in lengths]
+    pairs = [(p, p.conjugate()) for p in poles if p.imag > 0]
+    for group in [*pairs, *((p,) for p in poles if p.imag == 0)]:
+        room = [i for i, k in enumerate(lengths) if k - len(groups[i]) >= len(group)]
+        if not room:
+            return None
+        groups[room[0]] += group
+    return groups if [len(g) for g in groups] == lengths else None
+
+
+def _heymann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarray:
+    """Return a feedback that makes a combination of the inputs reach all states, plus Ackermann's for that one.
+
+    Of some candidates, drawn the same every time, the one with the smallest gain that places the poles best is taken.
+    """
+    rng = np.random.default_rng(0)
+    size = max(np.linalg.norm(A), np.max(np.abs(polynomial[1:]) ** (1 / np.arange(1, len(polynomial)))))
+    best: tuple[float, np.ndarray] | None = None
+    for _ in range(40):
+        F = rng.normal(size=(B.shape[1], len(A))) * size / (np.linalg.norm(B) * np.sqrt(B.shape[1] * len(A)))
+        q = rng.normal(size=(B.shape[1], 1))
+        try:
+            K = F + q @ _ackermann(A - B @ F, B @ q, polynomial)
+        except np.linalg.LinAlgError:
+            continue
+        cost = float(np.linalg.norm(K)) * (
+            1 + 1e6 * _difference(np.poly(A - B @ K), polynomial, float(np.linalg.norm(A)))
+        )
+        if best is None or cost < best[0]:
+            best = cost, K
+    if best is None:
+        raise ParameterError("no combination of the inputs reaches all states; is A, B controllable?", block="place")
+    return best[1]
+
+
+def _difference(found: np.ndarray, wanted: np.ndarray, size: float = 0.0) -> float:
+    """Return the largest difference of two monic polynomials' coefficients, time scaled by the size of the roots.
+
+    ``size`` is taken where all roots that are wanted are at zero.
+    """
+    n = len(wanted) - 1
+    roots = float(np.max(np.abs(wanted[1:]) ** (1 / np.arange(1, n + 1)), initial=0.0))
+    scale = (roots or size or 1.0) ** np.arange(n + 1)
+    return float(np.max(np.abs(found - wanted) / scale) / np.max(np.abs(wanted) / scale))
+
+
+def _confirm_polynomial(found: np.ndarray, wanted: np.ndarray, who: str, size: float = 0.0) -> None:
+    difference = _difference(found, wanted, size)
+    if not difference < AGREE:
+        raise ConfirmationError(
+            f"the characteristic polynomial that was found differs from the one asked for by {difference:.3g} of its "
+            f"largest coefficient; expected less than {AGREE:g}. The system is nearly uncontrollable, or badly scaled.",
+            block=who,
+        )
+
+
+@dataclass(frozen=True)
+class SampledDesign:
+    """What a sampled PID loop around a chain of integrators really is.
+
+    Parameters
+    ----------
+    gains : tuple of float
+        (a₀, a₁, …): gain of the integral, of the error, of its rate, …
+    sample_time : float
+        T in s.
+    delay : int
+        Samples between measurement and hold.
+    poles : tuple of complex
+        All closed-loop poles, as s = log(z)/T in 1/s, the slowest first. Multiple ones scatter.
+    poles_z : tuple of complex
+        The same in the z plane.
+    polynomial : tuple of float
+        Characteristic polynomial in w = (z − 1)/T, highest power first.
+    """
+
+    gains: tuple[float, ...]
+    sample_time: float
+    delay: int
+    poles: tuple[complex, ...]
+    poles_z: tuple[complex, ...]
+    polynomial: tuple[float, ...]
+
+    @property
+    def stable(self) -> bool:
+        """Whether all poles lie inside the unit circle."""
+        return all(abs(z) < 1 for z in self.poles_z)
+
+
+def sampled_poles(
+    gains: Sequence[float], sample_time: float, *, delay: int = 0, integral: Integral = "forward"
+) -> SampledDesign:
+    """Return the poles that a sampled implementation of the error dynamics really has.
+
+    v = −(a₀ ∫e + a₁ e + a₂ ė + …) is held over each sample, in front of a chain of as many integrators as there are
+    gains of e and its rates, which are measured at the ticks. `ErrorDynamics` integrates by forward Euler.
+
+    Parameters
+    ----------
+    gains : sequence of float
+        (a₀, a₁, a₂): of the integral, the error, its rate; more for a longer chain.
+    sample_time : float
+        T in s.
+    delay : int
+        Samples between measurement and hold.
+    integral : {"forward", "backward", "trapezoidal"}
+        How ∫e is summed: without the error of this tick, with it, or with half of it.
+    """
+    base, parts = _pencil(len(gains), sample_time, delay, integral)
+    polynomial = base.copy()
+    for a, part in zip(gains, parts, strict=True):
+        polynomial[-len(part) :] += a * part
+    w = np.roots(polynomial)
+    with np.errstate(divide="ignore"):
+        s = np.log((1 + sample_time * w).astype(complex)) / sample_time
+    order = np.argsort(np.abs(s))
+    return SampledDesign(
+        gains=tuple(float(a) for a in gains),
+        sample_time=sample_time,
+        delay=delay,
+        poles=tuple(complex(v) for v in s[order]),
+        poles_z=tuple(complex(v) for v in 1 + sample_time * w[order]),
+        polynomial=tuple(float(c) for c in polynomial),
+    )
+
+
+def sampled_gains(
+    poles: Sequence[complex], sample_time: float, *, delay: int = 0, integral: Integral = "forward"
+) -> SampledDesign:
+    """Return the gains with which the sampled loop really has the poles that are asked for, multiple ones included.
+
+    The characteristic polynomial is affine in the gains; it vanishes at each z = exp(s T), and so do as many of its
+    derivatives as the pole has further multiplicity. These are linear equations. A delay adds one pole a sample that
+    can't be chosen: they are in the result too.
+
+    Parameters
+    ----------
+    poles : sequence of complex
+        In 1/s, one for each gain, complex ones in conjugate pairs, in the left half plane.
+    sample_time : float
+        T in s.
+    delay : int
+        Samples between measurement and hold.
+    integral : {"forward", "backward", "trapezoidal"}
+        How ∫e is summed.
+
+    Raises
+    ------
+    ParameterError
+        If the poles are not stable or not in pairs, or those that the delay adds come out unstable.
+    ConfirmationError
+        If the polynomial with these gains has not the roots that were asked for.
+    """
+    wanted = np.asarray(poles, dtype=complex)
+    if wanted.ndim != 1 or not len(wanted) or not np.all(wanted.real < 0) or not np.isfinite(wanted).all():
+        raise ParameterError(
+            f"found {list(poles)!r}; expected poles in the left half plane, one for each gain.",
+            block="sampled_gains",
+            port="poles",
+        )
+    w = np.expm1(wanted * sample_time) / sample_time
+    asked = _real_polynomial(w)
+    base, parts = _pencil(len(w), sample_time, delay, integral)
+    # the remainders of a division by the polynomial that is asked for vanish: multiplicities need no case of their own
+    size = float(np.max(np.abs(w)))
+    columns = [_remainder(part, asked, size) for part in parts]
+    gains = np.linalg.solve(np.array(columns).T, -_remainder(base, asked, size))
+    design = sampled_poles([float(a) for a in gains], sample_time, delay=delay, integral=integral)
+    quotient, _ = _divide(np.array(design.polynomial), asked)
+    _confirm_polynomial(np.array(design.polynomial), np.polymul(quotient, asked), "sampled_gains")
+    others = 1 + sample_time * np.roots(quotient)
+    if np.any(np.abs(others) >= 1):
+        raise ParameterError(
+            f"found gains that put the poles there, but the delay adds others at z = {others.round(6).tolist()}, which "
+            "are not stable; expected |z| < 1. Ask for slower poles.",
+            block="sampled_gains",
+            port="poles",
+        )
+    return design
+
+
+def _remainder(polynomial: np.ndarray, divisor: np.ndarray, size: float) -> np.ndarray:
+    """Return the remainder of a division of polynomials in w/size, padded to the degree of the divisor."""
+    scaled = polynomial * size ** np.arange(len(polynomial) - 1, -1, -1.0)
+    by = divisor * size ** np.arange(len(divisor) - 1, -1, -1.0)
+    return _divide(np.append(np.zeros(max(0, len(by) - len(scaled))), scaled), by)[1]
+
+
+def _divide(polynomial: np.ndarray, divisor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return quotient and remainder, which has as many coefficients as the divisor has roots (np.polydiv's varies)."""
+    rest, steps = np.array(polynomial, dtype=float), len(polynomial) - len(divisor) + 1
+    quotient = np.zeros(steps)
+    for k in range(steps):
+        quotient[k] = rest[k] / divisor[0]
+        rest[k : k + len(divisor)] -= quotient[k] * divisor
+    return quotient, rest[steps:]
+
+
+def _pencil(gains: int, T: float, delay: int, integral: Integral) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return p₀ and pᵢ of the characteristic polynomial p₀ + Σ aᵢ pᵢ in w = (z − 1)/T.
+
+    A chain of k integrators behind a hold is T^k E_k(z)/(k! (z − 1)^k) with the Eulerian polynomial E_k.
+    """
+    chain = gains - 1
+    if chain < 1 or not (np.isfinite(T) and T > 0) or delay < 0 or int(delay) != delay:
+        raise ParameterError(
+            f"found {gains} gains, a sample time of {T} s and a delay of {delay} samples; expected two gains or more, "
+            "a positive time, and a whole number.",
+            block="sampled_design",
+        )
+    sums = {"forward": [1.0], "backward": [T, 1.0], "trapezoidal": [T / 2, 1.0]}
+    if integral not in sums:
+        raise ParameterError(
+            f"found integral={integral!r}; expected 'forward', 'backward' or 'trapezoidal'.", block="sampled_design"
+        )
+    base = np.array([1.0] + [0.0] * (chain + 1))
+    for _ in range(int(delay)):
+        base = np.polymul(base, [T, 1.0])
+    # a₁ sees the whole chain, the last gain a single integrator
+    parts = [np.polymul(_held(k, T), [1.0] + [0.0] * (chain + 1 - k)) for k in range(chain, 0, -1)]
+    return base, [np.polymul(sums[integral], _held(chain, T)), *parts]
+
+
+def _held(k: int, T: float) -> np.ndarray:
+    """Return E_k(z)/k! in w, where z = 1 + T w."""
+    eulerian = [1.0]
+    for n in range(2, k + 1):
+        longer = [0.0] * n
+        for j in range(n):
+            longer[j] = (j + 1) * (eulerian[j] if j < n - 1 else 0.0) + (n - j) * (eulerian[j - 1] if j else 0.0)
+        eulerian = longer
+    out: np.ndarray = np.zeros(1)
+    for c in eulerian:
+        out = np.polyadd(np.polymul(out, [T, 1.0]), [c])
+    return np.asarray(np.trim_zeros(out, "f")) / factorial(k)

@@ -1,0 +1,207 @@
+"""What python-control says about the same loop, beside our numbers, and which of the two is right."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import ConfirmationError, ParameterError
+from . import confirm
+from .crossings import Scan
+from .margins import Margins, margins
+from .one_thread import on_one_thread
+from .realization import Realization
+
+SAME = 1e-4  # relative difference up to which two values are called the same
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One number by us and by python-control.
+
+    Parameters
+    ----------
+    name : str
+        Name as in `Margins`.
+    value : float
+        Ours.
+    control : float
+        python-control's, in our unit; NaN where it gives none.
+    function : str
+        The function that gave it.
+    right : str
+        "both", "ours" (also where python-control gives none), or "neither is refuted".
+    why : str
+        What decides it.
+    """
+
+    name: str
+    value: float
+    control: float
+    function: str
+    right: str
+    why: str
+
+
+def compare_with_control(loop: Any, *, delay: int = 0) -> tuple[Comparison, ...]:
+    """Return each margin beside python-control's value, with the one that is right and why.
+
+    A value that differs is tried with closed-loop eigenvalues at 0.99 and 1.01 of it (gain, phase), or held against
+    the response (frequencies, peaks).
+
+    Parameters
+    ----------
+    loop : control.StateSpace
+        L with one channel, closed loop stable.
+    delay : int
+        Whole samples of delay in series with a sampled loop.
+
+    Raises
+    ------
+    ParameterError
+        If the closed loop is not stable.
+    """
+    import control
+
+    ours = margins(loop, delay=delay)
+    if not ours.stable:
+        raise ParameterError(
+            "found a closed loop that is not stable; expected a stable one: it has no margins to compare.",
+            block="compare_with_control",
+        )
+    L = control.ss(loop)
+    for _ in range(delay):
+        L = L * control.ss(0, 1, 1, 0, L.dt)
+    return compared(Realization.of(loop, delay=delay), ours, L)
+
+
+@on_one_thread
+def compared(r: Realization, ours: Margins, L: Any) -> tuple[Comparison, ...]:
+    """Return margins that are there already beside python-control's of L, of which r is the realization."""
+    theirs = _ControlValues(L)
+    judge = _Judge(r, ours)
+    found = []
+    for name, (function, value, reason) in theirs.values(ours).items():
+        mine = ours.encirclements if name == "encirclements" else getattr(ours, name).value
+        found.append(judge.compare(name, float(mine), value, function, reason))
+    return tuple(found)
+
+
+class _ControlValues:
+    """python-control's numbers of a loop; what raises is NaN with its message."""
+
+    def __init__(self, L: Any):
+        self.L = L
+
+    def values(self, ours: Margins) -> dict[str, tuple[str, float, str]]:
+        import control
+
+        L = self.L
+
+        def disk() -> float:
+            top = np.pi / L.dt if L.dt else 100 * max([1.0, *(abs(p) for p in ours.closed_loop_poles)])
+            return float(control.disk_margins(L, np.geomspace(top * 1e-6, top * (1 - 1e-9), 4000))[0])
+
+        def bandwidth() -> float:
+            return float(control.bandwidth(control.feedback(L, 1)))
+
+        def encirclements() -> float:
+            return float(control.nyquist_response(L).count)
+
+        out: dict[str, tuple[str, float, str]] = {}
+        margins_of, why = _quiet(lambda: control.stability_margins(L))
+        gm, pm, sm, _, wgc, _ = margins_of if margins_of is not None else (np.nan,) * 6
+        low = gm if gm < 1 else np.nan
+        high = gm if gm > 1 else np.nan
+        one = "it gives one gain margin only, the other side's is not reported"
+        out["gain_margin_low"] = ("stability_margins", float(low), why or one)
+        out["gain_margin_high"] = ("stability_margins", float(high), why or one)
+        out["phase_margin_deg"] = ("stability_margins", float(pm), why)
+        if np.isinf(ours.delay_margin_s.value):
+            out["delay_margin_s"] = ("stability_margins", np.inf if np.isinf(pm) else np.nan, why)
+        else:
+            lag = np.radians(pm % 360)
+            out["delay_margin_s"] = ("stability_margins, pm/ωpm", float(lag / wgc) if wgc else np.nan, why)
+        out["modulus_margin"] = ("stability_margins", float(sm), why or "it gives none")
+        for name, function, call in (
+            ("disk_margin", "disk_margins", disk),
+            ("bandwidth", "bandwidth", bandwidth),
+            ("encirclements", "nyquist_response", encirclements),
+        ):
+            value, message = _quiet(call)
+            out[name] = (function, np.nan if value is None else value, message)
+        return out
+
+
+def _quiet(call: Callable[[], Any]) -> tuple[Any, str]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            return call(), ""
+        except Exception as error:
+            return None, f"it raises {type(error).__name__}: {error}"
+
+
+class _Judge:
+    """Decides between two values of one loop."""
+
+    def __init__(self, r: Realization, ours: Margins):
+        self.r, self.ours, self.scan = r, ours, Scan(r)
+
+    def compare(self, name: str, mine: float, theirs: float, function: str, reason: str) -> Comparison:
+        same = mine == theirs or abs(mine - theirs) <= SAME * abs(mine)
+        if same:
+            return Comparison(name, mine, theirs, function, "both", "they agree")
+        how = "our value is confirmed"
+        if name in self.ours.numbers():
+            how += " by " + self.ours.numbers()[name].confirmed_by
+        if np.isnan(theirs):
+            return Comparison(name, mine, theirs, function, "ours", f"{reason or 'it gives none'}; {how}")
+        try:
+            refuted = self._refuted(name, mine, theirs)
+        except (np.linalg.LinAlgError, ArithmeticError) as error:
+            refuted, reason = "", f"theirs can't be judged ({error})"
+        return Comparison(
+            name, mine, theirs, function, "ours" if refuted else "neither is refuted", f"{refuted or reason}; {how}"
+        )
+
+    def _refuted(self, name: str, mine: float, value: float) -> str:
+        """Return why a value can't be right, empty if it may be."""
+        r = self.r
+        if name in ("gain_margin_low", "gain_margin_high"):
+            if value in (0.0, np.inf):
+                return f"it says that there is none, and the factor {mine:.9g} ends stability"
+            return self._no_limit(value, 1.0, r.stable)
+        if name == "phase_margin_deg":
+            if not np.isfinite(value):
+                return "|L| = 1 somewhere, and a rotation there ends stability"
+            return self._no_limit(value, 0.0, lambda degrees: r.stable(np.exp(-1j * np.radians(degrees))))
+        if name == "encirclements":
+            return "it is not Z − P of the eigenvalues"
+        if name == "bandwidth":
+            L = complex(r.response(value)[0][0]) if 0 < value <= r.nyquist else complex(np.nan)
+            zero = self.scan.ends()[0][1]
+            low = 1.0 if np.isinf(zero) else abs(zero / (1 + zero))
+            fall = abs(L / (1 + L)) / low
+            text = f"|T| is {fall:.6f} of its low-frequency value there, not 1/√2 = {2**-0.5:.6f}"
+            return text + (" (10^(−3/20) = 0.707946 is used)" if abs(fall - 10**-0.15) < 1e-5 else "")
+        if name == "modulus_margin":
+            nearest = 1 / self.scan.peak(1, 0).value
+            return f"L comes as near as {nearest:.9g} to −1" if nearest < value else "L does not come as near to −1"
+        if name == "disk_margin":
+            return f"max|S − T|/2 is {self.scan.peak(0.5, -0.5).value:.9g}, the reciprocal of ours"
+        return "its phase margin or crossover is another" if name == "delay_margin_s" else ""
+
+    @staticmethod
+    def _no_limit(value: float, nominal: float, stable: Callable[[float], bool]) -> str:
+        try:
+            confirm.limit("control", value, [], nominal, stable, "closed-loop eigenvalues")
+        except ConfirmationError:
+            inside, outside = (stable(v) for v in confirm.beside(value, [], nominal))
+            words = ["stable" if s else "unstable" for s in (inside, outside)]
+            return f"closed-loop eigenvalues say {words[0]} just before it and {words[1]} just beyond"
+        return ""

@@ -1,0 +1,306 @@
+"""A loop as balanced matrices: its frequency response, its slope, and its closed-loop matrix."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import ParameterError
+
+Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+HIDDEN = 1e-11  # relative size of a coupling that counts as none when hidden modes are split off
+STRUCTURE = 1e-14  # relative size, all scaled, below which an entry is what rounding has left of a zero
+ROUNDING = (1e-8, 1e-10, 1e-12)  # sizes below which it perhaps is, tried in this order and held against the response
+MARGINAL = 1e-14  # relative to the largest pole: one that near to the limit of stability is taken to lie on it
+LARGE = 1e4  # |L| above which a difference shows nowhere in the closed loop
+
+
+@dataclass(frozen=True, eq=False)
+class Realization:
+    """A linear system (p I − A) x = B u, y = C x + D u with p = s, or p = z − 1 where it is sampled.
+
+    The shift z − 1 keeps a loop accurate far below the sampling frequency, where several poles at z = 1 would
+    otherwise cancel all digits. Frequencies and points of the contour are given as s in both cases: p = exp(s T) − 1.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    dt: float
+    hidden: np.ndarray
+
+    @classmethod
+    def of(cls, loop: Any, *, delay: int = 0) -> Realization:
+        """Return the balanced, minimal realization of a linear system of python-control.
+
+        Parameters
+        ----------
+        loop : control.StateSpace or control.TransferFunction
+            Continuous (dt = 0) or sampled (dt = T in s).
+        delay : int
+            Whole samples of delay in series with it.
+        """
+        import control
+
+        who = getattr(loop, "name", None) or "loop"
+        try:
+            system = control.ss(loop)
+        except Exception as error:
+            raise ParameterError(
+                f"found {type(loop).__name__}, of which python-control makes no state space ({error}); expected a "
+                "control.StateSpace.",
+                block=who,
+            ) from error
+        dt = system.dt
+        if dt is None or dt is True:
+            raise ParameterError(
+                f"found dt={dt}; expected 0 (continuous) or the sample time in s. Set it: control.ss(A, B, C, D, dt).",
+                block=who,
+                port="dt",
+            )
+        if int(delay) != delay or delay < 0 or (delay and not dt):
+            raise ParameterError(
+                f"found a delay of {delay!r} samples; expected a whole number that is not negative, of a sampled loop.",
+                block=who,
+                port="delay",
+            )
+        A, B, C, D = (np.array(getattr(system, name), dtype=float) for name in "ABCD")
+        if not all(np.isfinite(m).all() for m in (A, B, C, D)):
+            raise ParameterError("found NaN or infinity in A, B, C or D; look at the operating point.", block=who)
+        if dt:
+            A = A - np.eye(len(A))
+        if len(A):  # a feedthrough that rounding has left would be crossings near infinity
+            size = max(float(np.abs(M).max(initial=0.0)) for M in _scaled(A, B, C))
+            D = np.where(np.abs(D) <= STRUCTURE * size, 0.0, D)
+        for _ in range(int(delay)):
+            A, B, C, D = _delayed(A, B, C, D)
+        made = cls(*_balanced(A, B, C), D, float(dt), np.zeros(0)).minimal()
+        # once more, with input and output: A alone may have been scaled by what rounding has left in it
+        return cls(*_scaled(made.A, made.B, made.C), D, made.dt, made.hidden)
+
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return len(self.A)
+
+    @property
+    def nyquist(self) -> float:
+        """Highest frequency of the response in rad/s: π/T, or infinity."""
+        return np.pi / self.dt if self.dt else np.inf
+
+    def point(self, s: np.ndarray) -> np.ndarray:
+        """Return p at s."""
+        return np.asarray(np.expm1(s * self.dt) if self.dt else s, dtype=complex)
+
+    def logarithm(self, p: np.ndarray) -> np.ndarray:
+        """Return s at p; −∞ for z = 0."""
+        p = np.asarray(p, dtype=complex)
+        if not self.dt:
+            return p
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # log|1 + p| without cancellation near p = 0
+            real = 0.5 * np.log1p(np.maximum(2 * p.real + np.abs(p) ** 2, -1.0))
+            return np.asarray((real + 1j * np.angle(1 + p)) / self.dt)
+
+    def matrix(self, s: Any) -> np.ndarray:
+        """Return the transfer matrix at the points s, shape (..., outputs, inputs)."""
+        return np.asarray(self.D + self.C @ self._states(np.atleast_1d(s)))
+
+    def response(self, omega: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return L and dL/dω of a loop with one channel at the frequencies ω."""
+        s = 1j * np.atleast_1d(np.asarray(omega, dtype=float))
+        return self.values(s, slope=1j)
+
+    def values(self, s: np.ndarray, slope: complex = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """Return L and ``slope`` times dL/ds of a loop with one channel at the points s."""
+        x = self._states(s)
+        rate = self.dt * (1 + self.point(s)) if self.dt else np.ones_like(s)
+        twice = self._solve(s, x)
+        return (self.D + self.C @ x)[:, 0, 0], -slope * rate * (self.C @ twice)[:, 0, 0]
+
+    def error(self, omega: float) -> float:
+        """Return an estimate of the relative rounding error of L at ω: the adjoint solution compared."""
+        s = np.array([1j * omega])
+        direct = self.matrix(s)[0]
+        adjoint = self.D + (_dual(self).C @ _dual(self)._states(s))[0].T
+        return 1e-13 + 10 * float(np.max(np.abs(direct - adjoint)) / (np.max(np.abs(direct)) + 1e-300))
+
+    def closed(self, factor: Any = 1.0) -> np.ndarray:
+        """Return the closed-loop matrix A − B F (I + D F)⁻¹ C, F multiplying the loop (scalar or matrix)."""
+        m = len(self.D)
+        F = factor * np.eye(m) if np.ndim(factor) == 0 else np.asarray(factor)
+        return np.asarray(self.A - self.B @ F @ np.linalg.solve(np.eye(m) + self.D @ F, self.C))
+
+    def eigenvalues(self, factor: Any = 1.0) -> np.ndarray:
+        """Return the closed-loop poles in the plane of p."""
+        return np.linalg.eigvals(self.closed(factor))
+
+    def growth(self, p: np.ndarray) -> np.ndarray:
+        """Return how far poles are beyond the limit of stability: Re s, or |z| − 1."""
+        if not self.dt:
+            return np.asarray(np.real(p))
+        square = 2 * np.real(p) + np.abs(p) ** 2
+        return np.asarray(square / (1 + np.sqrt(1 + square)))
+
+    def unstable(self, factor: Any = 1.0) -> int:
+        """Return the number of closed-loop poles that are not stable; within rounding of the limit is not stable."""
+        poles = self.eigenvalues(factor)
+        rounding = MARGINAL * float(np.abs(poles).max(initial=0.0))
+        return int(np.sum(self.growth(poles) >= -rounding))
+
+    def stable(self, factor: Any = 1.0) -> bool:
+        """Whether all closed-loop poles are stable."""
+        return self.unstable(factor) == 0
+
+    @cached_property
+    def scale(self) -> float:
+        """Size of A."""
+        return float(np.linalg.norm(self.A)) if self.order else 0.0
+
+    def delayed(self) -> Realization:
+        """Return this sampled system with one more sample of delay."""
+        return Realization(*_delayed(self.A, self.B, self.C, self.D), self.dt, self.hidden)
+
+    def minimal(self) -> Realization:
+        """Return the part that is controllable and observable; what was split off is kept in ``hidden``."""
+        whole = self._without(*_connected(self, STRUCTURE))
+        for tolerance in ROUNDING:
+            fewer = whole._without(*_connected(whole, tolerance))
+            if fewer.order < whole.order and fewer.agrees(whole):
+                whole = fewer
+        part, first = _split(whole)
+        part, second = _split(_dual(part))
+        return whole._without(_dual(part), np.concatenate([first, second]))
+
+    def agrees(self, other: Realization) -> bool:
+        """Whether the responses are the same to 1e-9 around every open- and closed-loop pole.
+
+        Where they are very large, near several poles at s = 0 that scatter, nothing depends on them.
+        """
+        p = [np.linalg.eigvals(other.A)]
+        if other.B.shape[1] == len(other.C) and np.linalg.cond(np.eye(len(other.D)) + other.D) < 1e12:
+            p.append(other.eigenvalues())
+        s = self.logarithm(np.concatenate(p))
+        s = s[np.isfinite(s)]
+        s = s[np.abs(s) > 1e-7 * np.abs(s).max(initial=0.0)]
+        around = np.outer(np.abs(s) if len(s) else [1.0], np.geomspace(0.3, 3, 7)).ravel()
+        omega = np.concatenate([around, np.abs(s.imag), np.abs(s.imag) + np.abs(s.real)]) * (1 + 1e-9)
+        omega = omega[(omega < self.nyquist) & (omega > 1e-3 * around.min())]
+        one, two = self.matrix(1j * omega), other.matrix(1j * omega)
+        size, apart = np.max(np.abs(two), axis=(1, 2)), np.max(np.abs(one - two), axis=(1, 2))
+        judged = size < LARGE
+        return bool(judged.any() and np.all(apart[judged] <= 1e-9 * size[judged]))
+
+    def _without(self, part: Realization, hidden: np.ndarray) -> Realization:
+        """Return a part of this system whose response is the same, with the poles of the rest; else this system."""
+        if part.order == self.order:
+            return self
+        part = Realization(*_scaled(part.A, part.B, part.C), self.D, self.dt, np.concatenate([self.hidden, hidden]))
+        poles = self.logarithm(np.linalg.eigvals(self.A))
+        size = np.abs(poles[np.isfinite(poles)])
+        top = min(10 * size.max(initial=1.0), self.nyquist)
+        s = 1j * np.geomspace(top * 1e-5, top, 101) * (1 + 1e-4)
+        before, after = self.matrix(s), part.matrix(s)
+        size = np.max(np.abs(before), axis=(1, 2)) + 1e-300
+        # far above 1 an error does not show in the closed loop, and integrators amplify rounding there
+        worst = np.max(np.abs(before - after), axis=(1, 2)) / (size * np.maximum(1.0, np.sqrt(size)))
+        return part if np.max(worst) < 1e-9 else self
+
+    def _solve(self, s: np.ndarray, right: np.ndarray) -> np.ndarray:
+        return np.linalg.solve(self.point(s)[:, None, None] * np.eye(self.order) - self.A, right)
+
+    def _states(self, s: np.ndarray) -> np.ndarray:
+        return self._solve(s, np.broadcast_to(self.B.astype(complex), (len(s), *self.B.shape)))
+
+
+def _dual(r: Realization) -> Realization:
+    return Realization(r.A.T, r.C.T, r.B.T, r.D.T, r.dt, r.hidden)
+
+
+def _delayed(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Matrices:
+    """Put z⁻¹ behind the inputs: z d = u, so p d = u − d."""
+    n, m = len(A), B.shape[1]
+    bottom = np.hstack([np.zeros((m, n)), -np.eye(m)])
+    return (
+        np.vstack([np.hstack([A, B]), bottom]),
+        np.vstack([np.zeros((n, m)), np.eye(m)]),
+        np.hstack([C, D]),
+        np.zeros_like(D),
+    )
+
+
+def _balanced(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scale the states by powers of two, so that A's rows and columns are of one size."""
+    if not len(A):
+        return A, B, C
+    d = _scales(A)
+    return A * d / d[:, None], B / d[:, None], C * d
+
+
+def _scales(M: np.ndarray) -> np.ndarray:
+    from scipy.linalg import matrix_balance
+
+    with np.errstate(invalid="ignore"):  # SciPy reads a permutation out of the factors, which may be too large for one
+        _, (d, _) = matrix_balance(M, permute=False, separate=True)
+    return np.asarray(d)
+
+
+def _scaled(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scale the states so that input, states and output are of one size.
+
+    A chain of integrators has no loop that fixes its scale: balanced alone, it is scaled by what rounding has left.
+    """
+    n = len(A)
+    if not n:
+        return A, B, C
+    whole = np.block([[A, np.linalg.norm(B, axis=1)[:, None]], [np.linalg.norm(C, axis=0)[None, :], np.zeros((1, 1))]])
+    d = _scales(whole)
+    d = d[:n] / d[n]
+    return A * d / d[:, None], B / d[:, None], C * d
+
+
+def _connected(r: Realization, tolerance: float) -> tuple[Realization, np.ndarray]:
+    """Return what the input reaches and the output sees along couplings above rounding, and the poles of the rest."""
+    A, B, C = _scaled(r.A, r.B, r.C)
+    n = len(A)
+    whole = np.block([[A, B], [C, np.zeros((len(C), B.shape[1]))]])
+    size = np.abs(whole).max(initial=0.0)
+    A, B, C = (np.abs(M) > tolerance * size for M in (A, B, C))
+    reached, seen = B.any(axis=1), C.any(axis=0)
+    for _ in range(n):
+        reached, seen = reached | A[:, reached].any(axis=1), seen | A[seen].any(axis=0)
+    keep = reached & seen
+    if keep.all():
+        return r, np.zeros(0)
+    part = Realization(r.A[np.ix_(keep, keep)], r.B[keep], r.C[:, keep], r.D, r.dt, r.hidden)
+    return part, np.linalg.eigvals(r.A[np.ix_(~keep, ~keep)])
+
+
+def _split(r: Realization) -> tuple[Realization, np.ndarray]:
+    """Return the controllable part, and the poles of the rest (block Krylov staircase)."""
+    if not r.order:
+        return r, np.zeros(0)
+    size = np.linalg.norm(r.B, axis=0)
+    new = _range(r.B / np.where(size > 0, size, 1.0), 1.0)
+    Q = new
+    while new.shape[1] and Q.shape[1] < r.order:
+        reached = r.A @ new
+        for _ in range(2):
+            reached = reached - Q @ (Q.T @ reached)
+        new = _range(reached, r.scale)
+        Q = np.hstack([Q, new])
+    if Q.shape[1] == r.order:
+        return r, np.zeros(0)
+    whole, _ = np.linalg.qr(np.hstack([Q, np.eye(r.order)]))
+    rest = whole[:, Q.shape[1] :]
+    part = Realization(Q.T @ r.A @ Q, Q.T @ r.B, r.C @ Q, r.D, r.dt, r.hidden)
+    return part, np.linalg.eigvals(rest.T @ r.A @ rest)
+
+
+def _range(M: np.ndarray, scale: float) -> np.ndarray:
+    U, sigma, _ = np.linalg.svd(M, full_matrices=False)
+    return np.asarray(U[:, sigma > HIDDEN * scale])

@@ -1,0 +1,1 @@
+"""Linear models, operating points and trim."""

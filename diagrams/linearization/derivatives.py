@@ -1,0 +1,260 @@
+"""Derivatives of a diagram's functions at an instant, with signals injected and wires cut."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ...blocks.core.errors import NonFiniteError, UnknownNameError, near
+from ...blocks.tracing.symbols import size
+from ..flat.evaluate import Pass
+from ..flat.flat_diagram import FlatDiagram
+from ..flat.functions import active_loops
+from ..flat.layout import Clock
+from ..results.signal_names import resolve
+from ..simulation.workspace import Machine
+from ..wiring.structure import Wire
+from .operating_point import elements
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A place in a diagram: an output port, or entries of it."""
+
+    name: str
+    port: tuple[str, str]
+    entries: tuple[int, ...]
+    labels: tuple[str, ...]
+
+
+def find_signal(flat: FlatDiagram, name: str) -> Signal:
+    """Return the place that a wire's or port's name stands for.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is none, or several.
+    """
+    wires, ports = flat.table.names, flat.log.slices
+    if not isinstance(name, str):
+        raise UnknownNameError(f"found {name!r}; expected the name of a wire, or the path of a port.")
+    name, entry = _split(name, {*wires, *ports})
+    try:
+        full = resolve(name, wires, ports)
+    except UnknownNameError as error:
+        if "stands for several" in str(error):
+            raise
+        known = {n.rpartition(".")[2] for n in (*wires, *ports)} | {*wires, *ports}
+        raise UnknownNameError(f"there is no signal {name!r} in this diagram. {near(name, known)}") from None
+    wire = wires[full] if full in wires else Wire(*flat.ports[full])
+    shape = flat.checked.shapes[wire.block, wire.port]
+    index = np.arange(size(shape)).reshape(shape)
+    part = index if wire.index is None else np.asarray(index[wire.index])
+    labels = np.array(elements(name if name in wires else full, part.shape)).reshape(part.shape)
+    if entry:
+        if len(entry) != part.ndim or any(not i < n for i, n in zip(entry, part.shape, strict=False)):
+            raise UnknownNameError(
+                f"{full!r} has the shape {part.shape}, and no entry {list(entry)}; entries are counted from 0."
+            )
+        part, labels = part[entry], labels[entry]
+    flat_labels = tuple(str(e) for e in np.ravel(labels))
+    return Signal(name, (wire.block, wire.port), tuple(np.ravel(part).tolist()), flat_labels)
+
+
+def _split(name: str, known: set[str]) -> tuple[str, tuple[int, ...]]:
+    """Return the name of a signal, and the entry behind it: ``q[1]`` is entry 1 of ``q``."""
+    found = re.fullmatch(r"(.+)\[(\d+(?:,\d+)*)\]", name)
+    if found is None or name in known:
+        return name, ()
+    return found[1], tuple(int(i) for i in found[2].split(","))
+
+
+class Parts:
+    """Exact derivatives of what a diagram does at a tick and between ticks.
+
+    Parameters
+    ----------
+    flat : FlatDiagram
+        The diagram.
+    inputs : sequence of Signal
+        Where signals d are injected: added to what the consumers of the port get.
+    outputs : sequence of Signal
+        What is measured: what the block puts out, ahead of the injection.
+    openings : sequence of Signal
+        Where the wire is cut: consumers get what the port puts out in the closed diagram, as a given value, and what is
+        injected. So the motion stays that of the closed diagram, whatever is cut.
+    """
+
+    def __init__(
+        self, flat: FlatDiagram, inputs: Sequence[Signal], outputs: Sequence[Signal], openings: Sequence[Signal]
+    ):
+        self.flat, self.inputs, self.outputs, self.openings = flat, inputs, outputs, openings
+        self.n_inputs = sum(len(s.entries) for s in inputs)
+        self.cut: dict[tuple[str, str], set[int]] = {}
+        for s in openings:
+            self.cut.setdefault(s.port, set()).update(s.entries)
+        self._functions: dict[Any, Any] = {}
+        self._machine = Machine(flat) if flat.loops.slices else None
+
+    @cached_property
+    def varies(self) -> bool:
+        """Whether the flow between ticks depends on time."""
+        t, x, w, p = self.flat.symbols()
+        return bool(ca.depends_on(self.flat.flow(t, x, w, p), t)) or self._machine is not None
+
+    def _taps(self, d: Any, c: Any) -> dict[tuple[str, str], Any]:
+        injected: dict[tuple[str, str], list[tuple[int, int]]] = {}
+        position = 0
+        for signal in self.inputs:
+            for entry in signal.entries:
+                injected.setdefault(signal.port, []).append((entry, position))
+                position += 1
+        kept: dict[tuple[str, str], Any] = {}
+        position = 0
+        for port in self.cut:
+            n = size(self.flat.checked.shapes[port])
+            kept[port] = c[position : position + n]
+            position += n
+
+        def tap(port: tuple[str, str]) -> Any:
+            def change(column: Any) -> Any:
+                column = column if isinstance(column, ca.MX) else ca.MX(ca.DM(column))
+                parts = [kept[port][i] if i in self.cut.get(port, ()) else column[i] for i in range(column.numel())]
+                for entry, k in injected.get(port, ()):
+                    parts[entry] = parts[entry] + d[k]
+                return ca.vertcat(*parts)
+
+            return change
+
+        return {port: tap(port) for port in {*injected, *self.cut}}
+
+    def _measured(self, done: Pass) -> Any:
+        columns = []
+        for signal in self.outputs:
+            column = done.returned.get(signal.port)
+            if column is None:
+                column = done.values[signal.port]
+            columns.append(
+                ca.MX(ca.DM(column[list(signal.entries)]))
+                if isinstance(column, np.ndarray)
+                else column[list(signal.entries)]
+            )
+        return ca.vertcat(*columns) if columns else ca.MX(0, 1)
+
+    def _closed(self, acting: frozenset[Clock]) -> Any:
+        """Return ``(t, x, w, p) -> c``: what the ports that are cut put out in the closed diagram."""
+        key = ("closed", acting)
+        if key not in self._functions:
+            t, x, w, p = self.flat.symbols()
+            done = Pass(self.flat, acting, t, x, w, p).run()
+            c = ca.vertcat(*(ca.densify(ca.MX(done.values[port])) for port in self.cut))
+            self._functions[key] = ca.Function("closed", [t, x, w, p], [c])
+        return self._functions[key]
+
+    def _function(self, acting: frozenset[Clock]) -> Any:
+        """Return values and Jacobians by (x, w, d) at an instant; ``NONE`` is one between ticks."""
+        if acting in self._functions:
+            return self._functions[acting]
+        flat = self.flat
+        t, x, w, p = flat.symbols()
+        d = ca.MX.sym("d", self.n_inputs)
+        c = ca.MX.sym("c", sum(size(flat.checked.shapes[port]) for port in self.cut))
+        done = Pass(flat, acting, t, x, w, p, taps=self._taps(d, c)).run()
+        sources = [flat.source(*flat.ports[name], done.values) for name in flat.plant_inputs.slices]
+        z = ca.vertcat(*(ca.MX(ca.densify(ca.DM(s))) if isinstance(s, np.ndarray) else s for s in sources))
+        of_all = ca.vertcat(
+            *(done.rates.get(path, ca.MX.zeros(where.stop - where.start)) for path, where in flat.states.slices.items())
+        )
+        dx = of_all[flat.continuous.tolist()] if flat.continuous.size else ca.MX(0, 1)
+        r = ca.vertcat(*(made - taken for made, taken in done.mismatch)) if done.mismatch else ca.MX(0, 1)
+        results = [flat.next_columns(x, done), z, self._measured(done), dx, r]
+        jacobians = [ca.densify(ca.jacobian(e, v)) for e in results for v in (x, w, d)]
+        f = ca.Function("parts", [t, x, w, p, d, c], [*map(ca.densify, results), *jacobians])
+        self._functions[acting] = f
+        return f
+
+    def _solved(self, acting: frozenset[Clock], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return x with the algebraic loops solved at an instant."""
+        machine = self._machine
+        solve = None if machine is None else machine.loop_solver(acting, machine.here)
+        if machine is None or solve is None:
+            return x
+        machine.here.t[0], machine.here.x[:], machine.here.w[:] = t, x, w
+        solve()
+        return machine.here.x.copy()
+
+    def at(self, acting: frozenset[Clock], t: float, x: np.ndarray, w: np.ndarray) -> dict[Any, Any]:
+        """Return the values x⁺, z, y, dx and, by name and argument, their derivatives at an instant.
+
+        ``found["z"]`` is a value, ``found["z", "w"]`` the derivative of z by w. Algebraic loops are solved, and
+        eliminated by the implicit function theorem.
+        """
+        flat = self.flat
+        x = self._solved(acting, t, x, w)
+        c = self._closed(acting)(t, x, w, flat.p) if self.cut else np.zeros(0)
+        numbers = self._function(acting).call([t, x, w, flat.p, np.zeros(self.n_inputs), c])
+        names, arguments = ("x", "z", "y", "dx", "r"), ("x", "w", "d")
+        found: dict[Any, Any] = {n: np.ravel(np.array(v)) for n, v in zip(names, numbers[:5], strict=True)}
+        keys = [(n, a) for n in names for a in arguments]
+        for key, value in zip(keys, numbers[5:], strict=True):
+            found[key] = np.array(value).reshape(value.shape)
+        self._check_finite(found, keys, t)
+        if found["r"].size:
+            where = active_loops(flat, acting)
+            through_all = np.linalg.solve(
+                found["r", "x"][:, where].T, np.vstack([found[n, "x"][:, where] for n in names[:4]]).T
+            ).T
+            row = 0
+            for n in names[:4]:
+                through = through_all[row : row + len(found[n])]
+                row += len(found[n])
+                for a in arguments:
+                    found[n, a] = found[n, a] - through @ found["r", a]
+                found[n, "x"][:, where] = 0.0
+        return found
+
+    def _check_finite(self, found: Any, keys: Any, t: float) -> None:
+        """Refuse a point at which something has no derivative, such as a square root at zero."""
+        for key in keys:
+            if not np.all(np.isfinite(found[key])):
+                raise NonFiniteError(
+                    "the derivative of what the diagram does is not finite here. Linearize at another "
+                    "instant, or take a block that is smooth there.",
+                    t=t,
+                )
+
+
+def steps_only(flat: FlatDiagram) -> tuple[str, ...]:
+    """Return what the linear model does not follow: outputs that depend on an input only by steps.
+
+    A quantizer, an encoder, a comparison: their derivative is zero everywhere, and it is known as such.
+    """
+    notes, known = [], dict[int, list[tuple[str, str]]]()
+    for path, trace in flat.checked.traced.items():
+        if id(trace) not in known:
+            known[id(trace)] = _steps(trace)
+        for port, source in known[id(trace)]:
+            notes.append(f"{path}.{port} follows {source!r} in steps only: it linearizes to zero")
+    return tuple(notes)
+
+
+def _steps(trace: Any) -> list[tuple[str, str]]:
+    try:
+        f = trace.function.expand()
+    except RuntimeError:  # a table, or an opaque block
+        return []
+    arguments = [ca.SX.sym(f"a{i}", f.sparsity_in(i)) for i in range(f.n_in())]
+    results, found = f.call(arguments), []
+    for port, y in zip(trace.outputs, results, strict=False):
+        for source, u in zip(trace.inputs, arguments[2:], strict=False):
+            if u.numel() and y.numel() and ca.depends_on(y, u):
+                slopes: list[Any] = ca.jacobian(y, u).nonzeros()
+                if all(e.is_zero() for e in slopes):
+                    found.append((port, source))
+    return found

@@ -1,0 +1,202 @@
+"""Loops cut in a model over a period of several ticks: where they begin, and what of a wire is renewed in the period.
+
+A signal injected at a wire and held over the whole period cuts the wire's loop only where the wire is renewed once in
+the period, and at its beginning. So the period of a loop begins at a tick at which the wire's source acts. A signal of
+its own is injected at every tick; ticks between which the wire stays are one channel, and a channel that nothing on the
+loop uses is none. What is left is the loop: one channel, or with a wire that is renewed N times a periodic loop, which
+has no L at one rate, but lifted one of N × N.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from ...blocks.core.errors import ConfirmationError, WiringError
+from ..flat.flat_diagram import FlatDiagram
+from ..flat.layout import Clock
+from .derivatives import Parts
+from .operating_point import OperatingPoint
+from .over_a_period import Chain, Model, needed, own_states, state_names, ticks
+
+SAME_ROWS = 1e-12
+"""Relative difference up to which a wire counts as unchanged from one tick to the next."""
+SAME_POLES = 1e-6
+"""Relative difference up to which two characteristic polynomials count as the same."""
+
+
+def period_of(flat: FlatDiagram) -> int:
+    """Return the least common period of all clocks, in ticks of the base."""
+    return math.lcm(*(clock.every for clock in flat.distinct)) if flat.distinct else 1
+
+
+def ticks_to_renewal(flat: FlatDiagram, ports: Iterable[tuple[str, str]], tick: int) -> int:
+    """Return how many ticks after ``tick`` the wires are renewed; 0 where this is at no one tick.
+
+    A wire is renewed where the clock behind its source acts; one that follows continuous states or an FMU, where the
+    clock of those acts that read it.
+    """
+    for reading in (False, True):
+        found: set[Clock] | None = set()
+        for port in ports:
+            clocks = _clocks(flat, port, reading=reading)
+            found = None if clocks is None or found is None else found | clocks
+        if found is not None and len(found) == 1:
+            (clock,) = found
+            return 0 if clock.acts(tick) else clock.after(tick) - tick
+    return 0
+
+
+def _clocks(flat: FlatDiagram, port: tuple[str, str], *, reading: bool) -> set[Clock] | None:
+    """Return the clocks behind a port, through blocks in continuous time that have no states; None with others."""
+    table = flat.table
+    found: set[Clock] = set()
+    todo, seen = [port[0]] if not reading else _readers(flat, port), set[str]()
+    while todo:
+        path = todo.pop()
+        if path in seen:
+            continue
+        seen.add(path)
+        frame = table.frame_of[path]
+        if table.sampled(frame) and frame in flat.clocks:
+            found.add(flat.clocks[frame])
+            continue
+        where = flat.states.slices.get(path)
+        if path not in flat.checked.traced or (where is not None and where.stop > where.start):
+            return None
+        if reading:
+            todo += [block for (block, _), w in table.wires.items() if w.block == path]
+        else:
+            todo += [w.block for (block, _), w in table.wires.items() if block == path]
+    return found
+
+
+def _readers(flat: FlatDiagram, port: tuple[str, str]) -> list[str]:
+    return [block for (block, _), w in flat.table.wires.items() if (w.block, w.port) == port]
+
+
+def moved(flat: FlatDiagram, at: OperatingPoint, way: str | None, count: int) -> OperatingPoint:
+    """Return the operating point after so many ticks."""
+    if not count:
+        return at
+    chain = Chain(flat, Parts(flat, (), (), ()), at, way)
+    for k, following in ticks(flat, at.tick, count):
+        chain.go(k, following - k)
+    return chain.here
+
+
+def loop_model(
+    flat: FlatDiagram, parts: Parts, at: OperatingPoint, way: str | None, *, lifted: bool
+) -> tuple[Model, list[str]]:
+    """Return the model from what is injected to what comes back at the same places, and the names of its channels.
+
+    Raises
+    ------
+    WiringError
+        A wire that is renewed, and used, several times in the period, unless ``lifted``.
+    """
+    period, m = period_of(flat), parts.n_inputs
+    chain = Chain(flat, parts, at, way)
+    for k, following in ticks(flat, at.tick, period):
+        chain.go(k, following - k)
+    A, B, C, D = _each_tick(chain)
+    plants = set(range(flat.width, flat.width + chain.n_p))
+    keep = needed(A, C, own_states(flat), plants)
+    names, labels = state_names(flat, chain.models), [e for s in parts.inputs for e in s.labels]
+    A, B, C = A[np.ix_(keep, keep)], B[keep], C[:, keep]
+    groups = _channels(A, B, C, D, m)
+    many = [e for e in range(m) if len(groups[e]) > 1]
+    if many and not lifted:
+        signal = next(s for s in parts.inputs if labels[many[0]] in s.labels)
+        raise WiringError(
+            f"{signal.name!r} is renewed {len(groups[many[0]])} times in the model's period of "
+            f"{float(flat.base * period):g} s, so that its loop is periodic and has no L at one rate. Take "
+            "loop(…, lifted=True), one channel for each renewal, or a wire that is renewed once in this time.",
+            block=signal.port[0],
+            port=signal.port[1],
+        )
+    chosen = [(e, j, group) for e in range(m) for j, group in enumerate(groups[e])]
+    into = np.zeros((B.shape[1], len(chosen)))
+    for column, (e, _, group) in enumerate(chosen):
+        into[[k * m + e for k in group], column] = 1.0
+    rows = [group[0] * m + e for e, _, group in chosen]
+    model = Model(
+        (A, B @ into, C[rows], D[rows] @ into),
+        float(flat.base * period),
+        [names[i] for i in keep],
+        chain.affine()[keep],
+        chain.how,
+        chain.uncertainty,
+    )
+    return model, [f"{labels[e]}@{j}" if len(groups[e]) > 1 else labels[e] for e, j, _ in chosen]
+
+
+def _each_tick(chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the model over all steps of a chain, with inputs and outputs of each tick one after the other."""
+    n, count, m = len(chain.M), len(chain.steps), chain.N.shape[1]
+    X, U = np.eye(n), np.zeros((n, count * m))
+    C, D = [], []
+    for k, (M, N, Cy, Dy) in enumerate(chain.steps):
+        by_d = Cy @ U
+        by_d[:, k * m : (k + 1) * m] += Dy
+        C.append(Cy @ X)
+        D.append(by_d)
+        X, U = M @ X, M @ U
+        U[:, k * m : (k + 1) * m] += N
+    return X, U, np.vstack(C), np.vstack(D)
+
+
+def _channels(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, m: int) -> list[list[list[int]]]:
+    """Return for each entry the groups of ticks between which it stays, those that act on anything that comes back."""
+    count = len(C) // m if m else 0
+    seen = np.any(C, axis=0)
+    while True:  # states that anything measured depends on
+        more = seen | np.any(A[seen], axis=0)
+        if np.array_equal(more, seen):
+            break
+        seen = more
+    acts = np.any(B[seen], axis=0) | np.any(D, axis=0)
+    both, found = np.hstack([C, D]), []
+    for e in range(m):
+        groups: list[list[int]] = []
+        for k in range(count):
+            row = both[k * m + e]
+            before = both[(k - 1) * m + e]
+            if k and np.max(np.abs(row - before), initial=0.0) <= SAME_ROWS * np.max(np.abs(row), initial=0.0):
+                groups[-1].append(k)
+            else:
+                groups.append([k])
+        used = [group for group in groups if any(acts[k * m + e] for k in group)]
+        found.append(used or groups[:1])
+    return found
+
+
+def confirm_closed(cut: Model, A: np.ndarray, wires: tuple[str, ...], name: str) -> None:
+    """Compare the poles of the loop, closed, with those of the diagram.
+
+    Raises
+    ------
+    ConfirmationError
+        If closing what was cut does not give the diagram.
+    """
+    Ac, B, C, D = cut.matrices
+    back = np.eye(len(D)) - D
+    if len(D) and not np.linalg.cond(back) < 1e12:
+        return  # the loop has no unique solution when closed; its margins say so
+    closed = Ac + B @ np.linalg.solve(back, C) if len(D) else Ac
+    size = [float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) for a in (closed, A, 0.1 * Ac)]
+    radius = 1.5 * max(size) or 1.0  # that of the open loop counts, too: a deadbeat loop's poles are rounding alone
+    worst = 0.0
+    for angle in (0.3, 1.1, 2.0):  # det(I − A/z): states at zero, such as values held for later, do not count
+        z = radius * np.exp(1j * angle)
+        (s1, l1), (s2, l2) = (np.linalg.slogdet(np.eye(len(a)) - a / z) for a in (closed, A))
+        worst = max(worst, float(abs(s1 / s2 * np.exp(l1 - l2) - 1.0)))
+    if not worst <= SAME_POLES + 100 * cut.uncertainty / radius:
+        raise ConfirmationError(
+            f"the loop at {', '.join(map(repr, wires))}, closed, has the poles of another system than the diagram: "
+            f"the characteristic polynomials differ by {worst:.3g} of their size. Its margins "
+            "are not those of the diagram. Cut another wire.",
+            block=name,
+        )

@@ -1,0 +1,307 @@
+"""Operating points: where a diagram is linearized."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core.errors import OptionError, UnknownNameError, near
+from ..flat.flat_diagram import FlatDiagram
+from ..results.run import Snapshot
+from ..results.saved_state import layout_of
+from ..wiring.structure import join
+
+if TYPE_CHECKING:
+    from ..diagram import Diagram
+
+OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start")
+"""How to run to an operating point."""
+AGAIN = 1e-3
+"""How far a run may be from where it was the first time, as its solver takes other steps; relative to 1 + its size."""
+MORE = {"linearize": ("inputs", "outputs", "openings", "plants"), "operating_point": ("t",)}
+
+
+@dataclass(frozen=True, eq=False)
+class OperatingPoint:
+    """An instant of a diagram: everything that its linear model depends on.
+
+    Made by `Diagram.operating_point` (from a run), `Diagram.trim`, or from a recorded instant, ``run.at(t)``.
+
+    Attributes
+    ----------
+    t : float
+        Time in s.
+    tick : int
+        Its tick, on the base ``base`` (seconds, exact).
+    x : ndarray
+        The vector x of the flattened diagram, as it is before the tick.
+    w, z : ndarray
+        Outputs of the FMUs then, and their inputs from then on.
+    plants : mapping
+        Time, states and inputs of each FMU by path, as `Fmu.linear_model` takes them.
+    residual : float
+        How far it is from an equilibrium: the largest change of a state over the next tick, and of a continuous state
+        in one second, relative to 1 + its size. States of FMUs count: by their rates, or by their change over a step
+        where the rates are not to be had. It means the same however the point was found; what a trim has left of its
+        equations is in ``residuals``.
+    largest : str
+        The block with that residual, of an FMU its state; empty where nothing moves.
+    how : str
+        "run", "trim" or "given".
+    """
+
+    t: float
+    tick: int
+    base: Fraction
+    x: np.ndarray = field(repr=False)
+    w: np.ndarray = field(repr=False)
+    z: np.ndarray = field(repr=False)
+    plants: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    residual: float = float("nan")
+    largest: str = ""
+    how: str = "run"
+    values: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    """Every signal by its path, then."""
+    layout: tuple[Any, ...] = field(default=(), repr=False)
+    """What its vectors mean: two diagrams with one of these can exchange operating points."""
+
+    def check_fits(self, flat: FlatDiagram, name: str) -> None:
+        """Refuse the operating point of a diagram with other blocks, states or ports.
+
+        Raises
+        ------
+        OptionError
+            If it is one.
+        """
+        sizes = (self.x.size, self.w.size, self.z.size)
+        needed = (flat.width, flat.plant_outputs.total, flat.plant_inputs.total)
+        if sizes == needed and (not self.layout or self.layout == layout_of(flat)):
+            return
+        raise OptionError(
+            "it is the operating point of a diagram with other blocks or wires. Make one of this diagram: "
+            "diagram.operating_point(t), or linearize(t).",
+            block=name,
+            port="operating point",
+        )
+
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    """Parameters that belong to it, where a trim has found them, by path, as `Diagram.replace` takes them."""
+    residuals: Mapping[str, float] = field(default_factory=dict, repr=False)
+    """What a trim has left of each of its equations, by name, largest first, relative to 1 + the size of what they
+    belong to."""
+
+
+def capture(simulation: Any, how: str = "run") -> OperatingPoint:
+    """Return the operating point at the tick that a simulation has reached."""
+    flat: FlatDiagram = simulation.flat
+    machine = simulation._machine
+    n = flat.log.total
+    x = machine.log[n : n + flat.width].copy()
+    w = machine.log[: flat.plant_outputs.total].copy()
+    plants = {path: plant.operating_point() for path, plant in simulation._plants}
+    values = {name: machine.log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
+    point = OperatingPoint(
+        simulation.t,
+        simulation._tick,
+        flat.base,
+        x,
+        w,
+        machine.z.copy(),
+        plants,
+        how=how,
+        values=values,
+        layout=layout_of(flat),
+    )
+    return judged(flat, point, machine.x_next)
+
+
+def judged(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) -> OperatingPoint:
+    """Return an operating point with its residual: the largest relative change of a state, and whose it is."""
+    from .plant_models import plant_changes
+
+    x, found, who = point.x, 0.0, ""
+    rates = np.zeros(flat.width)
+    if flat.continuous.size:
+        rates[flat.continuous] = np.ravel(np.array(flat.flow(point.t, x, point.w, flat.p)))
+    changes = {
+        path: np.maximum(np.abs(x_next[where] - x[where]), np.abs(rates[where])) / (1.0 + np.abs(x[where]))
+        for path, where in flat.states.slices.items()
+    }
+    for name, change in (changes | plant_changes(flat, point)).items():
+        worst = float(np.max(change, initial=0.0))
+        if worst > found or np.isnan(worst):
+            found, who = worst, name
+        if np.isnan(found):
+            break
+    return replace(point, residual=found, largest=who)
+
+
+def check_options(diagram: Diagram, options: Mapping[str, Any], what: str) -> None:
+    """Refuse what is no option of how to run to an operating point.
+
+    Raises
+    ------
+    UnknownNameError
+        If something else is given.
+    """
+    for name in options:
+        if name not in OPTIONS:
+            raise UnknownNameError(
+                f"{what} takes no {name!r}. {near(name, (*OPTIONS, *MORE.get(what, ())))}", block=diagram.name
+            )
+
+
+def operating_point(diagram: Diagram, point: Any, options: Mapping[str, Any]) -> OperatingPoint:
+    """Return an operating point from what a user gives: one, a recorded instant, a time in s, or None for the start.
+
+    Raises
+    ------
+    OptionError
+        Anything else.
+    """
+    if isinstance(point, OperatingPoint):
+        return point
+    if isinstance(point, Snapshot):
+        _check_whose(diagram, point)
+        recipe = dict(getattr(point.run, "recipe", {}) or {})
+        found = at_time(diagram, point.t, {**recipe, **options})
+        _check_found_again(diagram, point, found)
+        return found
+    if point is None:
+        start = options.get("start")
+        return at_time(diagram, 0.0 if start is None else start.t, options)
+    if isinstance(point, int | float | np.floating | np.integer) and not isinstance(point, bool):
+        return at_time(diagram, float(point), options)
+    raise OptionError(
+        f"found {point!r}; expected an operating point: run.at(t), a time in s, diagram.operating_point(…), "
+        "diagram.trim(…), or None for the start.",
+        block=diagram.name,
+        port="operating point",
+    )
+
+
+def _check_whose(diagram: Diagram, given: Snapshot) -> None:
+    """Refuse an instant of a run of a diagram that has nothing to do with this one."""
+    whose = getattr(given.run, "diagram_name", diagram.name)
+    if whose != diagram.name and not {path.partition(".")[0] for path in given.values} <= _tops(diagram):
+        raise OptionError(
+            f"found an instant of a run of the diagram {whose!r}, which has other blocks. Take one of a run of this "
+            "diagram, or a time in s.",
+            block=diagram.name,
+            port="operating point",
+        )
+
+
+def _tops(diagram: Diagram) -> set[str]:
+    return {path.partition(".")[0] for path in diagram.blocks}
+
+
+def _check_found_again(diagram: Diagram, given: Snapshot, found: OperatingPoint) -> None:
+    """Refuse an instant of a run that does not come again: one that was restored from a state on the way."""
+    if getattr(given.run, "diagram", None) is not diagram or given.state.shape != found.x.shape:
+        return
+    off = float(np.max(np.abs(found.x - given.state) / (1.0 + np.abs(found.x)), initial=0.0))
+    if not off <= AGAIN:
+        raise OptionError(
+            f"run again to t = {given.t:g} s, the diagram is not where it was in this run: a state is off by "
+            f"{off:.3g}. The run was restored from a state on its way, or an FMU does not repeat itself. Give "
+            "the state that it began with: linearize(t, start=…).",
+            block=diagram.name,
+            port="operating point",
+        )
+
+
+def at_time(diagram: Diagram, t: float, options: Mapping[str, Any]) -> OperatingPoint:
+    """Run a diagram to a time, and return the operating point there."""
+    from ..simulation.simulation import Simulation
+
+    check_options(diagram, options, "operating_point")
+    options = dict(options)
+    start = options.get("start")
+    first = 0.0 if start is None else float(start.t)
+    if not first <= t < np.inf:
+        raise OptionError(
+            f"found an operating point at t = {t!r} s; expected a time from {first:g} s on, where the run begins.",
+            block=diagram.name,
+            port="operating point",
+        )
+    if not diagram.has_clock:
+        if start is not None:
+            options.setdefault("step", start.base)
+        elif not _is_tick(options, t, diagram.has_fmu):
+            options["step"] = _any_step(diagram, t)
+            t = 0.0 if t == 0 else float(options["step"])
+    with Simulation(diagram, **options) as simulation:
+        if t > first:
+            _check_tick(diagram, simulation.flat.base, t)
+            simulation.advance(t - first)
+        if simulation.stopped is not None and simulation.t < t:
+            raise OptionError(
+                f"the run is stopped at t = {simulation.t:.9g} s by {simulation.stopped.block!r}, before the operating "
+                f"point at t = {t:g} s. Choose an earlier one.",
+                block=diagram.name,
+                port="operating point",
+            )
+        events = [e for e in simulation._recorder.events if e.t == simulation.t]
+        if events:
+            raise OptionError(
+                f"at t = {t:g} s the event {events[-1].event!r} of {events[-1].block!r} fires, so there is no linear "
+                "model at that instant. Choose a time before or after it.",
+                block=diagram.name,
+                port="operating point",
+            )
+        return capture(simulation)
+
+
+def _is_tick(options: Mapping[str, Any], t: float, has_fmu: bool) -> bool:
+    """Whether the step that was given is kept: it is one of communication, or of the solver, or meets the time."""
+    if options.get("step") is None:
+        return False
+    steps = t / float(options["step"])
+    return has_fmu or options.get("solver") in ("euler", "heun", "rk4") or abs(steps - round(steps)) <= 1e-12 * steps
+
+
+def _check_tick(diagram: Diagram, base: Fraction, t: float) -> None:
+    n = round(Fraction(t) / base)
+    if abs(Fraction(t) - n * base) > Fraction(t) * Fraction(1, 10**12):
+        raise OptionError(
+            f"t = {t!r} s is between two ticks, {float(base):g} s apart. Take {float(n * base)!r} s, or a step=… of "
+            "which both this time and all sample times are multiples.",
+            block=diagram.name,
+            port="operating point",
+        )
+
+
+def _any_step(diagram: Diagram, t: float) -> Fraction:
+    """Return a step on which a time is a tick, where nothing else asks for one."""
+    if not t > 0:
+        return Fraction(1, 1000)
+    if diagram.has_fmu:
+        raise OptionError(
+            f"to run to t = {t:g} s the FMU needs a communication step. Give one, operating_point({t:g}, step=1e-3), "
+            "and linearize there.",
+            block=diagram.name,
+            port="step",
+        )
+    return Fraction(max(1, round(t * 10**9)), 10**9)
+
+
+def names_of_states(flat: FlatDiagram) -> list[str]:
+    """Return what every entry of x is: ``block.state[i]``, ``held(port)[i]``, and so on."""
+    names: list[str] = []
+    for path in flat.states.slices:
+        for name, shape in flat.checked.traced[path].states.items():
+            names += elements(join(path, name), shape)
+    for layout, kind in ((flat.held, "held"), (flat.gates, "gate"), (flat.starts, "start"), (flat.loops, "loop")):
+        for name, shape in layout.shapes.items():
+            names += [f"{kind}({e})" for e in elements(name, shape)]
+    return names
+
+
+def elements(name: str, shape: tuple[int, ...]) -> list[str]:
+    """Return the names of the elements of an array, counted from 0."""
+    return [f"{name}[{','.join(map(str, index))}]" if index else name for index in np.ndindex(*shape)]

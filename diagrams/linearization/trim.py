@@ -1,0 +1,329 @@
+"""Operating points by trim: the states and inputs at which a diagram is at rest, or does what was asked.
+
+Unknown are the states of all blocks and FMUs, the FMUs' outputs, the values of algebraic loops, and the parameters that
+are free. The equations: every state stays (or changes as asked), the FMUs' outputs belong to their states, the signals
+have their targets. They are solved by least squares within bounds (a trust-region reflective method, then
+Gauss-Newton steps), with exact derivatives: of the traced functions, and of FMUs by their linear models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+
+from ...blocks.core.errors import OptionError, SimulationError
+from ..flat.evaluate import Pass
+from ..flat.flat_diagram import FlatDiagram
+from .operating_point import OperatingPoint, elements, judged, names_of_states, operating_point
+from .trim_plants import Plants
+from .trim_request import Free, Target, free_parameters, known_states, named_states, targets_of
+
+if TYPE_CHECKING:
+    from ..diagram import Diagram
+
+TOLERANCE = 1e-9
+"""Largest residual that counts as solved, relative to 1 + the size of what it belongs to."""
+
+
+class _Equations:
+    """The residual of a trim, and its exact derivative, by the unknowns.
+
+    Unknowns, one after the other: entries of x (states that are free, values of algebraic loops), w, states of the FMUs
+    that are free, free parameters.
+    """
+
+    def __init__(self, diagram: Diagram, flat: FlatDiagram, at: OperatingPoint, free: list[Free], target: Target):
+        self.diagram, self.flat, self.at, self.parameters, self.target = diagram, flat, at, free, target
+        self.plants = Plants(flat, at, diagram)
+        steady = {path: flat.checked.traced[path].advance for path in flat.states.slices}
+        discrete = set(range(flat.states.total)) - set(flat.continuous.tolist())
+        self.sampled = [
+            i for path, where in flat.states.slices.items() for i in range(where.start, where.stop)
+            if i in discrete and steady[path] != "derivative"
+        ]  # fmt: skip
+        loops = [i for where in flat.loops.slices.values() for i in range(where.start, where.stop)]
+        movable = sorted({*flat.continuous.tolist(), *self.sampled})
+        self.free_x = np.array([i for i in movable if i not in target.fixed] + loops, dtype=int)
+        n = self.plants.total
+        self.free_p = np.array([i for i in range(n) if flat.width + i not in target.fixed], dtype=int)
+        self.sizes = [len(self.free_x), at.w.size, len(self.free_p), sum(f.start.size for f in free)]
+        self.function = self._function()
+        self._memory: tuple[bytes | None, Any] = (None, None)
+        self.names, self.wanted, self.keep = self._rows()
+
+    def _function(self) -> Any:
+        flat = self.flat
+        t, x, w, p = flat.symbols()
+        acting = frozenset(flat.clocks.values())
+        done = Pass(flat, acting, t, x, w, p).run()
+        of_all = ca.vertcat(
+            *(done.rates.get(path, ca.MX.zeros(s.stop - s.start)) for path, s in flat.states.slices.items())
+        )
+        dx = of_all[flat.continuous.tolist()] if flat.continuous.size else ca.MX(0, 1)
+        after = flat.next_columns(x, done)
+        change = (after - x)[self.sampled] if self.sampled else ca.MX(0, 1)
+        loop = [made - taken for made, taken in done.mismatch]
+        y = [done.values[port][list(entries)] for port, entries in self.target.signals]
+        sources = [flat.source(*flat.ports[name], done.values) for name in flat.plant_inputs.slices]
+        z = [ca.MX(ca.densify(ca.DM(c))) if isinstance(c, np.ndarray) else c for c in sources]
+        results = [ca.vertcat(*column) if column else ca.MX(0, 1) for column in ([dx], [change], loop, y, z)]
+        jacobians = [ca.densify(ca.jacobian(e, v)) for e in results for v in ((x, w, p) if self.parameters else (x, w))]
+        return ca.Function("trim", [t, x, w, p], [*map(ca.densify, results), *jacobians])
+
+    def _rows(self) -> tuple[list[str], np.ndarray, np.ndarray]:
+        """Return for every equation its name, what is wanted, and whether it counts."""
+        flat, states, target = self.flat, names_of_states(self.flat), self.target
+        loops = self.function.numel_out(2)
+        outputs = [e for name, shape in flat.plant_outputs.shapes.items() for e in elements(name, shape)]
+        names = [
+            *(f"d/dt {states[i]}" for i in flat.continuous),
+            *(f"{states[i]} per tick" for i in self.sampled),
+            *(f"loop[{i}]" for i in range(loops)),
+            *target.labels,
+            *outputs,
+            *self.plants.equations,
+        ]
+
+        def asked(which: Any, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            rates = np.array([target.rates.get(int(i), 0.0 if target.rest else np.nan) for i in which])
+            keep = np.isfinite(rates)
+            return np.where(keep, rates, 0.0) * seconds, keep
+
+        traced = flat.checked.traced
+        period = np.ones(flat.width)
+        for path, where in flat.states.slices.items():
+            rate = flat.table.rate(flat.table.frame_of[path]) if path in traced else None
+            period[where] = 1.0 if rate is None else float(rate)
+        groups = [
+            asked(flat.continuous, np.ones(flat.continuous.size)),
+            asked(self.sampled, period[self.sampled]),
+            (np.zeros(loops), np.ones(loops, bool)),
+            (target.wanted, np.ones(target.wanted.size, bool)),
+            (np.zeros(self.at.w.size), np.ones(self.at.w.size, bool)),
+            asked(flat.width + np.arange(self.plants.total), self.plants.seconds),
+        ]
+        wanted, keep = (np.concatenate([g[i] for g in groups]) for i in (0, 1))
+        return names, wanted, keep.astype(bool)
+
+    def start(self) -> np.ndarray:
+        """Return the unknowns at the point from which the search begins."""
+        q = [f.start for f in self.parameters]
+        return np.concatenate([self.at.x[self.free_x], self.at.w, self.plants.x0[self.free_p], *q])
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lower and upper bounds of the unknowns."""
+        low, high = np.full(sum(self.sizes), -np.inf), np.full(sum(self.sizes), np.inf)
+        for i, where in enumerate([*self.free_x, *([-1] * self.at.w.size), *(self.flat.width + self.free_p)]):
+            if where in self.target.bounds:
+                low[i], high[i] = self.target.bounds[int(where)]
+        if self.parameters:
+            first = sum(self.sizes[:3])
+            low[first:] = np.concatenate([f.low for f in self.parameters])
+            high[first:] = np.concatenate([f.high for f in self.parameters])
+        return low, high
+
+    def split(self, unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
+        """Return x, w, states of the FMUs and values of the free parameters."""
+        parts = np.split(unknown, np.cumsum(self.sizes)[:-1])
+        x, xp = self.at.x.copy(), self.plants.x0.copy()
+        x[self.free_x], xp[self.free_p] = parts[0], parts[2]
+        sizes = [f.start.size for f in self.parameters]
+        return x, parts[1], xp, np.split(parts[3], np.cumsum(sizes)[:-1]) if sizes else []
+
+    def at_unknown(self, unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the residual, its derivative, and z."""
+        key = unknown.tobytes()
+        if self._memory[0] != key:
+            self._memory = key, self._evaluate(unknown)
+        found: tuple[np.ndarray, np.ndarray, np.ndarray] = self._memory[1]
+        return found
+
+    def _evaluate(self, unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        flat, (x, w, xp, q) = self.flat, self.split(unknown)
+        p, by_q = flat.p.copy(), np.zeros((flat.p.size, self.sizes[3]))
+        column = 0
+        for f, value in zip(self.parameters, q, strict=True):
+            if f.where is not None:
+                p[f.where] = f.packed(value)
+                by_q[f.where, column : column + value.size] = f.slope(value)
+            column += value.size
+        numbers = [np.array(v) for v in self.function.call([self.at.t, x, w, p])]
+        values, rest = [np.ravel(v) for v in numbers[:5]], numbers[5:]
+        many = 3 if self.parameters else 2
+
+        def derivative(i: int) -> np.ndarray:
+            J = np.zeros((values[i].size, sum(self.sizes)))
+            found = zip(rest[many * i : many * (i + 1)], (x.size, w.size, p.size), strict=False)
+            by = [b.reshape(values[i].size, n) for b, n in found]
+            J[:, : self.sizes[0]] = by[0][:, self.free_x]
+            J[:, self.sizes[0] : sum(self.sizes[:2])] = by[1]
+            if self.parameters:
+                J[:, sum(self.sizes[:3]) :] = by[2] @ by_q
+            return J
+
+        rows, slopes = values[:4], [derivative(i) for i in range(4)]
+        z = values[4]
+        m = self.plants.at(xp, z, self.parameters, q)
+        z_by = derivative(4)
+        own = slice(sum(self.sizes[:2]), sum(self.sizes[:3]))
+        of_w = np.zeros((w.size, sum(self.sizes)))
+        of_w[:, self.sizes[0] : sum(self.sizes[:2])] = np.eye(w.size)
+        of_w -= m.D @ z_by
+        of_w[:, own] -= m.C[:, self.free_p]
+        of_f = m.B @ z_by
+        of_f[:, own] += m.A[:, self.free_p]
+        if self.parameters:
+            of_w[:, sum(self.sizes[:3]) :] -= m.y_by_q
+            of_f[:, sum(self.sizes[:3]) :] += m.f_by_q
+        rows, slopes = [*rows, w - m.y, m.f], [*slopes, of_w, of_f]
+        r, keep = np.concatenate(rows) - self.wanted, self.keep
+        return np.where(keep, r, 0.0), np.where(keep[:, None], np.vstack(slopes), 0.0), z
+
+    def scaled(self, unknown: np.ndarray) -> np.ndarray:
+        """Return the residual relative to 1 + the size of what it belongs to."""
+        r, _, _ = self.at_unknown(unknown)
+        x, w, xp, _ = self.split(unknown)
+        n = self.function.numel_out(2)
+        sizes = [x[self.flat.continuous], x[self.sampled], np.zeros(n), self.target.wanted, w, xp]
+        relative: np.ndarray = np.abs(r) / (1.0 + np.abs(np.concatenate(sizes)))
+        return relative
+
+
+def solve(equations: _Equations) -> np.ndarray:
+    """Return the unknowns that the equations are nearest to being satisfied at."""
+    from scipy.optimize import least_squares
+
+    low, high = equations.bounds()
+    unknown = equations.start()
+    if not unknown.size:
+        return unknown
+    pinned = low == high
+    unknown = np.clip(unknown, low, high)
+    moves = ~pinned
+
+    def full(part: np.ndarray) -> np.ndarray:
+        whole: np.ndarray = np.array(unknown)
+        whole[moves] = part
+        return whole
+
+    inside = np.where(np.isfinite(high - low), 1e-9 * (high - low), 0.0)[moves]
+    begin = np.clip(unknown[moves], low[moves] + inside, high[moves] - inside)
+    found = least_squares(
+        lambda v: equations.at_unknown(full(v))[0],
+        begin,
+        jac=lambda v: equations.at_unknown(full(v))[1][:, moves],
+        bounds=(low[moves], high[moves]),
+        x_scale="jac",
+        ftol=1e-15,
+        xtol=1e-15,
+        gtol=1e-15,
+        max_nfev=200,
+    )
+    best = full(found.x)
+    for _ in range(5):  # to the last digits, and onto a bound
+        r, J, _ = equations.at_unknown(best)
+        step = np.zeros(best.size)
+        step[moves] = np.linalg.lstsq(J[:, moves], -r, rcond=1e-12)[0]
+        trial = np.clip(best + step, low, high)
+        if not np.max(equations.scaled(trial), initial=0.0) < np.max(equations.scaled(best), initial=0.0):
+            break
+        best = trial
+    return best
+
+
+def trim(
+    diagram: Diagram,
+    free: Any = None,
+    targets: Mapping[str, Any] | None = None,
+    *,
+    rates: Mapping[str, Any] | None = None,
+    fixed: Iterable[str] = (),
+    at: Any = None,
+    tolerance: float = TOLERANCE,
+    **options: Any,
+) -> OperatingPoint:
+    """Find an operating point; see `Diagram.trim`."""
+    if isinstance(free, str) or (free is not None and not isinstance(free, Mapping | Iterable)):
+        raise OptionError(
+            f"found free={free!r}; expected names with bounds, such as {{'force.value': (-10, 10)}}, or a list.",
+            block=diagram.name,
+            port="free",
+        )
+    asked = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free or ())
+    guess = operating_point(diagram, at, options)
+    base = diagram.replace(guess.parameters) if guess.parameters else diagram
+    flat = base.flatten(guess.base)
+    states = known_states(flat, guess)
+    parameters, base = free_parameters(base, {n: b for n, b in asked.items() if n not in states})
+    flat = base.flatten(guess.base)
+    bounds = {n: b for n, b in asked.items() if n in states}
+    target = targets_of(flat, states, targets or {}, rates or {}, [fixed] if isinstance(fixed, str) else fixed, bounds)
+    return _found(base, diagram, flat, guess, parameters, target, tolerance, "trim")
+
+
+def given(diagram: Diagram, t: float, states: Mapping[str, Any], options: Mapping[str, Any]) -> OperatingPoint:
+    """Return the operating point with states that are given by name, the others as they are at the time t.
+
+    Signals and the FMUs' outputs follow from the states. See `Diagram.operating_point`.
+    """
+    guess = operating_point(diagram, t, options)
+    flat = diagram.flatten(guess.base)
+    guess = named_states(flat, guess, states)
+    known = known_states(flat, guess)
+    target = targets_of(flat, known, {}, {}, list(known), {})
+    target.rest = False
+    return _found(diagram, diagram, flat, guess, [], target, TOLERANCE, "given")
+
+
+def _found(
+    base: Diagram, diagram: Diagram, flat: FlatDiagram, guess: OperatingPoint,
+    parameters: list[Free], target: Target, tolerance: float, how: str,
+) -> OperatingPoint:  # fmt: skip
+    equations = _Equations(base, flat, guess, parameters, target)
+    unknown = solve(equations)
+    left = equations.scaled(unknown)
+    order = [i for i in np.argsort(-left) if equations.keep[i]]
+    residuals = {equations.names[i]: float(left[i]) for i in order}
+    worst = float(left[order[0]]) if order else 0.0
+    x, w, xp, q = equations.split(unknown)
+    if not worst <= tolerance:
+        shown = "; ".join(f"{name}: {value:.3g}" for name, value in list(residuals.items())[:5])
+        stuck = [f.name for f, v in zip(parameters, q, strict=True) if f.is_at_bound(v)]
+        advice = f"{', '.join(stuck)} is at its bound. " if stuck else ""
+        raise SimulationError(
+            f"no operating point was found: relative to 1 + their size, these are left: {shown}; expected at most "
+            f"{tolerance:g}. {advice}Free more parameters or states, widen bounds, begin nearer with at=…, or "
+            "take what is nearest with tolerance=….",
+            block=diagram.name,
+            t=guess.t,
+        )
+    values = {f.name: f.shaped(v) for f, v in zip(parameters, q, strict=True)}
+    final = diagram.replace({**guess.parameters, **values})
+    plants = equations.plants.points(xp, equations.at_unknown(unknown)[2], equations.plants.changed(parameters, q))
+    return _completed(final, guess, x, w, plants, {
+        "parameters": {**guess.parameters, **values}, "residuals": residuals, "how": how,
+    })  # fmt: skip
+
+
+def _completed(
+    diagram: Diagram,
+    guess: OperatingPoint,
+    x: np.ndarray,
+    w: np.ndarray,
+    plants: Mapping[str, Any],
+    more: dict[str, Any],
+) -> OperatingPoint:
+    """Return the operating point with all its signals: the boxes hold what they put out there."""
+    flat = diagram.flatten(guess.base)
+    at_tick = flat.at_tick(frozenset(flat.clocks.values()))
+    x_next, z, log, _ = (np.ravel(np.array(v)) for v in at_tick(guess.t, x, w, flat.p))
+    values = {name: log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
+    x = x.copy()
+    for name, where in flat.held.slices.items():
+        x[where] = np.ravel(values[name])
+    point = replace(guess, x=x, w=w.copy(), z=z, plants=plants, values=values, **more)
+    return judged(flat, point, x_next)

@@ -1,0 +1,1 @@
+"""Frequency responses measured on a running diagram."""

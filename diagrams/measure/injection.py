@@ -1,0 +1,246 @@
+"""A test signal in a running diagram: the consumers of a port get what it puts out, plus the test signal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core.block import Block
+from ...blocks.core.errors import WiringError
+from ...blocks.core.ports import Output
+from ...blocks.core.values import Array, parameter
+from ...blocks.library.algebra import Sum
+from ..flat.flat_diagram import FlatDiagram
+from ..linearization.derivatives import Signal
+from ..linearization.operating_point import OperatingPoint
+from ..simulation.simulation import Simulation
+from ..simulation.start_at_point import carried
+from ..wiring.structure import Frame, Structure, Wire
+
+if TYPE_CHECKING:
+    from ..diagram import Diagram
+
+NEVER = 1e12
+"""A time in s that no run reaches."""
+
+
+class Excitation(Block):
+    """Test signal: d = e g Σ aₖ sin(ωₖ τ + ½ cₖ τ² + φₖ), τ = t − t₀ modulo the period.
+
+    The ramp g rises from 0 to 1 within ``ramp`` from t₀ on, with two continuous derivatives.
+    """
+
+    direction: Array = parameter(description="e, what a signal of size 1 adds to each entry")
+    amplitude: Array = parameter(description="aₖ of each line")
+    frequency: Array = parameter(unit="rad/s", description="ωₖ of each line")
+    sweep: Array = parameter(description="cₖ of each line in rad/s²")
+    phase: Array = parameter(unit="rad", description="φₖ of each line")
+    start_time: float = parameter(unit="s", description="t₀")
+    ramp: float = parameter(unit="s", description="length of the ramp")
+    period: float = parameter(unit="s", description="period of the whole signal")
+    y = Output(shape=None, description="the test signal d")
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the test signal."""
+        since = t - self.start_time
+        z = since / self.ramp
+        z = np.where(z < 0.0, 0.0, np.where(z > 1.0, 1.0, z))
+        rise = z**3 * (10.0 - z * (15.0 - 6.0 * z))
+        tau = since - self.period * np.floor(since / self.period)
+        lines = self.amplitude * np.sin((self.frequency + 0.5 * self.sweep * tau) * tau + self.phase)
+        return self.direction * (rise * np.sum(lines))
+
+
+@dataclass(frozen=True, eq=False)
+class Waveform:
+    """A periodic test signal: its lines, and the samples of a period."""
+
+    amplitude: np.ndarray
+    frequency: np.ndarray
+    sweep: np.ndarray
+    phase: np.ndarray
+    period: float
+
+
+@dataclass(frozen=True, eq=False)
+class Injected:
+    """A diagram with a test signal added at one of its ports; all other blocks keep their paths."""
+
+    diagram: Diagram
+    source: str
+    sum: str
+    lines: int
+
+
+def injected(diagram: Diagram, signal: Signal, lines: int, held: tuple[Fraction, Fraction] | None) -> Injected:
+    """Return the diagram in which every consumer of a port gets the port's signal plus a test signal.
+
+    Parameters
+    ----------
+    lines : int
+        Number of lines of the test signal.
+    held : (Fraction, Fraction), optional
+        Seconds between two samples of the test signal, and time of the first one; without it the signal is continuous.
+
+    Raises
+    ------
+    WiringError
+        A port that nothing is wired to.
+    """
+    lowered = diagram._lowered
+    table = Structure(**{k: dict(v) for k, v in vars(lowered).items()})
+    for path, frame in table.frames.items():
+        table.frames[path] = replace(frame, delay=0)  # the delays have become blocks
+    block, port = signal.port
+    consumers = [(group, key) for group in (table.wires, table.controls) for key, w in group.items()
+                 if (w.block, w.port) == (block, port)]  # fmt: skip
+    if not consumers:
+        raise WiringError(
+            f"nothing is wired to it, so an injection at {signal.name!r} would act on nothing. Name a wire of a loop.",
+            block=block,
+            port=port,
+        )
+    taken = {*table.blocks, *table.frames}
+    frame_path, total = _free("injection", taken), _free("injection_sum", taken)
+    source = f"{frame_path}.signal"
+    shape = diagram._checked.shapes[signal.port]
+    ones = np.ones(lines)
+    table.blocks[source] = Excitation(
+        direction=np.ones(shape) if shape else 1.0, amplitude=ones, frequency=ones, sweep=ones, phase=ones,
+        start_time=NEVER, ramp=1.0, period=1.0, name="signal",
+    )  # fmt: skip
+    table.frames[frame_path] = Frame(frame_path, None, "exact", outputs=("y",))
+    if held is not None:
+        table.frames[frame_path] = replace(table.frames[frame_path], sample_time=held[0], offset=held[1])
+    table.frame_of[source] = frame_path
+    table.blocks[total], table.frame_of[total] = Sum(name=total), ""
+    for group, key in consumers:
+        wire: Wire = group[key]  # type: ignore[index]
+        group[key] = Wire(total, "y", wire.index)  # type: ignore[index]
+    table.wires[total, "u1"], table.wires[total, "u2"] = Wire(block, port), Wire(source, "y")
+    return Injected(type(diagram)._of(diagram.name, table, diagram.loops), source, total, lines)
+
+
+def _free(name: str, taken: set[str]) -> str:
+    path, count = name, 2
+    while path in taken:
+        path, count = f"{name}_{count}", count + 1
+    return path
+
+
+class Experiment:
+    """A run in the making with a test signal, which may be changed as it goes on: used in a ``with`` statement.
+
+    Parameters
+    ----------
+    made : Injected
+        The diagram.
+    signal : Signal
+        Where the test signal is added.
+    outputs : sequence of Signal
+        What is measured, beside it.
+    point : OperatingPoint or None
+        Where the run begins; at its start without it.
+    options : mapping
+        How it is run.
+    """
+
+    def __init__(
+        self, diagram: Diagram, made: Injected, signal: Signal, outputs: Any, point: OperatingPoint | None,
+        options: Mapping[str, Any],
+    ):  # fmt: skip
+        self.made, self.signal, self.outputs = made, signal, list(outputs)
+        ports = [signal.port, *(o.port for o in self.outputs)]
+        record = sorted({f"{b}.{p}" for b, p in ports} | {f"{made.sum}.y", f"{made.source}.y"})
+        start: dict[str, Any] = {}
+        if point is not None:
+            before = diagram.replace(point.parameters) if point.parameters else diagram
+            start["start"] = _translated(point, before.flatten(point.base), made, signal)
+        self.simulation = Simulation(made.diagram, record=record, states=False, **{**options, **start})
+        self.flat: FlatDiagram = self.simulation.flat
+        self.held = True
+        """Whether the signal has never changed between two samples that were recorded, at the ticks there."""
+
+    def __enter__(self) -> Experiment:
+        self.simulation.__enter__()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.simulation.__exit__(*exc)
+
+    @property
+    def t(self) -> float:
+        """Time that the run has reached in s."""
+        return self.simulation.t
+
+    def play(self, waveform: Waveform, entry: int, ramp: float) -> None:
+        """Begin a test signal at one entry of the wire, now."""
+        path, flat = self.made.source, self.flat
+        block: Any = flat.table.blocks[path]
+        direction = np.zeros(np.size(block.direction))
+        direction[entry] = 1.0
+        shape = np.shape(block.direction)
+        changed = block.replace(
+            direction=direction.reshape(shape) if shape else float(direction[0]), amplitude=waveform.amplitude,
+            frequency=waveform.frequency, sweep=waveform.sweep, phase=waveform.phase, start_time=self.t, ramp=ramp,
+            period=waveform.period,
+        )  # fmt: skip
+        rate = flat.table.rate(flat.table.frame_of[path])
+        packed = flat.checked.traced[path].pack(changed, float("nan") if rate is None else float(rate))
+        flat.p[flat.parameters.slices[path]] = packed  # the run's functions read it there
+
+    def go(self, count: int, every: int) -> None:
+        """Go on by so many samples."""
+        self.simulation.advance(count * every * self.flat.base)  # type: ignore[arg-type]
+
+    def stands(self) -> np.ndarray:
+        """Return the states of all blocks, and the outputs of all FMUs, at the last tick."""
+        here = self.simulation._machine.here
+        return np.concatenate([here.x[: self.flat.states.total], here.w])
+
+    def record(self, count: int, every: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Go on by so many samples; return v, u and the outputs, a row for each sample, both ends included.
+
+        v is what the port puts out, u what its consumers get: v plus the test signal.
+        """
+        simulation = self.simulation
+        simulation.run(final=False)  # what was recorded before is left
+        first = simulation._tick
+        simulation._recorder.row(simulation.t, simulation._machine.log)
+        self.go(count, every)
+        run = simulation.run(final=False)
+        times = np.array([simulation.time_of(first + i * every) for i in range(count + 1)])
+        rows = np.searchsorted(run.t, times * (1.0 + 1e-15), side="right") - 1
+
+        if every > 1:
+            v = np.asarray(run[".".join(self.signal.port)])
+            between = (
+                np.searchsorted(run.t, [simulation.time_of(first + i) for i in range(count * every)], side="right") - 1
+            )
+            all_ticks = v[between].reshape(count, every, -1)
+            self.held &= bool(np.all(all_ticks == all_ticks[:, :1]))
+
+        def measured(port: tuple[str, str], entries: tuple[int, ...]) -> np.ndarray:
+            data = np.asarray(run[".".join(port)])[rows].reshape(count + 1, -1)
+            return np.array(data[:, list(entries)])
+
+        v, u = (measured(port, self.signal.entries) for port in (self.signal.port, (self.made.sum, "y")))
+        y = [measured(o.port, o.entries) for o in self.outputs]
+        return v, u, np.hstack([np.zeros((count + 1, 0)), *y])
+
+
+def _translated(point: OperatingPoint, old: FlatDiagram, made: Injected, signal: Signal) -> OperatingPoint:
+    """Return an operating point as the diagram with the injection takes it."""
+    new = made.diagram.flatten(point.base)
+    x = new.x0.copy()
+    carried(point.x, old, new, x)
+    known = {**point.values, f"{made.sum}.y": point.values[".".join(signal.port)]}
+    for layout in (new.held, new.loops):
+        for name, where in layout.slices.items():
+            if name in known:
+                x[where] = np.ravel(known[name])
+    return replace(point, x=x)

@@ -1,0 +1,59 @@
+"""The files of a report."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ...blocks.core.errors import OptionError
+from .html import to_html
+from .json import to_json
+from .model import Report
+from .pdf import printer, write_pdf
+
+
+def check_files(path: str | os.PathLike[str] | None, *, pdf: bool, json: bool) -> None:
+    """Find out, before anything is computed, whether the files of a report can be written.
+
+    Raises
+    ------
+    OptionError
+        A name that does not end in ``.html``, a folder that isn't there, or no library for PDF.
+    """
+    if path is None:
+        if pdf or json:
+            raise OptionError('a PDF or JSON stands beside the page; give its path, such as "fig3.html".', port="path")
+        return
+    file = Path(path).expanduser()
+    if file.suffix.lower() not in (".html", ".htm"):
+        step = f" Name it {file.stem}.html."
+        if file.suffix.lower() in (".pdf", ".json"):
+            step = f" Name it {file.stem}.html, and ask for the {file.suffix[1:].upper()} beside it."
+        raise OptionError(f"found {str(path)!r}; expected a file that ends in .html.{step}", port="path")
+    if file.is_dir():
+        raise OptionError(f"{str(path)!r} is a folder. Name a file in it.", port="path")
+    if not file.parent.is_dir():
+        raise OptionError(f"there is no folder {str(file.parent)!r}. Make it, or name another one.", port="path")
+    if not os.access(file.parent, os.W_OK):
+        raise OptionError(f"nothing can be written to {str(file.parent)!r}. Name another folder.", port="path")
+    if pdf:
+        printer()
+
+
+def write_report(
+    report: Report, path: str | os.PathLike[str] | None, *, pdf: bool = False, json: bool = False
+) -> list[Path]:
+    """Write a report's page and, beside it, its PDF and its numbers; return the files."""
+    if path is None:
+        return []
+    file = Path(path).expanduser()
+    page = to_html(report)
+    file.write_text(page, encoding="utf-8")
+    files = [file]
+    if pdf:
+        files.append(file.with_suffix(".pdf"))
+        write_pdf(page, files[-1])
+    if json:
+        files.append(file.with_suffix(".json"))
+        files[-1].write_text(to_json(report), encoding="utf-8")
+    return files

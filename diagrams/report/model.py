@@ -1,0 +1,82 @@
+"""What a report holds: sections with text, tables, figures, and numbers by dotted paths."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..frequency.number import Number
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: a title, column headings, and rows of texts or numbers."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Any, ...], ...]
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """A figure: a key for its file, a caption, and the matplotlib figure, or SVG text."""
+
+    key: str
+    caption: str
+    figure: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Section:
+    """A section: what it is about in words, then tables and figures; ``key`` starts the paths of its numbers."""
+
+    key: str
+    title: str
+    text: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    plots: tuple[Plot, ...] = ()
+    numbers: Mapping[str, Number] = field(default_factory=dict)
+    """By path within the section, such as ``par.sampled_d0.phase_margin_deg``."""
+    sections: tuple[Section, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A design report of a diagram.
+
+    Attributes
+    ----------
+    title : str
+        Its heading.
+    sections : tuple of Section
+        In order.
+    meta : mapping
+        What was analysed, when, with which versions.
+    """
+
+    title: str
+    sections: tuple[Section, ...]
+    meta: Mapping[str, Any] = field(default_factory=dict)
+
+    def numbers(self) -> dict[str, Number]:
+        """Return every number by its dotted path, such as ``inner.par.sampled_d0.phase_margin_deg``."""
+
+        def walk(sections: Iterable[Section], prefix: str) -> Iterator[tuple[str, Number]]:
+            for section in sections:
+                here = f"{prefix}{section.key}."
+                for path, number in section.numbers.items():
+                    yield here + path, number
+                yield from walk(section.sections, here)
+
+        return dict(walk(self.sections, ""))
+
+    def _repr_html_(self) -> str:
+        """Show it in a notebook, in a frame of its own: its styles are meant for a whole page."""
+        from html import escape
+
+        from .html import to_html
+
+        page = escape(to_html(self), quote=True)
+        return f'<iframe srcdoc="{page}" style="width:100%;height:45em;border:1px solid #d5dbe1"></iframe>'

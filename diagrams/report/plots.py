@@ -1,0 +1,244 @@
+"""Figures of a report: Bode, Nyquist, sensitivities, admittances, stability maps; drawn without pyplot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..results.plots import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, new_figure, style
+from .model import Plot
+
+if TYPE_CHECKING:
+    from ..frequency.margins import Margins
+
+LOOKS: Mapping[str, tuple[str, Any]] = {
+    "continuous": (GREY, "-"),
+    "sampled_d0": (BLUE, "-"),
+    "sampled_d1": (VERMILION, (0, (4, 2))),
+}
+OTHER = ((GREEN, "-"), (ORANGE, (0, (4, 2))), (PURPLE, (0, (1, 1.5))))
+
+
+def _look(key: str, i: int) -> dict[str, Any]:
+    color, line = LOOKS.get(key, OTHER[i % len(OTHER)])
+    return {"color": color, "linestyle": line}
+
+
+def _span(loops: Mapping[str, Any], found: Mapping[str, Margins]) -> tuple[float, float]:
+    """Return the frequencies that matter: a decade and a half around the crossings."""
+    marks = [c.frequency.value for m in found.values() for c in m.gain_crossovers]
+    marks += [p.frequency.value for m in found.values() for p in m.phase_crossovers]
+    marks = [w for w in marks if 0 < w < np.inf]
+    tops = [np.pi / L.dt for L in loops.values() if L.dt]
+    low = min(marks, default=1.0) / 30
+    high = max([10 * max(marks, default=100.0), *tops])
+    return low, high
+
+
+def _response(L: Any, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+    from ..frequency.realization import Realization
+
+    top = min(high, np.pi / L.dt * (1 - 1e-6)) if L.dt else high
+    w = np.geomspace(low, top, 600)
+    return w, Realization.of(L).response(w)[0]
+
+
+def bode(
+    key: str, wire: str, loops: Mapping[str, Any], found: Mapping[str, Margins], titles: Mapping[str, str]
+) -> Plot:
+    """Draw L over frequency, with the margins marked."""
+    low, high = _span(loops, found)
+    with style():
+        figure = new_figure(4.4)
+        top, bottom = figure.subplots(2, 1, sharex=True)
+        for i, (name, L) in enumerate(loops.items()):
+            look = _look(name, i)
+            w, value = _response(L, low, high)
+            phase = np.degrees(np.unwrap(np.angle(value)))
+            phase -= 360 * np.round((phase[0] + 180) / 360)  # the branch that begins nearest to −180°
+            top.loglog(w, np.abs(value), label=titles[name], **look)
+            bottom.semilogx(w, phase, **look)
+            for c in found[name].gain_crossovers:
+                x, y = c.frequency.value, np.interp(c.frequency.value, w, phase)
+                top.plot(x, 1.0, "o", color=look["color"], markersize=3.5)
+                bottom.plot([x, x], [-180, y], color=look["color"], linewidth=2.0, alpha=0.6)
+            for p in found[name].phase_crossovers:
+                if low < p.frequency.value < high:
+                    k = p.gain_margin.value
+                    top.plot([p.frequency.value] * 2, [1.0, 1.0 / k], color=look["color"], linewidth=2.0, alpha=0.6)
+                    bottom.plot(p.frequency.value, -180, "s", color=look["color"], markersize=3.5)
+            if L.dt:
+                for ax in (top, bottom):
+                    ax.axvline(np.pi / L.dt, color=GREY, linewidth=0.6, linestyle=":")
+        top.axhline(1.0, color=DARK, linewidth=0.6)
+        bottom.axhline(-180, color=DARK, linewidth=0.6)
+        top.set_ylabel("|L|")
+        bottom.set_ylabel("phase of L [°]")
+        bottom.set_xlabel("ω [rad/s]")
+        top.legend(loc="best")
+    caption = (
+        f"Bode diagram of the loop at {wire}. Thick: the phase margin at each |L| = 1 (○), and the gain margin at each "
+        "crossing of −180° (□). Dotted: the Nyquist frequency π/T."
+    )
+    return Plot(key, caption, figure)
+
+
+def nyquist(
+    key: str, wire: str, loops: Mapping[str, Any], found: Mapping[str, Margins], titles: Mapping[str, str]
+) -> Plot:
+    """Draw L in the complex plane near −1, with the disk that it keeps away from."""
+    low, high = _span(loops, found)
+    with style():
+        figure = new_figure(4.0)
+        ax = figure.subplots()
+        angle = np.linspace(0, 2 * np.pi, 361)
+        ax.plot(np.cos(angle), np.sin(angle), color=GREY, linewidth=0.6)
+        for i, (name, L) in enumerate(loops.items()):
+            look = _look(name, i)
+            _, value = _response(L, low, high)
+            ax.plot(value.real, value.imag, label=titles[name], **look)
+            ax.plot(value.real, -value.imag, color=look["color"], linestyle=look["linestyle"], linewidth=0.5)
+            m = found[name]
+            if np.isfinite(m.modulus_margin.value):
+                r = m.modulus_margin.value
+                ax.plot(-1 + r * np.cos(angle), r * np.sin(angle), color=look["color"], linewidth=0.5, linestyle=":")
+            for c in m.gain_crossovers:
+                ends = np.exp(1j * np.radians(c.phase_margin_deg.value - 180))
+                ax.plot([0, ends.real], [0, ends.imag], color=look["color"], linewidth=0.6)
+                ax.plot(ends.real, ends.imag, "o", color=look["color"], markersize=3.5)
+        ax.plot(-1, 0, "+", color=DARK, markersize=9, markeredgewidth=1.4)
+        ax.set_aspect("equal")
+        ax.set_xlim(-3.2, 1.4)
+        ax.set_ylim(-2.0, 2.0)
+        ax.set_xlabel("Re L")
+        ax.set_ylabel("Im L")
+        ax.legend(loc="lower right")
+    caption = (
+        f"Nyquist diagram of the loop at {wire}, negative frequencies thin. Marked are −1, the points with |L| = 1 (○, "
+        "whose angle from −1 is the phase margin), and dotted the largest circle around −1 that L keeps out of."
+    )
+    return Plot(key, caption, figure)
+
+
+def sensitivities(
+    key: str, wire: str, loops: Mapping[str, Any], found: Mapping[str, Margins], titles: Mapping[str, str]
+) -> Plot:
+    """Draw |S| and |T|."""
+    low, high = _span(loops, found)
+    with style():
+        figure = new_figure(2.7)
+        left, right = figure.subplots(1, 2, sharey=True)
+        for i, (name, L) in enumerate(loops.items()):
+            w, value = _response(L, low, high)
+            left.loglog(w, np.abs(1 / (1 + value)), label=titles[name], **_look(name, i))
+            right.loglog(w, np.abs(value / (1 + value)), **_look(name, i))
+            for ax, x, y in ((left, "ms_frequency", "ms"), (right, "mt_frequency", "mt")):
+                mark = getattr(found[name], x).value, getattr(found[name], y).value
+                if low < mark[0] < high:
+                    ax.plot(*mark, "o", color=_look(name, i)["color"], markersize=3.5)
+        for ax, name in ((left, "|S|"), (right, "|T|")):
+            ax.axhline(1.0, color=DARK, linewidth=0.6)
+            ax.set_title(name)
+            ax.set_xlabel("ω [rad/s]")
+            ax.set_ylim(bottom=1e-3)
+        left.legend(loc="best")
+    return Plot(key, f"Sensitivity S and complementary sensitivity T at {wire}; ○ are M_s and M_t.", figure)
+
+
+def admittances(key: str, side: str, w: np.ndarray, curves: Mapping[str, tuple[str, np.ndarray]]) -> Plot:
+    """Draw target and rendered admittances: magnitude, phase, and where the real part is negative."""
+    looks: dict[str, dict[str, Any]] = {
+        "target": {"color": DARK, "linestyle": (0, (1, 1.5)), "linewidth": 1.6},
+        "friction": {"color": GREEN, "linestyle": "-"},
+    }
+    with style():
+        figure = new_figure(4.2)
+        top, bottom = figure.subplots(2, 1, sharex=True)
+        for i, (name, (title, Y)) in enumerate(curves.items()):
+            look = looks.get(name) or _look(name, i)
+            top.loglog(w, np.abs(Y), label=title, **look)
+            bottom.semilogx(w, np.degrees(np.angle(Y)), **look)
+        for y in (-90, 90):
+            bottom.axhline(y, color=DARK, linewidth=0.6)
+        bottom.axhspan(90, 180, color=VERMILION, alpha=0.07, linewidth=0)
+        bottom.axhspan(-180, -90, color=VERMILION, alpha=0.07, linewidth=0)
+        bottom.set_ylim(-180, 180)
+        bottom.set_yticks([-180, -90, 0, 90, 180])
+        top.set_ylabel("|Y| [m/(N s)]")
+        bottom.set_ylabel("phase of Y [°]")
+        bottom.set_xlabel("ω [rad/s]")
+        top.legend(loc="best")
+    name = "along the path" if side == "par" else "across the path"
+    caption = f"Admittance {name}, target and rendered; shaded: Re Y < 0, where the robot feeds energy into a motion."
+    return Plot(key, caption, figure)
+
+
+def stability(key: str, side: str, shown: Any, lines: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Plot:
+    """Draw a stability map: growth rates, and the limits of several variants."""
+    looks: dict[str, dict[str, Any]] = {
+        "sampled d0": {"color": BLUE, "linewidth": 1.6},
+        "sampled d1": {"color": VERMILION, "linestyle": (0, (4, 2))},
+        "sampled d0, friction slope at rest": {"color": GREEN},
+        "rule of thumb, d0": {"color": DARK, "linestyle": (0, (1, 1.5))},
+    }
+    with style():
+        figure = new_figure(3.4)
+        ax = figure.subplots()
+        levels = [-100, -10, -1, -0.1, 0, 0.1, 1, 10, 100, 1000]
+        from matplotlib.colors import SymLogNorm
+
+        k, b, growth = shown
+        growth = np.clip(growth, -99.9, 999.0)
+        filled = ax.contourf(
+            k,
+            b,
+            growth,
+            levels=levels,
+            cmap="RdBu_r",
+            alpha=0.55,
+            norm=SymLogNorm(linthresh=0.1, vmin=-1000, vmax=1000),
+        )
+        for name, (x, y) in lines.items():
+            ax.plot(x, y, label=name, **looks.get(name, {}))
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        ax.set_xlim(k[0], k[-1])
+        ax.set_ylim(b[0], b[-1])
+        ax.set_xlabel("stiffness k$_e$ of the environment [N/m]")
+        ax.set_ylabel("damping b$_e$ [N s/m]")
+        figure.colorbar(filled, ax=ax, label="growth rate σ, sampled d0 [1/s]", ticks=levels, format="%g")
+        ax.legend(loc="upper left")
+    name = "along the path" if side == "par" else "across the path"
+    caption = f"Stability map {name}: stable left of the line of each variant; colours for sampled d0, red grows."
+    return Plot(key, caption, figure)
+
+
+def response(L: Any, w: np.ndarray) -> np.ndarray:
+    """Return the response of a loop with one channel at frequencies."""
+    from ..frequency.realization import Realization
+
+    return Realization.of(L).response(w)[0]
+
+
+def injected(key: str, wire: str, curves: Mapping[str, tuple[np.ndarray, ...]]) -> Plot:
+    """Draw measured points over linear models."""
+    with style():
+        figure = new_figure(2.9)
+        left, right = figure.subplots(1, 2)
+        for color, (title, (w, value, omega, points)) in zip((BLUE, VERMILION, GREEN), curves.items(), strict=False):
+            left.loglog(w, np.abs(value), color=color, label=title)
+            left.loglog(omega, np.abs(points), "o", color=color, markersize=3.5)
+            right.semilogx(w, np.degrees(np.unwrap(np.angle(value))), color=color)
+            phase = np.degrees(np.angle(points))
+            near = np.interp(omega, w, np.degrees(np.unwrap(np.angle(value))))
+            right.semilogx(omega, phase + 360 * np.round((near - phase) / 360), "o", color=color, markersize=3.5)
+        left.set_ylabel("|L|")
+        right.set_ylabel("phase of L [°]")
+        for ax in (left, right):
+            ax.set_xlabel("ω [rad/s]")
+        left.legend(loc="best")
+    return Plot(
+        key, f"Loop at {wire}: linear model (lines), and measured in the running co-simulation (points).", figure
+    )

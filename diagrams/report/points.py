@@ -1,0 +1,78 @@
+"""Operating points of a diagram's variants: each runs to its own, or takes over a given one by the names of states."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core.errors import OptionError
+from ..linearization.operating_point import OperatingPoint, capture, operating_point
+from ..results.run import Snapshot
+from ..simulation.start_at_point import carried, placed
+
+if TYPE_CHECKING:
+    from ..diagram import Diagram
+
+STEP = Fraction(1, 1000)
+"""Communication step in s at which a diagram without a clock is run to its operating point."""
+PASSES = 120
+"""How many ticks states without a value, such as those of a delay, are given to take theirs."""
+
+
+def point_of(diagram: Diagram, where: Any, source: Diagram | None = None) -> OperatingPoint:
+    """Return the operating point of a variant.
+
+    Parameters
+    ----------
+    diagram : Diagram
+        The variant.
+    where : OperatingPoint, Snapshot or float, optional
+        A time to which the variant itself is run; or a point of the diagram that it is a variant of. One that a run has
+        reached is run to anew; one that was found or given is taken over by the names of its states.
+    source : Diagram, optional
+        The diagram of a point that is taken over.
+    """
+    options: dict[str, Any] = {}
+    if diagram.has_fmu and not diagram.has_clock:
+        options["step"] = STEP
+    if isinstance(where, Snapshot) or (isinstance(where, OperatingPoint) and where.how == "run"):
+        where = where.t
+    if not isinstance(where, OperatingPoint):
+        return operating_point(diagram, where, options)
+    try:
+        where.check_fits(diagram.flatten(where.base), diagram.name)
+    except OptionError:
+        return taken_over(diagram, where, diagram if source is None else source, options)
+    return where
+
+
+def taken_over(diagram: Diagram, point: OperatingPoint, source: Diagram, options: dict[str, Any]) -> OperatingPoint:
+    """Return a point of another diagram as one of this diagram: its FMUs', and its blocks' states by their names.
+
+    States that only this diagram has, such as those of a delay, take the values that they settle at while all others
+    are held.
+    """
+    from ..simulation.simulation import Simulation
+
+    old = source.flatten(point.base)
+    if not diagram.has_clock:
+        options = {**options, "step": point.base}
+    with Simulation(placed(diagram, point), **options) as simulation:
+        machine, flat = simulation._machine, simulation.flat
+        x, marked = machine.here.x, np.zeros(flat.width)
+        carried(point.x, old, flat, x)
+        carried(np.ones(point.x.size), old, flat, marked)
+        known = marked > 0
+        kept = x.copy()
+        tick = machine.tick(flat.acting(0))
+        for _ in range(PASSES):
+            tick()
+            new = np.where(known, kept, machine.x_next)
+            if np.array_equal(new, x):
+                break
+            x[:] = new
+        tick()
+        return replace(capture(simulation, point.how), parameters=point.parameters)

@@ -1,0 +1,171 @@
+"""What was analysed: blocks, rates, FMUs, versions; and the operating points."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.block import Block
+from ..frequency.number import Number
+from .case import AT_REST, Case
+from .model import Section, Table
+
+PACKAGES = ("loopwright", "numpy", "scipy", "casadi", "control", "fmpy", "matplotlib")
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what computed the report."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed as a package"
+    return found
+
+
+def subject(case: Case) -> Section:
+    """Return the section about the diagram itself."""
+    diagram = case.diagram
+    numbers: dict[str, Number] = {}
+    frames, parameters, plants = [], [], []
+    for path, frame in sorted(diagram.frames.items()):
+        rate = diagram._table.rate(path)
+        name = path or diagram.name
+        if rate is not None and frame.sample_time is not None:
+            numbers[f"{path or 'diagram'}.sample_time"] = Number(float(rate), "s", 0.0, "given, exact")
+        rated = "continuous" if rate is None else f"{float(rate):g} s"
+        frames.append(
+            (name, rated, frame.method if rate is not None else "", frame.delay, f"{float(frame.offset):g} s")
+        )
+    for path, block in sorted(diagram.blocks.items()):
+        rows = list(_parameters(block))
+        for name, shown, unit, value in rows:
+            parameters.append((path, type(block).__name__, name, shown, unit))
+            if isinstance(value, float) and np.isfinite(value):
+                numbers[f"{path}.{name}"] = Number(value, unit or "1", 0.0, "given")
+        if not rows:
+            parameters.append((path, type(block).__name__, "", "", ""))
+        if hasattr(block, "description"):
+            plants.append(_plant(path, block))
+    tables = [
+        Table(
+            "Subsystems and their rates",
+            ("subsystem", "sample time", "discretization", "delay [samples]", "offset"),
+            tuple(frames),
+        ),
+    ]
+    if plants:
+        columns = ("block", "file", "model", "generation tool", "token", "SHA-256", "derivatives")
+        tables.append(Table("FMUs", columns, tuple(plants)))
+    tables.append(Table("Blocks and parameters", ("block", "type", "parameter", "value", "unit"), tuple(parameters)))
+    tables.append(Table("Versions", ("package", "version"), tuple(versions().items())))
+    text = [f"The diagram “{diagram.name}”: {len(diagram.blocks)} blocks, {len(diagram.names)} named wires."]
+    if case.experiment is not None:
+        text.append(
+            f"Experiment {case.experiment.letter}: {case.experiment.title.partition(':')[0].replace('_', ' ')}."
+        )
+    if case.has_friction:
+        text.append(
+            "Where keys end with _friction, the diagram is analysed as it is, with the plant's friction and its "
+            "compensation at the velocity of the operating point. All others are the design itself: exact "
+            "linearization, "
+            "without friction in plant and model."
+        )
+    return Section("subject", "What was analysed", (*text, *case.notes), tuple(tables), (), numbers)
+
+
+def _parameters(block: Block) -> Any:
+    for name, spec in block.parameter_specs.items():
+        value = getattr(block, name)
+        if hasattr(value, "parameter_specs"):
+            inner = ", ".join(f"{n} = {_shown(getattr(value, n))}" for n in value.parameter_specs if n[:6] != "start_")
+            yield name, f"{type(value).__name__}({inner})", "", value
+        elif value is not None and not (isinstance(value, dict) and not value):
+            yield name, _shown(value), spec.unit or "", value
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, float | np.ndarray) and np.ndim(value) == 0:
+        return f"{float(value):.9g}"
+    if isinstance(value, np.ndarray):
+        return "(" + ", ".join(_shown(v) for v in value) + ")" if value.size <= 12 else f"array {value.shape}"
+    if hasattr(value, "items"):
+        return ", ".join(f"{k} = {_shown(v)}" for k, v in value.items())
+    return str(value)
+
+
+def _plant(path: str, block: Any) -> tuple[Any, ...]:
+    d = block.description
+    given = [
+        name
+        for name, has in (
+            ("directional, co-simulation", d.has_derivatives),
+            ("directional, model exchange", d.model_exchange_has_derivatives),
+            ("states to save", d.can_save),
+        )
+        if has
+    ]
+    tool = getattr(d, "generation_tool", "") or "not read"
+    return (path, str(d.file.name), d.model_name, tool, d.token, d.digest, ", ".join(given) or "none")
+
+
+def operating_points(case: Case) -> Section:
+    """Return the section about where the linear models were made."""
+    numbers: dict[str, Number] = {}
+    rows, notes = [], []
+    for v in case.usable():
+        point, model = v.point, v.model
+        how = {"run": "the run's own next tick and rates", "trim": "the trim's equations"}.get(point.how, point.how)
+        numbers[f"{v.key}.t"] = Number(point.t, "s", 0.0, "given")
+        numbers[f"{v.key}.residual"] = Number(point.residual, "1", 1e-15, how)
+        worst = float(np.max(np.abs(model.affine), initial=0.0))
+        numbers[f"{v.key}.affine"] = Number(worst, "1", 1e-12 * (1 + worst), "the linear model's affine term")
+        plants = "; ".join(f"{p}: {h}" for p, h in model.how.items())
+        rows.append((v.title, numbers[f"{v.key}.t"], point.how, numbers[f"{v.key}.residual"], point.largest, plants))
+        if not point.residual < AT_REST:
+            notes.append(_moving(v))
+        hidden = [p for p, b in v.diagram.blocks.items() if hasattr(b, "description") and not b.description.states]
+        if hidden:
+            notes.append(f"{v.title}: {', '.join(sorted(hidden))} shows no states; the residual does not count them.")
+        notes += [f"{v.title}: {note}" for note in model.notes]
+    tables = [
+        Table("Operating points", ("variant", "t", "how", "residual", "largest of", "derivative of FMUs"), tuple(rows))
+    ]
+    first = next(case.usable(), None)
+    if first is not None:
+        values = [
+            (name, _shown(_value(first, wire)))
+            for name, wire in sorted(first.diagram.names.items())
+            if f"{wire.block}.{wire.port}" in first.point.values
+        ]
+        tables.append(Table(f"Named wires there ({first.title})", ("wire", "value"), tuple(values)))
+    text = (
+        (
+            "The linear models below are made at these points. The residual is the largest change of a "
+            "state over the next tick, "
+            "and of a continuous state, an FMU's as well, in one second, relative to 1 + its size; it is 0 at rest."
+        ),
+        *notes,
+    )
+    return Section("operating_points", "Operating points", text, tuple(tables), (), numbers)
+
+
+def _moving(v: Any) -> str:
+    """Return what is said of an operating point that is no equilibrium."""
+    point, model = v.point, v.model
+    start = f"{v.title}: not an equilibrium (residual {point.residual:.3g}, of {point.largest}); "
+    moving = [i for i, change in enumerate(model.affine) if not abs(change) <= AT_REST]
+    fed = model.A - np.eye(len(model.A)) if model.dt else model.A
+    if moving and np.max(np.abs(fed[:, moving])) <= 1e-9 * (model.dt or 1.0):
+        names = ", ".join(model.states[i] for i in moving)
+        return f"{start}nothing but {names} moves, on which nothing depends: all else is as at an equilibrium."
+    return f"{start}the linear model follows the motion through one period only."
+
+
+def _value(v: Any, wire: Any) -> Any:
+    value = np.asarray(v.point.values[f"{wire.block}.{wire.port}"])
+    return value if wire.index is None else np.asarray(value[wire.index])

@@ -1,0 +1,147 @@
+"""What the uncertainty of an FMU's linear model does to a loop's numbers, and why a loop has none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import LoopwrightError
+from ..frequency.margins import margins
+from ..frequency.number import Number
+from .case import Case, Variant
+from .model import Section, Table
+
+LINEAR = 1e-3
+"""A difference between an FMU's step and its equations beyond which it is not the solver's: it moves as it steps."""
+NOTHING = 1e-12
+"""What is left of a loop that is zero, by rounding."""
+WAYS = ("differences", "identified")
+"""How the derivatives of an FMU are said to be found that are not exact."""
+
+
+def left_out(case: Case, wire: str, on_cycles: Collection[str]) -> list[str]:
+    """Return why there are no margins at a wire."""
+    said: dict[str, None] = {}
+    for v in case.usable():
+        try:
+            L = v.loop(wire)
+            if _is_zero(L):
+                said |= dict.fromkeys([_zero(v, wire, on_cycles)])
+            else:
+                margins(L)
+        except LoopwrightError as error:
+            said |= dict.fromkeys([f"{wire}, {v.title}: {error.message}"])
+    return list(said)
+
+
+def _is_zero(L: Any) -> bool:
+    points = np.exp(1j * np.geomspace(1e-3, 3.0, 9)) if L.dt else 1j * np.geomspace(1e-3, 1e3, 9)
+    return all(bool(np.max(np.abs(_response(L, p)), initial=0.0) <= NOTHING) for p in points)
+
+
+def _zero(v: Variant, wire: str, on_cycles: Collection[str]) -> str:
+    names = v.diagram.names
+    block = names[wire].block if wire in names else wire.rpartition(".")[0]
+    if block not in on_cycles:
+        return f"{wire} does not lie on a loop."
+    steps = [note for note in v.model.notes if "in steps only" in note]
+    return f"{wire} lies on a loop, but the loop's slope is zero at the operating point, so that it has no margins" + (
+        ": " + "; ".join(steps) + ". For margins of the loop on average, take the quantization out." if steps else "."
+    )
+
+
+def widened(case: Case, wire: str, part: Section) -> Section:
+    """Return the section of a loop with tolerances that know how far the linear models of its FMUs are right.
+
+    The error of a response is found at the frequencies of the section: by moving the model's entries by the
+    differences' own uncertainty, and by the equations held over a step in place of the step that the FMU's solver
+    makes, where it tells them.
+    """
+    changed: dict[int, Number] = {}
+    numbers, text = dict(part.numbers), list(part.text)
+    for v in case.usable():
+        if not any(how.startswith(WAYS) for how in v.model.how.values()):
+            continue
+        own = {path: n for path, n in numbers.items() if path.startswith(f"{v.key}.") and ".control." not in path}
+        w = [n.value for n in own.values() if n.unit == "rad/s" and 0 < n.value < math.inf]
+        if not w:
+            continue
+        error, said = _relative_error(v, wire, np.unique(w))
+        text += [f"{v.title}: {said}"] if said else []
+        peaks = [n.value for path, n in own.items() if path.endswith((".ms", ".mt")) and math.isfinite(n.value)]
+        slopes = 1.0 + 2.0 * max([1.0, *peaks])
+        for path, n in own.items():
+            more = _floor(n, error * slopes)
+            if more > n.tolerance:
+                why = f"{n.confirmed_by}; tolerance: its FMUs' linear models are right to {error:.1e} of L"
+                changed[id(n)] = numbers[path] = replace(n, tolerance=more, confirmed_by=why)
+    tables = tuple(_renewed(table, changed) for table in part.tables)
+    return replace(part, numbers=numbers, tables=tables, text=tuple(text))
+
+
+def _floor(n: Number, error: float) -> float:
+    """Return the error of a number that a relative error of L makes."""
+    if not math.isfinite(n.value) or n.confirmed_by.startswith("winding") or n.value == 0.0:
+        return 0.0
+    if n.unit == "deg":
+        return math.degrees(error)
+    whole = n.unit == "1" and n.tolerance == 0.0  # counted
+    return 0.0 if whole else error * abs(n.value)
+
+
+def _relative_error(v: Variant, wire: str, w: np.ndarray) -> tuple[float, str]:
+    """Return the largest relative error of L at frequencies, and what is to be said of it."""
+    L = v.loop(wire)
+    points = np.exp(1j * w * L.dt) if L.dt else 1j * w
+    nominal = [_response(L, p) for p in points]
+    sizes = [np.linalg.norm(n) or 1.0 for n in nominal]
+
+    def off(other: Any) -> float:
+        moved = [_response(other, p) for p in points]
+        return float(np.nanmax([np.linalg.norm(m - n) / s for m, n, s in zip(moved, nominal, sizes, strict=True)]))
+
+    rng = np.random.default_rng(0)
+    largest = max([1e-300, *(float(np.max(np.abs(M), initial=0.0)) for M in (L.A, L.B, L.C, L.D))])
+    relative = v.model.uncertainty / largest
+    error = 0.0
+    for _ in range(4):
+        error = max(error, off(_Moved(*(M * (1 + relative * rng.choice([-1, 1], M.shape)) for M in _matrices(L)))))
+    if not any("differences of steps" in how for how in v.model.how.values()):
+        return error, ""
+    try:
+        held = v.diagram.linearize(v.point, plants="equations").loop(wire)
+    except LoopwrightError:
+        return error, "an FMU tells no equations, so that its own solver's error is not in the tolerances."
+    solver = off(held)
+    if solver > LINEAR:
+        return error, (
+            f"the FMU's step and its equations at the point give responses that differ by {solver:.2g}: it moves "
+            "during the step, or its solver's own step is coarse. That is not in the tolerances."
+        )
+    return error + solver, ""
+
+
+class _Moved:
+    """A state-space model, no more than its matrices."""
+
+    def __init__(self, A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray):
+        self.A, self.B, self.C, self.D = A, B, C, D
+
+
+def _matrices(L: Any) -> tuple[np.ndarray, ...]:
+    return tuple(np.asarray(M, dtype=float) for M in (L.A, L.B, L.C, L.D))
+
+
+def _response(L: Any, p: complex) -> np.ndarray:
+    try:
+        return np.asarray(L.C @ np.linalg.solve(p * np.eye(len(L.A)) - L.A, L.B.astype(complex)) + L.D)
+    except np.linalg.LinAlgError:  # on a pole
+        return np.full(np.shape(L.D), np.nan + 0j)
+
+
+def _renewed(table: Table, changed: dict[int, Number]) -> Table:
+    return replace(table, rows=tuple(tuple(changed.get(id(cell), cell) for cell in row) for row in table.rows))

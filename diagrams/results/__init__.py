@@ -1,0 +1,1 @@
+"""Results of runs: recording, storage, plots and exports."""

@@ -1,0 +1,170 @@
+"""Runs for other tools: CSV, pandas, xarray, Parquet, MATLAB."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core.errors import OptionError
+
+if TYPE_CHECKING:
+    from .run import Run
+
+_GROUP = 2**24  # bytes of a row group
+_LONGEST = 63  # characters of a name in MATLAB
+_LARGEST = 2**31 - 2**16  # bytes of a variable in a MATLAB file of version 5, with its header
+_TAKEN = {
+    *("t", "info"),
+    *("break", "case", "catch", "classdef", "continue", "else", "elseif", "end", "for", "function", "global", "if"),
+    *("otherwise", "parfor", "persistent", "return", "spmd", "switch", "try", "while"),
+}
+
+
+def to_csv(run: Run, path: Any, names: Sequence[str]) -> None:
+    """See `Run.to_csv`."""
+    table = dict(columns(run, names))
+    header = ",".join(["t", *table])
+    rows = np.column_stack([run.t, *table.values()])
+    np.savetxt(path, rows, "%.17g", ",", header=header, comments="", encoding="utf-8")
+
+
+def to_pandas(run: Run, names: Sequence[str]) -> Any:
+    """See `Run.to_pandas`."""
+    pandas = library("pandas")
+    table = dict(columns(run, names))
+    frame = pandas.DataFrame(table, index=pandas.Index(np.array(run.t), name="t"))
+    frame.attrs["units"] = {"t": "s", **units_of_columns(run, names)}
+    return frame
+
+
+def to_xarray(run: Run, names: Sequence[str]) -> Any:
+    """See `Run.to_xarray`."""
+    xarray = library("xarray")
+    variables, coordinates = {}, {"t": ("t", np.array(run.t), {"units": "s"})}
+    for name in chosen(run, names):
+        values = run[name]
+        axes = values.shape[1:]
+        dims = [f"{name}_dim"] if len(axes) == 1 else [f"{name}_dim{i + 1}" for i in range(len(axes))]
+        units = unit_list(run, name, values[:1].size)
+        text = units[0] if len(set(units)) == 1 else ", ".join(units)
+        variables[name] = (("t", *dims), values, {"units": text} if any(units) else {})
+        coordinates |= {dim: (dim, np.arange(1, n + 1), {}) for dim, n in zip(dims, axes, strict=True)}
+    return xarray.Dataset(variables, coordinates, attrs={"title": run.diagram_name})
+
+
+def to_parquet(run: Run, path: Any, names: Sequence[str]) -> None:
+    """See `Run.to_parquet`."""
+    arrow, parquet = library("pyarrow"), library("pyarrow.parquet")
+    units = {"t": "s", **units_of_columns(run, names)}
+    fields = [arrow.field(n, arrow.float64(), metadata={"unit": u} if u else None) for n, u in units.items()]
+    schema = arrow.schema(fields, metadata={"diagram": run.diagram_name})
+    n = _GROUP // (8 * len(fields)) + 1
+    with parquet.ParquetWriter(path, schema) as writer:
+        for k in range(0, max(len(run.t), 1), n):
+            some = slice(k, k + n)
+            arrays = [np.ascontiguousarray(run.t[some]), *(v for _, v in columns(run, names, some))]
+            writer.write_table(arrow.Table.from_arrays([arrow.array(a) for a in arrays], schema=schema))
+
+
+def to_mat(run: Run, path: Any, names: Sequence[str]) -> None:
+    """See `Run.to_mat`."""
+    from scipy.io import savemat
+
+    signals = chosen(run, names)
+    variables = matlab_names(signals)
+    values = {v: flat(run[n]) for n, v in variables.items()}
+    for name, variable in variables.items():
+        if values[variable].nbytes > _LARGEST:
+            raise OptionError(
+                f"the signal {name!r} takes {values[variable].nbytes / 2**30:.1f} GiB; a MATLAB file of version 5 "
+                "holds less than 2 a variable. Write it with to_parquet, which MATLAB reads with parquetread."
+            )
+    units = [", ".join(unit_list(run, n, values[v].shape[1])) if run.unit(n) else "" for n, v in variables.items()]
+    info = {
+        "diagram": run.diagram_name,
+        "variables": np.array([*variables.values()], dtype=object),
+        "names": np.array([*variables], dtype=object),
+        "units": np.array(units, dtype=object),
+    }
+    contents = {"t": np.array(run.t), "info": info, **values}
+    savemat(path, contents, appendmat=False, long_field_names=True, oned_as="column")
+
+
+def matlab_names(names: Sequence[str]) -> dict[str, str]:
+    """Return a valid MATLAB name for each signal; the rules stand at `Run.to_mat`."""
+    made: dict[str, str] = {}
+    for name in names:
+        plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
+        if len(plain) > _LONGEST:
+            plain = plain[-_LONGEST:]
+        if not re.match(r"[A-Za-z]", plain) or plain in _TAKEN:
+            plain = f"s_{plain}"[:_LONGEST]
+        unique, k = plain, 1
+        while unique in made.values():
+            k += 1
+            unique = f"{plain[: _LONGEST - len(f'_{k}')]}_{k}"
+        made[name] = unique
+    return made
+
+
+def chosen(run: Run, names: Sequence[str]) -> list[str]:
+    """Return the signals to export: those given, else all named wires, else all ports; each once."""
+    every = run.names
+    wires = [n for n in every if n in run.wires]
+    return list(dict.fromkeys(names or wires or every))
+
+
+def columns(run: Run, names: Sequence[str], some: slice = slice(None)) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the name and the values of each column; entries of a vector are counted from 1."""
+    for name in chosen(run, names):
+        values = run.part(name, some)
+        for label, column in zip(labels(name, values.shape[1:]), flat(values).T, strict=True):
+            yield label, np.ascontiguousarray(column)
+
+
+def flat(values: np.ndarray) -> np.ndarray:
+    """Return the entries of each sample side by side, a matrix's row by row."""
+    return values.reshape(len(values), int(np.prod(values.shape[1:])))
+
+
+def labels(name: str, shape: tuple[int, ...]) -> list[str]:
+    """Return the names of a signal's columns."""
+    return [name] if shape == () else [f"{name}[{i + 1}]" for i in range(int(np.prod(shape)))]
+
+
+def units_of_columns(run: Run, names: Sequence[str]) -> dict[str, str]:
+    """Return the unit of each column, "" where it is not declared."""
+    units: dict[str, str] = {}
+    for name in chosen(run, names):
+        shape = run.part(name, slice(0)).shape[1:]
+        units |= zip(labels(name, shape), unit_list(run, name, int(np.prod(shape))), strict=True)
+    return units
+
+
+def unit_list(run: Run, name: str, size: int) -> list[str]:
+    """Return the unit of each entry of a signal, "" where it is not declared."""
+    unit: Any = run.unit(name)
+    if not isinstance(unit, tuple):
+        return [unit or ""] * size
+    return [u or "" for u in unit] if len(unit) == size else [", ".join(u or "" for u in unit)] * size
+
+
+def library(name: str) -> Any:
+    """Return a library of the extra ``export``.
+
+    Raises
+    ------
+    OptionError
+        If it is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        raise OptionError(
+            f"this export needs {name.partition('.')[0]}, which is not installed. Install it: "
+            'pip install "loopwright[export]".'
+        ) from error

@@ -1,0 +1,214 @@
+"""Plots of a run's signals over time, and the look of all figures; drawn without pyplot and its global state."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core.errors import OptionError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from .run import Run
+
+# Okabe and Ito's palette, which colour-blind readers tell apart
+BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
+GREY, DARK = "#A6A6A6", "#333333"
+
+WIDTH = 170 / 25.4
+"""Width of a figure in inches: the text of an A4 page."""
+
+STYLE: Mapping[str, Any] = MappingProxyType(
+    {
+        "axes.axisbelow": True,
+        "axes.edgecolor": "#666666",
+        "axes.formatter.limits": (-4, 5),
+        "axes.formatter.useoffset": False,
+        "axes.grid": True,
+        "axes.labelsize": 8,
+        "axes.linewidth": 0.6,
+        "axes.prop_cycle": f"cycler(color={[BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY]})",
+        "axes.titlesize": 8.5,
+        "figure.facecolor": "white",
+        "font.family": "DejaVu Sans",
+        "font.size": 8,
+        "grid.alpha": 1.0,
+        "grid.color": "#E6E6E6",
+        "grid.linewidth": 0.5,
+        "legend.borderaxespad": 0.3,
+        "legend.borderpad": 0.25,
+        "legend.columnspacing": 1.0,
+        "legend.facecolor": "white",
+        "legend.fontsize": 7,
+        "legend.frameon": True,
+        "legend.framealpha": 0.85,
+        "legend.edgecolor": "none",
+        "legend.handlelength": 1.6,
+        "legend.handletextpad": 0.5,
+        "legend.labelspacing": 0.25,
+        "lines.linewidth": 1.1,
+        "mathtext.fontset": "dejavusans",
+        "savefig.dpi": 150,
+        "svg.fonttype": "path",
+        "svg.hashsalt": "loopwright",
+        "xtick.color": DARK,
+        "xtick.labelsize": 7,
+        "ytick.color": DARK,
+        "ytick.labelsize": 7,
+    }
+)
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Apply our style inside the block only."""
+    import matplotlib
+    from matplotlib import rcParamsDefault
+
+    plain: dict[Any, Any] = {k: v for k, v in rcParamsDefault.items() if k.split(".")[0] in _OWN}
+    with matplotlib.rc_context(plain | dict(STYLE)):
+        yield
+
+
+_OWN = {
+    "axes",
+    "figure",
+    "font",
+    "grid",
+    "legend",
+    "lines",
+    "mathtext",
+    "patch",
+    "path",
+    "savefig",
+    "svg",
+    "text",
+    "xtick",
+    "ytick",
+}
+
+
+@cache
+def _figure_class() -> type[Figure]:
+    """Return a figure that a notebook shows, whether or not pyplot was imported."""
+    from io import BytesIO
+
+    from matplotlib.figure import Figure
+
+    class Picture(Figure):
+        def _repr_png_(self) -> bytes:
+            buffer = BytesIO()
+            with style():
+                self.savefig(buffer, format="png", dpi=110)
+            return buffer.getvalue()
+
+    return Picture
+
+
+def new_figure(height: float) -> Figure:
+    """Return an empty figure of the usual width; heights are in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure = _figure_class()(figsize=(WIDTH, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, stem: Path) -> tuple[Path, Path]:
+    """Write a figure as PNG (150 dpi) and SVG, the same bytes for the same figure, and return the files."""
+    files = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
+    with style():
+        figure.savefig(files[0], dpi=150, metadata={"Software": None})
+        figure.savefig(files[1], metadata={"Date": None, "Creator": None})
+    return files
+
+
+def plot_signals(run: Run, names: Sequence[str], axes: Any = None) -> Figure:
+    """Draw signals over time, one below the other; a vector's entries share an axis.
+
+    Parameters
+    ----------
+    run : Run
+        What was recorded.
+    names : sequence of str
+        Signals, by the names that ``run[name]`` takes.
+    axes : sequence of matplotlib axes, optional
+        Axes to draw into, one for each name.
+
+    Returns
+    -------
+    Figure
+
+    Raises
+    ------
+    OptionError
+        Without a name, or with another number of axes.
+    UnknownNameError
+        For a name that was not recorded.
+    """
+    if not names:
+        raise OptionError('found no signal to draw; expected names, such as run.plot("eta", "xi").')
+    signals = [
+        (name, run[name].reshape(len(run.t), _size(run, name)), run[name].ndim > 1, _units(run, name)) for name in names
+    ]
+    with style():
+        if axes is None:
+            figure = new_figure(0.5 + 1.35 * len(names))
+            axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
+        axes = np.ravel(axes)
+        if len(axes) != len(names):
+            raise OptionError(f"found {len(axes)} axes for {len(names)} signals; expected one for each.")
+        for ax, (name, values, vector, units) in zip(axes, signals, strict=True):
+            for i, column in enumerate(values.T):
+                unit = f" [{units[i]}]" if vector and len(set(units)) > 1 and units[i] else ""
+                ax.plot(run.t, column, marker=marker_of(run), label=f"{name}[{i + 1}]{unit}" if vector else name)
+            common = units[0] if units and len(set(units)) == 1 else None
+            ax.set_ylabel(f"{name} [{common}]" if common else name)
+            if vector:
+                ax.legend(loc="best", ncols=min(values.shape[1], 3))
+        axes[-1].set_xlabel("t [s]")
+        for ax in axes:
+            limit_time(ax, run)
+        result: Figure = axes[0].figure
+        result.align_ylabels()
+    return result
+
+
+def _size(run: Run, name: str) -> int:
+    """Return the number of entries of a signal."""
+    return int(np.prod(run[name].shape[1:]))
+
+
+def _units(run: Run, name: str) -> list[str]:
+    """Return the unit of every entry, as it is to be read."""
+    unit = run.unit(name)
+    units = [u or "" for u in unit] if isinstance(unit, tuple) else [unit or ""] * _size(run, name)
+    return [_readable(u) for u in units]
+
+
+def _readable(unit: str) -> str:
+    """Write an FMI unit with superscripts: m/s2 as m/s²."""
+    return "" if unit == "1" else unit.translate(str.maketrans("23", "²³")).replace(".", " ")
+
+
+def marker_of(run: Run) -> str:
+    """Return the marker of a line: a single sample is a dot."""
+    return "." if len(run.t) == 1 else ""
+
+
+def limit_time(ax: Axes, run: Run) -> None:
+    """Let the time axis span the run."""
+    from matplotlib.ticker import MaxNLocator
+
+    ax.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10]))
+    if len(run.t) > 1:
+        margin = 0.015 * float(run.t[-1] - run.t[0])  # what happens at the first tick is not hidden by the frame
+        ax.set_xlim(float(run.t[0]) - margin, float(run.t[-1]) + margin)

@@ -1,0 +1,313 @@
+"""Recording: samples into memory, or to disk as the run goes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import OptionError, SimulationError, UnknownNameError
+from ..flat.layout import Layout
+from ..simulation.duration import memory
+from ..wiring.structure import Wire
+from .signal_names import entries, resolve
+from .stored import END, Occurrence, create, line, prepare, read, split, write_json
+
+_FIRST, _LARGEST = 1024, 2**26  # rows of the first chunk in memory, bytes of the largest
+_ROWS, _BYTES = 1024, 2**18  # of a chunk on its way to disk, whichever is less
+_LATEST = 1.0  # seconds after which a row is written at the latest when the next one comes
+
+
+class Recorder:
+    """Takes a run's samples.
+
+    In memory, samples go into chunks that double until they hold 64 MiB; `finish` puts them together chunk by chunk, so
+    that little more than the samples themselves is ever held. With ``to`` they go to disk in chunks of at most 1024
+    rows and about 256 KiB, and no more than one chunk is held. Nothing is allocated or written before the first sample.
+
+    What holds after a kill of the process (``kill -9``, a crash): all that was flushed can be read. Rows and events are
+    flushed when the chunk is full, when a row comes a second or more after the last flush, and by `flush`. So a kill
+    loses at most the last 1024 rows, and of these only what came in the second before the newest one. A row that was
+    cut in the middle is left out. After a power failure the same holds for what the operating system had written by
+    then, and for everything once `finish` has returned.
+
+    Parameters
+    ----------
+    width : int
+        Entries of the vector of a sample, without the residual.
+    columns : sequence of int, optional
+        Entries that are kept, ascending; None for all.
+    every : int
+        Of so many calls of `row` one is kept, beginning with the first.
+    rows : int, optional
+        Calls that are to come, if that is known: memory is then taken once.
+    residual : bool
+        Whether the vector has one more entry at its end: the residual of the algebraic loops. It is always kept, and
+        stands apart from the data.
+    to : path, optional
+        Folder for a run on disk; see `loopwright.diagrams.Run.open`.
+    header : mapping, optional
+        Its header (`_stored.header`); needed with ``to``.
+    overwrite : bool
+        Whether a stored run at ``to`` may be replaced.
+
+    Raises
+    ------
+    OptionError
+        For an ``every`` that is no positive integer, or if something at ``to`` is in the way.
+    """
+
+    row: Callable[[float, np.ndarray], None]
+    """Append a sample ``(t, vector)``; the vector is copied."""
+
+    def __init__(
+        self,
+        width: int,
+        columns: Iterable[int] | None = None,
+        *,
+        every: int = 1,
+        rows: int | None = None,
+        residual: bool = False,
+        to: Any = None,
+        header: Mapping[str, Any] | None = None,
+        overwrite: bool = False,
+    ):
+        check_every(every)
+        self.every, self.has_residual = int(every), residual
+        self.columns = None if columns is None else np.array([*columns], dtype=int)
+        self._pick = self.columns
+        if self.columns is not None and residual:
+            self._pick = np.append(self.columns, width)
+        self._width = 1 + (width + residual if self._pick is None else len(self._pick))
+        self._expected = None if rows is None else -(-rows // self.every) + 1
+        self.to = None if to is None else Path(to)
+        if self.to is not None:
+            prepare(self.to, overwrite)
+        self._header, self._written = header, 0
+        self._files: tuple[Any, Any] | None = None
+        self.events: Any = []
+        self._done: list[np.ndarray] = []
+        self._chunk = self._times = self._values = np.empty((0, 0))
+        self._k = self._limit = self._skip = 0
+        self._due, self._broken = 0.0, False
+        self._tail: np.ndarray | None = None  # the newest row that was flushed
+        self._keep = self._in_memory if to is None else self._on_disk
+        self.row = self._keep if self.every == 1 else self._nth
+        self.residual: np.ndarray | None = None
+        """After `finish`: the residual of each sample kept."""
+
+    # --- samples: called at every tick -------------------------------------------------------------------------------
+
+    def _in_memory(self, t: float, vector: np.ndarray) -> None:
+        k = self._k
+        if k == self._limit:
+            self._grow(t)
+            k = 0
+        self._times[k] = t
+        self._values[k] = vector if self._pick is None else vector[self._pick]
+        self._k = k + 1
+
+    def _on_disk(self, t: float, vector: np.ndarray) -> None:
+        k = self._k
+        if k == self._limit or monotonic() >= self._due:
+            self._start()
+            self.flush()
+            k = 0
+        self._times[k] = t
+        self._values[k] = vector if self._pick is None else vector[self._pick]
+        self._k = k + 1
+
+    def _nth(self, t: float, vector: np.ndarray) -> None:
+        if self._skip:
+            self._skip -= 1
+        else:
+            self._skip = self.every - 1
+            self._keep(t, vector)
+
+    def last(self, t: float, vector: np.ndarray) -> None:
+        """Append the final sample, whatever ``every`` is; one that `row` has just kept is not kept twice."""
+        newest = self._chunk[self._k - 1] if self._k else self._tail
+        values = vector if self._pick is None else vector[self._pick]
+        if newest is None or newest[0] != t or not np.array_equal(newest[1:], values, equal_nan=True):
+            self._keep(t, vector)
+
+    def event(self, occurrence: Occurrence) -> None:
+        """Append an event that fired."""
+        if self.to is None:
+            self.events.append(occurrence)
+        else:
+            self._start()[1].write(line(occurrence))
+
+    # --- chunks ------------------------------------------------------------------------------------------------------
+
+    def _new(self, rows: int) -> None:
+        self._chunk = np.empty((rows, self._width), "<f8")
+        self._times, self._values = self._chunk[:, 0], self._chunk[:, 1:]
+        self._k, self._limit = 0, rows
+
+    def _grow(self, t: float) -> None:
+        """Begin the next chunk."""
+        if self._limit:
+            self._done.append(self._chunk)
+        row = 8 * self._width
+        rows = min(2 * self._limit, max(_LARGEST // row, 1)) if self._limit else (self._expected or _FIRST)
+        held = sum(chunk.nbytes for chunk in self._done)
+        if self._done and held + rows * row > 0.8 * memory():
+            self._chunk, self._k, self._limit = self._chunk[:0], 0, 0  # what is full is among the chunks done
+            raise SimulationError(
+                f"the samples fill {held / 2**30:.1f} GiB, and this machine has {memory() / 2**30:.0f}. Record less "
+                "with record=[…] or every=…, or stream to disk with to=path.",
+                t=t,
+            )
+        self._new(rows)
+
+    def _start(self) -> Any:
+        """Create the folder, if that has not been done."""
+        if self._files is None:
+            assert self.to is not None
+            try:
+                self._files = create(self.to, self._header or {})
+            except OSError as error:
+                raise self._failed(error) from error
+            self._new(max(1, min(_ROWS, _BYTES // (8 * self._width))))
+            self._due = monotonic() + _LATEST
+        return self._files
+
+    @property
+    def is_open(self) -> bool:
+        """Whether files on disk are open: samples were written, and `finish` was not called."""
+        return self._files is not None
+
+    def flush(self) -> None:
+        """Write what is held to disk; in memory, nothing is to be done."""
+        if self._files is None:
+            return
+        rows, events = self._files
+        if self._k:
+            self._tail = self._chunk[self._k - 1].copy()
+        left = self._chunk[: self._k].data.cast("B") if self._k else memoryview(b"")
+        try:
+            while left:
+                left = left[rows.write(left) :]
+            events.flush()
+        except OSError as error:
+            rows.truncate(self._written * 8 * self._width)  # whole rows only: later ones must not be shifted
+            self._k = 0
+            raise self._failed(error) from error
+        self._written += self._k
+        self._k, self._due = 0, monotonic() + _LATEST
+
+    def _failed(self, error: OSError) -> SimulationError:
+        self._broken = True
+        return SimulationError(
+            f"the run can't be written to {os.fspath(self.to or '')!r}: {error.strerror or error}. What was written "
+            "before is kept; make room, or choose another path."
+        )
+
+    def finish(self, **end: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return times, shape (n,), and samples, shape (n, entries kept).
+
+        Parameters
+        ----------
+        **end
+            How the run ended (``elapsed``, ``messages``, ``stopped``), for the run on disk.
+        """
+        if self.to is not None:
+            return self._close(end)
+        if self._k:
+            self._done.append(self._chunk[: self._k])
+        self._chunk, self._k, self._limit = np.empty((0, 0)), 0, 0
+        rows = self._done.pop() if len(self._done) == 1 else self._together()
+        self.events = tuple(self.events)
+        t, data, self.residual = split(rows, self.has_residual)
+        return np.ascontiguousarray(t), data
+
+    def _together(self) -> np.ndarray:
+        rows, n = np.empty((sum(map(len, self._done)), self._width)), 0
+        self._done.reverse()
+        while self._done:  # each is freed as soon as it is copied: the pages of `rows` come only with what is written
+            chunk = self._done.pop()
+            rows[n : n + len(chunk)] = chunk
+            n += len(chunk)
+        return rows
+
+    def _close(self, end: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        assert self.to is not None
+        files = self._start()
+        try:
+            self.flush()
+            for file in files:
+                file.flush()
+                os.fsync(file.fileno())
+            write_json(self.to / END, end)
+        except OSError as error:
+            if not self._broken:  # else that was said already
+                raise self._failed(error) from error
+        finally:
+            for file in files:
+                file.close()
+            self._files = None
+        stored = read(self.to)
+        self.events, self.residual = stored.events, stored.residual
+        return stored.t, stored.data
+
+
+def check_every(every: Any) -> None:
+    """Refuse an ``every`` that is no positive integer.
+
+    Raises
+    ------
+    OptionError
+        If it is none.
+    """
+    if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
+        raise OptionError(f"found every={every!r}; expected a positive integer: one of so many samples is kept.")
+
+
+def select(
+    record: Iterable[str] | None,
+    layout: Layout,
+    wires: Mapping[str, Wire],
+    width: int,
+    *,
+    states: bool = True,
+) -> np.ndarray | None:
+    """Return the entries of a sample's vector that a selection keeps, ascending; None for all.
+
+    Parameters
+    ----------
+    record : iterable of str, optional
+        Signals, by the names that ``run[name]`` takes, and subsystems or blocks, for all that is in them; None for all.
+    layout : Layout
+        Where each port stands in the vector; from ``layout.total`` to ``width`` it holds the states.
+    wires : mapping
+        The named wires.
+    states : bool
+        Whether the states are kept.
+
+    Raises
+    ------
+    UnknownNameError
+        For a name that stands for no signal, or for several.
+    """
+    if record is None:
+        return None if states else np.arange(layout.total)
+    if isinstance(record, str):
+        record = (record,)
+    kept: set[int] = set()
+    for name in record:
+        inside = [where for port, where in layout.slices.items() if port.startswith(f"{name}.")]
+        try:
+            kept.update(entries(resolve(name, wires, layout.slices), layout, wires).ravel().tolist())
+        except UnknownNameError:
+            if not inside:
+                raise
+            for where in inside:
+                kept.update(range(where.start, where.stop))
+    if states:
+        kept.update(range(layout.total, width))
+    return np.array(sorted(kept), dtype=int)

@@ -1,0 +1,104 @@
+"""What a run records, and where to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import OptionError
+from ..flat.flat_diagram import FlatDiagram
+from ..simulation.duration import check_memory
+from ..wiring.structure import join
+from .recorder import Recorder, check_every, select
+from .stored import header
+
+
+@dataclass
+class Recording:
+    """What a run records, and where to: the choices of `Diagram.simulate`."""
+
+    flat: FlatDiagram
+    name: str
+    record: Iterable[str] | None
+    every: int
+    states: bool
+    to: Any
+    overwrite: bool
+
+    def __post_init__(self) -> None:
+        check_every(self.every)
+        if self.record is not None and not isinstance(self.record, Iterable):
+            raise OptionError(
+                f"found record={self.record!r}; expected names of signals, such as record=['y'].", block=self.name
+            )
+        if self.to is not None and not isinstance(self.to, str | os.PathLike):
+            raise OptionError(f"found to={self.to!r}; expected the path of a folder.", block=self.name)
+
+    @property
+    def width(self) -> int:
+        """Entries of the vector of a sample, without the residual."""
+        return self.flat.log.total + self.flat.width
+
+    @cached_property
+    def columns(self) -> np.ndarray | None:
+        """The entries that are kept; None for all."""
+        return select(self.record, self.flat.log, self.flat.table.names, self.width, states=self.states)
+
+    @cached_property
+    def units(self) -> dict[str, Any]:
+        """The units of the ports by path."""
+        return {join(*port): unit for port, unit in self.flat.checked.units.items()}
+
+    def check_memory(self, ticks: int, *, every_tick: bool) -> None:
+        """Refuse a run whose samples can't fit; see `_duration.check_memory`.
+
+        Parameters
+        ----------
+        ticks : int
+            Ticks of the run.
+        every_tick : bool
+            Whether each is visited, not only those at which a box acts.
+        """
+        width = self.width if self.columns is None else len(self.columns)
+        clocks = self.flat.distinct
+        samples = ticks + 1
+        if clocks and not every_tick:
+            samples = min(samples, sum(ticks // clock.every + 1 for clock in clocks) + 2)
+        check_memory(samples, width, self.flat.base, self.name, every=self.every, to=self.to)
+
+    def begin(self, rows: int | None = None) -> Recorder:
+        """Return a recorder that has no sample yet.
+
+        Parameters
+        ----------
+        rows : int, optional
+            Samples that are to come, if that is known.
+        """
+        flat, head = self.flat, None
+        residual = bool(flat.loops.slices)
+        if self.to is not None:
+            head = header(
+                diagram=self.name,
+                layout=flat.log,
+                wires=flat.table.names,
+                units=self.units,
+                width=self.width,
+                columns=self.columns,
+                has_states=self.states,
+                residual=residual,
+            )
+        return Recorder(
+            self.width,
+            self.columns,
+            every=self.every,
+            rows=rows,
+            residual=residual,
+            to=self.to,
+            header=head,
+            overwrite=self.overwrite,
+        )

@@ -1,0 +1,388 @@
+"""What a run recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core.errors import OptionError, UnknownNameError
+from ..flat.layout import Layout
+from ..wiring.structure import Wire
+from .signal_names import entries, resolve
+from .stored import Occurrence, Stopped, read, write
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+    from xarray import Dataset
+
+    from .saved_state import RunState
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All signals and states at one recorded instant."""
+
+    t: float
+    tick: int
+    """The sample's number in the run, from 0; the tick, where every tick was recorded."""
+    values: dict[str, Any]
+    state: np.ndarray
+    """The state vector x of the flattened diagram."""
+    names: dict[str, Wire]
+    """The named wires: two of one short name are told apart by what they carry."""
+    run: Any = field(default=None, repr=False, compare=False)
+    """The run that it comes from."""
+
+    def __getitem__(self, name: str) -> Any:
+        return self.values[resolve(name, self.names, self.values)]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run: the outputs of the blocks, and the states, at the instants that were recorded.
+
+    ``run.t`` are the times in s, ``run["xi"]`` is an array with one row per sample, reached by a wire's name, by a
+    port's dotted path (``"controller.pid_par.v"``), or by any end of such a path that is unique. Steps need not be
+    equal; at an event there may be two samples of one time, before and after it.
+
+    Attributes
+    ----------
+    t : (N,) ndarray
+        Times in s, ascending, up to and including the end.
+    messages : tuple of str
+        What the FMUs said, and whether the run was cut off.
+    events : sequence of Occurrence
+        The events that fired, in their order.
+    stopped : Stopped or None
+        The stop condition that ended the run before its time.
+    residual : (N,) ndarray or None
+        Largest residual of the algebraic loops that were solved, by sample; None where there were none.
+    has_states : bool
+        Whether the states were recorded, which `at` needs.
+    elapsed : float
+        Elapsed time of the loop in s.
+    real_time_factor : float
+        Simulated time over elapsed time of the loop.
+
+    Examples
+    --------
+    >>> from loopwright.blocks import Gain, Step
+    >>> from loopwright.diagrams import Diagram
+    >>> step = Step(times=0.2, values=3.0)
+    >>> run = Diagram("step", Gain(gain=2.0)(step).named("y")).simulate(0.4, step=0.2, progress=False)
+    >>> run.t
+    array([0. , 0.2, 0.4])
+    >>> run["y"]
+    array([0., 6., 6.])
+    >>> "gain.y" in run
+    True
+    """
+
+    t: np.ndarray
+    data: np.ndarray = field(repr=False)
+    layout: Layout = field(repr=False)
+    wires: dict[str, Wire] = field(repr=False)
+    units: dict[str, Any] = field(repr=False)
+    diagram: Any = field(repr=False)
+    elapsed: float = float("nan")
+    messages: tuple[str, ...] = ()
+    events: Sequence[Occurrence] = field(default=(), repr=False)
+    stopped: Stopped | None = None
+    residual: np.ndarray | None = field(default=None, repr=False)
+    columns: np.ndarray | None = field(default=None, repr=False)
+    """Which entries of a sample's vector (outputs as in ``layout``, then states) are in ``data``; None for all."""
+    has_states: bool = field(default=True, repr=False)
+    diagram_name: str = ""
+    final_state: RunState | None = field(default=None, repr=False)
+    """The complete state at the end, to go on from with ``simulate(…, start=)``; None where an FMU can't save its."""
+
+    recipe: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    """How it was run (step, solver, tolerances, start), so that an instant of it can be found again."""
+
+    def __post_init__(self) -> None:
+        if not self.diagram_name:
+            object.__setattr__(self, "diagram_name", getattr(self.diagram, "name", ""))
+
+    @classmethod
+    def open(cls, path: Any) -> Run:
+        """Open a run on disk, as `save` and ``simulate(…, to=path)`` write it; its diagram is not needed.
+
+        The samples stay on disk and are read when a signal is asked for. A run that was killed, or that still runs,
+        opens with what was written until then; its messages say so.
+
+        Parameters
+        ----------
+        path : path
+            The run's folder.
+
+        Raises
+        ------
+        OptionError
+            If there is no run at that path.
+        """
+        stored = read(Path(path))
+        end, n = stored.end, len(stored.t)
+        if end is None:
+            until = f", until t = {stored.t[-1]:g} s" if n else ""
+            end = {"messages": [f"This run did not end: it was killed, or still runs. It holds {n} samples{until}."]}
+        vector = stored.head["vector"]
+        return cls(
+            t=stored.t,
+            data=stored.data,
+            layout=stored.layout,
+            wires=stored.wires,
+            units=stored.units,
+            diagram=None,
+            elapsed=end.get("elapsed", float("nan")),
+            messages=tuple(end.get("messages", ())),
+            events=stored.events,
+            stopped=Stopped(**end["stopped"]) if end.get("stopped") else None,
+            residual=stored.residual,
+            columns=stored.columns,
+            has_states=vector["has_states"],
+            diagram_name=stored.head["diagram"],
+        )
+
+    def save(self, path: Any, *, overwrite: bool = False) -> None:
+        """Write the run to a folder, from which `Run.open` reads it, exact to the last bit.
+
+        Parameters
+        ----------
+        path : path
+            Folder to make: ``header.json``, ``rows.f64`` (little-endian 64-bit floats, t first), ``events.jsonl`` and
+            ``end.json``.
+        overwrite : bool
+            Whether a run that stands there may be replaced.
+
+        Raises
+        ------
+        OptionError
+            If something is in the way.
+        """
+        write(Path(path), self, overwrite)
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated seconds per elapsed second."""
+        return float(self.t[-1] - self.t[0]) / self.elapsed if self.elapsed > 0 and len(self.t) else float("nan")
+
+    @property
+    def names(self) -> list[str]:
+        """Every name under which a signal was recorded: the wires' names, then the ports' paths."""
+        return [n for n in (*sorted(self.wires), *self.layout.slices) if self._where(n) is not None]
+
+    @cached_property
+    def _position(self) -> np.ndarray | None:
+        """For every entry of a sample's vector, its column in ``data``; -1 where it has none."""
+        if self.columns is None:
+            return None
+        position = np.full(max([self.layout.total, *(self.columns + 1)]), -1)
+        position[self.columns] = np.arange(len(self.columns))
+        return position
+
+    def _where(self, full: str) -> np.ndarray | None:
+        """Return the columns of a signal in ``data``, in its shape; None if not all were recorded."""
+        where = entries(full, self.layout, self.wires)
+        if self._position is None:
+            return where
+        where = self._position[where]
+        return where if np.all(where >= 0) else None
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return a signal, shape (N, *shape of the port).
+
+        Raises
+        ------
+        UnknownNameError
+            If there is none of that name, or several, or if it was not recorded.
+        """
+        return self.part(name, slice(None))
+
+    def part(self, name: str, samples: slice) -> np.ndarray:
+        """Return some samples of a signal, as ``run[name][samples]`` does, without reading the others.
+
+        Parameters
+        ----------
+        name : str
+            The signal, by a name that ``run[name]`` takes.
+        samples : slice
+            Which samples, by number.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is none of that name, or several, or if it was not recorded.
+        """
+        full = resolve(name, self.wires, self.layout.slices)
+        where = self._where(full)
+        if where is None:
+            raise UnknownNameError(
+                f"the signal {full!r} was not recorded in this run, as the selection left it out. Run again with "
+                f"record=[…, {full!r}], or without record for all signals."
+            )
+        flat = where.ravel()
+        if flat.size and np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
+            values = self.data[samples, flat[0] : flat[0] + flat.size]
+        else:
+            values = self.data[samples][:, flat]
+        return np.ascontiguousarray(values.reshape(len(values), *where.shape))
+
+    def _ipython_key_completions_(self) -> list[str]:
+        return self.names
+
+    def __contains__(self, name: str) -> bool:
+        try:
+            return self._where(resolve(name, self.wires, self.layout.slices)) is not None
+        except UnknownNameError:
+            return False
+
+    def unit(self, name: str) -> str | tuple[str, ...] | None:
+        """Return the unit of a signal, None where it is not declared."""
+        full = resolve(name, self.wires, self.layout.slices)
+        wire = self.wires.get(full)
+        if wire is None:
+            return self.units.get(full)
+        unit = self.units.get(f"{wire.block}.{wire.port}")
+        return unit[wire.index] if isinstance(unit, tuple) and wire.index is not None else unit
+
+    def at(self, t: float) -> Snapshot:
+        """Return all recorded signals and the states at the last sample not after ``t`` (in s).
+
+        Raises
+        ------
+        OptionError
+            If t is not within the run, or the states were not recorded.
+        """
+        if not (len(self.t) and self.t[0] <= t <= self.t[-1] * (1 + 1e-12) + 1e-12):
+            span = f"{self.t[0]:g} s to {self.t[-1]:g} s" if len(self.t) else "nothing"
+            raise OptionError(f"found t = {t!r}; the run holds {span}.")
+        k = int(np.searchsorted(self.t, t * (1 + 1e-12) + 1e-12, side="right")) - 1
+        if not self.has_states:
+            raise OptionError(
+                f"the states at t = {t!r} s were not recorded in this run, and an operating point needs them. Run "
+                f"again with the states recorded; for a signal alone, take run[name][{k}]."
+            )
+        row = np.array(self.data[k])
+        found = ((name, self._where(name)) for name in (*self.layout.slices, *self.wires))
+        values = {name: row[where] for name, where in found if where is not None}
+        first = self.layout.total if self.columns is None else int(np.searchsorted(self.columns, self.layout.total))
+        return Snapshot(float(self.t[k]), k, values, row[first:].copy(), dict(self.wires), self)
+
+    def plot(self, *names: str, axes: Any = None) -> Figure:
+        """Draw signals over time, one below the other, and return the figure.
+
+        Parameters
+        ----------
+        *names : str
+            Signals to draw; a vector's entries share an axis.
+        axes : sequence of matplotlib axes, optional
+            Axes to draw into, one per name.
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that was not recorded.
+        """
+        from .plots import plot_signals
+
+        return plot_signals(self, names, axes)
+
+    # --- for other tools: all named wires (where none has a name, all ports) if no signal is given -------------------
+
+    def to_csv(self, path: Any, *names: str) -> None:
+        """Write ``t`` (s) and signals as comma-separated values, 17 significant digits.
+
+        A column is called as its signal; those of a vector are ``name[1]``, ``name[2]``, ….
+
+        Parameters
+        ----------
+        path : path or file
+            File to write.
+        *names : str
+            Signals; all named wires if none is given, and all ports where no wire has a name.
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that was not recorded.
+        """
+        from .exports import to_csv
+
+        to_csv(self, path, names)
+
+    def to_pandas(self, *names: str) -> DataFrame:
+        """Return signals as a pandas DataFrame with the times (s) as index ``t``; columns are called as in `to_csv`.
+
+        Units are in its ``attrs["units"]``, by column. At an event an index repeats: before and after.
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that was not recorded.
+        OptionError
+            If pandas is not installed.
+        """
+        from .exports import to_pandas
+
+        return to_pandas(self, names)
+
+    def to_xarray(self, *names: str) -> Dataset:
+        """Return signals as an xarray Dataset over ``t`` (s).
+
+        A vector ``f`` has the dimensions ``t`` and ``f_dim``, a matrix ``t``, ``f_dim1`` and ``f_dim2``; entries are
+        counted from 1, as in `to_csv`. ``attrs["units"]`` of a variable is its unit, those of a vector separated by
+        commas where they differ.
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that was not recorded.
+        OptionError
+            If xarray is not installed.
+        """
+        from .exports import to_xarray
+
+        dataset: Dataset = to_xarray(self, names)
+        return dataset
+
+    def to_parquet(self, path: Any, *names: str) -> None:
+        """Write ``t`` (s) and signals as a Parquet file; columns are called as in `to_csv`.
+
+        A field's metadata holds its unit. Rows are written in groups, so a run on disk need not fit into memory.
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that was not recorded.
+        OptionError
+            If pyarrow is not installed.
+        """
+        from .exports import to_parquet
+
+        to_parquet(self, path, names)
+
+    def to_mat(self, path: Any, *names: str) -> None:
+        """Write ``t`` (s) and signals as a MATLAB file (version 5), a column vector or an N-by-n matrix each.
+
+        A variable is called as its signal, with what MATLAB allows in a name: every character other than a letter of
+        ASCII, a digit or ``_`` becomes ``_``; ``s_`` is put in front of what does not begin with a letter, and of
+        MATLAB's keywords, ``t`` and ``info``; of a name longer than 63 characters the end is kept; what is then taken
+        already gets ``_2``, ``_3``, …. The struct ``info`` lists ``variables``, the ``names`` they stand for, and their
+        ``units``. Of a matrix each row holds its entries row by row.
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that was not recorded.
+        OptionError
+            If a signal takes 2 GiB or more, which the format can't hold.
+        """
+        from .exports import to_mat
+
+        to_mat(self, path, names)

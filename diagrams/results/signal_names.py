@@ -1,0 +1,39 @@
+"""The names under which a run's signals are found."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import UnknownNameError, near
+from ..flat.layout import Layout
+
+
+def resolve(name: str, wires: Any, ports: Any) -> str:
+    """Return the full name that ``name`` stands for: a wire's or port's path, or a unique end of one; wires go first.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is none, or several.
+    """
+    if name in wires or name in ports:
+        return name
+    for group in (wires, ports):
+        found = sorted(n for n in group if n.endswith("." + name))
+        if found and (len(found) == 1 or (group is wires and len({wires[n] for n in found}) == 1)):
+            return str(found[0])
+        if found:
+            raise UnknownNameError(f"{name!r} stands for several signals: {', '.join(found)}. Write more of the path.")
+    short = {n.rpartition(".")[2] for n in (*wires, *ports)}
+    raise UnknownNameError(f"no signal {name!r} was recorded. {near(name, short | set(wires) | set(ports))}")
+
+
+def entries(full: str, layout: Layout, wires: Any) -> np.ndarray:
+    """Return where a signal stands in the vector of a sample, in the signal's shape."""
+    wire = wires.get(full)
+    port = full if wire is None else f"{wire.block}.{wire.port}"
+    where = layout.slices[port]
+    whole = np.arange(where.start, where.stop).reshape(layout.shapes[port])
+    return whole if wire is None or wire.index is None else np.asarray(whole[wire.index])

@@ -1,0 +1,129 @@
+"""Who made a value that is not finite: the instant is evaluated again, block by block, with numbers."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import NonFiniteError, SimulationError
+from ...blocks.tracing.numpy_check import GUARDS, NEXT
+from ...blocks.tracing.opaque_equations import raise_failure
+from ...blocks.tracing.symbols import bundle
+from ..flat.evaluate import Pass
+from ..flat.flat_diagram import FlatDiagram
+from ..flat.layout import Clock
+from .workspace import Machine
+
+
+def failure(machine: Machine, acting: frozenset[Clock]) -> SimulationError:
+    """Return the error of the first block that made a value that is not finite, or whose guard fails, at ``here``."""
+    flat, here = machine.flat, machine.here
+    forget_trials(machine)
+    for name, where in flat.plant_outputs.slices.items():
+        if not np.all(np.isfinite(here.w[where])):
+            path, port = flat.ports[name]
+            return _non_finite(path, port, here.w[where], "It comes out of the FMU.")
+    found: list[SimulationError] = []
+
+    def visit(path: str, names: tuple[str, ...], inputs: dict[str, Any], made: dict[str, Any]) -> None:
+        if not found and done.gate_of(path) is not False:
+            error = _wrong(flat, here.x, path, names, inputs, {n: np.ravel(np.array(v)) for n, v in made.items()})
+            if error is not None:
+                found.append(error)
+
+    done = Pass(flat, acting, float(here.t[0]), here.x, here.w, flat.p, visit=visit)
+    done.run()
+    return opaque_failure(machine) or (found[0] if found else _overflow(machine))
+
+
+def forget_trials(machine: Machine) -> None:
+    """Forget what opaque blocks have raised in trials that the solver got over; an interrupt is raised."""
+    for trace in machine.flat.checked.traced.values():
+        if trace.failures:
+            last = trace.failures.pop()
+            if not isinstance(last, Exception):
+                raise last
+
+
+def opaque_failure(machine: Machine) -> SimulationError | None:
+    """Return what an opaque block has raised since its failures were looked at; an interrupt is raised."""
+    for path, trace in machine.flat.checked.traced.items():
+        try:
+            raise_failure(trace.failures, path)
+        except SimulationError as error:
+            return error
+    return None
+
+
+def _wrong(
+    flat: FlatDiagram, x: np.ndarray, path: str, names: tuple[str, ...], inputs: dict[str, Any], made: dict[str, Any]
+) -> SimulationError | None:
+    trace, block = flat.checked.traced[path], flat.table.blocks[path]
+    shaped = shaped_inputs(trace, inputs)
+    u = bundle("u", shaped)
+    for name in sorted(names, key=lambda n: n != GUARDS):  # a guard says more than the NaN behind it
+        if name == GUARDS:
+            for guard, value in zip(trace.guards, made[name], strict=True):
+                if not value > 0:
+                    y = bundle("y", {n: made.get(n) for n in trace.outputs})
+                    error = block.guard_error(guard, float(value), u, y, states_of(flat, path, x))
+                    error.at(block=path)
+                    return error
+        elif not np.all(np.isfinite(made[name])):
+            what = {NEXT: "the rate of its states" if trace.advance == "derivative" else "the next state"}.get(
+                name, name
+            )
+            return _non_finite(path, what, made[name], inputs_text(shaped))
+    return None
+
+
+def shaped_inputs(trace: Any, inputs: dict[str, Any]) -> dict[str, Any]:
+    """Return the columns at a block's inputs as arrays of their shapes; None for what is not made yet."""
+    return {
+        q: None if inputs[q] is None else np.reshape(np.array(inputs[q], dtype=float), shape)
+        for q, shape in trace.inputs.items()
+    }
+
+
+def states_of(flat: FlatDiagram, path: str, x: np.ndarray) -> Any:
+    """Return the states of a block as its equations see them."""
+    return bundle("x", state_values(flat, path, x))
+
+
+def state_values(flat: FlatDiagram, path: str, x: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the states of a block by name."""
+    part, position, parts = x[flat.states.slices[path]], 0, {}
+    for name, shape in flat.checked.traced[path].states.items():
+        n = math.prod(shape)
+        parts[name] = part[position : position + n].reshape(shape).copy()
+        position += n
+    return parts
+
+
+def _overflow(machine: Machine) -> NonFiniteError:
+    layout = machine.flat.log
+    sizes = {name: float(np.max(np.abs(machine.log[where]), initial=0.0)) for name, where in layout.slices.items()}
+    largest = max(sizes, key=lambda name: sizes[name])
+    path, port = machine.flat.ports[largest]
+    return NonFiniteError(
+        f"found {sizes[largest]:g}; the signals of this tick overflow when they are added up, and this "
+        "is the largest. Look at what drives it in the last samples of error.run.",
+        block=path,
+        port=port,
+    )
+
+
+def inputs_text(inputs: dict[str, Any]) -> str:
+    """Say what a block's inputs were."""
+    shown = ", ".join(f"{n} = {np.asarray(v).tolist()}" for n, v in inputs.items() if v is not None)
+    return f"Its inputs then: {shown}." if shown else "It has no inputs."
+
+
+def _non_finite(path: str, port: str, values: np.ndarray, hint: str) -> NonFiniteError:
+    return NonFiniteError(
+        f"found {values.tolist()}; expected finite numbers. This is the first block that made such a value. {hint}",
+        block=path,
+        port=port,
+    )

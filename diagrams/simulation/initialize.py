@@ -1,0 +1,151 @@
+"""The start of a run: states, held outputs, and inputs and outputs of FMUs that agree at t = 0."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import LoopwrightError, NonFiniteError, SimulationError
+from ...blocks.tracing.equations import initial_state
+from ...blocks.tracing.symbols import bundle
+from ..flat.evaluate import Pass, above
+from ..flat.flat_diagram import FlatDiagram
+from .diagnosis import failure, inputs_text, shaped_inputs
+from .workspace import Machine
+
+_MAX_PASSES = 100  # over inputs and outputs of the FMUs at the start
+_SETTLED = 1e-13  # relative change of an input between two passes, a few hundred ulps
+
+
+def initialize(machine: Machine, plants: list[tuple[str, Any]], delays: Any) -> None:
+    """Find values of everything at t = 0.
+
+    In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). What they change is given on
+    until it changes no more than by rounding.
+    """
+    flat = machine.flat
+    acting = flat.acting(0)
+    machine.here.t[0] = 0.0
+    if delays is not None:
+        delays.outputs_at(0.0, machine.here.w)
+    passes, last = 0, np.full(flat.width, np.nan)
+    most = _MAX_PASSES * (10 if machine.looped else 1)
+    while True:
+        _states(machine)
+        _boxes(machine)
+        machine.tick(acting)()
+        if not machine.ok[0]:
+            raise failure(machine, acting)
+        before = machine.z.copy()
+        for _, plant in plants:
+            plant.exchange()
+        if delays is not None:
+            delays.begin(machine.z, machine.here.w)
+        machine.tick(acting)()
+        passes += 1
+        found = not machine.looped or np.allclose(last, machine.here.x, rtol=_SETTLED, atol=_SETTLED)
+        if found and np.allclose(before, machine.z, rtol=_SETTLED, atol=0.0, equal_nan=True):
+            break
+        if passes == most:
+            raise _unsettled(machine, before) if found else _unsolved_start(machine, last)
+        last = machine.here.x.copy()
+
+
+def _states(machine: Machine) -> None:
+    """Compute the initial states of the blocks that ask for their inputs first."""
+    flat, x = machine.flat, machine.here.x
+    blocks = flat.table.blocks
+    if any(blocks[path].starts_from_inputs for path in flat.checked.traced):
+        ready: set[str] = set()
+
+        def before(path: str, inputs: dict[str, Any]) -> None:
+            block, trace = blocks[path], flat.checked.traced[path]
+            if block.starts_from_inputs and path not in ready:
+                ready.add(path)
+                for port, column in inputs.items():
+                    _check_finite(flat, path, port, column)
+                u = bundle("u", shaped_inputs(trace, inputs))
+                x[flat.states.slices[path]] = _initial(path, block, u, trace.states)
+
+        Pass(
+            flat, frozenset(), 0.0, x, machine.here.w, flat.p, opened=True, order=flat.start_order.steps, before=before
+        ).run()
+    for path, where in flat.starts.slices.items():
+        x[where] = x[flat.states.slices[path]]
+
+
+def _check_finite(flat: FlatDiagram, path: str, port: str, column: Any) -> None:
+    """Refuse to start a block from an input that is not finite: whoever made that is to blame."""
+    wire = flat.table.wires.get((path, port))
+    if column is None or wire is None:
+        return
+    values = np.ravel(np.array(column, dtype=float))
+    if not np.all(np.isfinite(values)):
+        raise NonFiniteError(
+            f"found {values.tolist()} at the start; expected finite numbers, since {path}.{port} begins with it. Look "
+            "for a division by zero, or a root or a logarithm of a negative number.",
+            block=wire.block,
+            port=wire.port,
+            t=0.0,
+        )
+
+
+def _boxes(machine: Machine) -> None:
+    """Let every box put out once what it would at the start, and remember what controls it."""
+    flat, x = machine.flat, machine.here.x
+    if not flat.held.slices and not flat.gates.slices:
+        return
+    done = Pass(flat, frozenset(), 0.0, x, machine.here.w, flat.p, opened=True).run()
+    for name, column in done.held.items():
+        where = flat.held.slices[name]
+        x[where] = np.ravel(np.array(column))
+    for box, where in flat.gates.slices.items():
+        x[where] = float(above(done.control(box)))
+
+
+def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]]) -> np.ndarray:
+    """Return a block's initial state from its inputs, flat; whatever fails says whose it is."""
+    try:
+        return initial_state(block, states, u)
+    except SimulationError as error:
+        raise error.at(block=path, t=0.0) from error.__cause__
+    except Exception as error:
+        expected = ", ".join(f"{name} of shape {shape}" for name, shape in states.items())
+        what = str(error) if isinstance(error, LoopwrightError) else f"{type(error).__name__}: {error}"
+        raise SimulationError(
+            f"its initial(u) failed: {what} {inputs_text(u._asdict())} Expected {expected}.", block=path, t=0.0
+        ) from error
+
+
+def _unsolved_start(machine: Machine, last: np.ndarray) -> SimulationError:
+    flat, x = machine.flat, machine.here.x
+    path = next(
+        (p for p, s in flat.states.slices.items() if not np.allclose(last[s], x[s], rtol=_SETTLED, atol=_SETTLED)), ""
+    )
+    loops = "\n".join(flat.start_order.loops)
+    return SimulationError(
+        f"its initial state depends on itself, and is not found: after {_MAX_PASSES * 10} passes it still changes.\n"
+        f"{loops}\nGive it an initial_value, or one to another block of this loop.",
+        block=path or flat.start_order.torn[0][0],
+    )
+
+
+def _unsettled(machine: Machine, before: np.ndarray) -> SimulationError:
+    flat, z = machine.flat, machine.z
+    slices = flat.plant_inputs.slices
+    name = next(n for n, s in slices.items() if not np.allclose(before[s], z[s], rtol=_SETTLED, atol=0.0))
+    path, port = flat.ports[name]
+    delay = flat.table.blocks[path].transport
+    own, step = (
+        ("its own output", "Give it an initial_value.")
+        if delay
+        else ("the FMU's own outputs", "Put a UnitDelay(initial_value=…) on one of the wires between.")
+    )
+    return SimulationError(
+        f"its value at the start depends on {own}, and is not found: after {_MAX_PASSES} passes it "
+        f"still changes, from {before[slices[name]].tolist()} to {z[slices[name]].tolist()}. {step}",
+        block=path,
+        port=port,
+    )

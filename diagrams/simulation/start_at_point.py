@@ -1,0 +1,76 @@
+"""A run that starts at an operating point."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core.errors import FmuError, LoopwrightError, OptionError
+from ..flat.flat_diagram import FlatDiagram
+from ..linearization.operating_point import OperatingPoint
+
+if TYPE_CHECKING:
+    from ..diagram import Diagram
+
+
+def placed(diagram: Diagram, point: OperatingPoint) -> Diagram:
+    """Return the diagram with the parameters of an operating point, and with its FMUs started in their states there.
+
+    Raises
+    ------
+    FmuError
+        An FMU whose states can't be set at the start.
+    """
+    changes: dict[str, Any] = dict(point.parameters)
+    variant = diagram.replace(changes) if changes else diagram
+    blocks: dict[str, Any] = {}
+    for path, known in point.plants.items():
+        block: Any = variant.blocks[path]
+        try:
+            blocks[path] = block.replace(start={**block.start, **known["state"]})
+        except LoopwrightError as error:
+            raise FmuError(
+                f"a run can't start at this operating point, because a state can't be set at the FMU's start: "
+                f"{error.message} Run to it instead: diagram.operating_point(t).",
+                block=path,
+            ) from error
+    return variant.replace(blocks) if blocks else variant
+
+
+def carried(values: np.ndarray, old: FlatDiagram, new: FlatDiagram, into: np.ndarray) -> None:
+    """Write a vector x of one diagram into that of another, whatever stands under the same name in both."""
+    for name in ("states", "held", "gates", "starts", "loops"):
+        theirs, mine = getattr(old, name), getattr(new, name)
+        for key, where in theirs.slices.items():
+            if key in mine.slices and mine.shapes[key] == theirs.shapes[key]:
+                into[mine.slices[key]] = values[where]
+
+
+def place(simulation: Any, point: OperatingPoint) -> int:
+    """Put a run that has just been initialized to what is just before an operating point's tick, and return that tick.
+
+    Raises
+    ------
+    OptionError
+        A point of another diagram, or one that stands on none of the run's ticks.
+    """
+    flat, here = simulation.flat, simulation._machine.here
+    tick = point.tick * point.base / flat.base
+    if tick.denominator != 1:
+        raise OptionError(
+            f"the operating point is at t = {point.t:.9g} s; this run has ticks of {float(flat.base):g} s, and none of "
+            f"them is there. Give step={float(point.base):g}, or find the point with this step.",
+            block=simulation.diagram.name,
+            port="start",
+        )
+    if point.x.size != here.x.size or point.w.size != here.w.size:
+        raise OptionError(
+            f"it is the operating point of another diagram: found {point.x.size} entries of state, expected "
+            f"{here.x.size}. Find one with diagram.trim(…) or diagram.operating_point(…) of this diagram.",
+            block=simulation.diagram.name,
+            port="start",
+        )
+    here.t[0] = point.t
+    here.x[:], here.w[:] = point.x, point.w
+    return int(tick)

@@ -1,0 +1,1 @@
+"""Solvers of fixed and variable step behind one interface."""

@@ -1,0 +1,355 @@
+"""Solvers of ordinary differential equations behind one interface: x' = f(t, x) between two discontinuities.
+
+How to choose (`rtol`, `atol` bound the error of one step; the error of a run is usually 1 to 100 times that):
+
+============== ======================== ====================================================================
+name           method                   choose it for
+============== ======================== ====================================================================
+auto           RK45 or DOP853, Radau    nearly everything: it starts non-stiff and changes where it is stiff
+RK45           Runge-Kutta 5(4)         non-stiff, rtol from 1e-3 to 1e-8
+DOP853         Runge-Kutta 8(5,3)       non-stiff, rtol below 1e-8
+RK23           Runge-Kutta 3(2)         non-stiff and crude; many discontinuities close together
+Radau          implicit Runge-Kutta 5   stiff, few states; also lightly damped fast modes; tight tolerances
+BDF            multistep, 1 to 5        stiff, many states, few discontinuities
+LSODA          Adams and BDF            changes between stiff and not; few discontinuities
+CVODE_BDF      multistep, 1 to 5        as BDF, in compiled code (also called CVODE)
+CVODE_Adams    multistep, 1 to 12       non-stiff, rates that are costly to evaluate, few discontinuities
+rk4            Runge-Kutta 4, fixed     a fixed step: real-time code, or a result that must be smooth in parameters
+heun           Runge-Kutta 2, fixed     as rk4, half its cost per step
+euler          Runge-Kutta 1, fixed     to see what a controller's forward Euler does
+============== ======================== ====================================================================
+
+The multistep methods start again at order 1 after every discontinuity, so that a sampled controller costs them most.
+
+A solver never evaluates the rates beyond the `stop` it was given and lands on it exactly: discontinuities in time are
+put there. The state at times inside a step comes from the method's own dense output (from a shorter step if the step is
+fixed).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import NonFiniteError, OptionError, SimulationError, near
+
+Dense = Callable[[float], np.ndarray]
+
+_STRETCH = 2_000  # steps between two looks at the progress
+_HOPELESS = 1e7  # steps to go, at which a run is given up
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is integrated: x' = rate(t, x).
+
+    Parameters
+    ----------
+    size : int
+        Number of states.
+    rate : callable
+        ``rate(t, x)``: the derivative. It may return the same array at every call.
+    jacobian : callable
+        ``jacobian(t, x)``: ∂rate/∂x, size × size.
+    names : sequence of str
+        What each entry of x is, for messages: ``"block.state[i]"``.
+    """
+
+    size: int
+    rate: Callable[[float, np.ndarray], np.ndarray]
+    jacobian: Callable[[float, np.ndarray], np.ndarray]
+    names: Sequence[str]
+
+
+@dataclass
+class Statistics:
+    """What a solver did. ``rejected`` is None where the method does not tell."""
+
+    solver: str
+    steps: int = 0
+    rejected: int | None = 0
+    rate_evaluations: int = 0
+    jacobian_evaluations: int = 0
+    messages: list[str] = field(default_factory=list)
+
+
+class Step:
+    """One accepted step, from ``t_old`` to ``t``, where the state is ``x``."""
+
+    __slots__ = ("_dense", "_prepare", "t", "t_old", "x")
+
+    def __init__(self, t_old: float, t: float, x: np.ndarray, prepare: Callable[[], Dense]):
+        self.t_old, self.t, self.x, self._prepare = t_old, t, x, prepare
+        self._dense: Dense | None = None
+
+    def interpolate(self, t: float) -> np.ndarray:
+        """Return the state at ``t`` in [t_old, t]. Only until the solver's next step or restart."""
+        if t == self.t:
+            return self.x.copy()
+        if self._dense is None:
+            self._dense = self._prepare()
+        return self._dense(t)
+
+
+class Solver(ABC):
+    """The interface of all solvers: `restart`, then `step` until ``t == stop``."""
+
+    fixed = False
+    stiff = False  # is it made for stiff problems?
+
+    def __init__(self, name: str, problem: Problem, rtol: float, atol: float | np.ndarray, max_step: float):
+        self.name, self.problem, self.rtol, self.atol, self.max_step = name, problem, rtol, atol, max_step
+        self.statistics = Statistics(name)
+        self.stop = -math.inf
+
+    @abstractmethod
+    def restart(self, t: float, x: np.ndarray, stop: float) -> None:
+        """Start at (t, x), up to ``stop``: after each discontinuity, and at the start."""
+
+    @abstractmethod
+    def step(self) -> Step:
+        """Take one step that the error control accepts, at most to ``stop``."""
+
+    def rate(self, t: float, x: np.ndarray) -> np.ndarray:
+        """Evaluate the rates, never beyond ``stop`` (t + h can be one ulp above it). The array is the caller's own."""
+        self.statistics.rate_evaluations += 1
+        return np.array(self.problem.rate(min(t, self.stop), x), dtype=float)
+
+    def jacobian(self, t: float, x: np.ndarray) -> np.ndarray:
+        """Evaluate the exact Jacobian. The array is the caller's own."""
+        self.statistics.jacobian_evaluations += 1
+        return np.array(self.problem.jacobian(min(t, self.stop), x), dtype=float)
+
+    def finite(self, t: float, values: np.ndarray, what: str) -> None:
+        """Raise if an entry is not finite; ``what`` is "state" or "rate"."""
+        if not np.isfinite(values).all():
+            i = int(np.flatnonzero(~np.isfinite(values))[0])
+            growth = "a step too long for a fast mode (try a tenth of it)" if self.fixed else "unbounded growth"
+            raise NonFiniteError(
+                f"The {what} of {self.problem.names[i]} is {values[i]:g} with solver={self.name!r}; expected a finite "
+                f"number. Look for a division by zero, a root or a logarithm of a negative number, or {growth}.",
+                t=t,
+            )
+
+    def failure(self, t: float, x: np.ndarray, h: float, found: str = "") -> SimulationError:
+        """Return the error of a step that can't be made small enough, at the accepted point (t, x).
+
+        The entry that it names has the largest weighted error there in a step of Euler's method.
+        """
+        f = self.rate(t, x)
+        try:
+            self.finite(t, f, "rate")
+        except NonFiniteError as error:
+            return error
+        h = max(abs(h), 16 * math.ulp(t))
+        with np.errstate(all="ignore"):
+            change = h * (self.rate(t + h, x + h * f) - f)
+            weighted = np.abs(change) / (self.atol + self.rtol * np.abs(x))
+        i = int(np.argmax(np.where(np.isnan(weighted), np.inf, weighted)))
+        found = found or f"can't meet rtol = {self.rtol:g} even with a step of {h:.2g} s"
+        beyond = "changes fastest" if np.isfinite(weighted[i]) else "is not finite just beyond"
+        other = "a larger atol" if self.stiff else "a larger atol or, if it is stiff, solver='Radau'"
+        return SimulationError(
+            f"{self.name} {found}: the rate of {self.problem.names[i]} = {x[i]:.6g} is {f[i]:.6g} there and {beyond}. "
+            "Expected rates that are finite, and smooth between events; look for growth to infinity, a root or a "
+            "logarithm that leaves its domain, a jump that is no event, or noise in an opaque block. If there is none, "
+            f"try {other}.",
+            t=t,
+        )
+
+
+class VariableStep(Solver):
+    """The base of the variable-step solvers: an interval of a few ulps is crossed by one step of Heun's method."""
+
+    _sliver: tuple[float, np.ndarray] | None = None
+    _count, _mark = 0, 0.0
+
+    def restart(self, t: float, x: np.ndarray, stop: float) -> None:
+        """Start at (t, x), up to ``stop``."""
+        t, x, self.stop = float(t), np.array(x, dtype=float), float(stop)
+        sliver = self.stop - t <= 100 * math.ulp(max(abs(t), abs(self.stop)))
+        self._sliver = (t, x) if sliver else None
+        self._count, self._mark = 0, t
+        if not sliver:
+            self._start(t, x)
+
+    def step(self) -> Step:
+        """Take one step that the error control accepts, at most to ``stop``."""
+        if self._sliver is None:
+            step = self._advance()
+            self._count += 1
+            if self._count % _STRETCH == 0:
+                self._check_progress(step)
+            return step
+        t, x = self._sliver
+        f = self.rate(t, x)
+        self.finite(t, f, "rate")
+        self.statistics.steps += 1
+        return Step(t, self.stop, _heun(self.rate, t, x, f, self.stop), lambda: lambda time: x + (time - t) * f)
+
+    def _check_progress(self, step: Step) -> None:
+        """Raise if the last steps were so small that the run would never end: at a jump that is no event, say."""
+        h, self._mark = (step.t - self._mark) / _STRETCH, step.t
+        if self.stop - step.t > _HOPELESS * h:
+            found = f"got no further than {h:.2g} s per step in {_STRETCH} steps, with {self.stop - step.t:.3g} s to go"
+            raise self.failure(step.t, step.x, h, found)
+
+    @abstractmethod
+    def _start(self, t: float, x: np.ndarray) -> None:
+        """Start the method at (t, x), up to ``self.stop``."""
+
+    @abstractmethod
+    def _advance(self) -> Step:
+        """Take one step of the method."""
+
+
+class FixedStep(Solver):
+    """Explicit Runge-Kutta methods of fixed step.
+
+    Stops that are further away than ``step`` are reached in equal steps of at most ``step``.
+    """
+
+    fixed = True
+
+    def __init__(self, name: str, problem: Problem, step: float, formula: Callable[..., np.ndarray]):
+        super().__init__(name, problem, math.nan, math.nan, step)
+        self._formula, self._t, self._x = formula, 0.0, np.empty(0)
+        self._start, self._done, self._count = 0.0, 0, 0
+
+    def restart(self, t: float, x: np.ndarray, stop: float) -> None:
+        """Start at (t, x), up to ``stop``."""
+        self._start = self._t = float(t)
+        self._x, self.stop, self._done = np.array(x, dtype=float), float(stop), 0
+        self._count = max(1, math.ceil((self.stop - self._t) / self.max_step * (1 - 1e-9)))
+
+    def step(self) -> Step:
+        """Take one step."""
+        t, x = self._t, self._x
+        self._done += 1
+        last = self._done >= self._count
+        t_new = self.stop if last else self._start + self._done * ((self.stop - self._start) / self._count)
+        if self.problem.size:
+            with np.errstate(all="ignore"):
+                f = self.rate(t, x)
+                self.finite(t, f, "rate")
+                x_new = self._formula(self.rate, t, x, f, t_new)
+            self.finite(t_new, x_new, "state")
+        else:
+            f = x_new = x
+        self._t, self._x = t_new, x_new
+        self.statistics.steps += 1
+        return Step(t, t_new, x_new.copy(), lambda: lambda time: self._formula(self.rate, t, x, f, time))
+
+
+def _euler(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray, t_new: float) -> np.ndarray:
+    """Forward Euler, order 1, one stage: x + h f(t, x). Stable for |1 + hλ| < 1: h < 2/|λ| for a real pole.
+
+    The step below is Hairer, Nørsett, Wanner, Solving Ordinary Differential Equations I, II.1, for all three methods.
+    """
+    return x + (t_new - t) * f
+
+
+def _heun(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray, t_new: float) -> np.ndarray:
+    """Heun's method, order 2, two stages: the mean of the rates at both ends. Stable for h < 2/|λ| for a real pole."""
+    h = t_new - t
+    x_new: np.ndarray = x + (0.5 * h) * (f + rate(t_new, x + h * f))
+    return x_new
+
+
+def _rk4(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray, t_new: float) -> np.ndarray:
+    """Classical Runge-Kutta method, order 4, four stages. Stable for h < 2.78/|λ| (real), h < 2.83/|λ| (imaginary)."""
+    h = t_new - t
+    middle = t + 0.5 * h
+    k2 = rate(middle, x + (0.5 * h) * f)
+    k3 = rate(middle, x + (0.5 * h) * k2)
+    k4 = rate(t_new, x + h * k3)
+    x_new: np.ndarray = x + (h / 6) * (f + 2 * (k2 + k3) + k4)
+    return x_new
+
+
+_FIXED = {"euler": _euler, "heun": _heun, "rk4": _rk4}
+_SCIPY = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
+_SUNDIALS = ("CVODE_BDF", "CVODE_Adams")
+
+SOLVERS: tuple[str, ...] = ("auto", *_FIXED, *_SCIPY, *_SUNDIALS)
+
+
+class _NoStates(FixedStep):
+    """Without states there is nothing to integrate: one step to ``stop``, or several of ``max_step``."""
+
+    fixed = False
+
+
+def solver_name(name: str) -> str:
+    """Return the name as `SOLVERS` spells it; an unknown one is an `OptionError`."""
+    spelled = {known.lower(): known for known in SOLVERS} | {"cvode": "CVODE_BDF"}
+    if not isinstance(name, str) or name.lower() not in spelled:
+        hint = near(str(name).lower(), spelled)
+        for lower, known in spelled.items():
+            hint = hint.replace(repr(lower), repr(known))
+        raise OptionError(f"There is no solver {name!r}; expected one of {', '.join(SOLVERS)}. {hint}")
+    return spelled[name.lower()]
+
+
+def make_solver(
+    name: str,
+    problem: Problem,
+    *,
+    rtol: float = 1e-6,
+    atol: float | np.ndarray = 1e-9,
+    step: float | None = None,
+    max_step: float | None = None,
+) -> Solver:
+    """Return the solver of this name (capitals don't matter).
+
+    Parameters
+    ----------
+    name : str
+        One of `SOLVERS`.
+    problem : Problem
+        What is integrated.
+    rtol, atol : float, float or ndarray
+        Each step's error in entry i is held below about atol[i] + rtol·|x[i]|.
+    step : float, optional
+        Step of a fixed-step method, s; the others take none.
+    max_step : float, optional
+        Upper bound of the step of a variable-step method, s.
+
+    Raises
+    ------
+    OptionError
+        If the name is unknown or an option is out of its range.
+    """
+    name = solver_name(name)
+    size = problem.size
+    for option, value in (("step", step), ("max_step", max_step)):
+        if value is not None and not (isinstance(value, int | float | np.number) and value > 0):
+            raise OptionError(f"{option} is {value!r}; expected a positive number of seconds.")
+    if name in _FIXED:
+        if step is None:
+            raise OptionError(f"solver={name!r} has a fixed step and step is None; give step=1e-3 or so, in s.")
+        return FixedStep(name, problem, step, _FIXED[name])
+    bound = math.inf if max_step is None else float(max_step)
+    if isinstance(rtol, bool) or not isinstance(rtol, int | float | np.number) or not 3e-14 <= rtol < 1:
+        raise OptionError(f"rtol is {rtol!r}; expected 3e-14 <= rtol < 1. 1e-6 serves most diagrams.")
+    try:
+        absolute = np.asarray(atol, dtype=float)
+    except (TypeError, ValueError):
+        absolute = np.full((), -1.0)
+    if absolute.shape not in ((), (size,)) or not (absolute >= 0).all():
+        raise OptionError(f"atol is {atol!r}; expected a number or an array of shape ({size},), not negative.")
+    if not size:
+        return _NoStates(name, problem, bound, _euler)
+    tolerance: Any = absolute if absolute.ndim else float(absolute)
+    if name in _SUNDIALS:
+        from .cvode import Cvode
+
+        return Cvode(name, problem, rtol, tolerance, bound)
+    from .scipy_methods import AutoSolver, SciPySolver
+
+    return (AutoSolver if name == "auto" else SciPySolver)(name, problem, rtol, tolerance, bound)

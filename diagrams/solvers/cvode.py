@@ -1,0 +1,245 @@
+"""CVODE, the multistep solver of SUNDIALS, in compiled code.
+
+FMPy, which is needed anyway, brings SUNDIALS for Linux and Windows (x86_64) and macOS (arm64); it is called through
+ctypes, so that nothing else is to be installed, and with everything that is needed here: one step at a time up to a
+stop time, the method's own dense output, the exact Jacobian, and a cheap start after each discontinuity.
+
+============  ================  ======================================  ================================================
+name          order             each step is solved by                  choose it for
+============  ================  ======================================  ================================================
+CVODE_BDF     1 to 5            Newton, with the exact Jacobian          stiff
+CVODE_Adams   1 to 12           fixed point                             not stiff, tight tolerances, costly rates
+============  ================  ======================================  ================================================
+
+The dense output has the order of the step. Reference: A. C. Hindmarsh et al., SUNDIALS: Suite of nonlinear and
+differential/algebraic equation solvers, ACM Trans. Math. Softw. 31 (2005), 363-396.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import weakref
+from ctypes import CFUNCTYPE, POINTER, byref, c_char_p, c_double, c_int, c_int64, c_long, c_void_p
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import NonFiniteError, OptionError
+from .base import Dense, Problem, Statistics, Step, VariableStep
+
+_ADAMS, _BDF, _ONE_STEP = 1, 2, 2
+_MEMORY = -20  # codes from here down are misuse or lack of memory, not mathematics
+_RATE = CFUNCTYPE(c_int, c_double, c_void_p, c_void_p, c_void_p)
+_JACOBIAN = CFUNCTYPE(c_int, c_double, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p)
+_MESSAGE = CFUNCTYPE(None, c_int, c_char_p, c_char_p, c_char_p, c_int, c_void_p, c_void_p)
+
+_FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {  # library → function → result, arguments
+    "sundials_core": {
+        "SUNContext_Create": (c_int, c_int, POINTER(c_void_p)),
+        "SUNContext_Free": (c_int, POINTER(c_void_p)),
+        "SUNContext_ClearErrHandlers": (c_int, c_void_p),
+        "SUNContext_PushErrHandler": (c_int, c_void_p, _MESSAGE, c_void_p),
+        "N_VGetArrayPointer": (c_void_p, c_void_p),
+        "N_VDestroy": (None, c_void_p),
+        "SUNMatDestroy": (None, c_void_p),
+        "SUNLinSolFree": (c_int, c_void_p),
+        "SUNDIALSGetVersionNumber": (c_int, POINTER(c_int), POINTER(c_int), POINTER(c_int), c_char_p, c_int),
+    },
+    "sundials_nvecserial": {"N_VNew_Serial": (c_void_p, c_int64, c_void_p)},
+    "sundials_sunmatrixdense": {
+        "SUNDenseMatrix": (c_void_p, c_int64, c_int64, c_void_p),
+        "SUNDenseMatrix_Data": (c_void_p, c_void_p),
+    },
+    "sundials_sunlinsoldense": {"SUNLinSol_Dense": (c_void_p, c_void_p, c_void_p, c_void_p)},
+    "sundials_cvode": {
+        "CVodeCreate": (c_void_p, c_int, c_void_p),
+        "CVodeFree": (None, POINTER(c_void_p)),
+        "CVodeInit": (c_int, c_void_p, _RATE, c_double, c_void_p),
+        "CVodeReInit": (c_int, c_void_p, c_double, c_void_p),
+        "CVodeSVtolerances": (c_int, c_void_p, c_double, c_void_p),
+        "CVodeSetLinearSolver": (c_int, c_void_p, c_void_p, c_void_p),
+        "CVodeSetJacFn": (c_int, c_void_p, _JACOBIAN),
+        "CVodeSetNonlinearSolver": (c_int, c_void_p, c_void_p),
+        "CVodeSetMaxStep": (c_int, c_void_p, c_double),
+        "CVodeSetMaxErrTestFails": (c_int, c_void_p, c_int),
+        "CVodeSetMaxConvFails": (c_int, c_void_p, c_int),
+        "CVodeSetMaxHnilWarns": (c_int, c_void_p, c_int),
+        "CVodeSetStopTime": (c_int, c_void_p, c_double),
+        "CVode": (c_int, c_void_p, c_double, c_void_p, POINTER(c_double), c_int),
+        "CVodeGetDky": (c_int, c_void_p, c_double, c_int, c_void_p),
+        "CVodeGetCurrentStep": (c_int, c_void_p, POINTER(c_double)),
+        "CVodeGetNumErrTestFails": (c_int, c_void_p, POINTER(c_long)),
+        "SUNNonlinSol_FixedPoint": (c_void_p, c_void_p, c_int, c_void_p),
+        "SUNNonlinSolFree": (c_int, c_void_p),
+    },
+}
+
+
+class _Library:
+    """The functions of `_FUNCTIONS`, by name."""
+
+    def __init__(self, libraries: Any):
+        for library, functions in _FUNCTIONS.items():
+            for name, (result, *arguments) in functions.items():
+                function = getattr(libraries, library)[name]  # [] makes a new one: FMPy's own keeps its types
+                function.restype, function.argtypes = result, arguments
+                setattr(self, name, function)
+
+    def __getattr__(self, name: str) -> Any:  # for type checkers: all attributes are set above
+        raise AttributeError(name)
+
+
+@functools.cache
+def _library() -> _Library:
+    try:
+        from fmpy.sundials import libraries
+
+        library = _Library(libraries)
+    except (ImportError, OSError, AttributeError) as error:
+        raise OptionError(
+            f"SUNDIALS can't be loaded: {error}. Expected version 7, as FMPy brings it for Linux and Windows (x86_64) "
+            "and macOS (arm64) from 0.3.28 on: pip install -U fmpy, or take solver='BDF', the same kind of method."
+        ) from error
+    major = c_int()
+    library.SUNDIALSGetVersionNumber(byref(major), byref(c_int()), byref(c_int()), ctypes.create_string_buffer(8), 8)
+    if major.value != 7:
+        raise OptionError(
+            f"FMPy brings SUNDIALS {major.value}; expected 7. Install another version of FMPy, or take solver='BDF'."
+        )
+    return library
+
+
+class _Calls:
+    """What CVODE calls back. Python's exceptions can't pass through it: they are kept and raised afterwards."""
+
+    def __init__(self, problem: Problem, statistics: Statistics, library: _Library):
+        self.problem, self.statistics, self.library = problem, statistics, library
+        self.stop, self.message = 0.0, ""
+        self.error: BaseException | None = None
+        self._views: dict[int, np.ndarray] = {}
+        self.rate, self.jacobian, self.say = _RATE(self._rate), _JACOBIAN(self._jacobian), _MESSAGE(self._say)
+
+    def view(self, address: int, size: int) -> np.ndarray:
+        """Return the memory at this address as an array."""
+        if address not in self._views:
+            self._views[address] = np.frombuffer(memoryview((c_double * size).from_address(address)).cast("B"))
+        return self._views[address]
+
+    def vector(self, handle: int) -> np.ndarray:
+        """Return the memory of a vector as an array."""
+        return self.view(self.library.N_VGetArrayPointer(handle), self.problem.size)
+
+    def _rate(self, t: float, x: int, f: int, _: Any) -> int:
+        try:
+            self.statistics.rate_evaluations += 1
+            rates = self.vector(f)
+            rates[:] = self.problem.rate(min(t, self.stop), self.vector(x))
+            return 0 if np.isfinite(rates).all() else 1  # 1: try a shorter step
+        except BaseException as error:
+            self.error = error
+            return -1
+
+    def _jacobian(self, t: float, x: int, f: int, matrix: int, *_: Any) -> int:
+        try:
+            self.statistics.jacobian_evaluations += 1
+            n = self.problem.size
+            columns = self.view(self.library.SUNDenseMatrix_Data(matrix), n * n).reshape(n, n)
+            columns.T[:] = self.problem.jacobian(min(t, self.stop), self.vector(x))
+            return 0 if np.isfinite(columns).all() else 1
+        except BaseException as error:
+            self.error = error
+            return -1
+
+    def _say(self, line: int, function: bytes, file: bytes, message: bytes, code: int, *_: Any) -> None:
+        self.message = message.decode("utf-8", "replace")
+
+
+class Cvode(VariableStep):
+    """CVODE with variable-order BDF (stiff) or Adams (not stiff). It selects its first step anew at each restart."""
+
+    def __init__(self, name: str, problem: Problem, rtol: float, atol: Any, max_step: float):
+        super().__init__(name, problem, rtol, atol, max_step)
+        self._library = library = _library()
+        self._calls = calls = _Calls(problem, self.statistics, library)
+        context = c_void_p()
+        library.SUNContext_Create(0, byref(context))
+        library.SUNContext_ClearErrHandlers(context)
+        library.SUNContext_PushErrHandler(context, calls.say, None)
+        adams, n = name == "CVODE_Adams", problem.size
+        self._x, self._dky, tolerances = (library.N_VNew_Serial(n, context) for _ in range(3))
+        self._memory = memory = library.CVodeCreate(_ADAMS if adams else _BDF, context)
+        calls.vector(self._x)[:] = 0.0
+        calls.vector(tolerances)[:] = atol
+        library.CVodeInit(memory, calls.rate, 0.0, self._x)
+        library.CVodeSVtolerances(memory, rtol, tolerances)
+        matrix = linear = fixed_point = None
+        if adams:
+            fixed_point = library.SUNNonlinSol_FixedPoint(self._x, 0, context)
+            library.CVodeSetNonlinearSolver(memory, fixed_point)
+        else:
+            matrix = library.SUNDenseMatrix(n, n, context)
+            linear = library.SUNLinSol_Dense(self._x, matrix, context)
+            library.CVodeSetLinearSolver(memory, linear, matrix)
+            library.CVodeSetJacFn(memory, calls.jacobian)
+        library.CVodeSetMaxErrTestFails(memory, 30)
+        library.CVodeSetMaxConvFails(memory, 40)
+        library.CVodeSetMaxHnilWarns(memory, -1)
+        library.CVodeSetMaxStep(memory, 0.0 if max_step == np.inf else max_step)  # 0: none
+        vectors = (self._x, self._dky, tolerances)
+        weakref.finalize(self, _free, calls, memory, (matrix, linear, fixed_point), vectors, context)
+        self._t, self._x_old, self._fails, self._t_new = 0.0, np.empty(0), 0, c_double()
+
+    def _start(self, t: float, x: np.ndarray) -> None:
+        self._fails += self._failed_tests()
+        self._calls.stop, self._t, self._x_old = self.stop, t, x
+        self._calls.vector(self._x)[:] = x
+        self._check(self._library.CVodeReInit(self._memory, t, self._x))
+        self._check(self._library.CVodeSetStopTime(self._memory, self.stop))
+
+    def _advance(self) -> Step:
+        t = self._t
+        self._check(self._library.CVode(self._memory, self.stop, self._x, byref(self._t_new), _ONE_STEP))
+        self._t, self._x_old = self._t_new.value, self._calls.vector(self._x).copy()
+        self.finite(self._t, self._x_old, "state")
+        self.statistics.steps += 1
+        self.statistics.rejected = self._fails + self._failed_tests()
+        return Step(t, self._t, self._x_old.copy(), self._dense)
+
+    def _failed_tests(self) -> int:
+        count = c_long()
+        self._library.CVodeGetNumErrTestFails(self._memory, byref(count))
+        return count.value
+
+    def _dense(self) -> Dense:
+        def at(t: float) -> np.ndarray:
+            self._check(self._library.CVodeGetDky(self._memory, t, 0, self._dky))
+            return self._calls.vector(self._dky).copy()
+
+        return at
+
+    def _check(self, code: int) -> None:
+        if code >= 0:
+            return
+        if self._calls.error is not None:
+            error, self._calls.error = self._calls.error, None
+            raise error
+        if code <= _MEMORY:
+            raise RuntimeError(f"CVODE: {self._calls.message} (code {code})")
+        h = c_double()
+        self._library.CVodeGetCurrentStep(self._memory, byref(h))
+        failure = self.failure(self._t, self._x_old, h.value)
+        if not isinstance(failure, NonFiniteError):
+            failure.message += f" CVODE says: {self._calls.message}"
+        raise failure
+
+
+def _free(calls: _Calls, memory: int, solvers: tuple[Any, ...], vectors: tuple[int, ...], context: c_void_p) -> None:
+    library = calls.library  # the callbacks live until CVODE is gone
+    library.CVodeFree(byref(c_void_p(memory)))
+    for handle, free in zip(solvers, ("SUNMatDestroy", "SUNLinSolFree", "SUNNonlinSolFree"), strict=True):
+        if handle:
+            getattr(library, free)(handle)
+    for vector in vectors:
+        library.N_VDestroy(vector)
+    library.SUNContext_Free(byref(context))

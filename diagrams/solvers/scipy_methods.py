@@ -1,0 +1,242 @@
+"""SciPy's variable-step solvers, and the default that chooses among them.
+
+========  =====================  ======  ==============================================================================
+name      order (estimate)       stages  reference
+========  =====================  ======  ==============================================================================
+RK23      3(2)                   4       P. Bogacki, L. F. Shampine, Appl. Math. Lett. 2 (1989), 321-325
+RK45      5(4)                   7       J. R. Dormand, P. J. Prince, J. Comp. Appl. Math. 6 (1980), 19-26
+DOP853    8(5,3)                 12      E. Hairer, S. P. Nørsett, G. Wanner, Solving Ordinary Differential Equations I
+Radau     5(3)                   3       E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, IV.8
+BDF       1 to 5 (quasi-const.)  –       L. F. Shampine, M. W. Reichelt, SIAM J. Sci. Comput. 18 (1997), 1-22
+LSODA     1 to 12, BDF to 5      –       L. Petzold, SIAM J. Sci. Stat. Comput. 4 (1983), 136-148
+========  =====================  ======  ==============================================================================
+
+Their dense outputs have order 3, 4, 7, 3 and, for the multistep methods, the order of the step.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import SimulationError
+from .base import Dense, Problem, Step, VariableStep
+
+_ATTEMPT = {"RK23": 3, "RK45": 6, "DOP853": 12}  # evaluations of the rates per attempted step
+_MULTISTEP = ("BDF", "LSODA")
+_RETRIES = 30  # of one step, or of every third step: then the border of the rates' domain is reached
+
+
+class SciPySolver(VariableStep):
+    """One of `scipy.integrate`'s solvers, given the exact Jacobian if it is implicit.
+
+    A one-step method goes on with the step that it would have taken next; a multistep method starts again at order 1,
+    and selects its first step anew.
+    """
+
+    def __init__(self, name: str, problem: Problem, rtol: float, atol: Any, max_step: float):
+        import scipy.integrate
+
+        super().__init__(name, problem, rtol, atol, max_step)
+        self._method: Any = getattr(scipy.integrate, name)
+        self._attempt, self.stiff = _ATTEMPT.get(name), name not in _ATTEMPT
+        self._options: dict[str, Any] = {"rtol": rtol, "atol": atol, "max_step": max_step}
+        if not self._attempt:
+            self._options["jac"] = self._usable_jacobian
+        self.statistics.rejected = 0 if self._attempt else None
+        self.planned: float | None = None  # the step that the method would take next
+        self._last_jacobian: np.ndarray | None = None
+        self._inner: Any = None
+        self.stuck: tuple[float, np.ndarray] | None = None  # where no step was small enough
+        self._retried = 0  # grows if many steps have to be taken again
+        self._strange = False  # a rate was not finite since the flag was cleared
+
+    def rate(self, t: float, x: np.ndarray) -> np.ndarray:
+        """Evaluate the rates; see `Solver.rate`."""
+        f = super().rate(t, x)
+        if not self._strange and not np.isfinite(f).all():
+            self._strange = True
+        return f
+
+    def _usable_jacobian(self, t: float, x: np.ndarray) -> np.ndarray:
+        """Return the Jacobian, or the last finite one: a predictor may reach beyond the domain of the rates."""
+        jacobian = self.jacobian(t, x)
+        if np.isfinite(jacobian).all():
+            self._last_jacobian = jacobian
+        elif self._last_jacobian is not None:
+            return self._last_jacobian.copy()
+        else:
+            self.finite(t, super().rate(t, x), "rate")
+            self.finite(t, jacobian.sum(axis=1), "row in the Jacobian")
+        return jacobian
+
+    def _start(self, t: float, x: np.ndarray) -> None:
+        first = None if self.planned is None else min(self.planned, self.stop - t)
+        self._strange = False
+        if self._attempt and self._inner is not None and first is not None:  # a new object would cost a third of a step
+            inner = self._inner
+            inner.t, inner.y, inner.t_bound, inner.t_old = t, x, self.stop, None
+            inner.h_abs, inner.status = first, "running"
+            inner.f = self.rate(t, x)
+        else:
+            self._create(t, x, first)
+
+    def _create(self, t: float, x: np.ndarray, first: float | None) -> None:
+        with np.errstate(all="ignore"):
+            self._inner = self._method(self.rate, t, x, self.stop, first_step=first, **self._options)
+            if self.name != "LSODA" and not math.isfinite(self._inner.h_abs):  # the trial of a first step went astray
+                first = 1e-6 * (self.stop - t)
+                self._inner = self._method(self.rate, t, x, self.stop, first_step=first, **self._options)
+
+    def _advance(self) -> Step:
+        inner = self._inner
+        before = self.statistics.rate_evaluations
+        planned = 0.0 if self.name == "LSODA" else inner.h_abs
+        if self._strange and inner.t_old is None:  # perhaps it is the very start
+            self.finite(inner.t, super().rate(inner.t, inner.y), "rate")
+        self._attempt_step()
+        inner = self._inner
+        if self._attempt and self.statistics.rejected is not None:
+            self.statistics.rejected += (self.statistics.rate_evaluations - before) // self._attempt - 1
+        if self.name not in _MULTISTEP:  # a step that was cut at the stop says little about the next
+            self.planned = max(planned, inner.h_abs) if inner.t == self.stop else inner.h_abs
+        self.statistics.steps += 1
+        return Step(float(inner.t_old), float(inner.t), inner.y.copy(), self._dense)
+
+    def _attempt_step(self) -> None:
+        """Take a step; go back and take a shorter one if it ended where the rates are not finite."""
+        first = self._inner
+        for _ in range(_RETRIES if self._retried < _RETRIES else 1):
+            inner = self._inner
+            t, x = inner.t, inner.y
+            self._strange = False
+            with np.errstate(all="ignore"):
+                if self.name == "LSODA":
+                    with warnings.catch_warnings():  # it says by a warning why it fails
+                        warnings.simplefilter("ignore")
+                        inner.step()
+                else:
+                    inner.step()
+            if inner.status == "failed":
+                break
+            if self._sound(inner):
+                self._retried = max(0, self._retried - 1) if inner is first else self._retried + 3
+                return
+            h = 0.25 * (inner.t - t)
+            if h < 10 * math.ulp(t):
+                break
+            self._create(t, x, h)
+        if self._strange:
+            f = super().rate(t, x)
+            self.finite(t, f, "rate")
+        self.stuck = (t, x)
+        raise self.failure(t, x, 10 * math.ulp(t))
+
+    def _sound(self, inner: Any) -> bool:
+        """Tell whether an accepted step is: a method may have met a NaN and shortened its step, which is well."""
+        if self.name == "LSODA":  # which accepts a NaN
+            return not self._strange
+        if self._attempt and not self._strange:
+            return True
+        finite = np.isfinite(inner.y).all() and np.isfinite(getattr(inner, "f", 0.0)).all()
+        return bool(finite and not math.isnan(inner.h_abs))
+
+    def _dense(self) -> Dense:
+        return self._inner.dense_output()  # type: ignore[no-any-return]
+
+
+_STABLE = {"RK45": 3.25, "DOP853": 6.1}  # h|λ| at the border of the stable region on the real axis
+_HITS, _MISSES, _LOOK_EVERY, _EASY = 15, 6, 10, 20
+
+
+class AutoSolver(VariableStep):
+    """The default: RK45 (DOP853 for rtol < 1e-8) as long as the problem is not stiff, Radau where it is.
+
+    Stiff means that the step is held down by stability, not by accuracy. Two evaluations at the end of each explicit
+    step give an estimate of the dominant eigenvalue (E. Hairer, G. Wanner, Solving Ordinary Differential Equations II,
+    IV.2); if h|λ| stays beyond the border of the stable region for 15 looks, and the spectral abscissa of the exact
+    Jacobian agrees, Radau goes on. It hands back when h‖J‖ < 1 for 20 steps: an explicit method would take them too.
+    What was used is in `Statistics.messages`.
+    """
+
+    def __init__(self, name: str, problem: Problem, rtol: float, atol: Any, max_step: float):
+        super().__init__(name, problem, rtol, atol, max_step)
+        self._explicit = SciPySolver("RK45" if rtol >= 1e-8 else "DOP853", problem, rtol, atol, max_step)
+        self._implicit = SciPySolver("Radau", problem, rtol, atol, max_step)
+        self._active = self._explicit
+        self._explicit.statistics = self._implicit.statistics = self.statistics
+        self.statistics.solver = f"auto ({self._explicit.name})"
+        self.statistics.rejected = 0
+        self._hits = self._misses = self._easy = self._switches = 0
+
+    def _start(self, t: float, x: np.ndarray) -> None:
+        self._active.restart(t, x, self.stop)
+
+    def _advance(self) -> Step:
+        try:
+            step = self._active.step()
+        except SimulationError:
+            if self._active is self._implicit or self._explicit.stuck is None:
+                raise
+            t, x = self._explicit.stuck
+            self._explicit.stuck = None
+            self._switch(self._implicit, t, x, None, why="no step is small enough")
+            step = self._active.step()
+        h = step.t - step.t_old
+        if self._active is self._explicit:
+            if (self._hits or not self.statistics.steps % _LOOK_EVERY) and self._stiff(step):
+                self._switch(self._implicit, step.t, step.x, h, why=f"stiff at steps of {h:.2g} s")
+        elif self._eased(step):
+            self._switch(self._explicit, step.t, step.x, h, why="no longer stiff")
+        return step
+
+    def _switch(self, to: SciPySolver, t: float, x: np.ndarray, h: float | None, *, why: str) -> None:
+        self._hits = self._misses = self._easy = 0
+        self._switches += 1
+        if self._switches <= 10:
+            self.statistics.messages.append(f"t = {t:.6g} s: {why}; {self._active.name} → {to.name}")
+        elif self._switches == 11:
+            self.statistics.messages.append("… and more such changes")
+        self.statistics.solver = f"auto ({self._explicit.name}, Radau)"
+        self.statistics.rejected = None
+        self._active, to.planned = to, h
+        if t < self.stop:
+            to.restart(t, x, self.stop)
+
+    def _stiff(self, step: Step) -> bool:
+        inner, border = self._explicit._inner, _STABLE[self._explicit.name]
+        h, stages, last = step.t - step.t_old, inner.K, inner.n_stages - 1
+        if inner.y_old is None or inner.y is None:
+            return False
+        weights = 1 / (self.atol + self.rtol * np.abs(step.x))
+        with np.errstate(all="ignore"):
+            argument = inner.y_old + h * (stages[:last].T @ inner.A[last, :last])
+            apart = np.linalg.norm((step.x - argument) * weights)
+            h_lambda = h * np.linalg.norm((stages[last + 1] - stages[last]) * weights) / apart if apart else 0.0
+        if not h_lambda > border:
+            self._misses += 1
+            if self._misses >= _MISSES:
+                self._hits = self._misses = 0
+            return False
+        self._hits, self._misses = self._hits + 1, 0
+        if self._hits < _HITS:
+            return False
+        self._hits = 0
+        return -h * self._abscissa(step.t, step.x) > 0.5 * border
+
+    def _abscissa(self, t: float, x: np.ndarray) -> float:
+        """Return the real part of the fastest decaying mode."""
+        jacobian = self.jacobian(t, x)
+        if self.problem.size > 300:  # the eigenvalues would cost more than many steps; trust the estimate
+            return -math.inf
+        return float(np.linalg.eigvals(jacobian).real.min()) if np.isfinite(jacobian).all() else 0.0
+
+    def _eased(self, step: Step) -> bool:
+        scale = self.atol + self.rtol * np.abs(step.x)
+        with np.errstate(all="ignore"):
+            norm = (np.abs(self._implicit._inner.J) @ scale / scale).max()  # in the units of the error control
+        self._easy = self._easy + 1 if (step.t - step.t_old) * norm < 1 else 0
+        return self._easy >= _EASY

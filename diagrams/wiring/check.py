@@ -1,0 +1,374 @@
+"""Checks of a diagram's wiring: ports, shapes, units, frames."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.block import Block
+from ...blocks.core.errors import (
+    LoopwrightError,
+    SampleTimeError,
+    ShapeError,
+    UnitError,
+    UnknownNameError,
+    UnwiredInputError,
+    WiringError,
+    near,
+)
+from ...blocks.core.ports import Shape
+from ...blocks.core.units import describe_mismatch, same_unit
+from ...blocks.library.python_control import SampleTimeOfFrame
+from ...blocks.tracing.equations import start_shapes
+from ...blocks.tracing.trace import Traced, trace, traced_parameters
+from .structure import Structure, Wire
+
+Unit = str | tuple[str, ...] | None
+Port = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What the checks found out: traces, and shape and unit of every output."""
+
+    traced: dict[str, Traced]
+    shapes: dict[Port, Shape]
+    units: dict[Port, Unit]
+
+
+def check(table: Structure) -> Checked:
+    """Check the wiring, and trace every block for the shapes it is wired to.
+
+    Raises
+    ------
+    WiringError
+        `UnknownNameError`, `UnwiredInputError`, `ShapeError`, `UnitError`, `SampleTimeError`.
+    TraceError
+        A block whose equations can't be traced.
+    """
+    _check_ports(table)
+    traced, shapes = _infer_shapes(table)
+    _check_boxes(table, traced, shapes)
+    _check_stops(table, shapes)
+    return Checked(traced, shapes, _check_units(table, shapes))
+
+
+def sources(table: Structure, path: str) -> dict[str, Wire | None]:
+    """Return the wire of every input of a block, None where its default is used."""
+    return {port: table.wires.get((path, port)) for port in table.blocks[path].inputs}
+
+
+def part_shape(shape: Shape, wire: Wire, who: str, port: str) -> Shape:
+    """Return the shape of the part of an output that a wire takes."""
+    if wire.index is None:
+        return shape
+    if not shape:
+        raise ShapeError(
+            f"{wire} takes a part of a scalar; wire the whole of {wire.block}.{wire.port}.", block=who, port=port
+        )
+    try:
+        return np.empty(shape)[wire.index].shape
+    except IndexError:
+        raise ShapeError(f"{wire} is out of range: the port has shape {shape}.", block=who, port=port) from None
+
+
+def _check_ports(table: Structure) -> None:
+    inputs = {path: block.inputs for path, block in table.blocks.items()}  # made anew each time they are asked for
+    for (consumer, port), wire in table.wires.items():
+        outputs = table.blocks[wire.block].outputs
+        if wire.port not in outputs:
+            raise UnknownNameError(
+                f"it has no output {wire.port!r}, which {consumer}.{port} is wired to. {near(wire.port, outputs)}",
+                block=wire.block,
+            )
+    for path in sorted(table.blocks):
+        for port, spec in inputs[path].items():
+            if (path, port) not in table.wires and spec.default is None:
+                raise UnwiredInputError("nothing is wired to it; wire it in the block's call.", block=path, port=port)
+    for (consumer, port), wire in table.wires.items():
+        if port not in inputs[consumer]:
+            raise UnknownNameError(
+                f"it has no input {port!r}, which {wire} is wired to. {near(port, inputs[consumer])}",
+                block=consumer,
+            )
+
+
+def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[Port, Shape]]:
+    """Trace every block as soon as the shapes at its inputs are known, then compare both ends of every wire."""
+    traced: dict[str, Traced] = {}
+    shapes: dict[Port, Shape] = {
+        (path, name): port.shape
+        for path, block in table.blocks.items()
+        for name, port in block.outputs.items()
+        if port.shape is not None
+    }
+    assumed: dict[Port, Shape] = {}
+    shared: dict[Any, Traced] = {}  # traces of users' classes: what they close over may change between two builds
+    consumers: dict[Port, list[Port]] = {}
+    fed: dict[Port, list[str]] = {}
+    unknown: dict[str, set[str]] = {path: set() for path in table.blocks}
+    inputs = {path: block.inputs for path, block in table.blocks.items()}
+    for (path, port), wire in table.wires.items():
+        source = (wire.block, wire.port)
+        fed.setdefault(source, []).append(path)
+        if inputs[path][port].shape is None and source not in shapes:
+            unknown[path].add(port)
+            consumers.setdefault(source, []).append((path, port))
+    ready = [path for path, ports in unknown.items() if not ports]
+    heapq.heapify(ready)
+    waiting = set(table.blocks) - set(ready)
+    stuck: list[tuple[bool, bool, str]] | None = None  # from the first assumption on: who is best to make the next one
+    while ready or waiting:
+        if not ready:
+            if stuck is None:
+                stuck = [(not _known(table, shapes, p), not table.blocks[p].states, p) for p in waiting]
+                heapq.heapify(stuck)
+            while (path := heapq.heappop(stuck)[2]) not in waiting:
+                pass
+            assumed.update(_assume(table, shapes, path))
+            unknown[path].clear()
+            waiting.discard(path)
+            heapq.heappush(ready, path)
+        path = heapq.heappop(ready)
+        block = table.blocks[path]
+        if table.stepped(path):
+            if not block.transport:
+                continue
+            found = {"y": _input_shapes(table, shapes, path, assumed)["u"]}
+        else:
+            traced[path] = _trace(block, _input_shapes(table, shapes, path, assumed), table, path, shared)
+            found = traced[path].outputs
+        for name, shape in found.items():
+            if (path, name) not in shapes:
+                shapes[path, name] = shape
+                for consumer in fed.get((path, name), ()):
+                    if stuck is not None and consumer in waiting:
+                        heapq.heappush(stuck, (False, not table.blocks[consumer].states, consumer))
+                for consumer, port in consumers.get((path, name), ()):
+                    unknown[consumer].discard(port)
+                    if not unknown[consumer] and consumer in waiting:
+                        waiting.discard(consumer)
+                        heapq.heappush(ready, consumer)
+    _check_shapes(table, traced, shapes, assumed)
+    return traced, shapes
+
+
+def _check_shapes(
+    table: Structure, traced: dict[str, Traced], shapes: dict[Port, Shape], assumed: dict[Port, Shape]
+) -> None:
+    for (path, port), wire in sorted(table.wires.items()):
+        found = part_shape(shapes[wire.block, wire.port], wire, path, port)
+        expected = traced[path].inputs[port] if path in traced else table.blocks[path].inputs[port].shape
+        if path not in traced and expected is None:  # a transport delay
+            expected = shapes[path, "y"]
+        if found == expected:
+            continue
+        if (path, port) in assumed:
+            raise ShapeError(
+                f"{wire} has shape {found}, where the loop that it closes asks for {expected}. Give the loop's shape "
+                "where it starts, for instance UnitDelay(initial_value=…).",
+                block=path,
+                port=port,
+            )
+        raise ShapeError(
+            f"{wire} has shape {found}; expected {expected}. Index the signal, or wire another one.",
+            block=path,
+            port=port,
+        )
+    for name, wire in sorted(table.names.items()):
+        part_shape(shapes[wire.block, wire.port], wire, wire.block, f"{wire.port} (named {name!r})")
+
+
+def _check_boxes(table: Structure, traced: dict[str, Traced], shapes: dict[Port, Shape]) -> None:
+    """Check what controls boxes, and what stands in them."""
+    for box, wire in sorted(table.controls.items()):
+        kind = table.frames[box].control
+        port = {"enabled": "enable", "triggered": "trigger"}[kind]
+        found = part_shape(shapes[wire.block, wire.port], wire, box, port)
+        if found != ():
+            raise ShapeError(
+                f"{wire} has shape {found}; expected a logic signal, one number. Index it.", block=box, port=port
+            )
+    for (path, port), handed in sorted(table.handed.items()):
+        for box, output in handed:
+            frame, clock = table.frames[box], table.clock(table.frame_of[path])
+            same = clock is not None and (clock.sample_time, clock.offset) == (frame.sample_time, frame.offset)
+            if not (frame.control or frame.delay) and (frame.sample_time is None or same):
+                continue
+            what = frame.control or ("delayed" if frame.delay else "sampled")
+            raise WiringError(
+                f"it is wired to {box}.{output}, and that box is {what}, but no block in it makes this output: it "
+                "comes from outside and would be handed on as it is. Put a block between, such as Gain(gain=1.0), or "
+                "wire what is outside.",
+                block=path,
+                port=port,
+            )
+    for path in sorted(table.blocks):
+        gates = table.gates(table.frame_of[path])
+        if gates and path not in traced:
+            what = "a transport delay" if table.blocks[path].transport else "an FMU"
+            raise WiringError(
+                f"{what} can't stand in a box that is {table.frames[gates[-1]].control} ({gates[-1]}): it goes on in "
+                "time whatever the box does. Put it outside, and wire its outputs in.",
+                block=path,
+            )
+        triggered = table.triggered(table.frame_of[path])
+        if triggered is None:
+            continue
+        trace = traced[path]
+        if trace.advance not in ("none", "update") or _reads_sample_time(table.blocks[path], trace):
+            raise SampleTimeError(
+                f"it needs a sample time, and the triggered box {triggered} has none: it acts whenever it is "
+                "triggered. Put it outside the box, or take a block that counts samples.",
+                block=path,
+            )
+        inner = table.clock(table.frame_of[path])
+        outer = table.clock(triggered)
+        if inner is not outer:
+            raise SampleTimeError(
+                f"the box {inner.path if inner else ''} has a sample time of its own inside of the triggered box "
+                f"{triggered}; it acts whenever {triggered} is triggered. Leave the sample time out.",
+                block=path,
+            )
+
+
+def _check_stops(table: Structure, shapes: dict[Port, Shape]) -> None:
+    for path, block in sorted(table.blocks.items()):
+        if block.stops is None:
+            continue
+        if block.stops not in block.outputs:
+            raise UnknownNameError(
+                f"found stops = {block.stops!r}; expected the name of an output. {near(block.stops, block.outputs)}",
+                block=path,
+            )
+        if shapes[path, block.stops] != ():
+            raise ShapeError(
+                f"found shape {shapes[path, block.stops]}; expected one number, as it ends the run where it is above "
+                "0.5. Put out np.max of it, for instance.",
+                block=path,
+                port=block.stops,
+            )
+
+
+def _reads_sample_time(block: Block, trace: Traced) -> bool:
+    """Whether a block's equations, or its precomputed numbers, depend on the sample time."""
+    position = sum(int(np.size(value)) for _, value in traced_parameters(block))
+    last = trace.function.n_in() - 1
+    columns = (trace.function.jac_sparsity(i, last).get_col() for i in range(trace.function.n_out()))
+    return hasattr(block, "constants") or any(position in column for column in columns)
+
+
+def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, shared: dict[Any, Traced]) -> Traced:
+    frame = table.frame_of[path]
+    sampled, method, rate = table.sampled(frame), table.method(frame), table.rate(frame)
+    try:
+        if rate is not None and isinstance(block, SampleTimeOfFrame):
+            block.check_rate(float(rate))
+        return trace(block, shapes, sampled=sampled, method=method, cache=shared)
+    except LoopwrightError as error:
+        error.block = path
+        raise
+
+
+def _known(table: Structure, shapes: dict[Port, Shape], path: str) -> list[Shape]:
+    """Return the shapes that are known of what is wired to a block."""
+    wires = ((port, table.wires.get((path, port))) for port in table.blocks[path].inputs)
+    return [
+        part_shape(shapes[w.block, w.port], w, path, port)
+        for port, w in wires
+        if w is not None and (w.block, w.port) in shapes
+    ]
+
+
+def _assume(table: Structure, shapes: dict[Port, Shape], path: str) -> dict[Port, Shape]:
+    """Return an assumption that lets a loop of unknown shapes go on; it is checked once the shapes are known.
+
+    A block's unknown inputs are assumed to have the shape of a known one beside them, else of its first state.
+    """
+    block = table.blocks[path]
+    shape = next(iter([*_known(table, shapes, path), *start_shapes(block)]), ())
+    return {
+        (path, port): shape
+        for port, spec in block.inputs.items()
+        if spec.shape is None and (w := table.wires.get((path, port))) is not None and (w.block, w.port) not in shapes
+    }
+
+
+def _input_shapes(
+    table: Structure, shapes: dict[Port, Shape], path: str, assumed: dict[Port, Shape]
+) -> dict[str, Shape]:
+    """Return the shapes to trace a block with; what a wire brings is compared with them at the end."""
+    found: dict[str, Shape] = {}
+    for port, spec in table.blocks[path].inputs.items():
+        wire = table.wires.get((path, port))
+        if wire is None:
+            found[port] = np.shape(np.asarray(spec.default)) if spec.shape is None else spec.shape
+        elif spec.shape is not None:
+            found[port] = spec.shape
+        elif (path, port) in assumed:
+            found[port] = assumed[path, port]
+        else:
+            found[port] = part_shape(shapes[wire.block, wire.port], wire, path, port)
+    return found
+
+
+def _check_units(table: Structure, shapes: dict[Port, Shape]) -> dict[Port, Unit]:
+    units: dict[Port, Unit] = {}
+    for path, block in table.blocks.items():
+        for name, port in block.outputs.items():
+            if port.unit is not None:
+                units[path, name] = port.unit
+    followers: dict[Port, list[tuple[Port, Wire]]] = {}  # outputs that take over an input's unit
+    for path, block in table.blocks.items():
+        for name, port in block.outputs.items():
+            like = getattr(port, "like", None)
+            wire = table.wires.get((path, like)) if like and not hasattr(port, "start") else None
+            if wire is not None and (path, name) not in units:
+                followers.setdefault((wire.block, wire.port), []).append(((path, name), wire))
+    told = list(units)
+    while told:
+        for output, wire in followers.get(told.pop(), ()):
+            unit = _part_unit(units, wire)
+            if unit is not None:
+                units[output] = unit
+                told.append(output)
+    for path, block in sorted(table.blocks.items()):
+        seen: tuple[Wire, Unit] | None = None
+        for name, spec in block.inputs.items():
+            wire = table.wires.get((path, name))
+            unit = None if wire is None else _part_unit(units, wire)
+            if wire is None or unit is None:
+                continue
+            expected, what = spec.unit, "expected"
+            if block.same_units:
+                if seen is None:
+                    seen = (wire, unit)
+                expected, what = seen[1], f"{seen[0]} beside it is"
+            problem = _mismatch(unit, expected)
+            if problem:
+                raise UnitError(
+                    f"{wire} is in {_text(unit)}; {what} in {_text(expected)}: {problem}", block=path, port=name
+                )
+    return units
+
+
+def _part_unit(units: dict[Port, Unit], wire: Wire) -> Unit:
+    unit = units.get((wire.block, wire.port))
+    if isinstance(unit, tuple) and wire.index is not None:
+        return unit[wire.index]
+    return unit
+
+
+def _text(unit: Unit) -> str:
+    return ", ".join(unit) if isinstance(unit, tuple) else str(unit)
+
+
+def _mismatch(found: Unit, expected: Unit) -> str:
+    if found is None or expected is None:
+        return ""
+    n = max(len(u) if isinstance(u, tuple) else 1 for u in (found, expected))
+    pairs: Any = zip(*(u if isinstance(u, tuple) else (u,) * n for u in (found, expected)), strict=False)
+    return next((describe_mismatch(a, b) for a, b in pairs if not same_unit(a, b)), "")

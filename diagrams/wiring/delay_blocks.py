@@ -1,0 +1,71 @@
+"""From the table that was wired to the one that runs.
+
+A computational delay becomes a block of its own; a transport delay in a sampled frame becomes one by whole samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from ...blocks.core.errors import LoopwrightError
+from ...blocks.library.delays import Delay
+from .structure import Structure, Wire, join
+
+
+def lowered(table: Structure) -> Structure:
+    """Return the table with a delay block for every output that leaves a box with a computational delay.
+
+    It stands inside the box, acts at its ticks, and is called ``delay_`` after the output, numbered where two outputs
+    share a name. What the box itself reads of its own outputs is not delayed.
+    """
+    sampled = {}
+    for path, block in sorted(table.blocks.items()):
+        rate = table.rate(table.frame_of[path])
+        if block.transport and rate is not None:
+            try:
+                sampled[path] = block.sampled(rate)
+            except LoopwrightError as error:
+                error.block = path
+                raise
+    late = [path for path in sorted(table.frames, key=lambda p: (-p.count("."), p)) if table.frames[path].delay]
+    if not late and not sampled:
+        return table
+    table = Structure(**{k: dict(v) for k, v in vars(table).items()})
+    table.blocks.update(sampled)
+    for frame in late:
+        _delay(table, frame)
+    return table
+
+
+def _inside(frame: str, path: str) -> bool:
+    return path == frame or path.startswith(f"{frame}.")
+
+
+def _delay(table: Structure, frame: str) -> None:
+    made: dict[tuple[str, str], str] = {}
+
+    def late(wire: Wire) -> Wire:
+        key = (wire.block, wire.port)
+        if key not in made:
+            base = path = join(frame, f"delay_{wire.port if wire.port.isidentifier() else 'output'}")
+            count = 2
+            while path in table.blocks:
+                path, count = f"{base}_{count}", count + 1
+            made[key] = path
+            table.blocks[path] = Delay(steps=table.frames[frame].delay, name=path.rpartition(".")[2])
+            table.frame_of[path] = frame
+            table.wires[path, "u"] = replace(wire, index=None)
+        return Wire(made[key], "y", wire.index)
+
+    def leaves(wire: Wire, consumer_frame: str) -> bool:
+        return _inside(frame, table.frame_of[wire.block]) and not _inside(frame, consumer_frame)
+
+    for key, wire in sorted(table.wires.items()):
+        if leaves(wire, table.frame_of[key[0]]):
+            table.wires[key] = late(wire)
+    for box, wire in sorted(table.controls.items()):
+        if leaves(wire, box.rpartition(".")[0]):
+            table.controls[box] = late(wire)
+    for name, wire in sorted(table.names.items()):
+        if leaves(wire, name.rpartition(".")[0]):
+            table.names[name] = late(wire)

@@ -1,0 +1,196 @@
+"""The order of evaluation, from feedthrough between ports.
+
+A block's outputs, its next state and its guards are ordered one by one: each waits only for the inputs that it
+depends on. So a cycle in the drawing is no algebraic loop as long as no port waits for itself. Blocks are taken by
+path, so the order never depends on how a diagram was written down.
+
+Where a loop is to be solved, some of its ports are *torn*: they are taken as known, and Newton's method finds the
+values at which what comes round is what was taken.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from ...blocks.core.errors import AlgebraicLoopError
+from ...blocks.tracing.numpy_check import GUARDS, NEXT
+from ...blocks.tracing.trace import Traced
+from .structure import Structure
+
+Port = tuple[str, str]
+Step = tuple[str, tuple[str, ...]]
+"""A block's path, and what is evaluated of it together."""
+
+
+def dependencies(table: Structure, traced: Mapping[str, Traced], *, start: bool = False) -> dict[Port, set[Port]]:
+    """Return, for every output, next state and guard, the output ports that it waits for.
+
+    With ``start`` it is the graph of initialization, in which a block that computes its initial state from its inputs
+    waits for all of them first.
+    """
+    waits: dict[Port, set[Port]] = {}
+    for path, trace in traced.items():
+        all_inputs = start and table.blocks[path].starts_from_inputs
+        controls = [table.controls[box] for box in table.gates(table.frame_of[path])]
+        for name in (*trace.outputs, NEXT, GUARDS):
+            inputs = trace.inputs if all_inputs else trace.depends[name]
+            wires = (table.wires.get((path, port)) for port in trace.inputs if port in inputs)
+            waits[path, name] = {(w.block, w.port) for w in [*wires, *controls] if w is not None and w.block in traced}
+    return waits
+
+
+@dataclass(frozen=True)
+class Order:
+    """What to evaluate, in order, and the output ports that are taken as known."""
+
+    steps: list[Step]
+    torn: tuple[Port, ...] = ()
+    loops: tuple[str, ...] = ()
+    """Every loop, printed port by port."""
+
+
+def evaluation_order(
+    table: Structure, traced: Mapping[str, Traced], *, start: bool = False, solve: bool = False
+) -> Order:
+    """Return what to evaluate, in order; a block is evaluated in one go where its inputs allow it.
+
+    Parameters
+    ----------
+    start : bool
+        The order of initialization; see `dependencies`.
+    solve : bool
+        Tear algebraic loops instead of refusing them.
+
+    Raises
+    ------
+    AlgebraicLoopError
+        With the loop printed port by port.
+    """
+    waits = dependencies(table, traced, start=start)
+    steps, stuck = _sorted(traced, waits)
+    if not stuck:
+        return Order(steps)
+    if not solve:
+        within = {port: {s for s in waits[port] if s in stuck} for port in stuck}
+        raise _loop_error(table, traced, _a_loop(within, _first(stuck)), start)
+    torn: set[Port] = set()
+    loops: list[str] = []
+    for loop, port in _tear(traced, waits, stuck):
+        torn.add(port)
+        loops.append("\n".join(_printed(table, traced, loop)))
+    steps, _ = _sorted(traced, {port: sources - torn for port, sources in waits.items()})
+    return Order(steps, tuple(sorted(torn)), tuple(loops))
+
+
+def _tear(
+    traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]], stuck: set[Port]
+) -> Iterator[tuple[list[Port], Port]]:
+    """Yield loop after loop among the ports that are stuck, and its port that is to be taken as known."""
+    waits = {port: {s for s in waits[port] if s in stuck} for port in stuck}
+    consumers: dict[Port, list[Port]] = defaultdict(list)
+    for port, sources in waits.items():
+        for source in sources:
+            consumers[source].append(port)
+    candidates = sorted((p for p in stuck if p[1] not in (NEXT, GUARDS)), reverse=True)
+    while candidates:
+        if not waits[candidates[-1]]:
+            candidates.pop()
+            continue
+        loop = _a_loop(waits, candidates[-1])
+        sizes = {port: math.prod(traced[port[0]].outputs[port[1]]) for port in loop}
+        torn = min(loop, key=lambda port: (sizes[port], port))
+        yield loop, torn
+        known = [torn]
+        while known:
+            source = known.pop()
+            for port in consumers.pop(source, ()):
+                waits[port].discard(source)
+                if not waits[port]:
+                    known.append(port)
+
+
+def _sorted(traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]]) -> tuple[list[Step], set[Port]]:
+    """Return what can be evaluated, in order, and what is left over."""
+    missing = {port: len(sources) for port, sources in waits.items()}
+    consumers: dict[Port, list[Port]] = defaultdict(list)
+    for port in sorted(waits):
+        for source in waits[port]:
+            consumers[source].append(port)
+    names = {path: (*trace.outputs, NEXT, GUARDS) for path, trace in traced.items()}
+    left = {path: set(every) for path, every in names.items()}
+    ready: dict[str, set[str]] = {path: {n for n in every if not missing[path, n]} for path, every in names.items()}
+    whole = [path for path in names if ready[path] == left[path]]
+    part = [path for path in names if ready[path]]
+    heapq.heapify(whole)
+    heapq.heapify(part)
+    order: list[Step] = []
+    while whole or part:
+        path = heapq.heappop(whole) if whole else heapq.heappop(part)
+        now = tuple(n for n in names[path] if n in ready[path])
+        if not now:
+            continue
+        ready[path].clear()
+        left[path].difference_update(now)
+        order.append((path, now))
+        for name in now:
+            for consumer, waiting in consumers[path, name]:
+                missing[consumer, waiting] -= 1
+                if not missing[consumer, waiting]:
+                    ready[consumer].add(waiting)
+                    heapq.heappush(whole if ready[consumer] == left[consumer] else part, consumer)
+    return order, {(path, name) for path, every in left.items() for name in every}
+
+
+def _first(ports: Iterable[Port]) -> Port:
+    """Return the first one that is an output."""
+    return min(p for p in ports if p[1] not in (NEXT, GUARDS))
+
+
+def _a_loop(waits: Mapping[Port, set[Port]], port: Port) -> list[Port]:
+    """Return the ports of one loop, found from a port that is stuck, each waiting for the next."""
+    seen: dict[Port, int] = {}
+    while port not in seen:
+        seen[port] = len(seen)
+        port = min(waits[port])
+    loop = list(seen)[seen[port] :]
+    first = loop.index(min(loop))
+    return loop[first:] + loop[:first]
+
+
+def _printed(table: Structure, traced: Mapping[str, Traced], loop: list[Port]) -> list[str]:
+    """Print a loop port by port."""
+    lines = []
+    for i, (path, name) in enumerate(reversed(loop)):
+        source = loop[-i - 2] if i + 2 <= len(loop) else loop[-1]
+        consumer_path = source[0]
+        wired = [
+            q
+            for q in traced[consumer_path].inputs
+            if (w := table.wires.get((consumer_path, q))) is not None and (w.block, w.port) == (path, name)
+        ]
+        through = [q for q in wired if q in traced[consumer_path].depends[source[1]]] or wired
+        if through:
+            lines.append(f"  {path}.{name} is wired to {consumer_path}.{through[0]}")
+            lines.append(f"  {consumer_path}.{through[0]} feeds through to {consumer_path}.{source[1]}")
+            continue
+        boxes = table.gates(table.frame_of[consumer_path])
+        box = next((b for b in boxes if (table.controls[b].block, table.controls[b].port) == (path, name)), "?")
+        lines.append(f"  {path}.{name} is wired to what controls {box}")
+        lines.append(f"  {box} acts on {consumer_path}.{source[1]}")
+    return lines
+
+
+def _loop_error(table: Structure, traced: Mapping[str, Traced], loop: list[Port], start: bool) -> AlgebraicLoopError:
+    advice = ", or have it solved at every instant: Diagram(…, loops='solve')"
+    what, delay = "these ports depend on each other within one instant", "UnitDelay"
+    if start:
+        what, delay = "initial values depend on each other", "UnitDelay(initial_value=…)"
+    return AlgebraicLoopError(
+        f"{what}:\n" + "\n".join(_printed(table, traced, loop)) + f"\nBreak the loop where a delay is real: put a "
+        f"{delay} on one of these wires{'' if start else advice}.",
+        block=min(loop)[0],
+    )

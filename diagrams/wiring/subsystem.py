@@ -1,0 +1,339 @@
+"""Subsystems: a function of signals is one box of a diagram."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from typing import Any, overload
+
+from ...blocks.core.errors import (
+    DoubleDriveError,
+    SampleTimeError,
+    UnknownNameError,
+    UnwiredInputError,
+    WiringError,
+    near,
+)
+from ...blocks.core.signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, recorder
+from ...blocks.tracing.discretization import check_method
+
+FINEST = Fraction(1, 10**9)
+ENABLED, TRIGGERED = ("held", "reset"), ("rising", "falling", "both")
+
+
+def exact_time(value: Any, *, block: str = "") -> Fraction:
+    """Return a sample time as an exact fraction of a second: a float is read as its shortest decimal.
+
+    Raises
+    ------
+    SampleTimeError
+        If it is not positive, or finer than 1 ns.
+    """
+    try:
+        time = value if isinstance(value, Fraction) else Fraction(repr(float(value)))
+    except (TypeError, ValueError, OverflowError):
+        raise SampleTimeError(
+            f"found the sample time {value!r}; expected seconds, such as 1e-3.", block=block
+        ) from None
+    if time <= 0:
+        raise SampleTimeError(f"found a sample time of {float(time):g} s; expected a positive one.", block=block)
+    if (time / FINEST).denominator != 1:
+        raise SampleTimeError(
+            f"found a sample time of {float(time)!r} s, which is no multiple of 1 ns; round it, for instance to "
+            f"{round(float(time), 9)!r}.",
+            block=block,
+        )
+    return time
+
+
+def exact_offset(value: Any, sample_time: Fraction | None, *, block: str) -> Fraction:
+    """Return an offset as an exact fraction of a second.
+
+    Raises
+    ------
+    SampleTimeError
+        If it is negative, not less than the sample time, or there is none.
+    """
+    if isinstance(value, int | float | Fraction) and not isinstance(value, bool) and value == 0:
+        return Fraction(0)
+    offset = exact_time(value, block=block)
+    if sample_time is None:
+        raise SampleTimeError("it has an offset but no sample time; give it sample_time=….", block=block)
+    if offset >= sample_time:
+        raise SampleTimeError(
+            f"found an offset of {float(offset):g} s; expected less than the sample time, {float(sample_time):g} s.",
+            block=block,
+        )
+    return offset
+
+
+def samples_of_delay(value: Any, sample_time: Fraction | None, *, block: str) -> int:
+    """Return a computational delay in samples.
+
+    Raises
+    ------
+    SampleTimeError
+        If it is no whole number, is negative, or there is no sample time.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise SampleTimeError(f"found delay={value!r}; expected a whole number of samples, 0 or more.", block=block)
+    if value and sample_time is None:
+        raise SampleTimeError("it has a delay but no sample time; give it sample_time=….", block=block)
+    return value
+
+
+class FrameInput:
+    """The inside of a subsystem's input: stands for the signal that is wired to it outside."""
+
+    def __init__(self, frame: SubsystemCall, port: str):
+        self.frame, self.port = frame, port
+        self.label, self.outputs = port, (port,)
+
+
+class Subsystem:
+    """A function of signals as a box; made by `subsystem`, called like a block."""
+
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        *,
+        sample_time: Any = None,
+        method: str | None = None,
+        name: str | None = None,
+        offset: Any = 0,
+        delay: int = 0,
+        enabled: str | None = None,
+        triggered: str | None = None,
+    ):
+        if method is not None:
+            check_method(method)
+        self.function, self.method = function, method
+        own = getattr(function, "__name__", "")  # a functools.partial has none, a lambda no identifier
+        own = own if own.isidentifier() else "subsystem"
+        self.name = check_name(name or own)
+        self.sample_time = None if sample_time is None else exact_time(sample_time, block=self.name)
+        self.offset = exact_offset(offset, self.sample_time, block=self.name)
+        self.delay = samples_of_delay(delay, self.sample_time, block=self.name)
+        self.enabled, self.triggered = enabled, triggered
+        if enabled is not None and triggered is not None:
+            raise WiringError("it is both enabled and triggered; put one box into the other.", block=self.name)
+        for value, key, allowed in ((enabled, "enabled", ENABLED), (triggered, "triggered", TRIGGERED)):
+            if value is not None and value not in allowed:
+                raise WiringError(
+                    f"found {key}={value!r}; expected {' or '.join(map(repr, allowed))}.", block=self.name
+                )
+        self.control = "enabled" if enabled else "triggered" if triggered else ""
+        self.when = enabled or triggered or ""
+        self.control_input = {"enabled": "enable", "triggered": "trigger", "": ""}[self.control]
+        every = inspect.signature(function).parameters.values()
+        self.parameters = [p for p in every if p.kind is not inspect.Parameter.VAR_KEYWORD]
+        self.open_ended = len(self.parameters) < len(every)
+        self.__doc__, self.__name__ = function.__doc__, self.name
+
+    def replace(self, **changes: Any) -> Subsystem:
+        """Return a variant; the keywords are those of `subsystem`.
+
+        Raises
+        ------
+        UnknownNameError
+            For any other name.
+        """
+        known = {
+            "sample_time": self.sample_time,
+            "method": self.method,
+            "name": self.name,
+            "offset": self.offset,
+            "delay": self.delay,
+            "enabled": self.enabled,
+            "triggered": self.triggered,
+        }
+        for key in changes:
+            if key not in known:
+                raise UnknownNameError(f"a subsystem has no {key!r}. {near(key, known)}", block=self.name)
+        return Subsystem(self.function, **{**known, **changes})
+
+    def __call__(self, *args: Any, **kwargs: Any) -> SubsystemCall:
+        """Wire the box: run the function on signals that stand for its inputs."""
+        names = [p.name for p in self.parameters]
+        if self.control_input and self.control_input not in names:
+            names.append(self.control_input)
+        if len(args) > len(names):
+            raise WiringError(f"{len(args)} signals for {len(names)} inputs ({', '.join(names)}).", block=self.name)
+        given = dict(zip(names, args, strict=False))
+        for key, value in kwargs.items():
+            if key not in names and not self.open_ended:
+                raise UnknownNameError(f"it has no input {key!r}. {near(key, names)}", block=self.name)
+            if key in given:
+                raise DoubleDriveError("it is driven twice in one call.", block=self.name, port=key)
+            given[key] = value
+        optional = {p.name for p in self.parameters if p.default is not inspect.Parameter.empty}
+        missing = [name for name in names if name not in given and name not in optional - {self.control_input}]
+        if missing:
+            raise UnwiredInputError(
+                f"nothing is wired to {', '.join(map(repr, missing))}; expected {self.name}({', '.join(names)}).",
+                block=self.name,
+                port=missing[0],
+            )
+        return SubsystemCall(self, {k: as_signal(v, block=self.name, port=k) for k, v in given.items()})
+
+    def __repr__(self) -> str:
+        rate = "" if self.sample_time is None else f", sample_time={float(self.sample_time):g}"
+        return f"<subsystem {self.name}({', '.join(p.name for p in self.parameters)}){rate}>"
+
+
+class SubsystemCall(Wireable):
+    """A subsystem with its inputs, and the calls that its function made."""
+
+    def __init__(self, subsystem: Subsystem, wires: dict[str, Signal]):
+        self.subsystem, self.wires, self.label = subsystem, wires, subsystem.name
+        calls: list[Any] = []
+        token = recorder.set(calls)
+        try:
+            own = {p.name for p in subsystem.parameters}
+            inside = [k for k in wires if k in own or k != subsystem.control_input]
+            result = subsystem.function(**{k: Signal(FrameInput(self, k), k) for k in inside})
+        finally:
+            recorder.reset(token)
+        self.calls = calls
+        self.results = self._name(result)
+        self.outputs = list(self.results)
+        outer = recorder.get()
+        if outer is not None:
+            outer.append(self)
+
+    def _name(self, result: Any) -> dict[str, Signal]:
+        if result is None:
+            return {}
+        if isinstance(result, dict):
+            return {check_name(k): as_signal(v, block=self.label, port=str(k)) for k, v in result.items()}
+        if isinstance(result, Call) and len(result.primary) != 1:
+            result = tuple(result)
+        parts = result if isinstance(result, tuple | list) else (result,)
+        named: dict[str, Signal] = {}
+        for part in parts:
+            signal = as_signal(part, block=self.label)
+            base = name = signal.wire or signal.port
+            count = 2
+            while name in named:
+                name, count = f"{base}_{count}", count + 1
+            named[name] = signal
+        return named
+
+    def _signal(self) -> Signal:
+        if len(self.results) != 1:
+            raise WiringError(
+                f"it has {len(self.results)} outputs ({', '.join(self.results) or 'none'}); unpack the call, or name "
+                f"one.",
+                block=self.label,
+            )
+        return Signal(self, self.outputs[0], None, None, self)
+
+    def __iter__(self) -> Iterator[Signal]:
+        return iter([Signal(self, port, None, None, self) for port in self.outputs])
+
+    def named(self, *names: str) -> Signal | tuple[Signal, ...]:
+        """Name the wires of the outputs, in order (all of them)."""
+        if len(names) != len(self.outputs):
+            raise WiringError(f"{len(names)} names for {len(self.outputs)} outputs; give one each.", block=self.label)
+        signals = tuple(s.named(n) for s, n in zip(self, names, strict=True))
+        return signals[0] if len(signals) == 1 else signals
+
+    def __getattr__(self, name: str) -> Signal:
+        if name.startswith("_") or "outputs" not in self.__dict__:
+            raise AttributeError(name)
+        if name in self.outputs:
+            return Signal(self, name, None, None, self)
+        raise UnknownAttributeError(f"it has no output {name!r}. {near(name, self.outputs)}", block=self.label)
+
+
+@overload
+def subsystem(function: Callable[..., Any], /) -> Subsystem: ...
+@overload
+def subsystem(
+    *,
+    sample_time: float | Fraction | None = None,
+    method: str | None = None,
+    name: str | None = None,
+    offset: float | Fraction = 0,
+    delay: int = 0,
+    enabled: str | None = None,
+    triggered: str | None = None,
+) -> Callable[[Callable[..., Any]], Subsystem]: ...
+def subsystem(
+    function: Callable[..., Any] | None = None,
+    /,
+    *,
+    sample_time: float | Fraction | None = None,
+    method: str | None = None,
+    name: str | None = None,
+    offset: float | Fraction = 0,
+    delay: int = 0,
+    enabled: str | None = None,
+    triggered: str | None = None,
+) -> Any:
+    """Make a function of signals a box of a diagram.
+
+    Parameters
+    ----------
+    sample_time : float or Fraction, optional
+        Sample time in s. Inputs are sampled at its ticks, outputs held between them, continuous blocks inside
+        discretized. A float is read as its shortest decimal. Without one the box has the rate of what surrounds it.
+    method : {"exact", "forward", "semi_implicit", "trapezoidal"}
+        How continuous blocks inside are discretized: ``exact`` is the zero-order hold for blocks that are linear in
+        their states, forward Euler for others; ``trapezoidal`` is of second order, solved by Newton's method where a
+        block is not linear, and the run stops at a step that it does not solve; see `loopwright.blocks.hold`.
+        Without one it is that of the box around, or ``exact``. Each block is discretized by itself, with its inputs
+        held over the sample: several `Integrator` blocks in a row are forward Euler between them whatever the method
+        (put them into one block, such as a `StateSpace`, for it to act on the whole), and ``trapezoidal`` is not
+        Tustin's method, ``c2d(…, "bilinear")``, which averages the inputs too.
+    name : str, optional
+        Name of the box; without one, the function's.
+    offset : float or Fraction
+        Time of the first tick in s, less than the sample time. Until then the outputs are what the box gives at t = 0,
+        and are held.
+    delay : int
+        Computational delay in samples: what leaves the box at a tick was computed that many ticks before, from the
+        inputs then. In the first ticks it is what was computed first.
+    enabled : {"held", "reset"}, optional
+        The box is called with one more input, ``enable``, and acts only while that is true (above 0.5). Else its
+        outputs and states are held; with "reset" the states start anew when it is enabled again. With a sample time it
+        looks at its own ticks, and boxes of other rates in it go by the last one.
+    triggered : {"rising", "falling", "both"}, optional
+        The box is called with one more input, ``trigger``, and acts only at the instants at which that becomes true
+        (rising), false (falling), or either. Between them its outputs are held. Blocks inside have no sample time.
+
+    Raises
+    ------
+    SampleTimeError
+        Not positive, or no multiple of 1 ns; an unknown method; an offset or a delay without a sample time.
+    WiringError
+        Another word for ``enabled`` or ``triggered``, or both.
+
+    Examples
+    --------
+    >>> from loopwright.blocks import Gain
+    >>> @subsystem(sample_time=1e-3)
+    ... def controller(error):
+    ...     return Gain(gain=2)(error)
+    >>> controller
+    <subsystem controller(error), sample_time=0.001>
+    """
+    if function is not None and not callable(function):
+        raise WiringError(
+            f"found {function!r}; expected a function, or keywords: @subsystem(sample_time={function!r})."
+        )
+
+    def decorate(f: Callable[..., Any]) -> Subsystem:
+        return Subsystem(
+            f,
+            sample_time=sample_time,
+            method=method,
+            name=name,
+            offset=offset,
+            delay=delay,
+            enabled=enabled,
+            triggered=triggered,
+        )
+
+    return decorate if function is None else decorate(function)

@@ -1,0 +1,127 @@
+"""Variants of a diagram: other blocks, parameters, sample times."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace as replace_fields
+from typing import Any
+
+from ...blocks.core.block import Block
+from ...blocks.core.errors import UnknownNameError, WiringError, near
+from ...blocks.core.values import Value
+from ...blocks.tracing.discretization import check_method
+from .structure import Frame, Structure
+from .subsystem import exact_offset, exact_time, samples_of_delay
+
+_OF_A_BOX = ("sample_time", "method", "offset", "delay")
+
+
+def replaced(table: Structure, changes: Mapping[str, Any], diagram: str) -> Structure:
+    """Return the structure of a variant; see `Diagram.replace`."""
+    table = Structure(**{k: dict(v) for k, v in vars(table).items()})
+    for path, value in changes.items():
+        _change(table, path, value, diagram)
+    return table
+
+
+def _owner(table: Structure, path: str) -> str:
+    """Return the block that a path is, or is the unique end of; "" if there is none."""
+    if path in table.blocks:
+        return path
+    found = [p for p in table.blocks if p.endswith("." + path)]
+    return found[0] if len(found) == 1 else ""
+
+
+def _change(table: Structure, path: str, value: Any, diagram: str) -> None:
+    head, _, last = path.rpartition(".")
+    owner = table.blocks.get(_owner(table, head)) if head else None
+    if isinstance(value, Block) and not (owner is not None and last in type(owner).parameter_specs):
+        full = unique(path, table.blocks, "block", diagram)
+        table.blocks[full] = value.replace(name=full.rpartition(".")[2])
+    elif last in _OF_A_BOX and (frame := _frame(table, head, last, diagram)) is not None:
+        table.frames[frame] = _changed_box(table.frames[frame], last, value)
+    elif path in table.blocks:
+        raise WiringError(
+            f"found {value!r}; expected a block in its place, such as Fmu('other.fmu'), or the name of a parameter "
+            f"({path}.…).",
+            block=path,
+        )
+    else:
+        full, keys = _split(table, path, diagram)
+        table.blocks[full] = _changed(table.blocks[full], keys, value)
+
+
+def _frame(table: Structure, path: str, what: str, diagram: str) -> str | None:
+    """Return the subsystem that a path means; None where it means none, but perhaps a block."""
+    boxes = {frame: None for frame in table.frames if frame}
+    if path:
+        found = [f for f in boxes if f == path or f.endswith("." + path)]
+        return unique(path, boxes, "subsystem", diagram) if found else None
+    if any(what in type(block).parameter_specs for block in table.blocks.values()):
+        return None  # a block's parameter of that name
+    offered = ", ".join(f"{frame}.{what}" for frame in boxes) or "none: this diagram has no subsystem"
+    raise UnknownNameError(f"a diagram has no {what!r} of its own; its subsystems have: {offered}.")
+
+
+def _split(table: Structure, path: str, diagram: str) -> tuple[str, list[str]]:
+    """Return the block and the parameter path that a dotted path means."""
+    parts = path.split(".")
+    for cut in range(len(parts) - 1, 0, -1):
+        try:
+            return unique(".".join(parts[:cut]), table.blocks, "block", diagram), parts[cut:]
+        except UnknownNameError:
+            continue
+    owners = [p for p, block in sorted(table.blocks.items()) if path in type(block).parameter_specs]
+    if len(owners) == 1:
+        return owners[0], [path]
+    if owners:
+        raise UnknownNameError(
+            f"{path!r} is a parameter of {', '.join(owners)}; write the path, such as '{owners[0]}.{path}'."
+        )
+    known = {f"{p}.{q}" for p, block in table.blocks.items() for q in type(block).parameter_specs} | set(table.blocks)
+    raise UnknownNameError(f"nothing is called {path!r} in diagram {diagram!r}. {near(path, known)}")
+
+
+def _changed_box(frame: Frame, what: str, value: Any) -> Frame:
+    """Return a box with another sample time, method, offset or delay."""
+    new, path = value, frame.path
+    if what == "sample_time" and value is not None:
+        new = exact_time(value, block=path)
+    elif what == "method" and value is not None:
+        check_method(value)
+    elif what == "offset":
+        new = exact_offset(value, frame.sample_time, block=path)
+    elif what == "delay":
+        new = samples_of_delay(value, frame.sample_time, block=path)
+    changed: dict[str, Any] = {what: new}
+    if what == "sample_time":
+        exact_offset(frame.offset, new, block=path)
+        samples_of_delay(frame.delay, new, block=path)
+    return replace_fields(frame, **changed)
+
+
+def unique(path: str, known: Mapping[str, Any], kind: str, diagram: str) -> str:
+    """Return the full path that ``path`` is, or is the unique end of."""
+    if not isinstance(path, str):
+        raise UnknownNameError(f"found {path!r}; expected the path of a {kind}, such as {next(iter(known), '')!r}.")
+    if path in known:
+        return path
+    found = sorted(p for p in known if p.endswith("." + path))
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise UnknownNameError(f"{path!r} stands for several {kind}s: {', '.join(found)}. Write more of the path.")
+    raise UnknownNameError(f"no {kind} {path!r} in diagram {diagram!r}. {near(path, known)}")
+
+
+def _changed(block: Value, keys: list[str], value: Any) -> Any:
+    """Return ``block`` with the parameter at a path of attribute names or mapping keys changed."""
+    name = keys[0]
+    if len(keys) == 1:
+        return block.replace(**{name: value})
+    inner = block.__dict__.get(name)
+    if isinstance(inner, Value):
+        return block.replace(**{name: _changed(inner, keys[1:], value)})
+    if isinstance(inner, Mapping):
+        return block.replace(**{name: {**inner, ".".join(keys[1:]): value}})
+    raise UnknownNameError(f"it has no parameter {'.'.join(keys)!r}. {near(name, type(block).parameter_specs)}")

@@ -1,0 +1,1 @@
+"""An FMU file: its description, read and checked."""

@@ -1,0 +1,208 @@
+"""Reading an FMU's description: what a diagram needs to know before anything is loaded."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zipfile
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from ...blocks.core.errors import FmuFileError, UnitError
+from ...blocks.core.units import parse_unit
+from ..export.compiler import native_platform
+
+
+@dataclass(frozen=True, eq=False)
+class FmuVariable:
+    """A Float64 variable of an FMU."""
+
+    name: str
+    reference: int
+    causality: str
+    shape: tuple[int, ...]
+    unit: str | None
+    start: Any
+    description: str
+    minimum: float | None
+    maximum: float | None
+    nominal: float | None = None
+    variability: str = "continuous"
+    initial: str = "exact"
+    """FMI's initial: exact where the start value is the value (FMI 3.0, 2.4.7.4)."""
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return int(np.prod(self.shape, dtype=int))
+
+
+@dataclass(frozen=True, eq=False)
+class FmuDescription:
+    """What is read from ``modelDescription.xml``."""
+
+    file: Path
+    digest: str
+    """SHA-256 of the file."""
+    model_name: str
+    identifier: str
+    token: str
+    variables: dict[str, FmuVariable]
+    other: dict[str, str]
+    """Variables of other types, with their type."""
+    can_save: bool = False
+    """Whether the state of an instance can be saved and restored (canGetAndSetFMUState)."""
+    can_serialize: bool = False
+    """Whether a saved state can be turned into bytes, for another process (canSerializeFMUState)."""
+    has_derivatives: bool = False
+    """Whether it gives directional derivatives in co-simulation (providesDirectionalDerivatives)."""
+    variable_step: bool = False
+    """Whether communication steps may differ in length (canHandleVariableCommunicationStepSize)."""
+    fixed_internal_step: float | None = None
+    """The step in s that it computes with inside, where it is fixed (fixedInternalStepSize): take multiples of it."""
+    states: dict[str, str] = field(default_factory=dict)
+    """Continuous states that are variables, with their derivatives' names, in the order of the model structure."""
+    model_exchange: str | None = None
+    """Model identifier of the model-exchange interface, None without one."""
+    model_exchange_has_derivatives: bool = False
+    """Whether it gives directional derivatives in model exchange."""
+
+    def of(self, causality: str) -> dict[str, FmuVariable]:
+        """Return the variables of a causality, in the file's order."""
+        return {name: v for name, v in self.variables.items() if v.causality == causality}
+
+
+def read_description(file: str | os.PathLike[str]) -> FmuDescription:
+    """Read and check an FMU, without loading its library.
+
+    Raises
+    ------
+    FmuFileError
+        No such file, no FMU, not FMI 3.0 co-simulation, no binary for this platform.
+    """
+    path = Path(file).expanduser()
+    if not path.is_file():
+        raise FmuFileError(f"there is no file {str(path)!r}; expected an FMU. Check the path.")
+    stat = path.stat()
+    return _read(path.resolve(), stat.st_mtime_ns, stat.st_size)
+
+
+@lru_cache(maxsize=256)
+def _read(path: Path, mtime: int, length: int) -> FmuDescription:
+    import fmpy
+
+    data = path.read_bytes()
+    try:
+        with zipfile.ZipFile(path) as archive:
+            entries = set(archive.namelist())
+            text = archive.read("modelDescription.xml") if "modelDescription.xml" in entries else b""
+    except zipfile.BadZipFile:
+        raise FmuFileError(
+            f"{str(path)!r} is no FMU: it is no zip archive (it starts with {data[:8]!r}). Give the .fmu that the "
+            f"tool exported."
+        ) from None
+    if "modelDescription.xml" not in entries:
+        raise FmuFileError(f"{str(path)!r} is a zip archive without modelDescription.xml, so it is no FMU.")
+    try:
+        model = fmpy.read_model_description(str(path))
+    except Exception as error:  # FMPy raises bare exceptions
+        raise FmuFileError(f"the modelDescription.xml of {str(path)!r} can't be read: {error}") from error
+    if not model.fmiVersion.startswith("3."):
+        raise FmuFileError(
+            f"{str(path)!r} is an FMU of FMI {model.fmiVersion}; expected FMI 3.0. Export it again with FMI 3.0 "
+            f"co-simulation."
+        )
+    if model.coSimulation is None:
+        raise FmuFileError(f"{str(path)!r} has no co-simulation interface; export it with one.")
+    identifier, platform = model.coSimulation.modelIdentifier, native_platform()
+    if not any(e.startswith(f"binaries/{platform}/{identifier}.") for e in entries):
+        found = sorted({e.split("/")[1] for e in entries if e.startswith("binaries/") and e.count("/") > 1})
+        raise FmuFileError(
+            f"{str(path)!r} has no binary for this platform, {platform} (it has: {', '.join(found) or 'none'}). "
+            f"Export or build "
+            "it for this platform."
+        )
+    variables, other = {}, {}
+    for v in model.modelVariables:
+        if v.causality == "independent":
+            continue
+        if v.type != "Float64":
+            other[v.name] = v.type
+            continue
+        shape = _shape(v, model)
+        start = None if v.start is None else _start(v.start, shape)
+        variables[v.name] = FmuVariable(
+            v.name, v.valueReference, v.causality or "local", shape, _unit(v.unit), start, v.description or "",
+            _number(v.min), _number(v.max), _number(v.nominal), v.variability or "continuous",
+            v.initial or ("calculated" if v.causality in ("output", "local", None) else "exact"),
+        )  # fmt: skip
+    return FmuDescription(
+        path, hashlib.sha256(data).hexdigest(), model.modelName, identifier, model.instantiationToken, variables, other,
+        states=_states(model, variables), **_capabilities(text),
+    )  # fmt: skip
+
+
+def _capabilities(text: bytes) -> dict[str, Any]:
+    """Return what the interfaces claim (FMI 3.0, 3.4 and 4.4); FMPy drops providesDirectionalDerivatives of 3.0."""
+    root = ET.fromstring(text)
+    steps, exchange = root.find("CoSimulation"), root.find("ModelExchange")
+    fixed = None if steps is None else steps.get("fixedInternalStepSize")
+    return {
+        "can_save": _flag(steps, "canGetAndSetFMUState"),
+        "can_serialize": _flag(steps, "canGetAndSetFMUState") and _flag(steps, "canSerializeFMUState"),
+        "has_derivatives": _flag(steps, "providesDirectionalDerivatives"),
+        "variable_step": _flag(steps, "canHandleVariableCommunicationStepSize"),
+        "fixed_internal_step": _number(fixed),
+        "model_exchange": None if exchange is None else exchange.get("modelIdentifier"),
+        "model_exchange_has_derivatives": _flag(exchange, "providesDirectionalDerivatives"),
+    }
+
+
+def _flag(interface: ET.Element | None, name: str) -> bool:
+    return interface is not None and interface.get(name) in ("true", "1")
+
+
+def _states(model: Any, variables: dict[str, FmuVariable]) -> dict[str, str]:
+    """Return the states behind the listed derivatives (FMI 3.0, 2.4.8); none where one is missing or no Float64."""
+    pairs = {
+        u.variable.derivative.name: u.variable.name for u in model.derivatives if u.variable.derivative is not None
+    }
+    complete = len(pairs) == len(model.derivatives) and all(a in variables and b in variables for a, b in pairs.items())
+    return pairs if complete else {}
+
+
+def _number(text: Any) -> float | None:
+    return None if text is None else float(text)
+
+
+def _shape(variable: Any, model: Any) -> tuple[int, ...]:
+    sizes = []
+    for dimension in variable.dimensions or ():
+        if dimension.start is not None:
+            sizes.append(int(dimension.start))
+        else:
+            parameters = {v.valueReference: v for v in model.modelVariables}
+            sizes.append(int(parameters[dimension.valueReference].start))
+    return tuple(sizes)
+
+
+def _start(text: Any, shape: tuple[int, ...]) -> np.ndarray:
+    values = np.array([float(x) for x in (text.split() if isinstance(text, str) else np.ravel(text))])
+    full = np.broadcast_to(values, (int(np.prod(shape, dtype=int)),)) if values.size == 1 else values
+    return np.array(full).reshape(shape)
+
+
+def _unit(text: str | None) -> str | None:
+    """Return a unit that can be checked, None for one that this library can't read."""
+    if text is None:
+        return None
+    try:
+        parse_unit(text)
+    except UnitError:
+        return None
+    return text

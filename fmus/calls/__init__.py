@@ -1,0 +1,1 @@
+"""FMI calls of a library that is loaded in this process."""

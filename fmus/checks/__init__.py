@@ -1,0 +1,1 @@
+"""Inspection, validation and trial runs of FMUs."""

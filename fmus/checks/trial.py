@@ -1,0 +1,151 @@
+"""Run an FMU once in this process, which it may crash.
+
+The command is ``python -m loopwright.fmus.checks.trial FILE INTERFACE REPORT``.
+
+Each stage is written to the report, a line of JSON, before it begins, so that a crash says where it was. The last line
+of a run that came to its end has the stage "done".
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import math
+import sys
+import tempfile
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+STAGES = {
+    "load": "loading and instantiating it",
+    "initialize": "initializing it",
+    "step": "its first step",
+    "get": "getting its outputs",
+    "terminate": "terminating it",
+}
+_MESSAGES = 20
+
+
+def main(file: str, interface: str, report: str) -> None:
+    """Instantiate, initialize, step once, get the outputs, terminate."""
+    import fmpy
+
+    with open(report, "w", encoding="utf-8") as stream, tempfile.TemporaryDirectory(prefix="loopwright-") as folder:
+
+        def tell(stage: str, **more: Any) -> None:
+            stream.write(json.dumps({"stage": stage, **more}) + "\n")
+            stream.flush()
+
+        messages: deque[str] = deque(maxlen=_MESSAGES)
+        stage = "load"
+
+        def begin(name: str) -> None:
+            nonlocal stage
+            stage = name
+            tell(name)
+
+        try:
+            begin("load")
+            fmpy.extract(file, folder)
+            model = fmpy.read_model_description(folder, validate=False)
+            notes = _run(fmpy, folder, model, interface, begin, messages)
+        except Exception as error:
+            said = [m for m in messages if m.strip()]
+            tell("failed", at=stage, error=f"{type(error).__name__}: {error}", messages=said[-3:])
+        else:
+            tell("done", **notes)
+
+
+def _run(
+    fmpy: Any, folder: str, model: Any, interface: str, begin: Callable[[str], None], messages: deque[str]
+) -> dict[str, Any]:
+    from fmpy.simulation import instantiate_fmu
+
+    three = model.fmiVersion.startswith("3.")
+
+    def logged(*parts: Any) -> None:  # FMI 2.0: environment, instance, status, category, text; 3.0: no instance
+        messages.append((parts[-1] or b"").decode(errors="replace"))
+
+    start, stop, step = _times(model, interface)
+    fmu = instantiate_fmu(folder, model, fmi_type=interface, logger=logged, debug_logging=True)
+    begin("initialize")
+    if three:
+        fmu.enterInitializationMode(startTime=start, stopTime=stop)
+    else:
+        fmu.setupExperiment(startTime=start, stopTime=stop)
+        fmu.enterInitializationMode()
+    fmu.exitInitializationMode()
+    begin("step")
+    if interface == "CoSimulation":
+        fmu.doStep(start, step)
+        missing: list[str] = []
+    else:
+        missing = _derivatives(fmu, model, three, start)
+    begin("get")
+    missing += _not_finite(fmu, model, three)
+    begin("terminate")
+    fmu.terminate()
+    fmu.freeInstance()
+    return {"step": step if interface == "CoSimulation" else None, "not_finite": missing}
+
+
+def _times(model: Any, interface: str) -> tuple[float, float | None, float]:
+    """Return start and stop time and the step of the default experiment, or what is likely to be taken."""
+    experiment = model.defaultExperiment
+    start, stop, step = (
+        None if (text := getattr(experiment, name, None)) is None else float(text)
+        for name in ("startTime", "stopTime", "stepSize")
+    )
+    start = start or 0.0
+    slave = model.coSimulation
+    fixed = getattr(slave, "fixedInternalStepSize", None)
+    if interface == "CoSimulation" and fixed is not None and not slave.canHandleVariableCommunicationStepSize:
+        step = float(fixed)
+    if step is None:
+        step = (stop - start) / 1000 if stop is not None and stop > start else 1e-3
+    return start, stop if stop is not None and stop >= start + step else None, step
+
+
+def _derivatives(fmu: Any, model: Any, three: bool, start: float) -> list[str]:
+    """Enter Continuous-Time Mode and evaluate the derivatives; return what is no finite number."""
+    more = True
+    rounds = 0
+    while more:
+        result = fmu.updateDiscreteStates() if three else fmu.newDiscreteStates()
+        more, rounds = bool(result[0]), rounds + 1
+        if rounds > 1000:
+            raise RuntimeError("the iteration for new discrete states at the start has not ended after 1000 rounds")
+    fmu.enterContinuousTimeMode()
+    fmu.setTime(start)
+    n = fmu.getNumberOfContinuousStates() if three else model.numberOfContinuousStates
+    if not n:
+        return []
+    values = (ctypes.c_double * n)()
+    (fmu.getContinuousStateDerivatives if three else fmu.getDerivatives)(values, n)
+    return [f"derivative {i + 1}" for i, value in enumerate(values) if not math.isfinite(value)]
+
+
+def _not_finite(fmu: Any, model: Any, three: bool) -> list[str]:
+    """Return the names of outputs that are no finite numbers."""
+    found = []
+    for v in model.modelVariables:
+        if v.causality != "output" or v.clocks or v.type not in ("Real", "Float64", "Float32"):
+            continue
+        if not three:
+            values = fmu.getReal([v.valueReference])
+        elif all(d.start is not None for d in v.dimensions or ()):
+            n = math.prod(int(d.start) for d in v.dimensions or ())
+            get = fmu.getFloat64 if v.type == "Float64" else fmu.getFloat32
+            values = get([v.valueReference], n)
+        else:
+            continue
+        if not all(math.isfinite(value) for value in values):
+            found.append(v.name)
+    return found
+
+
+if __name__ == "__main__":
+    file, interface, report = sys.argv[1:]
+    main(str(Path(file)), interface, report)

@@ -1,0 +1,327 @@
+"""Check an FMU of anyone's: FMPy's validation, and what it lacks.
+
+The archive, the description against the schemas of the standard that FMPy ships, the model structure, the binaries and
+sources declared; then each interface is instantiated, initialized and stepped once in a process of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...blocks.core.errors import FmuFileError
+from ..export.compiler import native_platform
+from .summary import INTERFACES, binaries_of, library_name, platforms_of_binary, read_archive, tuple_of
+from .trial import STAGES
+
+#: Seconds that an FMU may take for its first step before it counts as hung.
+PATIENCE = 120.0
+_AGAIN = "Export it again with a newer version of its tool ({tool}), or report it to its makers."
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong with an FMU.
+
+    Parameters
+    ----------
+    found : str
+        What is wrong, and where.
+    step : str
+        What to do next.
+    """
+
+    found: str
+    step: str
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a validation found.
+
+    Parameters
+    ----------
+    problems : tuple of Problem
+        Nothing in it: the FMU is clean.
+    done : tuple of str
+        What was checked and run.
+    left : tuple of str
+        What could not be checked here, and why.
+    """
+
+    problems: tuple[Problem, ...]
+    done: tuple[str, ...]
+    left: tuple[str, ...]
+
+
+def validate(file: Path, *, run: bool = True) -> Report:
+    """Check an FMU.
+
+    Parameters
+    ----------
+    file : Path
+        The FMU.
+    run : bool
+        Whether to run it, in a process of its own.
+    """
+    try:
+        entries, root = read_archive(file)
+    except FmuFileError as error:
+        return Report((Problem(str(error), "Export it again; the file may be cut off, or no FMU at all."),), (), ())
+    tool = root.get("generationTool") or "not named"
+    again = _AGAIN.format(tool=tool)
+    fmi = root.get("fmiVersion") or "(none)"
+    if not (fmi in ("1.0", "2.0") or fmi.startswith("3.")):
+        problem = Problem(f"fmiVersion is {fmi!r}; expected 1.0, 2.0 or 3.0.", again)
+        return Report((problem,), (), ("everything else: the version isn't known",))
+    problems = [*_archive(file, entries, again), *_description(file, again)]
+    done = [f"description against FMI {fmi}'s schema and rules"]
+    left: list[str] = []
+    if fmi != "1.0":
+        problems += [Problem(found, again) for found in (*_initial_unknowns(root), *_sources(file, root, entries))]
+    problems += [Problem(*pair) for pair in _binaries(file, root, entries, tool)]
+    folders = binaries_of(entries)
+    if folders:
+        done.append(f"binaries for {', '.join(folders)}")
+    for kind in INTERFACES:
+        element = root.find(kind)
+        if element is None or not run:
+            continue
+        name = INTERFACES[kind]
+        reason = _reason_not_to_run(kind, element, folders)
+        if reason:
+            left.append(f"{name} was not run: {reason}")
+            continue
+        wrong = try_out(file, kind)
+        done.append(f"{name} run for one step")
+        if wrong is not None:
+            problems.append(wrong)
+    if fmi == "1.0":
+        left.append("it was not run: FMI 1.0 isn't supported")
+    return Report(tuple(problems), tuple(done), tuple(left))
+
+
+# --- the archive and the description --------------------------------------------------------------------------------
+
+
+def _archive(file: Path, entries: Iterable[str], again: str) -> Iterator[Problem]:
+    with zipfile.ZipFile(file) as archive:
+        try:
+            broken = archive.testzip()
+        except Exception as error:  # what it raises depends on where the damage is
+            yield Problem(f"the archive is damaged: {error}.", "Copy or export it again.")
+        else:
+            if broken is not None:
+                yield Problem(f"the archive is damaged: {broken} has a wrong checksum.", "Copy or export it again.")
+    for name, count in Counter(entries).items():
+        if count > 1:
+            yield Problem(f"the archive holds {name} {count} times.", again)
+        if name.startswith("/") or ".." in name.split("/") or ":" in name:
+            yield Problem(f"the archive holds {name!r}, which points out of its folder.", "Don't unpack it. " + again)
+
+
+def _description(file: Path, again: str) -> Iterator[Problem]:
+    """Give what FMPy's validation finds: schema, names, start values, units, model structure."""
+    from fmpy.validation import validate_fmu
+
+    for found in validate_fmu(str(file)):
+        step = again
+        if "has no start value" in found:
+            step = "Give the variable a start value and export it again."
+        elif "is not defined" in found and "unit" in found:
+            step = "Define the unit in UnitDefinitions, or leave it out, and export it again."
+        yield Problem(_end(found), step)
+
+
+def _end(text: str) -> str:
+    text = text.strip()
+    return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+def _initial_unknowns(root: Any) -> Iterator[str]:
+    """Give what is wrong with the list of initial unknowns, beyond the set that FMPy compares (FMI 2.0, 2.2.8)."""
+    structure = root.find("ModelStructure")
+    if structure is None:
+        return
+    three = (root.get("fmiVersion") or "").startswith("3.")
+    key = "valueReference" if three else "index"
+    unknowns = structure.findall("InitialUnknown" if three else "InitialUnknowns/Unknown")
+    references = [u.get(key) for u in unknowns]
+    for reference, count in Counter(references).items():
+        if count > 1:
+            yield f"ModelStructure lists the initial unknown with {key} {reference} {count} times; expected once."
+    numbers = [int(r) for r in references if r is not None and r.isdigit()]
+    if not three and numbers != sorted(numbers):
+        yield "ModelStructure/InitialUnknowns is not in the order of the variables; expected ascending indices."
+
+
+def _sources(file: Path, root: Any, entries: Iterable[str]) -> Iterator[str]:
+    """Give the source files that are declared and not there."""
+    from lxml import etree
+
+    there = set(entries)
+    if "sources/buildDescription.xml" in there:
+        with zipfile.ZipFile(file) as archive:
+            try:
+                build = etree.fromstring(archive.read("sources/buildDescription.xml"))
+            except (etree.XMLSyntaxError, zipfile.BadZipFile):
+                return  # FMPy's validation has said so
+        declared = [e.get("name") for e in build.findall("BuildConfiguration/SourceFileSet/SourceFile")]
+        where = "sources/buildDescription.xml"
+    else:
+        declared = [e.get("name") for kind in INTERFACES for e in root.findall(f"{kind}/SourceFiles/File")]
+        where = "modelDescription.xml"
+    for name in dict.fromkeys(declared):
+        if f"sources/{name}" not in there:
+            yield f"{where} declares the source file {name}; there is no sources/{name}."
+
+
+# --- binaries -------------------------------------------------------------------------------------------------------
+
+
+def _identifiers(root: Any) -> dict[str, str]:
+    """Return the model identifier of each interface."""
+    if root.get("fmiVersion") == "1.0":
+        return {"its interface": root.get("modelIdentifier")}
+    found = ((INTERFACES[kind], root.find(kind)) for kind in INTERFACES)
+    return {name: element.get("modelIdentifier") for name, element in found if element is not None}
+
+
+def _binaries(file: Path, root: Any, entries: list[str], tool: str) -> Iterator[tuple[str, str]]:
+    """Give what is wrong with the libraries: missing, or for another machine than their folder says."""
+    build = f"Export it again with its tool ({tool}); if it has sources, fmpy compile builds it for this machine."
+    folders = binaries_of(entries)
+    if not folders and not any(name.startswith("sources/") for name in entries):
+        yield "it holds neither a binary nor sources, so that nothing can run it.", build
+    with zipfile.ZipFile(file) as archive:
+        for folder, names in folders.items():
+            platform = tuple_of(folder)
+            if platform is None:
+                continue  # a folder of a tool's own is allowed
+            for library in sorted({library_name(i, platform) for i in _identifiers(root).values() if i}):
+                users = [who for who, i in _identifiers(root).items() if i and library_name(i, platform) == library]
+                if library not in names:
+                    has = f"binaries/{folder} has no {library}, needed for {' and '.join(users)}; it has"
+                    step = f"Put {library} there, or take the folder out. {build}"
+                    yield f"{has} {', '.join(names)}.", step
+                    continue
+                try:
+                    found = platforms_of_binary(archive.read(f"binaries/{folder}/{library}"))
+                except Exception:  # damage, which has been reported
+                    continue
+                if platform not in found:
+                    is_for = " and ".join(sorted(found)) or "no platform known here: it is no shared library"
+                    yield (
+                        f"binaries/{folder}/{library} is for {is_for}; expected {platform}.",
+                        f"Put the library that is for {platform} there, or take the folder out.",
+                    )
+
+
+# --- running --------------------------------------------------------------------------------------------------------
+
+
+def _reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]]) -> str:
+    if kind == "ScheduledExecution":
+        return "scheduled execution needs a scheduler"
+    native = native_platform()
+    identifier = element.get("modelIdentifier") or ""
+    for folder, names in folders.items():
+        if tuple_of(folder) == native and library_name(identifier, native) in names:
+            return ""
+    return f"it has no binary for this machine, {native}"
+
+
+def try_out(file: Path, interface: str) -> Problem | None:
+    """Run an FMU for one step in a process of its own; return what goes wrong.
+
+    Parameters
+    ----------
+    file : Path
+        The FMU; it must have a binary for this machine.
+    interface : {"CoSimulation", "ModelExchange"}
+        How to run it.
+    """
+    name = INTERFACES[interface]
+    with tempfile.TemporaryDirectory(prefix="loopwright-") as folder:
+        report = Path(folder) / "report"
+        command = [sys.executable, "-m", "loopwright.fmus.checks.trial", str(file.resolve()), interface, str(report)]
+        # A session of its own, so that what a hung FMU has started ends with it.
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        hung = False
+        try:
+            output, _ = process.communicate(timeout=PATIENCE)
+        except subprocess.TimeoutExpired:
+            hung = True
+            _kill(process)
+            output, _ = process.communicate()
+        except BaseException:
+            _kill(process)
+            process.wait()
+            raise
+        lines = report.read_text(encoding="utf-8").splitlines() if report.is_file() else []
+    told = [json.loads(line) for line in lines]
+    last = told[-1] if told else {"stage": "load"}
+    said = _said([*last.get("messages", []), *output.decode(errors="replace").splitlines()])
+    if hung:
+        return Problem(
+            f"{name}: {STAGES.get(last['stage'], 'it')} has not ended after {PATIENCE:g} s.{said}",
+            "Run it in the tool that exported it; it may wait for a licence or another program.",
+        )
+    if last["stage"] == "done":
+        if last["not_finite"]:
+            return Problem(
+                f"{name}: after one step from its start values, {', '.join(last['not_finite'])} is no finite number.",
+                "Check its start values and inputs: see them with loopwright inspect.",
+            )
+        return None if process.returncode == 0 else Problem(
+            f"{name}: it ran, and then {_death(process.returncode)}.{said}", "Report it to its makers."
+        )  # fmt: skip
+    if last["stage"] == "failed":
+        step = "Check its start values and inputs: see them with loopwright inspect."
+        if last["at"] == "load":
+            step = "See what its binary needs: loopwright inspect names the libraries that are missing here."
+        return Problem(f"{name}: {STAGES[last['at']]} failed: {last['error']}{said}", step)
+    return Problem(
+        f"{name}: {STAGES[last['stage']]} {_death(process.returncode)}.{said}",
+        "Don't load it into a program whose work you need. Report it to its makers.",
+    )
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """End a trial and all that it has started."""
+    if sys.platform == "win32":
+        process.kill()
+    else:
+        os.killpg(process.pid, signal.SIGKILL)
+
+
+def _death(code: int) -> str:
+    if code < 0:
+        try:
+            return f"crashed the process ({signal.Signals(-code).name})"
+        except ValueError:
+            return f"crashed the process (signal {-code})"
+    return f"ended the process with exit code {code}"
+
+
+def _said(lines: Iterable[str]) -> str:
+    """Quote the last lines that an FMU has said."""
+    kept = [line.strip() for line in lines if line.strip()]
+    return f" It says: {' / '.join(kept[-4:])}" if kept else ""

@@ -1,0 +1,248 @@
+"""Build an FMU from a model: generate, compile, zip, cache.
+
+A build is keyed by everything that goes into it (equations, variables, runtime, compiler, flags, version), so that the
+second build of the same model only looks up a file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import importlib.util
+import io
+import os
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ...blocks.core.errors import FmuError
+from .c_code import generate, runtime
+from .compiler import (
+    SUFFIXES,
+    TARGETS,
+    Compiler,
+    cache_folder,
+    check_platform,
+    compile_shared,
+    find_compiler,
+    flags,
+    native_platform,
+)
+from .html_page import index_html
+from .model import ModelSpec
+from .scalars import scalarized
+from .xml_fmi2 import model_description2
+from .xml_fmi3 import build_description, model_description, package_version
+
+_TOKEN = "{instantiation-token}"
+_DATE = (1980, 1, 1, 0, 0, 0)
+# Folders of binaries in FMI 2.0 (2.3.1), where they differ from FMI 3.0's platform tuples.
+_FOLDERS2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What an FMU is built as, beside its model.
+
+    Parameters
+    ----------
+    fmi : {3, 2}
+        Version of FMI.
+    platforms : tuple of str
+        FMI 3.0 platform tuples.
+    documentation : str
+        Text of the documentation.
+    """
+
+    fmi: int
+    platforms: tuple[str, ...]
+    documentation: str = ""
+
+
+@lru_cache(maxsize=1)
+def fmi_headers() -> tuple[Path, str]:
+    """Find the folder of FMI's header files, which FMPy brings, and its version."""
+    spec = importlib.util.find_spec("fmpy")
+    folder = Path(spec.origin).parent / "c-code" if spec is not None and spec.origin is not None else None
+    if folder is None or not all((folder / f"fmi{v}Functions.h").is_file() for v in (2, 3)):
+        raise FmuError(
+            f"FMI's header files are not in {folder}. Install FMPy anew: pip install --force-reinstall fmpy."
+        )
+    return folder, importlib.metadata.version("fmpy")
+
+
+def _hash(*parts: str) -> str:
+    digest = hashlib.sha256()
+    for part in parts:
+        data = part.encode()
+        digest.update(f"{len(data)}:".encode() + data)
+    return digest.hexdigest()
+
+
+def _text(value: Any) -> str:
+    """Write a model down, all of it, to be hashed."""
+    if isinstance(value, ca.Function):
+        return str(value.serialize())
+    if is_dataclass(value):
+        return repr([(f.name, _text(getattr(value, f.name))) for f in fields(value)])
+    if isinstance(value, (tuple, list)):
+        return repr([_text(item) for item in value])
+    if isinstance(value, (np.ndarray, np.generic)):
+        return repr((np.shape(value), value.tolist()))
+    return repr(value)
+
+
+def _code_parts(fmi: int) -> list[str]:
+    """Give the text of what writes the files, so that a change of it (while developing) builds anew."""
+    folder = Path(__file__).parent
+    written = ("build", "c_code", "html_page", "quantities", "scalars", "xml_fmi2", "xml_fmi3")
+    modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
+    return [package_version(), *(text for _, text in sorted(runtime(fmi).items())), *modules]
+
+
+def build_key(spec: ModelSpec, options: Options, compiler: Compiler) -> str:
+    """Hash all that goes into a build; nothing is generated for it."""
+    toolchain = [f"{p} {flags(compiler, p)}" for p in options.platforms]
+    made = [_text(spec), _text(options), *_code_parts(options.fmi)]
+    return _hash(*made, compiler.identity, fmi_headers()[1], *toolchain)
+
+
+def _zip(files: Mapping[str, bytes]) -> bytes:
+    """Pack files with fixed dates, in sorted order: same content, same bytes (FMI 3.0, 2.5.1)."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in sorted(files):
+            info = zipfile.ZipInfo(name, _DATE)
+            info.compress_type = zipfile.ZIP_DEFLATED
+            info.create_system = 3
+            info.external_attr = 0o644 << 16
+            archive.writestr(info, files[name], compresslevel=6)
+    return buffer.getvalue()
+
+
+def _binary(
+    spec: ModelSpec, fmi: int, platform: str, sources: Mapping[str, str], compiler: Compiler
+) -> dict[str, bytes]:
+    suffix = SUFFIXES.get(platform.rpartition("-")[2], ".so")
+    with tempfile.TemporaryDirectory(prefix="loopwright-") as folder:
+        library = Path(folder) / f"{spec.name}{suffix}"
+        headers = fmi_headers()[0]
+        compile_shared(sources, library, platform=platform, compiled=["model.c"], include=[headers], compiler=compiler)
+        name = _FOLDERS2.get(platform, platform) if fmi == 2 else platform
+        return {f"binaries/{name}/{library.name}": library.read_bytes()}
+
+
+def _archive(spec: ModelSpec, options: Options, compiler: Compiler, notify: Callable[[str], None]) -> bytes:
+    fmi = options.fmi
+    model, derivatives = generate(spec, _TOKEN, fmi)
+    describe = model_description2 if fmi == 2 else model_description
+    description = describe(spec, _TOKEN, derivatives=derivatives)
+    token = _hash(description, model, *runtime(fmi).values())[:32]
+    sources = {**runtime(fmi), "model.c": model.replace(_TOKEN, token)}
+    files = {
+        "modelDescription.xml": description.replace(_TOKEN, token).encode(),
+        "documentation/index.html": index_html(spec, options.documentation, fmi=fmi).encode(),
+    }
+    if fmi == 3:
+        files["sources/buildDescription.xml"] = build_description(spec).encode()
+    files |= {f"sources/{name}": text.encode() for name, text in sources.items()}
+    for platform in options.platforms:
+        notify(f"compiling {spec.name} for {platform} (the first build on a machine takes longer)")
+        files |= _binary(spec, fmi, platform, sources, compiler)
+    return _zip(files)
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file that is either there and complete, or not there."""
+    temporary = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(prefix=".writing-", dir=path.parent)
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException as error:
+        if temporary is not None:
+            Path(temporary).unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise FmuError(f"can't write {path}: {error}. Give another folder, or set LOOPWRIGHT_CACHE.") from error
+        raise
+
+
+def build_fmu(
+    spec: ModelSpec,
+    out: Path | str | None = None,
+    *,
+    fmi: int = 3,
+    arrays: bool = True,
+    platform: str | Iterable[str] | None = None,
+    documentation: str = "",
+    notify: Callable[[str], None] | None = None,
+) -> Path:
+    """Build an FMU, or find it in the cache.
+
+    Same input, same bytes, on every machine with the same version of the compiler's package.
+
+    Parameters
+    ----------
+    spec : ModelSpec
+        The model.
+    out : path, optional
+        File to copy it to; a folder gets ``<name>.fmu``. Without it, the file in the cache is returned.
+    fmi : {3, 2}
+        FMI 3.0 or FMI 2.0.
+    arrays : bool
+        Whether vectors and matrices are arrays of FMI 3.0; else, and in FMI 2.0 always, each element is a scalar
+        variable of its own: ``s[1]``, ``s[2]``, ``m[1,2]``.
+    platform : str or iterable of str, optional
+        FMI 3.0 platform tuples (2.5.1.4) to build binaries for, or "all" of them; native if not given.
+    documentation : str
+        Plain text for ``documentation/index.html``, beside the equations and the table of variables.
+    notify : callable, optional
+        Is told what takes long, in one line.
+
+    Returns
+    -------
+    Path
+        The FMU.
+
+    Raises
+    ------
+    CompilerError
+        If there is no C compiler, or it fails.
+    FmuError
+        If ``fmi`` is neither, or the cache or ``out`` can't be written.
+    """
+    if fmi not in (2, 3):
+        raise FmuError(f"found fmi={fmi!r}, expected 3 (FMI 3.0) or 2 (FMI 2.0). Give one of them.")
+    chosen = TARGETS if platform == "all" else (platform,) if isinstance(platform, str) else platform
+    platforms = tuple(sorted(set(chosen or (native_platform(),))))
+    spec = spec if arrays and fmi == 3 else scalarized(spec)
+    options = Options(fmi, platforms, documentation)
+    compiler = find_compiler()
+    for name in platforms:
+        check_platform(compiler, name)
+    cached = cache_folder() / "fmus" / build_key(spec, options, compiler)[:32] / f"{spec.name}.fmu"
+    if not cached.is_file():
+        write_atomically(cached, _archive(spec, options, compiler, notify or (lambda message: None)))
+    if out is None:
+        return cached
+    out = Path(out)
+    target = out / cached.name if out.is_dir() else out
+    write_atomically(target, cached.read_bytes())
+    return target
+
+
+def clear_cache() -> None:
+    """Delete all cached FMUs and the compiler's own cache."""
+    for name in ("fmus", "zig"):
+        shutil.rmtree(cache_folder() / name, ignore_errors=True)

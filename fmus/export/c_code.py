@@ -1,0 +1,343 @@
+"""From a model to C: CasADi writes the equations, this module the tables around them.
+
+The generated ``model.c`` is the only file to compile: it includes the runtime (``runtime/``), so that the equations are
+inlined into the integrator.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
+from typing import Any, Literal
+
+import casadi as ca
+
+from ...blocks.core.errors import DefinitionError
+from ...blocks.core.units import rate_of
+from .model import DIRECTIONS, INTEGRATORS, ModelSpec, Variable
+
+Kind = Literal["time", "fixed", "tunable", "input", "state", "discrete", "derivative", "output", "indicator"]
+_COMMON = ("model.h", "core.c", "integrators.c", "events.c", "stepping.c")
+RUNTIME = {3: (*_COMMON, "fmi3.c", "fmi3_events.c", "fmi3_refused.c"), 2: (*_COMMON, "fmi2.c", "fmi2_refused.c")}
+_ORDER = {3: "FMI 3.0, 2.3, 3.2 and 4.2", 2: "FMI 2.0, 3.2.3 and 4.2.4"}
+
+# Longest function that is expanded: beyond, calls of shared functions keep the code small (compile time grows faster).
+_SCALAR_LIMIT = 20_000
+# Longest function of the rates that is put into every stage of the integrators: left alone, the compiler calls it.
+_INLINE_LIMIT = 300
+_INLINE = "static inline __attribute__((always_inline))"
+_STEP_DESCRIPTION = (
+    "Longest step of the explicit Runge-Kutta method of order 4 (integrator = 1); a communication step h, or what an "
+    "event leaves of it, takes ceil(h / internal_step) equal substeps, at least one"
+)
+_INTEGRATOR_DESCRIPTION = (
+    "Integrator of Co-Simulation. 1: explicit Runge-Kutta, order 4, fixed step; 2: explicit Runge-Kutta, order 5(4), "
+    "adaptive; 3: implicit (Rosenbrock), order 4(3), adaptive, for stiff models"
+)
+_TOLERANCE_DESCRIPTION = (
+    "Relative tolerance of the adaptive integrators; times a state's nominal value, its absolute one"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """A variable as the FMU has it: its value reference is an index into the table of variables.
+
+    Parameters
+    ----------
+    reference : int
+        Value reference.
+    kind : str
+        Which of time, fixed, tunable, input, state, discrete (state), derivative, output, (event) indicator it is.
+    variable : Variable
+        What is known of it; of time and of derivatives only name, unit, shape and description count.
+    name : str
+        Its name in the FMU: ``der(x)`` for the derivative of ``x``.
+    first : int
+        Index of its first element in the values of an instance.
+    of : int, optional
+        Of a derivative: reference of its state.
+    """
+
+    reference: int
+    kind: Kind
+    variable: Variable
+    name: str
+    first: int
+    of: int | None = None
+
+    @property
+    def is_output(self) -> bool:
+        """Whether it is an output, computed or a state."""
+        return self.variable.causality == "output" and self.kind in ("state", "discrete", "output")
+
+    @property
+    def last(self) -> int:
+        """One past the index of its last element."""
+        return self.first + self.variable.size
+
+
+def _rate(state: Variable) -> Variable:
+    unit = None if state.unit is None else rate_of(state.unit)
+    return Variable("der", shape=state.shape, unit=unit, description=f"Time derivative of {state.name}")
+
+
+def _settings(spec: ModelSpec) -> list[tuple[Kind, Variable, str]]:
+    """Give the parameters of the FMU's own integrator."""
+    step = Variable(
+        "v", "parameter", "tunable", description=_STEP_DESCRIPTION, start=spec.internal_step, unit="s", minimum=0.0
+    )
+    integrator = Variable(
+        *("v", "parameter", "fixed"), description=_INTEGRATOR_DESCRIPTION, start=INTEGRATORS[spec.integrator],
+        unit="1", minimum=1.0, maximum=3.0,
+    )  # fmt: skip
+    tolerance = Variable(
+        *("v", "parameter", "tunable"), description=_TOLERANCE_DESCRIPTION, start=spec.tolerance,
+        unit="1", minimum=1e-14, maximum=0.1,
+    )  # fmt: skip
+    return [
+        ("tunable", step, "internal_step"),
+        ("fixed", integrator, "integrator"),
+        ("tunable", tolerance, "tolerance"),
+    ]
+
+
+def _indicators(spec: ModelSpec) -> list[tuple[Kind, Variable, str]]:
+    about = "Event indicator"
+    return [
+        (
+            "indicator",
+            Variable("z", description=f"{about}: {e.description}" if e.description else about, nominal=e.nominal),
+            e.indicator,
+        )
+        for e in spec.events
+    ]
+
+
+def layout(spec: ModelSpec) -> tuple[Entry, ...]:
+    """Give every variable its value reference and its place among the values, in the order of ``model.h``."""
+    time = Variable("t", unit="s", description="Simulation time")
+    rows: list[tuple[Kind, Variable, str]] = [("time", time, "time")]
+    rows += [("tunable" if v.variability == "tunable" else "fixed", v, v.name) for v in spec.parameters]
+    rows += [("input", v, v.name) for v in spec.inputs]
+    rows += [("state", v, v.name) for v in spec.continuous]
+    rows += [("discrete", v, v.name) for v in spec.discrete]
+    rows += [("derivative", _rate(v), f"der({v.name})") for v in spec.continuous]
+    rows += [("output", v, v.name) for v in spec.outputs]
+    rows += _indicators(spec)
+    rows += _settings(spec)
+    entries: list[Entry] = []
+    first = 0
+    for reference, (kind, variable, name) in enumerate(rows):
+        of = reference - len(spec.states) if kind == "derivative" else None
+        entries.append(Entry(reference, kind, variable, name, first, of))
+        first += variable.size
+    return tuple(entries)
+
+
+def scalar(f: ca.Function) -> ca.Function:
+    """Expand ``f`` to scalar operations (three times as fast in C) where that is possible and not too long."""
+    if f.is_a("SXFunction"):
+        return f
+    try:
+        expanded = f.expand()
+    except RuntimeError:  # interpolation tables and the like have no scalar expansion
+        return f
+    return expanded if expanded.n_instructions() <= _SCALAR_LIMIT else f
+
+
+def symbolic(spec: ModelSpec) -> tuple[Any, Any]:
+    """Give all knowns (time, parameters, inputs, states) as one column; and derivatives, outputs, indicators of them.
+
+    SX where all functions have a scalar expansion, else MX. The unknowns are one column too.
+    """
+    sizes = [1, *(sum(v.size for v in group) for group in (spec.parameters, spec.inputs, spec.states))]
+    functions = [scalar(f) for f in (spec.derivative, spec.output, spec.indicators) if f is not None]
+    sx = all(f.is_a("SXFunction") for f in functions)
+    knowns = (ca.SX if sx else ca.MX).sym("knowns", sum(sizes))
+    t, p, u, x = ca.vertsplit(knowns, [0, *(sum(sizes[: i + 1]) for i in range(4))])
+    return knowns, ca.vertcat(*(_call(f, (t, x, u, p)) for f in functions))
+
+
+def _call(f: ca.Function, args: Sequence[Any]) -> Any:
+    shaped = [a if a.shape == f.size_in(i) else ca.reshape(a, *f.size_in(i)) for i, a in enumerate(args)]
+    out = f.call(shaped, True, False)[0]
+    return ca.densify(ca.reshape(out, f.numel_out(0), 1))
+
+
+def _plain(name: str, f: ca.Function) -> ca.Function:
+    """Write ``f`` under our own name, with a dense output (generated code leaves structural zeros unwritten)."""
+    f = scalar(f)
+    args = f.sx_in() if f.is_a("SXFunction") else f.mx_in()
+    return ca.Function(name, args, [_call(f, args)])
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """All functions to generate, and the places of the nonzeros of the Jacobian if there are derivatives."""
+
+    functions: list[ca.Function]
+    nonzeros: list[tuple[int, int]] | None = None
+
+
+def _equations(spec: ModelSpec) -> _Equations:
+    functions = [_plain("lw_derivative", spec.derivative), _plain("lw_output", spec.output)]
+    if spec.indicators is not None and spec.jump is not None:
+        functions += [_plain("lw_indicator", spec.indicators), _plain("lw_jump", spec.jump)]
+    try:
+        knowns, unknowns = symbolic(spec)
+        seed, adjoint = knowns.sym("seed", knowns.numel()), knowns.sym("adjoint", unknowns.numel())
+        forward = ca.densify(ca.jtimes(unknowns, knowns, seed))
+        reverse = ca.densify(ca.jtimes(unknowns, knowns, adjoint, True))
+        linear, nonzeros = _linear(spec)
+        derived = [
+            ca.Function("lw_forward", [knowns, seed], [forward]),
+            ca.Function("lw_reverse", [knowns, adjoint], [reverse]),
+            *linear,
+        ]
+    except (RuntimeError, NotImplementedError):  # an operation that CasADi can't differentiate
+        if spec.integrator == "rodas":
+            raise DefinitionError(
+                "its equations have no derivatives, which the integrator rodas needs. Choose rk4 or dopri5.",
+                block=spec.name,
+                port="integrator",
+            ) from None
+        return _Equations(functions)
+    return _Equations(functions + derived, nonzeros)
+
+
+def _linear(spec: ModelSpec) -> tuple[list[ca.Function], list[tuple[int, int]]]:
+    """Derive the derivatives by continuous states and time, and the indicators along a solution."""
+    f = scalar(spec.derivative)
+    kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
+    t, x, u, p = (kind.sym(name, f.numel_in(i)) for i, name in enumerate("txup"))
+    dx = _call(f, (t, x, u, p))
+    n = dx.numel()
+    jacobian = ca.jacobian(dx, x)[:, :n]
+    slope = ca.densify(ca.jtimes(dx, t, kind.ones(1)))
+    sparsity = jacobian.sparsity()
+    nonzeros = list(zip(*sparsity.get_triplet(), strict=True)) if sparsity.nnz() else []
+    functions = [ca.Function("lw_jacobian", [t, x, u, p], [jacobian, slope])]
+    if spec.indicators is not None:
+        f, g = scalar(spec.derivative), scalar(spec.indicators)
+        kind = ca.SX if f.is_a("SXFunction") and g.is_a("SXFunction") else ca.MX
+        t, x, u, p = (kind.sym(name, f.numel_in(i)) for i, name in enumerate("txup"))
+        z = _call(g, (t, x, u, p))
+        flow = ca.vertcat(kind.ones(1), _call(f, (t, x, u, p)), kind.zeros(x.numel() - n))
+        rate = ca.jtimes(z, t, flow[0]) + (ca.jtimes(z, x, flow[1:]) if x.numel() else 0)
+        functions.append(ca.Function("lw_crossing", [t, x, u, p], [ca.vertcat(z, ca.densify(rate))]))
+    return functions, nonzeros
+
+
+def _number(value: float | None, missing: str) -> str:
+    return missing if value is None else repr(float(value))
+
+
+def _table(entries: Iterable[Entry]) -> str:
+    rows = []
+    for e in entries:
+        low, high = _number(e.variable.minimum, "-INFINITY"), _number(e.variable.maximum, "INFINITY")
+        output = "true" if e.is_output else "false"
+        discrete = "true" if e.kind == "input" and e.variable.variability == "discrete" else "false"
+        about = f'"{e.name}", LW_{e.kind.upper()}, {output}, {discrete}, {e.first}, {e.variable.size}'
+        rows.append(f"    {{{about}, {low}, {high}}},")
+    return "static const lw_variable lw_variables[LW_N_VARIABLES] = {\n" + "\n".join(rows) + "\n};\n"
+
+
+def _starts(entries: Iterable[Entry]) -> str:
+    values = [v for e in entries for v in (e.variable.flat_start or [0.0] * e.variable.size)]
+    return _array("double", "lw_start_values", map(repr, values))
+
+
+def _array(of: str, name: str, values: Iterable[object]) -> str:
+    """Write an array, of at least one element (C has no empty ones)."""
+    texts = [str(v) for v in values] or ["0"]
+    lines = [", ".join(texts[i : i + 8]) for i in range(0, len(texts), 8)]
+    return f"static const {of} {name}[] = {{\n    " + ",\n    ".join(lines) + "\n};\n"
+
+
+def _tables(spec: ModelSpec, nonzeros: list[tuple[int, int]] | None) -> Iterable[str]:
+    """Write the nominal values of the continuous states, the events, and where the Jacobian is not zero."""
+    nominals = [1.0 if v.nominal is None else float(v.nominal) for v in spec.continuous for _ in range(v.size)]
+    yield _array("double", "lw_nominals", map(repr, nominals))
+    if spec.events:
+        rows = [f'{{"{e.name}", {DIRECTIONS[e.direction]}, {float(e.nominal)!r}}}' for e in spec.events]
+        yield _array("lw_event", "lw_events", rows)
+    if nonzeros is not None:
+        yield _array("int", "lw_jacobian_rows", (row for row, _ in nonzeros))
+        yield _array("int", "lw_jacobian_columns", (column for _, column in nonzeros))
+
+
+def _dimensions(spec: ModelSpec, token: str, equations: _Equations, n: int, fmi: int) -> str:
+    groups = {"P": spec.parameters, "U": spec.inputs, "X": spec.continuous, "D": spec.discrete, "Y": spec.outputs}
+    nonzeros = equations.nonzeros
+    lines = [f'#define LW_MODEL_NAME "{spec.name}"', f'#define LW_TOKEN "{token}"']
+    lines += [f'#define LW_API "fmi{fmi}"', f"#define LW_FMI {fmi}", f'#define LW_ORDER "{_ORDER[fmi]}"']
+    lines += [f"#define LW_N_{letter} {sum(v.size for v in group)}" for letter, group in groups.items()]
+    lines += [f"#define LW_N_Z {len(spec.events)}", f"#define LW_N_J {len(nonzeros or ())}"]
+    lines += [f"#define LW_N_VARIABLES {n}", f"#define LW_HAS_DERIVATIVES {int(nonzeros is not None)}"]
+    for what in ("arg", "res", "iw", "w"):
+        lines.append(f"#define LW_SZ_{what.upper()} {max(getattr(f, f'sz_{what}')() for f in equations.functions)}")
+    return "\n".join(lines) + "\n"
+
+
+def _generated(functions: Sequence[ca.Function]) -> str:
+    generator = ca.CodeGenerator("eq.c", {"with_export": False, "casadi_int": "long long int"})
+    for f in functions:
+        generator.add(f)
+    text: str = generator.dump()
+    rates = functions[0]
+    if rates.is_a("SXFunction") and rates.n_instructions() <= _INLINE_LIMIT:
+        for declared in ("static int casadi_f0(", f"int {rates.name()}("):
+            text = text.replace(f"\n{declared}", f"\n{_INLINE} int {declared.partition('int ')[2]}")
+    if missing := re.search(r"CASADI_MEM|_alloc_mem\(", text):
+        raise DefinitionError(
+            f"the equations need memory of their own ({missing[0]}), as solvers and external functions do. "
+            "Write them without."
+        )
+    return text
+
+
+def generate(spec: ModelSpec, token: str, fmi: int = 3) -> tuple[str, bool]:
+    """Write ``model.c``.
+
+    Parameters
+    ----------
+    spec : ModelSpec
+        The model.
+    token : str
+        Its instantiation token (FMI 3.0, 2.3.1).
+    fmi : {3, 2}
+        Version whose functions it has.
+
+    Returns
+    -------
+    text : str
+        The C text; it includes the files of `runtime`.
+    derivatives : bool
+        Whether it has directional and adjoint derivatives.
+    """
+    entries = layout(spec)
+    equations = _equations(spec)
+    parts = [
+        "/* Generated by Loopwright. */\n",
+        _dimensions(spec, token, equations, len(entries), fmi),
+        '#include "model.h"\n',
+        "/* The equations, written by CasADi. */\n" + _generated(equations.functions),
+        "#include <math.h>\n",
+        _table(entries),
+        _starts(entries),
+        *_tables(spec, equations.nonzeros),
+        "".join(f'#include "{name}"\n' for name in RUNTIME[fmi] if name.endswith(".c")),
+    ]
+    return "\n".join(parts), equations.nonzeros is not None
+
+
+@lru_cache(maxsize=2)
+def runtime(fmi: int = 3) -> dict[str, str]:
+    """Read the files of the C runtime for a version of FMI."""
+    folder = resources.files(__package__) / "runtime"
+    return {name: (folder / name).read_text(encoding="utf-8") for name in RUNTIME[fmi]}

@@ -1,0 +1,260 @@
+"""Find a C compiler and build a shared library with it.
+
+The ``ziglang`` package comes first: it is the same compiler on every machine and builds for all platforms from any of
+them. Flags are fixed, so that one source gives one binary.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform as _platform
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import platformdirs
+
+from ...blocks.core.errors import CompilerError, FmuError, near
+
+#: FMI 3.0 platform tuples (2.5.1.4) that can be built for, and zig's name of each with the oldest system:
+#: glibc 2.17, macOS 11. On Windows the C library is the system's own since version 10.
+TARGETS = {
+    "x86_64-linux": "x86_64-linux-gnu.2.17",
+    "aarch64-linux": "aarch64-linux-gnu.2.17",
+    "x86_64-windows": "x86_64-windows-gnu",
+    "x86_64-darwin": "x86_64-macos.11.0",
+    "aarch64-darwin": "aarch64-macos.11.0",
+}
+SUFFIXES = {"linux": ".so", "windows": ".dll", "darwin": ".dylib"}
+
+# -ffp-contract=off: no fused multiply-add, so that every platform and every compiler rounds alike.
+FLAGS = ("-O2", "-std=c11", "-shared", "-fvisibility=hidden", "-ffp-contract=off", "-g0", "-s")
+TIMEOUT = 600.0
+"""Seconds after which a compilation is given up; the first one on a machine takes some, a slow machine a minute."""
+
+_INSTALL = 'Install one: pip install "loopwright[build]" (it brings ziglang), or set LOOPWRIGHT_CC to a command line.'
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A compiler command.
+
+    Parameters
+    ----------
+    command : tuple of str
+        Command line up to the flags.
+    identity : str
+        What tells its version apart from another's; part of cache keys.
+    zig : bool
+        Whether it takes zig's ``-target``.
+    """
+
+    command: tuple[str, ...]
+    identity: str
+    zig: bool = False
+
+
+def native_platform() -> str:
+    """Name this machine's platform as FMI 3.0 does (2.5.1.4), such as ``x86_64-linux``."""
+    machine = _platform.machine().lower()
+    arch = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}.get(machine, machine)
+    system = {"linux": "linux", "windows": "windows", "darwin": "darwin"}.get(_platform.system().lower(), sys.platform)
+    return f"{arch}-{system}"
+
+
+def cache_folder() -> Path:
+    """Folder of everything that can be built again: LOOPWRIGHT_CACHE, else the user's cache folder."""
+    given = os.environ.get("LOOPWRIGHT_CACHE")
+    return Path(given).expanduser() if given else Path(platformdirs.user_cache_dir("loopwright", appauthor=False))
+
+
+def check_cache() -> Path:
+    """Return the cache folder, after making it and writing to it.
+
+    Raises
+    ------
+    FmuError
+        If it can't be written.
+    """
+    folder = cache_folder()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise FmuError(
+            f"can't write the cache folder {str(folder)!r}: {error}. Set LOOPWRIGHT_CACHE to a folder that can be "
+            "written."
+        ) from error
+    return folder
+
+
+def find_compiler() -> Compiler:
+    """Find the compiler to use: LOOPWRIGHT_CC, the ziglang package, else the system's cc, gcc or clang.
+
+    Raises
+    ------
+    CompilerError
+        If there is none; it says what to install.
+    """
+    if given := os.environ.get("LOOPWRIGHT_CC"):
+        command = tuple(shlex.split(given, posix=os.name != "nt"))
+        if not command or shutil.which(command[0]) is None:
+            raise CompilerError(f"LOOPWRIGHT_CC is {given!r}, but there is no such command. Correct it, or unset it.")
+        return Compiler(command, f"{given}\n{_version(command)}")
+    if (spec := importlib.util.find_spec("ziglang")) is not None and spec.origin is not None:
+        zig = Path(spec.origin).parent / ("zig.exe" if os.name == "nt" else "zig")
+        command = (str(zig), "cc") if zig.is_file() else (sys.executable, "-m", "ziglang", "cc")
+        return Compiler(command, f"ziglang {importlib.metadata.version('ziglang')}", zig=True)
+    for name in ("cc", "gcc", "clang"):
+        if (path := shutil.which(name)) is not None:
+            return Compiler((path,), f"{path}\n{_version((path,))}")
+    raise CompilerError(f"no C compiler was found: neither the ziglang package nor cc, gcc or clang. {_INSTALL}")
+
+
+@lru_cache(maxsize=8)
+def _version(command: tuple[str, ...]) -> str:
+    try:
+        done = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise CompilerError(f"the C compiler {shlex.join(command)} can't be run: {error}. {_INSTALL}") from error
+    return done.stdout + done.stderr
+
+
+def flags(compiler: Compiler, platform: str) -> tuple[str, ...]:
+    """All flags for a platform but sources, include folders and the output."""
+    target = ("-target", TARGETS[platform]) if compiler.zig else ()
+    pic = () if platform.endswith("windows") else ("-fPIC",)
+    return (*target, *FLAGS, *pic)
+
+
+def check_platform(compiler: Compiler, platform: str) -> None:
+    """Refuse a platform that can't be built for with this compiler."""
+    if platform not in TARGETS and (compiler.zig or platform != native_platform()):
+        raise CompilerError(f"there is no platform {platform!r}. {near(platform, TARGETS)}")
+    if not compiler.zig and platform != native_platform() and "LOOPWRIGHT_CC" not in os.environ:
+        raise CompilerError(
+            f"{compiler.command[0]} builds for {native_platform()} only, found platform {platform!r}. "
+            'Install the compiler for all platforms: pip install "loopwright[build]".'
+        )
+
+
+def compile_shared(
+    sources: Mapping[str, str],
+    out: Path,
+    *,
+    platform: str | None = None,
+    compiled: Sequence[str] | None = None,
+    include: Sequence[Path] = (),
+    compiler: Compiler | None = None,
+) -> None:
+    """Compile C sources into a shared library.
+
+    Parameters
+    ----------
+    sources : mapping of str to str
+        Text of each file, headers too, by name.
+    out : Path
+        The library to write. It appears at once, complete, or not at all.
+    platform : str, optional
+        FMI 3.0 platform tuple; native if not given.
+    compiled : sequence of str, optional
+        Which of ``sources`` to compile; if not given, all that end in ``.c``.
+    include : sequence of Path
+        Further folders of headers.
+    compiler : Compiler, optional
+        As `find_compiler` gives it.
+
+    Raises
+    ------
+    CompilerError
+        If there is no compiler, it does not come to an end, or it fails: then its own message is quoted.
+    FmuError
+        If the cache can't be written.
+    """
+    check_cache()  # zig tries for ever where it can't
+    compiler = compiler or find_compiler()
+    platform = platform or native_platform()
+    check_platform(compiler, platform)
+    names = [name for name in sources if name.endswith(".c")] if compiled is None else list(compiled)
+    out = Path(out)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".building-", dir=out.parent) as temporary:
+        folder = Path(temporary)
+        for name, text in sources.items():
+            (folder / name).write_text(text, encoding="utf-8", newline="\n")
+        library = out.name  # a relative name: it is written into some formats
+        math = () if platform.endswith("windows") else ("-lm",)
+        includes = [f"-I{path}" for path in include]
+        command = [*compiler.command, *flags(compiler, platform), "-I.", *includes, "-o", library, *names, *math]
+        _run(command, folder, platform)
+        if not (folder / library).is_file():
+            raise CompilerError(f"{shlex.join(command)} wrote no library. Check LOOPWRIGHT_CC.")
+        os.replace(folder / library, out)
+
+
+def _run(command: Sequence[str], folder: Path, platform: str) -> None:
+    environment = dict(os.environ)
+    zig = cache_folder() / "zig"
+    environment.setdefault("ZIG_GLOBAL_CACHE_DIR", str(zig))
+    environment.setdefault("ZIG_LOCAL_CACHE_DIR", str(zig))
+    code, output, errors = _wait(command, folder, environment)
+    if code:
+        lines = (errors.strip() or output.strip() or "(nothing)").splitlines()
+        said = "\n".join(lines if len(lines) <= 40 else [*lines[:20], "...", *lines[-20:]])  # the first error counts
+        raise CompilerError(
+            f"the C compiler failed for {platform} with exit code {code}. Its message:\n{said}\n"
+            f"The command was: {shlex.join(command)}\n"
+            "Check the model's equations, or try another compiler with LOOPWRIGHT_CC."
+        )
+
+
+def _wait(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, str, str]:
+    """Run a compiler to its end; it and what it started end with this call, whatever happens."""
+    group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
+    try:
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            **group,
+        )
+    except OSError as error:
+        raise CompilerError(f"the C compiler {command[0]} can't be run: {error}. {_INSTALL}") from error
+    with process:
+        try:
+            output, errors = process.communicate(timeout=TIMEOUT)
+        except BaseException as error:
+            _kill(process)
+            if isinstance(error, subprocess.TimeoutExpired):
+                raise CompilerError(
+                    f"the C compiler did not end within {TIMEOUT:g} s and was stopped. The command was: "
+                    f"{shlex.join(command)}\nRun it by hand, or try another compiler with LOOPWRIGHT_CC."
+                ) from error
+            raise
+    return process.returncode, output, errors
+
+
+def _kill(process: subprocess.Popen[str]) -> None:
+    """End a process and, where there are process groups, all that it started."""
+    with suppress(OSError):
+        if sys.platform != "win32":
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()

@@ -1,0 +1,272 @@
+"""From a block's equations to an FMU."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, cast
+
+import casadi as ca
+import numpy as np
+
+from ...blocks.core.block import Block
+from ...blocks.core.errors import DefinitionError, LoopwrightError
+from ...blocks.core.ports import Port, Shape
+from ...blocks.core.values import ParameterSpec
+from ...blocks.tracing.numpy_check import GUARDS, NEXT
+from ...blocks.tracing.symbols import size
+from ...blocks.tracing.trace import Traced, trace, traced_parameters
+from .build import build_fmu
+from .html_page import block_text
+from .model import Event, Integrator, ModelSpec, Variable
+
+_TINY = float(np.finfo(float).tiny)  # the least positive number that is not denormal
+
+
+def model_spec(
+    block: Block,
+    *,
+    name: str | None = None,
+    internal_step: float = 1e-3,
+    stop_time: float = 1.0,
+    step_size: float = 1e-3,
+    integrator: Integrator = "rk4",
+    tolerance: float = 1e-8,
+) -> ModelSpec:
+    """Return what an FMU of a continuous block consists of: its variables, and its equations as CasADi functions.
+
+    States that are outputs become output variables; the other outputs are computed. All parameters are symbols, so
+    that each can be set in the FMU.
+
+    Raises
+    ------
+    DefinitionError
+        If the block has no ``derivative``, or a port without a declared shape.
+    TraceError
+        If its equations can't be traced.
+    """
+    name = name or type(block).__name__.lower()
+    try:
+        return _model_spec(
+            block,
+            name,
+            internal_step=internal_step,
+            stop_time=stop_time,
+            step_size=step_size,
+            integrator=integrator,
+            tolerance=tolerance,
+        )
+    except LoopwrightError as error:
+        error.at(block=name)
+        raise
+
+
+def _model_spec(block: Block, name: str, **experiment: Any) -> ModelSpec:
+    _check_exportable(block, name)
+    shapes = {port: spec.shape or () for port, spec in block.inputs.items()}
+    equations = _Equations(block, trace(block, shapes, sampled=False, zeros=False))
+    traced = equations.traced
+    computed = [n for n in block.outputs if n not in block.states]
+    return ModelSpec(
+        name=name,
+        description=(type(block).__doc__ or name).strip().splitlines()[0],
+        inputs=tuple(
+            _variable(port, "input", shape=shapes[n], start=0.0 if port.default is None else port.default)
+            for n, port in block.inputs.items()
+        ),
+        outputs=tuple(_variable(block.outputs[n], "output", shape=traced.outputs[n]) for n in computed),
+        parameters=tuple(_parameter(block, n, v) for n, v in traced_parameters(block)),
+        states=tuple(_state(block, n, traced.states[n], shapes) for n in equations.order),
+        derivative=equations.derivative(),
+        output=equations.output(computed),
+        events=tuple(
+            Event(n, cast(Any, port.direction), port.description, port.nominal or 1.0)
+            for n, port in block.events.items()
+        ),
+        indicators=equations.indicators(),
+        jump=equations.jump(),
+        **experiment,
+    )
+
+
+class _Equations:
+    """A block's traced equations as functions of (t, x, u, p), with the discrete states behind the continuous ones."""
+
+    def __init__(self, block: Block, traced: Traced):
+        self.block, self.traced = block, traced
+        states = block.states
+        self.order = sorted(states, key=lambda n: states[n].discrete)
+        sizes = {n: size(shape) for n, shape in traced.states.items()}
+        first = dict(zip(sizes, itertools.accumulate(sizes.values(), initial=0), strict=False))
+        self._rows = [first[n] + i for n in self.order for i in range(sizes[n])]
+        self._n_continuous = sum(sizes[n] for n in self.order if not states[n].discrete)
+        f = traced.function
+        n_u = [f.numel_in(2 + i) for i in range(len(traced.inputs))]
+        self.t, self.x, self.u = ca.MX.sym("t"), ca.MX.sym("x", len(self._rows)), ca.MX.sym("u", sum(n_u))
+        self.p = ca.MX.sym("p", sum(np.size(v) for _, v in traced_parameters(block)))
+        columns = ca.vertsplit(self.u, [0, *itertools.accumulate(n_u)]) if n_u else []
+        x = self.x[[self._rows.index(i) for i in range(len(self._rows))]] if self._rows else self.x
+        # the sample time does not enter a continuous model
+        self._arguments = [self.t, x, *columns, ca.vertcat(self.p, 0.0)]
+        names = (*traced.outputs, NEXT, GUARDS)
+        self._made = dict(zip(names, f.call(self._arguments), strict=True))
+
+    def _function(self, name: str, result: Any, *more: Any) -> Any:
+        return ca.Function(name, [self.t, self.x, self.u, self.p, *more], [result])
+
+    def derivative(self) -> Any:
+        """Return the rates of the continuous states."""
+        return self._function("derivative", self._made[NEXT][self._rows[: self._n_continuous]])
+
+    def output(self, computed: list[str]) -> Any:
+        """Return the computed outputs, in one column."""
+        return self._function("output", ca.vertcat(*(self._made[n] for n in computed)))
+
+    def indicators(self) -> Any:
+        """Return the event indicators; None without events."""
+        f = self.traced.indicators
+        return None if f is None else self._function("indicators", f.call(self._arguments)[0])
+
+    def jump(self) -> Any:
+        """Return the states after an event; None without events."""
+        if self.traced.jump is None:
+            return None
+        fired = ca.MX.sym("fired", len(self.block.events))
+        after = self.traced.jump.call([*self._arguments, fired])[0]
+        return self._function("jump", after[self._rows], fired)
+
+
+def _state(block: Block, name: str, shape: Shape, shapes: dict[str, Shape]) -> Variable:
+    port = block.states[name]
+    return _variable(
+        port,
+        "output" if port.output else "local",
+        variability="discrete" if port.discrete else "continuous",
+        shape=shape,
+        state=True,
+        start=port.start_value(block, shapes),
+    )
+
+
+def build(
+    block: Block,
+    out: Path | str | None = None,
+    *,
+    name: str | None = None,
+    internal_step: float = 1e-3,
+    stop_time: float = 1.0,
+    step_size: float = 1e-3,
+    integrator: Integrator = "rk4",
+    tolerance: float = 1e-8,
+    fmi: int = 3,
+    arrays: bool = True,
+    platform: str | Iterable[str] | None = None,
+    documentation: str | None = None,
+    notify: Callable[[str], None] | None = None,
+) -> Path:
+    """Export a continuous block as an FMU and return the file.
+
+    The equations become C, compiled without Python inside; the build is cached by content.
+
+    Parameters
+    ----------
+    block : Block
+        A block with a ``derivative``; its parameter values become the FMU's start values.
+    out : path, optional
+        Where to put the file (or the folder for it); without it, the file in the cache is returned.
+    name : str, optional
+        The model's name; the class name in lower case without one.
+    internal_step : float
+        Start value, in s, of the FMU's parameter ``internal_step``: the longest step of its Runge-Kutta integrator
+        (order 4); the adaptive ones choose their own.
+    integrator : {"rk4", "dopri5", "rodas"}
+        Start value of the FMU's parameter ``integrator``, for co-simulation: explicit with a fixed step, explicit with
+        an adaptive one, or implicit for stiff models.
+    tolerance : float
+        Start value of the FMU's parameter ``tolerance``: relative error of a step of the adaptive integrators.
+    stop_time, step_size : float
+        Default experiment, s.
+    fmi : {3, 2}
+        FMI 3.0 or FMI 2.0.
+    arrays : bool
+        Whether vectors and matrices are arrays; else, and in FMI 2.0 always, each element is a variable: ``s[1]``.
+    platform : str or iterable of str, optional
+        FMI 3.0 platform tuples, such as ``"x86_64-linux"``, or ``"all"``; this machine's without one.
+    documentation : str, optional
+        Plain text for the FMU's page of documentation; the block's docstring and the source of its equations if not
+        given.
+    notify : callable, optional
+        Called with a line of text when a compilation starts.
+
+    Raises
+    ------
+    DefinitionError, TraceError
+        A block that can't be exported.
+    CompilerError
+        No compiler, or one that failed.
+    """
+    spec = model_spec(
+        block,
+        name=name,
+        internal_step=internal_step,
+        stop_time=stop_time,
+        step_size=step_size,
+        integrator=integrator,
+        tolerance=tolerance,
+    )
+    text = block_text(block) if documentation is None else documentation
+    return build_fmu(spec, out, fmi=fmi, arrays=arrays, platform=platform, documentation=text, notify=notify)
+
+
+def _check_exportable(block: Block, name: str) -> None:
+    """Refuse what an FMU would leave out without a word."""
+    if isinstance(block, type) or not isinstance(block, Block):
+        raise DefinitionError(f"found {block!r}; expected a block, such as Gantry().", block=name)
+    if not (hasattr(block, "derivative") or block.events):
+        raise DefinitionError(
+            "it has no derivative(t, x, u), so it is no continuous model; an FMU is made from one.", block=name
+        )
+    for what, why in (
+        ("guards", "an FMU has no guards"),
+        ("initial", "an FMU's states have start values, and none that are computed from its inputs"),
+    ):
+        if hasattr(block, what):
+            raise DefinitionError(f"it has {what}(…), but {why}. Export a block without.", block=name)
+    for port, spec in block.inputs.items():
+        if spec.shape is None:
+            raise DefinitionError("its shape is not declared; declare it with Input(shape=…).", block=name, port=port)
+    for port, declared in {**block.inputs, **block.outputs, **block.states}.items():
+        if isinstance(declared.unit, tuple):
+            raise DefinitionError(
+                f"its entries have units of their own, {', '.join(declared.unit)}; a variable of an FMU has one. Split "
+                "the port.",
+                block=name,
+                port=port,
+            )
+
+
+def _variable(port: Port, causality: Any, **more: Any) -> Variable:
+    unit = port.unit if isinstance(port.unit, str) else None
+    limits: dict[str, Any] = {"nominal": port.nominal, "minimum": port.minimum, "maximum": port.maximum}
+    return Variable(name=port.name, causality=causality, unit=unit, description=port.description, **limits, **more)
+
+
+def _parameter(block: Block, name: str, value: Any) -> Variable:
+    owner: Any = block
+    *outer, last = name.split(".")
+    for part in outer:
+        owner = owner.__dict__[part]
+    spec: ParameterSpec = type(owner).parameter_specs[last]
+    above = spec.above if spec.above is None else float(np.nextafter(spec.above, np.inf)) if spec.above else _TINY
+    return Variable(
+        name=name,
+        causality="parameter",
+        variability="tunable" if spec.tunable else "fixed",
+        shape=np.shape(value),
+        unit=spec.unit,
+        description=spec.description,
+        start=value,
+        minimum=spec.minimum if above is None else above,
+        maximum=spec.maximum,
+    )

@@ -1,0 +1,196 @@
+"""``documentation/index.html`` of an FMU: what it is, its equations, its variables. One file that needs no other."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import textwrap
+from collections.abc import Callable, Iterable, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.block import Block
+from .c_code import Entry, layout
+from .equation_text import equations, number
+from .model import ModelSpec, Variable
+from .scalars import scalarized
+
+_STYLE = """
+:root { color-scheme: light dark; }
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; }
+pre { white-space: pre-wrap; padding: 0.75rem 1rem; border: 1px solid #8886; border-radius: 0.3rem; }
+pre.text { border: 0; padding: 0; }
+table { border-collapse: collapse; width: 100%; }
+caption { text-align: left; padding-bottom: 0.5rem; }
+th, td { text-align: left; vertical-align: top; padding: 0.3rem 0.75rem 0.3rem 0; border-bottom: 1px solid #8886; }
+code, pre { font-family: ui-monospace, monospace; font-size: 0.9em; }
+"""
+_COLUMNS = ("Name", "Causality", "Variability", "Unit", "Start", "Min", "Max", "Description")
+_CAUSALITY = {"time": "independent", "fixed": "parameter", "tunable": "parameter", "input": "input"}
+_EQUATIONS = ("derivative", "output", "indicators", "jump")  # they may be inherited
+_MOST = 12  # numbers of a start value that are listed
+
+
+_GENERATED = re.compile(r"\n\n(?:Parameters|Inputs|Outputs|States|Events)\n-+\n")
+
+
+def block_text(block: Block) -> str:
+    """Give the text of a block's documentation: its docstrings, and the source of its equations where there is one."""
+    cls = type(block)
+    module = inspect.getmodule(cls)
+    about = module.__doc__ if module is not None and module.__name__ != "__main__" else None
+    # the first line is the model's description, and the sections on parameters and ports are the table's rows
+    written = _GENERATED.split(inspect.cleandoc(cls.__doc__ or ""), maxsplit=1)[0].partition("\n")[2]
+    parts = [written, inspect.cleandoc(about or "")]
+    inherited = {name: getattr(cls, name) for name in _EQUATIONS if getattr(cls, name, None) is not None}
+    for member in {**inherited, **vars(cls)}.values():
+        function = member.fget if isinstance(member, property) else member
+        if inspect.isfunction(function) and not function.__name__.startswith("_"):
+            parts.append(_source(function))
+    return "\n\n".join(part.strip() for part in parts if part.strip())
+
+
+def _source(function: Callable[..., Any]) -> str:
+    try:
+        return textwrap.dedent(inspect.getsource(function))
+    except (OSError, TypeError):  # typed at a prompt: there is no file to read
+        return ""
+
+
+def _names(variables: Iterable[Variable]) -> list[str]:
+    return [v.name for v in variables]
+
+
+def _equations(spec: ModelSpec) -> list[tuple[str, str]]:
+    """Give the printed equations, each group with its title; none if one group can't be printed."""
+    flat = scalarized(spec)
+    knowns = [["time"], _names(flat.states), _names(flat.inputs), _names(flat.parameters)]
+    events = [e.name for e in spec.events]
+    groups = [
+        ("Rates of the states", spec.derivative, knowns, [f"der({v.name})" for v in flat.continuous]),
+        ("Outputs", spec.output, knowns, _names(flat.outputs)),
+    ]
+    if spec.indicators is not None and spec.jump is not None:
+        fires = (
+            "Event indicators: an event fires where its indicator comes to be above 0 (rising), or no longer (falling)"
+        )
+        after = "States after an event; the name of an event is 1 where it fires, else 0"
+        groups.append((fires, spec.indicators, knowns, [e.indicator for e in spec.events]))
+        groups.append((after, spec.jump, [*knowns, events], [f"next({v.name})" for v in flat.states]))
+    found = []
+    for title, f, names, unknowns in groups:
+        if not unknowns:
+            continue
+        lines = equations(f, names, unknowns)
+        if not lines:
+            return []
+        kept = {f"next({v.name}) = {v.name}" for v in flat.states}  # a jump leaves them alone
+        found.append((title, "\n".join(line for line in lines if line not in kept)))
+    return found
+
+
+def _events(spec: ModelSpec) -> list[str]:
+    if not spec.events:
+        return []
+    head = "".join(f'<th scope="col">{name}</th>' for name in ("Name", "Direction", "Nominal", "Description"))
+    rows = []
+    for e in spec.events:
+        cells = "".join(f"<td>{escape(cell)}</td>" for cell in (e.direction, number(e.nominal), e.description))
+        rows.append(f'<tr><th scope="row"><code>{escape(e.name)}</code></th>{cells}</tr>')
+    return ["<table>", f"<thead><tr>{head}</tr></thead>", "<tbody>", *rows, "</tbody>", "</table>"]
+
+
+def _start(variable: Variable) -> str:
+    values = np.asarray(variable.flat_start)
+    if values.size > 1 and (values == values[0]).all():
+        return f"all {number(values[0])}"
+    more = ", …" if values.size > _MOST else ""
+    return ", ".join(number(v) for v in values[:_MOST]) + more
+
+
+def _least(minimum: float) -> str:
+    """Write a minimum; the least number above another, which stands for an open bound, as that bound."""
+    below = 0.0 if minimum == np.finfo(float).tiny else float(np.nextafter(minimum, -np.inf))
+    return f"> {number(below)}" if len(number(below)) < len(number(minimum)) else number(minimum)
+
+
+def _row(e: Entry) -> str:
+    v = e.variable
+    shape = f" ({' × '.join(map(str, v.shape))})" if v.shape else ""
+    cells = [
+        _CAUSALITY.get(e.kind, "output" if e.is_output else "local") + (", state" if e.kind == "state" else ""),
+        "continuous" if e.kind in ("time", "derivative") else v.variability,
+        v.unit or "",
+        _start(v),
+        "" if v.minimum is None else _least(v.minimum),
+        "" if v.maximum is None else number(v.maximum),
+        v.description,
+    ]
+    inner = "".join(f"<td>{escape(cell)}</td>" for cell in cells)
+    return f'<tr><th scope="row"><code>{escape(e.name)}</code>{escape(shape)}</th>{inner}</tr>'
+
+
+def _section(title: str, body: Sequence[str]) -> list[str]:
+    return [f"<h2>{escape(title)}</h2>", *body] if body else []
+
+
+def index_html(spec: ModelSpec, text: str = "", *, fmi: int = 3) -> str:
+    """Write ``documentation/index.html`` (FMI 3.0, 2.5.1; FMI 2.0, 2.3).
+
+    Parameters
+    ----------
+    spec : ModelSpec
+        The model, as it is exported: with arrays or without.
+    text : str
+        Plain text of the author, such as a docstring; shown as it is.
+    fmi : {3, 2}
+        Version of FMI.
+
+    Returns
+    -------
+    str
+        HTML 5 that refers to nothing outside.
+    """
+    rows = [_row(e) for e in layout(spec)]
+    head = "".join(f'<th scope="col">{name}</th>' for name in _COLUMNS)
+    note = "Arrays are listed row by row." if fmi == 3 else "Elements of arrays count from 1."
+    traced = _equations(spec)
+    if traced:
+        printed = [f"<p>{escape(title)}:</p>\n<pre>{escape(lines)}</pre>" for title, lines in traced]
+        printed.append("<p>As they are compiled; <code>where(c, a, b)</code> is a where c holds, else b.</p>")
+    else:
+        printed = ["<p>Too long to print, or with tables; <code>sources/model.c</code> has them.</p>"]
+    lines = [
+        "<!DOCTYPE html>",
+        '<html lang="en">',
+        "<head>",
+        '<meta charset="utf-8"/>',
+        '<meta name="viewport" content="width=device-width, initial-scale=1"/>',
+        f"<title>{escape(spec.name)}</title>",
+        f"<style>{_STYLE}</style>",
+        "</head>",
+        "<body>",
+        f"<h1>{escape(spec.name)}</h1>",
+        *([f"<p>{escape(spec.description)}</p>"] if spec.description else []),
+        f"<p>An FMU of FMI {fmi}.0. It needs no other software to run.</p>",
+        *_section("Description", [f'<pre class="text">{escape(text.strip())}</pre>'] if text.strip() else []),
+        *_section("Equations", printed),
+        *_section("Events", _events(spec)),
+        *_section(
+            "Variables",
+            [
+                "<table>",
+                f"<caption>{note}</caption>",
+                f"<thead><tr>{head}</tr></thead>",
+                "<tbody>",
+                *rows,
+                "</tbody>",
+                "</table>",
+            ],
+        ),
+        "</body>",
+        "</html>",
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,46 @@
+"""Scalars in place of arrays, for FMI 2.0 and for importers that read no arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from .model import ModelSpec, Variable
+
+
+def _elements(variable: Variable) -> Iterator[Variable]:
+    """Give each element, row by row: ``s[1]``, ``s[2]``; ``m[1,2]``: FMI counts from 1 (FMI 2.0, 2.2.9)."""
+    for index in np.ndindex(variable.shape):
+        start = None if variable.start is None else float(np.asarray(variable.start)[index])
+        element = replace(variable, shape=(), start=start)
+        # Past the check of names: an index is no part of a name that a user may give.
+        object.__setattr__(element, "name", f"{variable.name}[{','.join(str(i + 1) for i in index)}]")
+        yield element
+
+
+def _scalars(variables: Iterable[Variable]) -> tuple[Variable, ...]:
+    return tuple(e for v in variables for e in (_elements(v) if v.shape else (v,)))
+
+
+def scalarized(spec: ModelSpec) -> ModelSpec:
+    """Give the same model with every array replaced by its elements; the flat vectors, and so the equations, stay.
+
+    Parameters
+    ----------
+    spec : ModelSpec
+        The model.
+
+    Returns
+    -------
+    ModelSpec
+        The model, all variables of shape ``()``.
+    """
+    return replace(
+        spec,
+        inputs=_scalars(spec.inputs),
+        outputs=_scalars(spec.outputs),
+        parameters=_scalars(spec.parameters),
+        states=_scalars(spec.states),
+    )

@@ -1,0 +1,152 @@
+"""``modelDescription.xml`` of an FMI 2.0 FMU: all variables are scalars of type Real.
+
+A function of the model alone, as that of FMI 3.0: no time stamp, no random identifier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+from .c_code import Entry, layout
+from .model import ModelSpec
+from .quantities import type_names
+from .xml_fmi3 import (
+    _CAUSALITY,
+    _INITIAL,
+    LOG_CATEGORIES,
+    Dependency,
+    _element,
+    _reinitialized,
+    _types,
+    _units_and_types,
+    dependencies,
+    package_version,
+)
+
+
+def _variable(e: Entry, reinitialized: set[str], types: Mapping[str, str]) -> str:
+    v = e.variable
+    about = {
+        "name": e.name,
+        "valueReference": e.reference,
+        "description": v.description or None,
+        "causality": _CAUSALITY.get(e.kind, "output" if e.is_output else "local"),
+        "variability": "continuous" if e.kind in ("time", "derivative") else v.variability,
+        "initial": _INITIAL.get(e.kind),
+    }
+    real = {
+        "declaredType": types.get(v.unit or ""),
+        "unit": v.unit,
+        "min": None if v.minimum is None else float(v.minimum),
+        "max": None if v.maximum is None else float(v.maximum),
+        "nominal": None if v.nominal is None else float(v.nominal),
+        "start": v.flat_start[0] if v.flat_start else None,
+        "derivative": None if e.of is None else _index(e.of),
+        "reinit": True if e.kind == "state" and e.name in reinitialized else None,
+    }
+    return _element("ScalarVariable", about, [_element("Real", real)])
+
+
+def _index(reference: int) -> int:
+    """Give the index of a variable, which FMI 2.0 counts from 1: value references follow the order of the variables."""
+    return reference + 1
+
+
+def _unknowns(
+    tag: str,
+    chosen: Iterable[Entry],
+    found: dict[int, tuple[Dependency, ...]],
+    kind: Callable[[Dependency], str | None],
+) -> list[str]:
+    rows = []
+    for e in chosen:
+        items = [(_index(d.known), k) for d in found[e.reference] if (k := kind(d)) is not None]
+        attributes = {
+            "index": _index(e.reference),
+            "dependencies": " ".join(str(i) for i, _ in items),
+            "dependenciesKind": " ".join(k for _, k in items),
+        }
+        rows.append(_element("Unknown", attributes))
+    return [_element(tag, {}, rows)] if rows else []
+
+
+def _structure(spec: ModelSpec, entries: tuple[Entry, ...]) -> list[str]:
+    """Write the model structure (FMI 2.0, 2.2.8).
+
+    Knowns of outputs and derivatives are inputs, continuous states and time alone; initial unknowns are those of
+    FMI 3.0, and of the kinds of dependency only "constant" and "dependent" are theirs.
+    """
+    found = dependencies(spec)
+    knowns = {e.reference for e in entries if e.kind in ("time", "input", "state")}
+
+    def running(d: Dependency) -> str | None:
+        return d.kind if d.known in knowns else None
+
+    def initial(d: Dependency) -> str:
+        return d.kind if d.kind == "constant" else "dependent"
+
+    return [
+        *_unknowns("Outputs", [e for e in entries if e.is_output], found, running),
+        *_unknowns("Derivatives", [e for e in entries if e.kind == "derivative"], found, running),
+        *_unknowns("InitialUnknowns", [e for e in entries if e.kind in ("derivative", "output")], found, initial),
+    ]
+
+
+def model_description2(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
+    """Write ``modelDescription.xml`` (FMI 2.0, 2.2).
+
+    Parameters
+    ----------
+    spec : ModelSpec
+        The model, without arrays (`_scalars.scalarized`).
+    token : str
+        Its GUID.
+    derivatives : bool
+        Whether the binary has directional derivatives.
+    """
+    entries = layout(spec)
+    root = {
+        "fmiVersion": "2.0",
+        "modelName": spec.name,
+        "guid": token,
+        "description": spec.description or None,
+        "generationTool": f"Loopwright {package_version()}",
+        "variableNamingConvention": "structured",
+        "numberOfEventIndicators": len(spec.events),
+    }
+    both: dict[str, object] = {
+        "modelIdentifier": spec.name,
+        "canNotUseMemoryManagementFunctions": True,
+        "canGetAndSetFMUstate": True,
+        "canSerializeFMUstate": True,
+        "providesDirectionalDerivative": derivatives,
+    }
+    stepping = {
+        "canHandleVariableCommunicationStepSize": True,
+        "canInterpolateInputs": True,
+        "maxOutputDerivativeOrder": 0,
+        "canRunAsynchronuously": False,
+    }
+    sources = _element("SourceFiles", {}, [_element("File", {"name": "model.c"})])
+    types = type_names(entries)
+    simple = [_element("SimpleType", {"name": about.pop("name")}, [_element("Real", about)]) for about in _types(types)]
+    categories = LOG_CATEGORIES | {"logAll": "All of them"}
+    experiment = {
+        "startTime": 0.0,
+        "stopTime": float(spec.stop_time),
+        "tolerance": float(spec.tolerance),
+        "stepSize": float(spec.step_size),
+    }
+    reinitialized = _reinitialized(spec)
+    children = [
+        _element("ModelExchange", both | {"completedIntegratorStepNotNeeded": True}, [sources]),
+        _element("CoSimulation", both | stepping, [sources]),
+        *_units_and_types(types, simple),
+        _element(
+            "LogCategories", {}, [_element("Category", {"name": n, "description": d}) for n, d in categories.items()]
+        ),
+        _element("DefaultExperiment", experiment),
+        _element("ModelVariables", {}, [_variable(e, reinitialized, types) for e in entries]),
+        _element("ModelStructure", {}, _structure(spec, entries)),
+    ]
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"

@@ -1,0 +1,310 @@
+"""The two XML files of an FMI 3.0 FMU: ``modelDescription.xml`` and ``sources/buildDescription.xml``.
+
+Both are functions of the model alone: no time stamp, no random identifier.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import itertools
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import casadi as ca
+
+from ...blocks.core.units import BASE_UNITS, parse_unit
+from .c_code import Entry, layout, scalar, symbolic
+from .model import ModelSpec
+from .quantities import quantity, type_names
+
+#: Log categories (FMI 3.0, 2.4.5) that the runtime uses.
+LOG_CATEGORIES = {
+    "logStatusWarning": "Warnings",
+    "logStatusError": "Errors: what was found, what was expected, and what to do",
+}
+# Operations with a derivative of zero almost everywhere: behind them, a constant derivative is no linear equation.
+_STEP_LIKE = {ca.OP_FLOOR, ca.OP_CEIL, ca.OP_SIGN, ca.OP_COPYSIGN, ca.OP_FMOD, ca.OP_REMAINDER, ca.OP_IF_ELSE_ZERO}
+_STEP_LIKE |= {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR}
+
+
+@lru_cache(maxsize=1)
+def package_version() -> str:
+    """Version of this package, ``0`` where it is not installed."""
+    try:
+        return importlib.metadata.version("loopwright")
+    except importlib.metadata.PackageNotFoundError:
+        return "0"
+
+
+@dataclass(frozen=True)
+class Dependency:
+    """That an unknown depends on a known (FMI 3.0, 2.4.8).
+
+    Parameters
+    ----------
+    known : int
+        Value reference.
+    kind : str
+        FMI's dependenciesKind: constant, fixed, tunable or dependent.
+    """
+
+    known: int
+    kind: str
+
+
+def _element(tag: str, attributes: Mapping[str, object], children: Iterable[str] = ()) -> str:
+    text = "".join(f" {name}={quoteattr(_text(value))}" for name, value in attributes.items() if value is not None)
+    inner = [f"  {line}" for child in children for line in child.splitlines()]
+    return "\n".join([f"<{tag}{text}>", *inner, f"</{tag}>"]) if inner else f"<{tag}{text}/>"
+
+
+def _text(value: object) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value) if isinstance(value, float) else str(value)
+
+
+# ---- dependencies, from the traced sparsity ----
+
+
+def _pairs(sparsity: Any) -> list[tuple[int, int]]:
+    return list(zip(*sparsity.get_triplet(), strict=True)) if sparsity.nnz() else []
+
+
+def _entry_at(entries: tuple[Entry, ...]) -> list[Entry]:
+    return [e for e in entries for _ in range(e.variable.size)]
+
+
+def _second_order(knowns: Any, unknowns: Any) -> dict[tuple[int, int], set[int]] | None:
+    """For each element (unknown, known) of the Jacobian, which knowns it depends on; None if it can't be said."""
+    try:
+        f = ca.Function("f", [knowns], [unknowns]).expand()
+    except RuntimeError:  # interpolation tables and the like have no scalar expansion
+        return None
+    if any(f.instruction_id(k) in _STEP_LIKE for k in range(f.n_instructions())):
+        return None
+    v = f.sx_in(0)
+    jacobian = ca.jacobian(f(v), v)
+    elements = ca.sparsity_cast(jacobian, ca.Sparsity.dense(jacobian.nnz(), 1))
+    found: dict[tuple[int, int], set[int]] = {pair: set() for pair in _pairs(jacobian.sparsity())}
+    order = list(found)
+    for row, known in _pairs(ca.Function("elements", [v], [elements]).jac_sparsity(0, 0)):
+        found[order[row]].add(known)
+    return found
+
+
+def _kind(of: Iterable[set[int] | None], at: list[Entry]) -> str:
+    """Say how a known enters, from what the elements of its Jacobian depend on (None: not known)."""
+    kinds: set[str] = set()
+    for elements in of:
+        if elements is None:
+            return "dependent"
+        kinds |= {at[i].kind for i in elements}
+    if kinds - {"fixed", "tunable", "discrete"}:
+        return "dependent"
+    return next((kind for kind in ("discrete", "tunable", "fixed") if kind in kinds), "constant")
+
+
+def dependencies(spec: ModelSpec) -> dict[int, tuple[Dependency, ...]]:
+    """Find what each output, derivative and event indicator depends on, among time, parameters, inputs and states.
+
+    Parameters
+    ----------
+    spec : ModelSpec
+        The model.
+
+    Returns
+    -------
+    dict
+        By value reference of the unknown: its dependencies, in the order of value references.
+    """
+    entries = layout(spec)
+    at = _entry_at(entries)
+    knowns, unknowns = symbolic(spec)
+    calculated = ("derivative", "output", "indicator")
+    first = next((e.first for e in entries if e.kind in calculated), 0)
+    second = _second_order(knowns, unknowns)
+    blocks: dict[tuple[int, int], list[set[int] | None]] = {}
+    for row, column in _pairs(ca.Function("f", [knowns], [unknowns]).jac_sparsity(0, 0)):
+        pair = (at[first + row].reference, at[column].reference)
+        blocks.setdefault(pair, []).append(None if second is None else second.get((row, column)))
+    found: dict[int, list[Dependency]] = {e.reference: [] for e in entries if e.kind in calculated}
+    for unknown, known in sorted(blocks):
+        found[unknown].append(Dependency(known, _kind(blocks[unknown, known], at)))
+    for e in entries:
+        if e.kind == "state" and e.is_output:  # it is its own known
+            found[e.reference] = [Dependency(e.reference, "constant")]
+        if e.kind == "discrete" and e.is_output:  # it changes between two iterations of an event alone
+            found[e.reference] = []
+    return {reference: tuple(items) for reference, items in found.items()}
+
+
+def _unknown(tag: str, reference: int, items: Iterable[Dependency]) -> str:
+    items = list(items)
+    attributes = {
+        "valueReference": reference,
+        "dependencies": " ".join(str(d.known) for d in items),
+        "dependenciesKind": " ".join(d.kind for d in items),
+    }
+    return _element(tag, attributes)
+
+
+def _structure(spec: ModelSpec, entries: tuple[Entry, ...]) -> list[str]:
+    """Write the model structure (FMI 3.0, 2.4.8).
+
+    Outputs, derivatives and event indicators list the knowns that can change between events or communication points;
+    fixed parameters and discrete states are frozen then. Initial unknowns are computed outputs and derivatives; states
+    have initial = exact and are knowns.
+    """
+    found = dependencies(spec)
+    frozen = {e.reference for e in entries if e.kind in ("fixed", "discrete")}
+    rows = []
+    for tag, chosen in (
+        ("Output", [e for e in entries if e.is_output]),
+        ("ContinuousStateDerivative", [e for e in entries if e.kind == "derivative"]),
+    ):
+        rows += [_unknown(tag, e.reference, [d for d in found[e.reference] if d.known not in frozen]) for e in chosen]
+    for e in entries:
+        if e.kind in ("derivative", "output"):
+            items = [Dependency(d.known, d.kind if d.kind == "constant" else "dependent") for d in found[e.reference]]
+            rows.append(_unknown("InitialUnknown", e.reference, items))
+    for e in entries:
+        if e.kind == "indicator":
+            items = [d for d in found[e.reference] if d.known not in frozen]
+            rows.append(_unknown("EventIndicator", e.reference, items))
+    return rows
+
+
+def _reinitialized(spec: ModelSpec) -> set[str]:
+    """Name the continuous states that a jump may change (FMI 3.0, 2.4.7.4: reinit)."""
+    if spec.jump is None:
+        return set()
+    jump = scalar(spec.jump)
+    if not jump.is_a("SXFunction"):
+        return {v.name for v in spec.continuous}
+    args = jump.sx_in()
+    after = ca.densify(ca.reshape(jump.call(args, True, False)[0], jump.numel_out(0), 1))
+    changed = [not ca.is_equal(after[i], args[1][i], 2) for i in range(after.numel())]
+    offsets = [0, *itertools.accumulate(v.size for v in spec.continuous)]
+    return {v.name for v, first in zip(spec.continuous, offsets, strict=False) if any(changed[first : first + v.size])}
+
+
+# ---- variables and units ----
+
+_CAUSALITY = {"time": "independent", "fixed": "parameter", "tunable": "parameter", "input": "input"}
+_INITIAL = dict.fromkeys(("fixed", "tunable", "state", "discrete"), "exact")
+_INITIAL |= dict.fromkeys(("derivative", "output", "indicator"), "calculated")
+
+
+def _variable(e: Entry, reinitialized: set[str], types: Mapping[str, str]) -> str:
+    v = e.variable
+    attributes: dict[str, object] = {
+        "name": e.name,
+        "valueReference": e.reference,
+        "description": v.description or None,
+        "causality": _CAUSALITY.get(e.kind, "output" if e.is_output else "local"),
+        "variability": "continuous" if e.kind in ("time", "derivative") else v.variability,
+        "initial": _INITIAL.get(e.kind),
+        "intermediateUpdate": True if (e.kind == "input" or e.is_output) and v.variability == "continuous" else None,
+        "declaredType": types.get(v.unit or ""),
+        "unit": v.unit,
+        "min": None if v.minimum is None else float(v.minimum),
+        "max": None if v.maximum is None else float(v.maximum),
+        "nominal": None if v.nominal is None else float(v.nominal),
+        "start": " ".join(map(repr, v.flat_start)) or None,
+        "derivative": e.of,
+        "reinit": True if e.kind == "state" and e.name in reinitialized else None,
+    }
+    return _element("Float64", attributes, [_element("Dimension", {"start": n}) for n in v.shape])
+
+
+def _unit(text: str) -> str:
+    unit = parse_unit(text)
+    base: dict[str, object] = {name: n for name, n in zip(BASE_UNITS, unit.exponents, strict=True) if n}
+    if unit.factor != 1:
+        base["factor"] = unit.factor
+    if unit.offset:
+        base["offset"] = unit.offset
+    return _element("Unit", {"name": text}, [_element("BaseUnit", base)])
+
+
+def _types(types: Mapping[str, str]) -> list[dict[str, object]]:
+    """Give the attributes of each type."""
+    return [{"name": name, "quantity": quantity(unit), "unit": unit} for unit, name in types.items()]
+
+
+def _units_and_types(units: Iterable[str], types: Iterable[str]) -> list[str]:
+    """Write both lists of definitions; a model without units has neither."""
+    lists = (("UnitDefinitions", [_unit(unit) for unit in units]), ("TypeDefinitions", list(types)))
+    return [_element(tag, {}, items) for tag, items in lists if items]
+
+
+# ---- the files ----
+
+
+def model_description(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
+    """Write ``modelDescription.xml`` (FMI 3.0, 2.4).
+
+    Parameters
+    ----------
+    spec : ModelSpec
+        The model.
+    token : str
+        Its instantiation token.
+    derivatives : bool
+        Whether the binary has directional and adjoint derivatives.
+    """
+    entries = layout(spec)
+    root = {
+        "fmiVersion": "3.0",
+        "modelName": spec.name,
+        "instantiationToken": token,
+        "description": spec.description or None,
+        "generationTool": f"Loopwright {package_version()}",
+        "variableNamingConvention": "structured",
+    }
+    both: dict[str, object] = {
+        "modelIdentifier": spec.name,
+        "canGetAndSetFMUState": True,
+        "canSerializeFMUState": True,
+        "providesDirectionalDerivatives": derivatives,
+        "providesAdjointDerivatives": derivatives,
+    }
+    stepping = {
+        "canHandleVariableCommunicationStepSize": True,
+        "maxOutputDerivativeOrder": 0,
+        "providesIntermediateUpdate": True,
+        "mightReturnEarlyFromDoStep": bool(spec.events),
+        "canReturnEarlyAfterIntermediateUpdate": True,
+        "hasEventMode": bool(spec.events),
+    }
+    experiment = {
+        "startTime": 0.0,
+        "stopTime": float(spec.stop_time),
+        "tolerance": float(spec.tolerance),
+        "stepSize": float(spec.step_size),
+    }
+    reinitialized = _reinitialized(spec)
+    types = type_names(entries)
+    categories = [_element("Category", {"name": n, "description": d}) for n, d in LOG_CATEGORIES.items()]
+    children = [
+        _element("ModelExchange", both | {"needsCompletedIntegratorStep": False}),
+        _element("CoSimulation", both | stepping),
+        *_units_and_types(types, [_element("Float64Type", about) for about in _types(types)]),
+        _element("LogCategories", {}, categories),
+        _element("DefaultExperiment", experiment),
+        _element("ModelVariables", {}, [_variable(e, reinitialized, types) for e in entries]),
+        _element("ModelStructure", {}, _structure(spec, entries)),
+    ]
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + _element("fmiModelDescription", root, children) + "\n"
+
+
+def build_description(spec: ModelSpec) -> str:
+    """Write ``sources/buildDescription.xml`` (FMI 3.0, 2.5.1.3): the one file to compile."""
+    files = _element("SourceFileSet", {"language": "C11"}, [_element("SourceFile", {"name": "model.c"})])
+    configuration = _element("BuildConfiguration", {"modelIdentifier": spec.name}, [files])
+    root = _element("fmiBuildDescription", {"fmiVersion": "3.0"}, [configuration])
+    return f'<?xml version="1.0" encoding="UTF-8"?>\n{root}\n'
