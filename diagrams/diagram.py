@@ -18,7 +18,7 @@ from .results.run import Run
 from .wiring.check import Checked, check
 from .wiring.delay_blocks import lowered
 from .wiring.evaluation_order import evaluation_order
-from .wiring.structure import Collector, Frame, Structure, Wire
+from .wiring.structure import Collector, Frame, Structure, Wire, stepped_blocks
 from .wiring.subsystem import exact_time
 from .wiring.variants import replaced, unique
 
@@ -215,7 +215,7 @@ class Diagram(Analysis):
     @property
     def has_fmu(self) -> bool:
         """Whether an FMU is in it."""
-        return any(hasattr(block, "instantiate") for block in self._table.blocks.values())
+        return bool(stepped_blocks(self._table))
 
     def flatten(self, step: float | Fraction | None = None) -> FlatDiagram:
         """Return the diagram as one CasADi function of a tick.

@@ -95,6 +95,12 @@ class Block(Value, Wireable):
     """Name of a scalar output that ends the run, normally, at the first instant at which it is above 0.5."""
     transport: ClassVar[bool] = False
     """True where, in continuous time, the output ``y`` is the input ``u`` a time ``delay`` ago, kept by the solver."""
+    stepped: ClassVar[bool] = False
+    """True where a run steps it from one tick to the next, as it does an FMU.
+
+    Instead of equations it has ``instantiate(wired, stop_time, start_time=t)``, a context manager: ``wired`` names the
+    inputs that the run sets, times are in s. It yields a plant, with the methods of the simulation's ``Plant``.
+    """
 
     inputs: ClassVar[Mapping[str, Input]] = {}
     outputs: ClassVar[Mapping[str, Output | State]] = {}
@@ -139,6 +145,11 @@ class Block(Value, Wireable):
     def label(self) -> str:
         """Name for messages and for numbering: the given one, else the class name in snake case."""
         return self.name or self._hint or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(self).__name__).lower()
+
+    @property
+    def drawn_as(self) -> str:
+        """Kind of the block as a drawing names it: its class."""
+        return type(self).__name__
 
     @property
     def starts_from_inputs(self) -> bool:

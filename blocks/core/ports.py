@@ -62,7 +62,7 @@ class Port:
         return f"{type(self).__name__}({self.name}, shape={self.shape}{unit})"
 
 
-_TAKEN = frozenset({"name", "inputs", "outputs", "states", "events", "replace", "parameters"})
+_TAKEN = frozenset({"name", "inputs", "outputs", "states", "events", "replace", "parameters", "stepped", "drawn_as"})
 
 
 def check_port_names(cls: type) -> None:

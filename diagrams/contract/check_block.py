@@ -169,7 +169,7 @@ class _Findings:
         """Check the block in a frame of one kind; return the error with which it refuses to stand there."""
         exercise, kind, checks = self.exercise, frame_text(sampled), self.checks
         block = exercise.block
-        if block.transport or hasattr(block, "instantiate"):
+        if block.transport or block.stepped:
             self.run(sampled)
             return None
         rng = np.random.default_rng([exercise.seed, 20140])

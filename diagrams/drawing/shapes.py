@@ -8,7 +8,7 @@ from html import escape
 
 INK, GREY, WIRE, BORDER = "#1f2933", "#66727f", "#33475b", "#8a9bab"
 NAME, PLANT = "#0b5394", "#fff3dc"
-"""Colours: of names of wires, of FMUs."""
+"""Colours: of names of wires, of blocks that are stepped, such as FMUs."""
 
 _NARROW, _WIDE = set("iljtfrI.,:;'|!()[]- "), set("mwMW@%")
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ...blocks.core.errors import OptionError, near
 from ...blocks.library.algebra import Sum
-from ..wiring.structure import Structure, Wire
+from ..wiring.structure import Structure, Wire, stepped_blocks
 from .layout import Net, arrange
 from .order import Node
 from .shapes import BORDER, GREY, INK, NAME, PLANT, WIRE, line, rect, seconds, text_at, width
@@ -218,9 +218,7 @@ class _Picture:
             node.ins[name] = HEADER / 2
 
     def _has_plant(self, path: str) -> bool:
-        return any(
-            hasattr(b, "instantiate") for p, b in self.table.blocks.items() if p == path or p.startswith(path + ".")
-        )
+        return bool(stepped_blocks(self.table, path))
 
     def _name(self, item: str, pin: str) -> str:
         """Return the names of a wire as written where it begins, in a frame."""
@@ -284,12 +282,8 @@ class _Picture:
         return node
 
     def _titles(self, path: str) -> tuple[str, str]:
-        block = self.table.blocks[path]
-        kind = type(block).__name__
-        if hasattr(block, "instantiate"):
-            kind = f"FMU {Path(str(block.file)).name}"
-            kind = kind if len(kind) < 36 else kind[:33] + "…"
-        return path.rpartition(".")[2], kind
+        kind = self.table.blocks[path].drawn_as
+        return path.rpartition(".")[2], kind if len(kind) < 36 else kind[:33] + "…"
 
     def _header(self, path: str) -> str:
         frame = self.table.frames[path]
@@ -339,7 +333,7 @@ class _Picture:
         path, x, y, w, h = node.key, node.x, node.y, node.width, node.height
         block = self.table.blocks[path]
         title, kind = self._titles(path)
-        plant = hasattr(block, "instantiate")
+        plant = block.stepped
         middle = x + w / 2
         out = [f"<g><title>{escape(path)}: {escape(kind)}</title>"]
         if isinstance(block, Sum):

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...blocks.core.errors import FmuError, LoopwrightError, OptionError
 from ..flat.flat_diagram import FlatDiagram
-from ..wiring.structure import join
+from ..wiring.structure import join, stepped_blocks
 from .identification import identified
 from .operating_point import OperatingPoint
 
@@ -49,7 +49,7 @@ class PlantModel:
 
 def plants(flat: FlatDiagram) -> list[str]:
     """Return the paths of the FMUs."""
-    return [p for p in sorted(flat.table.blocks) if hasattr(flat.table.blocks[p], "instantiate")]
+    return list(stepped_blocks(flat.table))
 
 
 def entries(flat: FlatDiagram, path: str) -> tuple[list[int], list[int], list[int]]:

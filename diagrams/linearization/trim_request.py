@@ -225,7 +225,7 @@ def free_parameters(diagram: Diagram, asked: Mapping[str, Any]) -> tuple[list[Fr
         low, high = _declared(block, keys, low, high)
         start = np.clip(np.ravel(np.asarray(value, dtype=float)), low, high)
         free = Free(f"{path}.{'.'.join(keys)}", path, keys, block, start, low, high, np.shape(value))
-        if not hasattr(block, "instantiate"):
+        if not block.stepped:
             start = np.where(start == 0.0, _away(low, high), start)
             free.start = start
             moved[free.name] = free.shaped(start)
@@ -268,7 +268,7 @@ def _value(block: Any, keys: list[str]) -> Any:
     value = block.__dict__[keys[0]]
     if len(keys) > 1 and isinstance(value, Value):
         return _value(value, keys[1:])
-    if len(keys) > 1 and hasattr(block, "instantiate") and keys[0] == "start":
+    if len(keys) > 1 and block.stepped and keys[0] == "start":
         name, variables = ".".join(keys[1:]), block.description.variables
         if name not in variables:
             raise UnknownNameError(f"the FMU has no variable {name!r}. {near(name, variables)}", block=block.label)

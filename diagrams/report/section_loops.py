@@ -63,7 +63,7 @@ def wires_on_loops(case: Case) -> dict[str, str]:
         driving = {
             f"{w.block}.{w.port}"
             for (block, _), w in table.wires.items()
-            if w.block in inside and hasattr(table.blocks[block], "instantiate")
+            if w.block in inside and table.blocks[block].stepped
         }
         names = {path: path for path in sorted(driving or sources)[:4]}
     ends = [name.rpartition(".")[2] for name in names]

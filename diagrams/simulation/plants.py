@@ -1,33 +1,87 @@
-"""The FMUs of a run: loaded, and bound to the vectors."""
+"""The plants of a run: loaded, and bound to the vectors. A plant is stepped from outside, as an FMU is."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from typing import Any, Protocol
 
 import numpy as np
 
 from ...blocks.core.errors import LoopwrightError, SimulationError
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.layout import Layout
+from ..wiring.structure import stepped_blocks
 from .workspace import Machine
 
 
+class Plant(Protocol):
+    """A stepped block in a run, as its ``instantiate`` yields it: `bind`, `exchange`, `begin`, then each `step`."""
+
+    @property
+    def messages(self) -> Sequence[str]:
+        """Messages of the run so far."""
+
+    @property
+    def failed(self) -> bool:
+        """Whether its last call failed, so that neither its outputs nor its state can be used."""
+
+    def bind(self, inputs: np.ndarray, outputs: np.ndarray) -> None:
+        """Take the vectors that it shares with the run: (n,) of wired inputs to read, (m,) of outputs to write."""
+
+    @property
+    def exchange(self) -> Callable[[], None]:
+        """Read the inputs and write the outputs that follow from them at the start, before `begin`."""
+
+    def begin(self) -> None:
+        """Write the outputs with which the run begins."""
+
+    @property
+    def step(self) -> Callable[[float, float], None]:
+        """``step(t, h)``: read the inputs, go from t to t + h (both in s), write the outputs there."""
+
+    def operating_point(self) -> dict[str, Any]:
+        """Return its time ``t`` in s, ``state`` and ``inputs`` by name."""
+
+    @property
+    def can_serialize(self) -> bool:
+        """Whether `serialize` works."""
+
+    def serialize(self) -> bytes:
+        """Return its complete state."""
+
+    def deserialize(self, data: bytes) -> Any:
+        """Make a state, for `restore`, from what `serialize` has returned."""
+
+    def restore(self, state: Any) -> None:
+        """Go to a state, and write the outputs there."""
+
+
+class Stepped(Protocol):
+    """A block whose class says ``stepped = True``."""
+
+    def instantiate(
+        self, wired: Sequence[str], stop_time: float | None, *, start_time: float
+    ) -> AbstractContextManager[Plant]:
+        """Load the plant for a run; see `loopwright.blocks.Block`."""
+
+
 def has_plants(flat: FlatDiagram) -> bool:
-    """Whether an FMU is in a diagram."""
-    return bool(_plants(flat))
+    """Whether a plant is in a diagram."""
+    return bool(stepped_blocks(flat.table))
 
 
-def loaded(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) -> Iterator[tuple[str, Any]]:
-    """Yield the FMUs by path, each as soon as it is loaded; ``stack`` unloads them.
+def loaded(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) -> Iterator[tuple[str, Plant]]:
+    """Yield the plants by path, each as soon as it is loaded; ``stack`` unloads them.
 
     They are told no end of the run: it may be gone on from, and an FMU may keep to the end that it was told.
     """
-    for path, block in _plants(flat).items():
+    for path, block in stepped_blocks(flat.table).items():
+        made: Any = block
+        stepped: Stepped = made
         try:
             wired = [port for port in block.inputs if (path, port) in flat.table.wires]
-            yield path, stack.enter_context(block.instantiate(wired, None, start_time=start_time))
+            yield path, stack.enter_context(stepped.instantiate(wired, None, start_time=start_time))
         except SimulationError as error:
             error.at(block=path, t=0.0)
             raise
@@ -36,17 +90,12 @@ def loaded(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) -> Iter
             raise
 
 
-def bind(machine: Machine, plants: Iterable[tuple[str, Any]]) -> None:
-    """Let the FMUs read their inputs from z and write their outputs to w."""
+def bind(machine: Machine, plants: Iterable[tuple[str, Plant]]) -> None:
+    """Let the plants read their inputs from z and write their outputs to w."""
     flat = machine.flat
     for path, plant in plants:
         inputs = _part(flat, flat.plant_inputs, path, machine.z)
         plant.bind(inputs, _part(flat, flat.plant_outputs, path, machine.here.w))
-
-
-def _plants(flat: FlatDiagram) -> dict[str, Any]:
-    table = flat.table
-    return {p: table.blocks[p] for p in sorted(table.blocks) if table.stepped(p) and not table.blocks[p].transport}
 
 
 def _part(flat: FlatDiagram, layout: Layout, path: str, vector: np.ndarray) -> np.ndarray:

@@ -134,7 +134,7 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[Port, Shape
             heapq.heappush(ready, path)
         path = heapq.heappop(ready)
         block = table.blocks[path]
-        if table.stepped(path):
+        if not table.is_traced(path):
             if not block.transport:
                 continue
             found = {"y": _input_shapes(table, shapes, path, assumed)["u"]}
@@ -209,7 +209,7 @@ def _check_boxes(table: Structure, traced: dict[str, Traced], shapes: dict[Port,
     for path in sorted(table.blocks):
         gates = table.gates(table.frame_of[path])
         if gates and path not in traced:
-            what = "a transport delay" if table.blocks[path].transport else "an FMU"
+            what = "a transport delay" if table.blocks[path].transport else "a block that is stepped, such as an FMU,"
             raise WiringError(
                 f"{what} can't stand in a box that is {table.frames[gates[-1]].control} ({gates[-1]}): it goes on in "
                 "time whatever the box does. Put it outside, and wire its outputs in.",

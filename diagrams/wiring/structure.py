@@ -111,14 +111,28 @@ class Structure:
         """Whether a box is enabled or triggered in continuous time, by an event, and not at ticks."""
         return box in self.controls and self.rate(box) is None and not self.sampled(box.rpartition(".")[0])
 
-    def stepped(self, path: str) -> bool:
-        """Whether a run steps a block instead of evaluating it: an FMU, or a transport delay in continuous time."""
+    def is_traced(self, path: str) -> bool:
+        """Whether a run evaluates a block's equations: it is not stepped, and no transport delay in continuous time."""
         block = self.blocks[path]
-        return hasattr(block, "instantiate") or (block.transport and not self.sampled(self.frame_of[path]))
+        return not block.stepped and (not block.transport or self.sampled(self.frame_of[path]))
 
     def sampled(self, frame: str) -> bool:
         """Whether blocks in a frame act at instants only: ticks, or those of a trigger."""
         return self.rate(frame) is not None or self.triggered(frame) is not None
+
+
+def stepped_blocks(table: Structure, inside: str = "") -> dict[str, Block]:
+    """Return the blocks that a run steps from outside, such as FMUs, by path in alphabetical order.
+
+    Parameters
+    ----------
+    table : Structure
+        The diagram's table.
+    inside : str
+        Path of a block or a subsystem: only what it is, or holds; all without it.
+    """
+    paths = [p for p, b in table.blocks.items() if b.stepped and (not inside or f"{p}.".startswith(f"{inside}."))]
+    return {path: table.blocks[path] for path in sorted(paths)}
 
 
 @dataclass(frozen=True, eq=False)

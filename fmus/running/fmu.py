@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ class Fmu(Block):
     """
 
     opaque = True
+    stepped = True
     file: str | os.PathLike[str] = parameter(kw_only=False, description="path of the .fmu")
     start: Mapping[str, Any] = parameter(
         default={}, description="start values of parameters, states and inputs, by the FMU's names"
@@ -145,6 +147,11 @@ class Fmu(Block):
     def label(self) -> str:
         """Name for messages: the given one, else ``fmu``."""
         return self.name or self._hint or "fmu"
+
+    @property
+    def drawn_as(self) -> str:
+        """Kind of the block as a drawing names it: its file."""
+        return f"FMU {Path(self.file).name}"
 
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]

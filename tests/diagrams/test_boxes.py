@@ -303,7 +303,10 @@ def test_an_fmu_in_an_enabled_box_is_refused():
     def box():
         return ball.height
 
-    with pytest.raises(WiringError, match=r"box\.ball: an FMU can't stand in a box that is enabled \(box\)"):
+    with pytest.raises(
+        WiringError,
+        match=r"box\.ball: a block that is stepped, such as an FMU, can't stand in a box that is enabled \(box\)",
+    ):
         Diagram("d", box(enable=Constant(value=1.0)))
 
 

@@ -297,21 +297,6 @@ def test_a_loop_whose_solution_ends_is_told_as_such(solver):
     assert caught.value.t == pytest.approx(2 / math.sqrt(27), abs=0.02)
 
 
-# --- FMUs ---------------------------------------------------------------------------------------------------------------
-
-
-def test_an_fmu_takes_steps_of_one_length_beside_continuous_blocks(spring):
-    """The difference of two times, each rounded, is not always the same; some FMUs refuse any other step."""
-    diagram = Diagram("d", Fmu(spring, name="m")(force=0.0), Integrator(name="i")(ONE))
-    widths = []
-    with diagram.simulation(step=0.1) as simulation:
-        plant = simulation._plants[0][1]
-        step = plant.step
-        plant.step = lambda t, h: (widths.append(h), step(t, h))
-        simulation.advance(2.0)
-    assert widths == [0.1] * 20
-
-
 # --- a run in the making ------------------------------------------------------------------------------------------------
 
 
