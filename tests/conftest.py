@@ -7,8 +7,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, an
 
 import pytest
 
-import oracle
 from loopwright.diagrams import experiments
+from support import oracle
 
 
 @pytest.fixture(scope="session")

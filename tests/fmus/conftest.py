@@ -2,9 +2,9 @@
 
 import pytest
 
-from exported import Instance, mass_spring_damper, pendulums
-from exported2 import Instance2
 from loopwright.fmus.export.build import build_fmu
+from support.exported import Instance, mass_spring_damper, pendulums
+from support.exported2 import Instance2
 
 
 @pytest.fixture(scope="session", autouse=True)

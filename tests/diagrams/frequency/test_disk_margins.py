@@ -1,0 +1,242 @@
+"""Disk margins of one and of several channels, and sensitivities: closed forms, SciPy, and perturbations that destabilize."""
+
+import control
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from loopwright.blocks import ConfirmationError, ParameterError
+from loopwright.diagrams import (
+    complementary,
+    delayed_hold,
+    delayed_hold_margin,
+    disk_margin,
+    gang_of_four,
+    loop_at,
+    margins,
+    mimo_disk_margin,
+    sensitivity,
+)
+from loopwright.diagrams.frequency import disk as disk
+from support.loops import sampled_triple, triple
+
+RANDOM = settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
+SATELLITE = control.ss([[0, 10], [-10, 0]], np.eye(2), [[1, 10], [-10, 1]], 0)  # Doyle's spinning body, unit feedback
+
+
+@pytest.mark.parametrize(("skew", "alpha"), [(0.0, 1.2), (1.0, 1.0), (-1.0, 7 / 9)])
+def test_the_triple_pole_has_its_closed_form_for_each_skew(skew, alpha):
+    found = disk_margin(triple(20.0), skew=skew)
+    assert found.alpha.value == pytest.approx(alpha, rel=1e-9)
+    assert found.destabilizing_alpha == pytest.approx(alpha, rel=1e-9)
+
+
+def test_gains_and_phase_of_the_symmetric_disk_are_those_of_its_definition():
+    found = disk_margin(triple(20.0))
+    assert (found.gain_low, found.gain_high) == pytest.approx((0.8 / 3.2, 3.2 / 0.8), rel=1e-9)
+    assert found.phase_deg == pytest.approx(2 * np.degrees(np.arctan(1.2 / 2)), rel=1e-9)
+
+
+@pytest.mark.parametrize("skew", [-1.0, -0.5, 0.0, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("alpha", [0.3, 0.9, 1.05, 1.2, 1.9])
+def test_gain_and_phase_of_a_disk_are_the_first_points_of_its_boundary(alpha, skew):
+    boundary = disk.factor(alpha * np.exp(1j * np.linspace(0, 2 * np.pi, 200_001)), skew)
+    boundary = boundary[np.abs(boundary) < 1e6]
+    low, high, phase = disk.disk_gains(alpha, skew)
+    real = boundary.real[(np.abs(boundary.imag) < 1e-3) & (boundary.real > 0)]
+    if np.isfinite(high):
+        assert high == pytest.approx(min(real[real > 1]), rel=2e-3)
+    else:
+        assert not len(real[real > 1])
+    if low > 0:
+        assert low == pytest.approx(max(real[real < 1]), rel=5e-3)
+    circle = np.degrees(np.abs(np.angle(boundary[np.abs(np.abs(boundary) - 1) < 1e-3])))
+    if phase < 180:
+        assert phase == pytest.approx(circle.min(), abs=0.3)
+    else:
+        assert not len(circle)
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_the_smallest_perturbation_puts_a_pole_on_the_limit(delay):
+    loop = sampled_triple(40.0) * (control.ss(0, 1, 1, 0, 1e-3) if delay else 1)
+    found = disk_margin(sampled_triple(40.0), delay=delay)
+    (f,) = found.destabilizing
+    poles = np.linalg.eigvals(loop.A - f * loop.B @ loop.C)
+    assert np.abs(poles).max() == pytest.approx(1.0, abs=1e-9)
+    # every factor in a slightly smaller disk leaves it stable
+    for angle in np.linspace(0, 2 * np.pi, 90):
+        f = disk.factor(0.99 * found.alpha.value * np.exp(1j * angle))
+        assert np.abs(np.linalg.eigvals(loop.A - f * loop.B @ loop.C)).max() < 1
+
+
+def test_the_spinning_body_has_small_margins_although_each_channel_alone_has_large_ones():
+    found = mimo_disk_margin(SATELLITE)
+    # L(0) = -I + J/10 with J² = -I: S - 1/2 = -10 J - 1/2 has μ² = 100 + 1/4; the peak is beside it, at 0.05 rad/s
+    assert found.alpha.value == pytest.approx(1 / np.sqrt(100.25), rel=3e-3)
+    assert found.destabilizing_alpha == pytest.approx(found.alpha.value, rel=1e-6)
+    closed = SATELLITE.A - SATELLITE.B @ np.diag(found.destabilizing) @ SATELLITE.C
+    assert np.linalg.eigvals(closed).real.max() == pytest.approx(0.0, abs=1e-6)
+    one = control.ss(SATELLITE.A - SATELLITE.B[:, 1:] @ SATELLITE.C[1:], SATELLITE.B[:, :1], SATELLITE.C[:1], 0)
+    assert disk_margin(one).alpha.value == pytest.approx(2.0, rel=1e-6)  # L = 1/s: no limit in either direction
+    both = mimo_disk_margin(loop_at(SATELLITE, control.ss([], [], [], np.eye(2)), "both"))
+    assert both.alpha.value < found.alpha.value / 1.9  # at plant input and output at once
+    assert both.destabilizing_alpha == pytest.approx(both.alpha.value, rel=1e-4)
+
+
+def test_two_loops_that_do_not_meet_have_the_margin_of_the_worse_one():
+    together = mimo_disk_margin(control.append(sampled_triple(20.0), sampled_triple(40.0)))
+    worse = disk_margin(sampled_triple(40.0))
+    assert together.alpha.value == pytest.approx(worse.alpha.value, rel=1e-9)
+
+
+def test_the_margin_at_both_ends_of_one_channel_is_smaller_than_at_one():
+    plant, controller = control.ss(control.tf([1.0], [1, 1, 0])), control.ss([], [], [], 2.0)
+    one = mimo_disk_margin(loop_at(plant, controller, "input")).alpha.value
+    both = mimo_disk_margin(loop_at(plant, controller, "both"))
+    assert both.alpha.value < one
+    assert both.destabilizing_alpha == pytest.approx(both.alpha.value, rel=1e-6)
+
+
+complex_entries = st.tuples(st.floats(-3, 3), st.floats(-3, 3)).map(lambda v: complex(*v))
+
+
+@RANDOM
+@given(st.lists(complex_entries, min_size=4, max_size=4))
+def test_the_closed_form_for_two_channels_is_what_scaling_by_scipy_finds(entries):
+    M = np.array(entries).reshape(2, 2)
+
+    def scaled(x):
+        d = np.array([np.exp(x[0]), 1.0])
+        return np.linalg.svd(d[:, None] * M / d, compute_uv=False)[0]
+
+    found = min(minimize(scaled, [x0], method="Nelder-Mead", options={"xatol": 1e-12, "fatol": 1e-14, "maxiter": 4000}).fun for x0 in (-3, 0, 3))  # fmt: skip
+    assert disk.mu_bound(M) <= found * (1 + 1e-9) + 1e-12
+    if min(abs(M[0, 1]), abs(M[1, 0])) > 1e-3:  # else the best scaling is at infinity
+        assert disk.mu_bound(M) == pytest.approx(found, rel=1e-6)
+
+
+@RANDOM
+@given(st.lists(complex_entries, min_size=4, max_size=4))
+def test_the_bound_is_exact_for_two_channels(entries):
+    M = np.array(entries).reshape(2, 2)
+    bound = disk.mu_bound(M)
+    if bound > 1e-3:
+        lower, delta = disk.mu_lower(M)
+        assert lower == pytest.approx(bound, rel=1e-5)
+        assert abs(np.linalg.det(np.eye(2) - M @ np.diag(delta))) < 1e-6 * max(1, bound)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_three_channels_lie_between_a_perturbation_and_any_scaling(seed):
+    rng = np.random.default_rng(seed)
+    M = rng.normal(size=(3, 3)) + 1j * rng.normal(size=(3, 3))
+    bound, (lower, _) = disk.mu_bound(M), disk.mu_lower(M)
+    assert lower <= bound * (1 + 1e-9) + 1e-12
+    assert bound <= np.linalg.norm(M, 2) * (1 + 1e-12) + 1e-12
+    assert lower == pytest.approx(bound, rel=1e-5)  # exact up to three channels
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_nothing_destabilizes_where_nothing_is_fed_back(n):
+    assert disk.mu_bound(np.zeros((n, n))) == disk.mu_lower(np.zeros((n, n)))[0] == 0.0
+    nilpotent = np.diag(np.ones(n - 1), 1)
+    assert disk.mu_bound(nilpotent) < 1e-3  # the scaling that makes it vanish is infinite
+    assert disk.mu_lower(nilpotent)[0] == 0.0
+
+
+def test_an_unstable_loop_has_no_disk_margin():
+    with pytest.raises(ParameterError, match="2 poles of 3 that are not stable"):
+        disk_margin(0.1 * triple(20.0))
+
+
+def test_a_bound_that_is_wrong_is_an_error(monkeypatch):
+    monkeypatch.setattr(disk, "mu_bound", lambda M, **_: 1.02 * np.linalg.norm(M, 2))
+    with pytest.raises(ConfirmationError, match="smallest destabilizing perturbation"):
+        mimo_disk_margin(SATELLITE)
+
+
+# --- sensitivities and the delayed hold ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dt", [0, 0.1])
+def test_the_gang_of_four_is_what_the_matrices_say(dt):
+    rng = np.random.default_rng(1)
+    P = control.ss(
+        -np.eye(3) * 0.3, rng.normal(size=(3, 2)), rng.normal(size=(2, 3)), rng.normal(size=(2, 2)) * 0.2, dt
+    )
+    C = control.ss(
+        -np.eye(2) * 0.1, rng.normal(size=(2, 2)), rng.normal(size=(2, 2)), rng.normal(size=(2, 2)) * 0.2, dt
+    )
+    four = gang_of_four(P, C)
+    s = np.exp(0.7j) if dt else 0.7j
+    p, c = P(s), C(s)
+    S = np.linalg.inv(np.eye(2) + p @ c)
+    for found, wanted in [(four.S, S), (four.PS, S @ p), (four.CS, c @ S), (four.T, S @ p @ c)]:
+        assert found(s) == pytest.approx(wanted, rel=1e-12)
+        assert found.dt == dt
+        assert found.nstates == 5
+    assert sensitivity(P * C)(s) + complementary(P * C)(s) == pytest.approx(np.eye(2), abs=1e-12)
+
+
+def test_a_singular_loop_has_no_sensitivity():
+    with pytest.raises(ParameterError, match="algebraic loop"):
+        sensitivity(control.ss(-1, 1, 1, -1))
+
+
+def controller(p, T):
+    return control.ss(1.0, [[T, 0.0]], p**3, [[3 * p**2, 3 * p]], T)
+
+
+AXIS = control.ss([[0, 1], [0, 0]], [[0], [1]], np.eye(2), 0)
+
+
+@pytest.mark.parametrize("fraction", [0.0, 0.25, 1.0, 2.6])
+def test_the_delayed_hold_is_what_simulation_between_the_ticks_gives(fraction):
+    T, rng = 0.05, np.random.default_rng(0)
+    plant = control.ss([[0, 1], [-9, -0.4]], [[0], [1]], np.eye(2), 0)
+    u = rng.normal(size=30)
+    model = delayed_hold(plant, T, fraction * T)
+    x = np.zeros((model.nstates, 1))
+    found = []
+    for k in range(30):
+        found.append((model.C @ x)[:, 0])
+        x = model.A @ x + model.B * u[k]
+    parts = 20  # fine holds of T/20, on which these delays are whole
+    fine = control.sample_system(plant, T / parts, "zoh")
+    held = np.concatenate([np.zeros(round(fraction * parts)), np.repeat(u, parts)])
+    y, seen = np.zeros((2, 1)), []
+    for k in range(30 * parts):
+        if k % parts == 0:
+            seen.append(y[:, 0])
+        y = fine.A @ y + fine.B * held[k]
+    assert np.array(found) == pytest.approx(np.array(seen), abs=1e-12)
+
+
+def test_whole_samples_of_delayed_hold_are_the_delay_of_the_loop():
+    p, T = 20.0, 1e-3
+    for n in (0, 1, 4):
+        late = margins(controller(p, T) * delayed_hold(AXIS, T, n * T))
+        assert late.phase_margin_deg.value == pytest.approx(margins(sampled_triple(p), delay=n).phase_margin_deg.value, abs=1e-8)  # fmt: skip
+
+
+def test_a_delay_between_the_ticks_is_borne_a_little_differently_than_the_response_says():
+    p, T = 20.0, 1e-3
+    exact = delayed_hold_margin(AXIS, controller(p, T))
+    read = margins(sampled_triple(p, T)).delay_margin_s
+    assert exact.value == pytest.approx(read.value, rel=1e-3)
+    assert exact.value != pytest.approx(read.value, rel=1e-5)
+    for factor, stable in ((0.999, True), (1.001, False)):
+        loop = controller(p, T) * delayed_hold(AXIS, T, factor * exact.value)
+        assert (np.abs(np.linalg.eigvals(loop.A - loop.B @ loop.C)).max() < 1) == stable
+
+
+def test_a_plant_that_can_not_be_held_is_refused():
+    with pytest.raises(ParameterError, match="without direct feedthrough"):
+        delayed_hold(control.ss(-1, 1, 1, 1), 1e-3)
+    with pytest.raises(ParameterError, match="expected T > 0"):
+        delayed_hold(AXIS, 1e-3, -1.0)
+    with pytest.raises(ParameterError, match="without any delay"):
+        delayed_hold_margin(AXIS, -1.0 * controller(20.0, 1e-3))

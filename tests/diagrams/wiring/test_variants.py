@@ -1,0 +1,218 @@
+"""One definition, ideal and sampled: ``continuous()``, ``sampled()``, and a box's options replaced."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from loopwright.blocks import (
+    AlgebraicLoopError,
+    Block,
+    Circle,
+    Clock,
+    Constant,
+    Delay,
+    EdgeDetector,
+    Function,
+    Gain,
+    Integrator,
+    ParameterError,
+    PathProjection,
+    SampleTimeError,
+    SimulationError,
+    Sine,
+    State,
+    StateSpace,
+    Step,
+    Sum,
+    TransportDelay,
+    UnitDelay,
+)
+from loopwright.diagrams import Diagram, experiments, subsystem
+from support.hybrid_blocks import TIGHT, Ball, Lag, counting
+
+A = np.array([[0.0, 1.0], [-9.0, -0.6]])
+B = np.array([0.0, 9.0])
+
+
+def drive(sample_time=0.02, **options):
+    """Return a PI controller, sampled, around a damped oscillator."""
+    plant = StateSpace(A=A, B=B, C=np.array([1.0, 0.0]), D=0.0, name="plant")
+
+    @subsystem(sample_time=sample_time, **options)
+    def control(e):
+        return Gain(gain=0.2, name="kp")(e) + Gain(gain=0.8, name="ki")(Integrator(name="i")(e))
+
+    return Diagram("drive", plant(control(Step(times=0.1, values=1.0) - plant.y)))
+
+
+def ideal(t):
+    """Return the plant's output with the ideal controller, from the matrix exponential; the step comes at 0.1 s."""
+    closed = np.array([[0, 1, 0, 0], [-9 - 9 * 0.2, -0.6, 9 * 0.8, 9 * 0.2], [-1, 0, 0, 1], [0, 0, 0, 0.0]])
+    return np.array([(expm(closed * max(s - 0.1, 0)) @ [0, 0, 0, 1])[0] for s in t])
+
+
+def test_continuous_is_the_ideal_controller():
+    run = drive().continuous().simulate(3.0, step=0.05, **TIGHT)
+    assert np.max(np.abs(run["plant.y"] - ideal(run.t))) < 1e-11
+
+
+def test_the_sampled_controller_tends_to_the_ideal_one():
+    errors = []
+    for T in (0.02, 0.01, 0.005):
+        run = drive(T).simulate(3.0, step=0.005, rtol=1e-10, atol=1e-12, progress=False)
+        errors.append(np.max(np.abs(run["plant.y"] - ideal(run.t))))
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(1.0, abs=0.15)
+    assert np.log2(errors[1] / errors[2]) == pytest.approx(1.0, abs=0.15)
+
+
+def test_continuous_takes_away_offsets_and_computational_delays():
+    run = drive(0.02, offset=0.01, delay=3).continuous().simulate(3.0, step=0.05, **TIGHT)
+    assert np.max(np.abs(run["plant.y"] - ideal(run.t))) < 1e-11
+
+
+def test_sampled_is_the_exact_hold_of_linear_blocks():
+    """All of it at one rate: the plant's zero-order hold and the integrator's, closed by hand."""
+    run = drive().sampled(0.02).simulate(3.0, progress=False)
+    assert len(run.t) == 151
+    phi = expm(np.block([[A, B[:, None]], [np.zeros((1, 3))]]) * 0.02)
+    x, z, y = np.zeros(2), 0.0, []
+    for k in range(151):
+        y.append(x[0])
+        e = (k >= 5) - x[0]
+        u = 0.2 * e + 0.8 * z
+        x, z = phi[:2, :2] @ x + phi[:2, 2] * u, z + 0.02 * e
+    assert np.max(np.abs(run["plant.y"] - y)) < 1e-13
+
+
+@pytest.mark.parametrize(
+    ("method", "growth"),
+    [("exact", np.exp(-0.5)), ("forward", 0.5), ("trapezoidal", (1 - 0.25) / (1 + 0.25))],
+)
+def test_sampled_discretizes_by_the_method_that_is_asked_for(method, growth):
+    run = (
+        Diagram("d", Lag(name="lag", k=5.0, start=1.0)(Constant(value=0.0)))
+        .sampled(0.1, method=method)
+        .simulate(1.0, progress=False)
+    )
+    assert np.max(np.abs(run["lag.y"] - growth ** np.arange(11))) < 1e-14
+
+
+@pytest.mark.parametrize(("method", "order"), [("forward", 1), ("semi_implicit", 1), ("trapezoidal", 2)])
+def test_a_method_for_blocks_that_are_not_linear_has_its_order(method, order):
+    """ẏ = −y³, y(0) = 1: y = 1/√(1 + 2 t)."""
+
+    class Cubic(Block):
+        y = State(output=True, start=1.0)
+
+        def derivative(self, t, x, u):
+            return -(x.y**3)
+
+    errors, n = [], (50, 100, 200)
+    for steps in n:
+        run = Diagram("d", Cubic(name="cubic")).sampled(2.0 / steps, method=method).simulate(2.0, progress=False)
+        errors.append(abs(run["cubic.y"][-1] - 1 / np.sqrt(5.0)))
+    assert -np.polyfit(np.log(n), np.log(errors), 1)[0] == pytest.approx(order, abs=0.2)
+
+
+def test_sampled_leaves_boxes_with_a_rate_of_their_own_alone():
+    diagram = Diagram("d", counting(0.3, "slow")().named("n"), Lag(name="lag")(Constant(value=1.0))).sampled(0.1)
+    run = diagram.simulate(0.9, progress=False)
+    assert run["n"].tolist() == [1, 1, 1, 2, 2, 2, 3, 3, 3, 4]
+    assert np.max(np.abs(run["lag.y"] - (1 - np.exp(-run.t)))) < 1e-15
+
+
+def test_there_and_back():
+    diagram = drive()
+    again = diagram.continuous().sampled(0.02)
+    assert again.frames["control"].sample_time is None
+    assert np.array_equal(
+        again.simulate(1.0, progress=False)["plant.y"], diagram.sampled(0.02).simulate(1.0, progress=False)["plant.y"]
+    )
+
+
+def test_variants_change_neither_the_diagram_nor_each_other():
+    diagram = drive()
+    before = diagram.simulate(0.5, progress=False).data
+    diagram.continuous()
+    diagram.sampled(0.1, method="forward")
+    assert np.array_equal(diagram.simulate(0.5, progress=False).data, before)
+
+
+def test_a_transport_delay_becomes_one_by_samples():
+    late = TransportDelay(delay=0.3, name="late")
+    i = Integrator(name="i")
+    diagram = Diagram("d", i(1.0 - late(i.y)))
+    run = diagram.sampled(0.1).simulate(2.0, progress=False)
+    y = [0.0]
+    for k in range(20):
+        y.append(y[-1] + 0.1 * (1 - (y[k - 3] if k >= 3 else 0.0)))
+    assert np.max(np.abs(run["i.y"] - y)) < 1e-14
+
+
+@pytest.mark.parametrize("block", [UnitDelay(name="z"), Delay(steps=2, name="z"), EdgeDetector(name="z")])
+def test_what_has_a_meaning_at_samples_only_is_refused_in_continuous_time(block):
+    @subsystem(sample_time=0.1)
+    def box(u):
+        return block(u)
+
+    diagram = Diagram("d", box(Clock()))
+    with pytest.raises(SampleTimeError, match=r"box\.z"):
+        diagram.continuous()
+
+
+def test_what_jumps_is_refused_at_samples_where_it_has_no_update():
+    with pytest.raises(SampleTimeError, match="ball"):
+        Diagram("d", Ball(name="ball")).sampled(0.1)
+
+
+def test_sampled_refuses_wrong_times_and_methods():
+    with pytest.raises(SampleTimeError, match=r"a sample time of -0\.1 s; expected a positive one"):
+        drive().sampled(-0.1)
+    with pytest.raises((SampleTimeError, ParameterError), match="simpson"):
+        drive().sampled(0.1, method="simpson")
+
+
+def test_a_loop_that_a_computational_delay_breaks_is_solved_in_continuous_time():
+    e = Sum(signs="+-", name="e")
+
+    @subsystem(sample_time=0.1, delay=1)
+    def box(u):
+        return Gain(gain=0.5, name="g")(u)
+
+    diagram = Diagram("d", e(Constant(value=1.0), box(e.y)), loops="solve")
+    start = 2 / 3  # what was computed first is its own input, at the start
+    assert diagram.simulate(0.3, progress=False)["e.y"] == pytest.approx([start] * 4)
+    assert diagram.continuous().simulate(0.1, step=0.1, progress=False)["e.y"] == pytest.approx([2 / 3, 2 / 3])
+    with pytest.raises(AlgebraicLoopError, match=r"box\.delay_y: initial values depend on each other"):
+        Diagram("d", e(Constant(value=1.0), box(e.y)))
+    divergent = diagram.replace({"g.gain": -1.0})
+    with pytest.raises(SimulationError, match=r"box\.delay_y.*its initial state depends on itself, and is not found"):
+        divergent.simulate(0.3, progress=False)
+
+
+def test_the_papers_controller_in_continuous_time_beside_the_fmu_is_near_the_sampled_one():
+    """The ideal controller, its projection solved at every evaluation; the plant steps once a millisecond."""
+    diagram = experiments.path_following().diagram
+    sampled = diagram.simulate(3.0, progress=False)
+    run = diagram.continuous().simulate(3.0, step=1e-3, progress=False)
+    assert np.array_equal(run.t, sampled.t)
+    for name in ("eta", "xi"):
+        assert np.max(np.abs(run[name] - sampled[name])) < 0.02 * np.max(np.abs(sampled[name]))
+
+
+def test_a_continuous_diagram_with_an_fmu_needs_a_step():
+    with pytest.raises(SampleTimeError, match=r"no subsystem has a sample time.*step=1e-3"):
+        experiments.path_following().diagram.continuous().simulate(0.1, progress=False)
+
+
+def test_functions_of_signals_are_the_same_in_both():
+    diagram = Diagram("d", Function(np.tanh, name="tanh")(Sine(frequency=1.0)).named("y"))
+    smooth = diagram.simulate(1.0, step=0.1, progress=False)
+    assert np.array_equal(diagram.sampled(0.1).simulate(1.0, progress=False)["y"], smooth["y"])
+
+
+def test_a_projection_in_continuous_time_follows_however_smooth_the_rest_is():
+    position = Function(lambda t: 0.6 * np.stack([np.cos(3.0 * t), np.sin(3.0 * t)]))(Clock())
+    theta = PathProjection(Circle(radius=0.5))(position).named("theta")
+    run = Diagram("d", Integrator()(theta)).simulate(10.0, progress=False)
+    assert np.abs(run["theta"] - 3.0 * run.t).max() < 1e-12 * 30.0  # nearly five laps, counted
