@@ -111,7 +111,15 @@ class DuplicateNameError(WiringError):
 
 
 class UnknownNameError(WiringError, KeyError):
-    """A path, port, signal or parameter is not there."""
+    """A path, port, signal or parameter is not there, or a short name stands for several.
+
+    Attributes
+    ----------
+    candidates : tuple of str
+        The full names that a short name stands for; empty where it stands for none.
+    """
+
+    candidates: tuple[str, ...] = ()
 
 
 class ShapeError(WiringError):

@@ -20,6 +20,7 @@ from ..flat.layout import Clock
 from ..results.signal_names import resolve
 from ..simulation.workspace import Machine
 from ..wiring.structure import Wire
+from .findings import Finding, StepsOnly
 from .operating_point import elements
 
 
@@ -48,7 +49,7 @@ def find_signal(flat: FlatDiagram, name: str) -> Signal:
     try:
         full = resolve(name, wires, ports)
     except UnknownNameError as error:
-        if "stands for several" in str(error):
+        if error.candidates:
             raise
         known = {n.rpartition(".")[2] for n in (*wires, *ports)} | {*wires, *ports}
         raise UnknownNameError(f"there is no signal {name!r} in this diagram. {near(name, known)}") from None
@@ -230,18 +231,18 @@ class Parts:
                 )
 
 
-def steps_only(flat: FlatDiagram) -> tuple[str, ...]:
+def steps_only(flat: FlatDiagram) -> tuple[Finding, ...]:
     """Return what the linear model does not follow: outputs that depend on an input only by steps.
 
     A quantizer, an encoder, a comparison: their derivative is zero everywhere, and it is known as such.
     """
-    notes, known = [], dict[int, list[tuple[str, str]]]()
+    found, known = list[Finding](), dict[int, list[tuple[str, str]]]()
     for path, trace in flat.checked.traced.items():
         if id(trace) not in known:
             known[id(trace)] = _steps(trace)
         for port, source in known[id(trace)]:
-            notes.append(f"{path}.{port} follows {source!r} in steps only: it linearizes to zero")
-    return tuple(notes)
+            found.append(StepsOnly(path, port, source))
+    return tuple(found)
 
 
 def _steps(trace: Any) -> list[tuple[str, str]]:

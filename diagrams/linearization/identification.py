@@ -20,6 +20,7 @@ import numpy as np
 
 from ...blocks.core.errors import FmuError
 from ...fmus.calls.loaded_library import LoadedFmu
+from ...fmus.running.derivation import Derivation, DerivativeMethod
 
 SAMPLES = 1000
 """Steps of a response."""
@@ -52,7 +53,7 @@ class IdentifiedStep:
     y0: np.ndarray
     states: tuple[str, ...]
     singular_values: np.ndarray
-    how: str
+    derivation: Derivation
     uncertainty: float
 
 
@@ -97,8 +98,11 @@ def identified(
     A, B, C, sigma = realization(G, noise)
     model = predicted(A, B, C, len(G))
     error = float(np.max(np.abs(model - G), initial=0.0) + np.max(noise, initial=0.0))
-    how = f"identified from pulse responses, order {len(A)}"
-    return IdentifiedStep(A, B, C, y0, tuple(f"mode[{i}]" for i in range(len(A))), sigma, how, error)
+    states, derivation = (
+        tuple(f"mode[{i}]" for i in range(len(A))),
+        Derivation(DerivativeMethod.IDENTIFIED, order=len(A)),
+    )
+    return IdentifiedStep(A, B, C, y0, states, sigma, derivation, error)
 
 
 class _Runner:

@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core.errors import LoopwrightError, OptionError, WiringError
+from ...fmus.running.derivation import Derivation, DerivativeMethod
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.functions import NONE
 from ..wiring.subsystem import exact_time
 from .derivatives import Parts, Signal, find_signal, steps_only
+from .findings import Finding
 from .loops_over_a_period import confirm_closed, loop_model, moved, period_of, ticks_to_renewal
 from .operating_point import OperatingPoint, check_options, names_of_states, operating_point
 from .over_a_period import EQUILIBRIUM, Model, discrete, moves_between
@@ -44,17 +46,17 @@ class Linearization:
     affine : ndarray
         What the model's states change by at the operating point itself, per second or over the period: zero at an
         equilibrium.
-    how : mapping
-        How the derivative of each FMU was found, by path; of an opaque block as well.
+    derivations : mapping
+        The way in which the derivative of each FMU was found, by path, as a `Derivation`; of an opaque block as well.
     uncertainty : float
         Largest estimated error of an entry of an FMU's linear model, where it was differenced; 0 where it is exact.
     memory : tuple of str
         States that are only a warm start (a projection's last foot point): their poles at z = 0 are no design poles.
     openings : tuple of str
         The wires that were cut.
-    notes : tuple of str
-        What the model does not follow: outputs that move in steps only, events within the period, a start that is
-        unlike every later tick.
+    findings : tuple of Finding
+        The things that the model does not follow: outputs that move in steps only, events within the period, a start
+        that is unlike every later tick. Ask by class, ``isinstance(finding, StepsOnly)``; ``str(finding)`` is the text.
     plants, step
         How it was asked for; its loops are made in the same way.
     """
@@ -70,13 +72,23 @@ class Linearization:
     outputs: tuple[str, ...]
     point: OperatingPoint
     affine: np.ndarray = field(repr=False)
-    how: Mapping[str, str] = field(default_factory=dict)
+    derivations: Mapping[str, Derivation] = field(default_factory=dict)
     uncertainty: float = 0.0
     memory: tuple[str, ...] = ()
     openings: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     plants: str | None = field(default=None, repr=False)
     step: Any = field(default=None, repr=False)
+
+    @property
+    def how(self) -> dict[str, str]:
+        """The texts of `derivations`, by path."""
+        return {path: str(derivation) for path, derivation in self.derivations.items()}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The texts of `findings`."""
+        return tuple(str(finding) for finding in self.findings)
 
     @property
     def system(self) -> Any:
@@ -241,7 +253,7 @@ def _linearize(
     n, ins, outs = len(A), *(tuple(e for s in group for e in s.labels) for group in found[:2])
     if channels:
         ins = outs = tuple(channels)
-    opaque = {p: "differences of the block" for p, b in flat.table.blocks.items() if b.opaque}
+    opaque = {p: Derivation(DerivativeMethod.BLOCK_DIFFERENCES) for p, b in flat.table.blocks.items() if b.opaque}
     return Linearization(
         diagram,
         A,
@@ -254,17 +266,17 @@ def _linearize(
         outputs=outs,
         point=at,
         affine=model.affine,
-        how={**opaque, **model.how},
+        derivations={**opaque, **model.derivations},
         uncertainty=model.uncertainty,
         memory=model.memory,
         openings=tuple(names[2]),
-        notes=(*_steps_only(flat), *model.notes),
+        findings=(*_steps_only(flat), *model.findings),
         plants=plants,
         step=step,
     )
 
 
-def _steps_only(flat: FlatDiagram) -> tuple[str, ...]:
+def _steps_only(flat: FlatDiagram) -> tuple[Finding, ...]:
     if "steps" not in flat._functions:
         flat._functions["steps"] = steps_only(flat)
     return flat._functions["steps"]  # type: ignore[no-any-return]
@@ -342,7 +354,7 @@ def _continuous(diagram: Diagram, flat: FlatDiagram, parts: Parts, at: Operating
         0.0,
         [names[i] for i in xc] + states_of(models),
         np.concatenate([J["dx"], *(m.f for m in models)]),
-        {m.path: m.how for m in models},
+        {m.path: m.derivation for m in models},
         max((m.uncertainty for m in models), default=0.0),
     )
 

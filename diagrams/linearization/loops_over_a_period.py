@@ -127,7 +127,7 @@ def loop_model(
         float(flat.base * period),
         [names[i] for i in keep],
         chain.affine()[keep],
-        chain.how,
+        chain.derivations,
         chain.uncertainty,
     )
     return model, [f"{labels[e]}@{j}" if len(groups[e]) > 1 else labels[e] for e, j, _ in chosen]

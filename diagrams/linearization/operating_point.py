@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,17 @@ OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start")
 AGAIN = 1e-3
 """How far a run may be from where it was the first time, as its solver takes other steps; relative to 1 + its size."""
 MORE = {"linearize": ("inputs", "outputs", "openings", "plants"), "operating_point": ("t",)}
+
+
+class PointOrigin(StrEnum):
+    """The way in which an operating point was made."""
+
+    RUN = "run"
+    """A run has reached it."""
+    TRIM = "trim"
+    """A trim has found it."""
+    GIVEN = "given"
+    """Its states were given."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +62,8 @@ class OperatingPoint:
         equations is in ``residuals``.
     largest : str
         The block with that residual, of an FMU its state; empty where nothing moves.
-    how : str
-        "run", "trim" or "given".
+    how : PointOrigin
+        The way in which it was made: "run", "trim" or "given".
     """
 
     t: float
@@ -63,7 +75,7 @@ class OperatingPoint:
     plants: Mapping[str, Any] = field(default_factory=dict, repr=False)
     residual: float = float("nan")
     largest: str = ""
-    how: str = "run"
+    how: PointOrigin = PointOrigin.RUN
     values: Mapping[str, Any] = field(default_factory=dict, repr=False)
     """Every signal by its path, then."""
     layout: tuple[Any, ...] = field(default=(), repr=False)
@@ -95,7 +107,7 @@ class OperatingPoint:
     belong to."""
 
 
-def capture(simulation: Any, how: str = "run") -> OperatingPoint:
+def capture(simulation: Any, how: PointOrigin = PointOrigin.RUN) -> OperatingPoint:
     """Return the operating point at the tick that a simulation has reached."""
     flat: FlatDiagram = simulation.flat
     machine = simulation._machine

@@ -17,9 +17,11 @@ import numpy as np
 
 from ...blocks.core.block import Block
 from ...blocks.library.instants import left_of
+from ...fmus.running.derivation import Derivation
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.functions import NONE
 from .derivatives import Parts, Signal
+from .findings import EventWithinPeriod, Finding, MemoryActs, UnusualStart
 from .operating_point import OperatingPoint, elements, names_of_states
 from .plant_models import PlantModel, inputs_before, joined, states_of, step_models
 
@@ -37,10 +39,10 @@ class Model:
     dt: float
     states: list[str]
     affine: np.ndarray
-    how: dict[str, str] = field(default_factory=dict)
+    derivations: dict[str, Derivation] = field(default_factory=dict)
     uncertainty: float = 0.0
     memory: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def discrete(flat: FlatDiagram, parts: Parts, at: OperatingPoint, way: str | None) -> Model:
@@ -52,8 +54,8 @@ def discrete(flat: FlatDiagram, parts: Parts, at: OperatingPoint, way: str | Non
     A, B = chain.M, chain.N
     names = state_names(flat, chain.models)
     keep = needed(A, chain.C, own_states(flat), set(range(flat.width, flat.width + chain.n_p)))
-    memory, notes = _memory(flat, A, names)
-    notes += chain.notes(at.tick + period)
+    memory, findings = _memory(flat, A, names)
+    findings += chain.findings(at.tick + period)
     A, B, C = A[np.ix_(keep, keep)], B[keep], chain.C[:, keep]
     labels = [names[i] for i in keep]
     return Model(
@@ -61,10 +63,10 @@ def discrete(flat: FlatDiagram, parts: Parts, at: OperatingPoint, way: str | Non
         float(flat.base * period),
         labels,
         chain.affine()[keep],
-        chain.how,
+        chain.derivations,
         chain.uncertainty,
         tuple(m for m in memory if m in labels),
-        tuple(notes),
+        tuple(findings),
     )
 
 
@@ -92,12 +94,12 @@ class Chain:
         self.flat, self.parts, self.way = flat, parts, way
         self.first = self.here = at
         self.models: Sequence[PlantModel] = ()
-        self.how: dict[str, str] = {}
+        self.derivations: dict[str, Derivation] = {}
         self.uncertainty, self.n_p = 0.0, 0
         self._reuse: dict[str, Any] = {}
         self._begun = False
         self.steps: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
-        self._fired: list[str] = []
+        self._fired: list[Finding] = []
         self._first_tick: dict[Any, Any] = {}
 
     def go(self, k: int, count: int) -> None:
@@ -139,7 +141,7 @@ class Chain:
             t = {path: point["t"] + h for path, point in self.here.plants.items()}
             return [replace(m, next={**m.next, "t": t[m.path]}) for m in known[3]]
         models = step_models(self.flat, self.here, z, h, self.way)
-        self.how |= {m.path: m.how for m in models}
+        self.derivations |= {m.path: m.derivation for m in models}
         self.uncertainty = max([self.uncertainty, *(m.uncertainty for m in models)])
         if all(_same(m.f, m.x0) for m in models):  # at rest: with the same inputs the same again
             self._reuse["plants"] = (h, z, before, models)
@@ -166,10 +168,7 @@ class Chain:
         )
         for event, a, b, now in zip(flat.events, g0 > 0, g1 > 0, opened > 0.5, strict=True):
             if a != b and now:
-                self._fired.append(
-                    f"{event.path}: its event {event.name!r} comes within the period from t = {here.t:.9g} s; the "
-                    "model is that of the motion without it"
-                )
+                self._fired.append(EventWithinPeriod(event.path, event.name, here.t))
 
     def _move(self, k: int, h: float, x: np.ndarray, z: np.ndarray) -> None:
         """Take the operating point along."""
@@ -187,18 +186,15 @@ class Chain:
         moved = [_plant_states(self.flat, point, self.models) for point in (first, last)]
         return np.concatenate([last.x - first.x, moved[1] - moved[0], ends[1] - ends[0]])
 
-    def notes(self, last: int) -> list[str]:
-        """Say what is special: events within the period, a start that is unlike all that follows."""
-        notes = list(dict.fromkeys(self._fired))
+    def findings(self, last: int) -> list[Finding]:
+        """Return events within the period, and a start that is unlike all that follows."""
+        findings = list(dict.fromkeys(self._fired))
         if self.first.tick == 0 and np.max(np.abs(self.affine()), initial=0.0) <= EQUILIBRIUM:
             later = self.parts.at(self.flat.acting(last), self.here.t, self.here.x, self.here.w)
             pairs = [(self._first_tick[e, a], later[e, a]) for e in "xzy" for a in "xwd"]
             if any(np.max(np.abs(a - b), initial=0.0) > 1e-9 * (1 + np.max(np.abs(b), initial=0.0)) for a, b in pairs):
-                notes.append(
-                    "the start is unlike every later tick (a block does something else at its first one); linearize at "
-                    "a later time"
-                )
-        return notes
+                findings.append(UnusualStart())
+        return findings
 
 
 def _plant_states(flat: FlatDiagram, point: OperatingPoint, models: Sequence[PlantModel]) -> np.ndarray:
@@ -353,9 +349,9 @@ def _only_stays(A: np.ndarray, keep: list[int], j: int) -> bool:
     return not np.any(row)
 
 
-def _memory(flat: FlatDiagram, A: np.ndarray, names: list[str]) -> tuple[list[str], list[str]]:
+def _memory(flat: FlatDiagram, A: np.ndarray, names: list[str]) -> tuple[list[str], list[Finding]]:
     """Return the states from which a block only starts its search: what they are has no effect on anything."""
-    found, notes = [], []
+    found, findings = list[str](), list[Finding]()
     scale = np.max(np.abs(A), initial=1.0)
     for path, where in flat.states.slices.items():
         if not flat.table.blocks[path].memory or where.stop == where.start:
@@ -363,7 +359,5 @@ def _memory(flat: FlatDiagram, A: np.ndarray, names: list[str]) -> tuple[list[st
         if np.max(np.abs(A[:, where])) <= EQUILIBRIUM * scale:
             found += names[where]
         else:
-            notes.append(
-                f"{path}: its memory acts on what follows ({np.max(np.abs(A[:, where])):.3g}): it counts as a state"
-            )
-    return found, notes
+            findings.append(MemoryActs(path, float(np.max(np.abs(A[:, where])))))
+    return found, findings

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ...blocks.core.errors import FmuError, LoopwrightError, OptionError
+from ...fmus.running.derivation import Derivation
 from ..flat.flat_diagram import FlatDiagram
 from ..wiring.structure import join, stepped_blocks
 from .identification import identified
@@ -37,7 +38,7 @@ class PlantModel:
     states: tuple[str, ...]
     inputs: list[int]
     outputs: list[int]
-    how: str
+    derivation: Derivation
     uncertainty: float
     y_next: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """Its outputs after the step."""
@@ -145,7 +146,7 @@ def continuous_models(flat: FlatDiagram, at: OperatingPoint, way: str | None) ->
         z, w, wired = entries(flat, path)
         m = _of_equations(flat, at, path, at.z)
         B, D, names = m.B[:, wired], m.D[:, wired], _named(path, m.states)
-        models.append(PlantModel(path, m.A, B, m.C, D, m.x0, m.f, names, z, w, m.how, _error(m)))
+        models.append(PlantModel(path, m.A, B, m.C, D, m.x0, m.f, names, z, w, m.derivation, _error(m)))
     return models
 
 
@@ -189,7 +190,7 @@ def _step_model(
             raise
         equations = None
     if equations is not None and (way == "equations" or (way is None and _rests(equations))):
-        m, how = _held(equations, h), f"{equations.how}, held over a step by a matrix exponential"
+        m, derivation = _held(equations, h), replace(equations.derivation, held=True)
         C, D = equations.C, equations.D
     elif way == "identified" or not block.description.states:  # it may have states that it doesn't show
         return _identified_model(flat, at, path, z, h)
@@ -205,7 +206,7 @@ def _step_model(
                 return _identified_model(flat, at, path, z, h)
             except FmuError as last:
                 raise last from error
-        how = m.how
+        derivation = m.derivation
         C, D = _outputs_before(flat, at, path, equations, m, z)
     names = _named(path, m.states)
     following = {
@@ -214,7 +215,7 @@ def _step_model(
         "inputs": _inputs(flat, at, path, z),
     }
     return PlantModel(
-        path, m.A, m.B[:, wired], C, D[:, wired], m.x0, m.f, names, mine, w, how, _error(m), m.y0, following
+        path, m.A, m.B[:, wired], C, D[:, wired], m.x0, m.f, names, mine, w, derivation, _error(m), m.y0, following
     )
 
 
@@ -225,7 +226,7 @@ def _identified_model(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.nd
     n, rest = len(m.A), {**now, "t": now["t"] + h}
     D = np.zeros((len(w), len(wired)))
     return PlantModel(
-        path, m.A, m.B[:, wired], m.C, D, np.zeros(n), np.zeros(n), _named(path, m.states), mine, w, m.how,
+        path, m.A, m.B[:, wired], m.C, D, np.zeros(n), np.zeros(n), _named(path, m.states), mine, w, m.derivation,
         m.uncertainty, m.y0, rest, True,
     )  # fmt: skip
 

@@ -18,7 +18,7 @@ import numpy as np
 from ...blocks.core.errors import OptionError, SimulationError
 from ..flat.evaluate import Pass
 from ..flat.flat_diagram import FlatDiagram
-from .operating_point import OperatingPoint, elements, judged, names_of_states, operating_point
+from .operating_point import OperatingPoint, PointOrigin, elements, judged, names_of_states, operating_point
 from .trim_plants import Plants
 from .trim_request import Free, Target, free_parameters, known_states, named_states, targets_of
 
@@ -262,7 +262,7 @@ def trim(
     flat = base.flatten(guess.base)
     bounds = {n: b for n, b in asked.items() if n in states}
     target = targets_of(flat, states, targets or {}, rates or {}, [fixed] if isinstance(fixed, str) else fixed, bounds)
-    return _found(base, diagram, flat, guess, parameters, target, tolerance, "trim")
+    return _found(base, diagram, flat, guess, parameters, target, tolerance, PointOrigin.TRIM)
 
 
 def given(diagram: Diagram, t: float, states: Mapping[str, Any], options: Mapping[str, Any]) -> OperatingPoint:
@@ -276,12 +276,12 @@ def given(diagram: Diagram, t: float, states: Mapping[str, Any], options: Mappin
     known = known_states(flat, guess)
     target = targets_of(flat, known, {}, {}, list(known), {})
     target.rest = False
-    return _found(diagram, diagram, flat, guess, [], target, TOLERANCE, "given")
+    return _found(diagram, diagram, flat, guess, [], target, TOLERANCE, PointOrigin.GIVEN)
 
 
 def _found(
     base: Diagram, diagram: Diagram, flat: FlatDiagram, guess: OperatingPoint,
-    parameters: list[Free], target: Target, tolerance: float, how: str,
+    parameters: list[Free], target: Target, tolerance: float, how: PointOrigin,
 ) -> OperatingPoint:  # fmt: skip
     equations = _Equations(base, flat, guess, parameters, target)
     unknown = solve(equations)

@@ -16,7 +16,7 @@ from ..flat.flat_diagram import FlatDiagram
 from ..wiring.structure import join
 from ..wiring.variants import _changed, _split
 from .derivatives import find_signal
-from .operating_point import OperatingPoint
+from .operating_point import OperatingPoint, PointOrigin
 
 if TYPE_CHECKING:
     from ..diagram import Diagram
@@ -198,7 +198,7 @@ def named_states(flat: FlatDiagram, at: OperatingPoint, states: Mapping[str, Any
             continue
         path = next(p for p in plants if full.startswith(p + "."))
         plants[path]["state"][full[len(path) + 1 :]] = numbers.reshape(where.shape)
-    return replace(at, x=x, plants=plants, how="given")
+    return replace(at, x=x, plants=plants, how=PointOrigin.GIVEN)
 
 
 # --- parameters ------------------------------------------------------------------------------------------------------

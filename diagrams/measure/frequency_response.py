@@ -33,7 +33,7 @@ from ..flat.flat_diagram import FlatDiagram
 from ..flat.functions import NONE
 from ..linearization.derivatives import find_signal
 from ..linearization.loops_over_a_period import ticks_to_renewal
-from ..linearization.operating_point import OperatingPoint, operating_point
+from ..linearization.operating_point import OperatingPoint, PointOrigin, operating_point
 from ..results.run import Snapshot
 from .injection import Experiment, injected
 from .waveforms import KINDS, Part, phasors_of, plan_of, step_for
@@ -273,7 +273,7 @@ def _beginning(
         options = {**recipe, **options}
         if "start" not in options:
             return options, None, at.t
-    if isinstance(at, OperatingPoint) and at.how == "run" and "start" not in options:
+    if isinstance(at, OperatingPoint) and at.how == PointOrigin.RUN and "start" not in options:
         return {**options, "step": options.get("step") or at.base}, None, at.t
     if at is None or (isinstance(at, int | float) and not isinstance(at, bool) and "start" not in options):
         return options, None, float(at or 0.0)

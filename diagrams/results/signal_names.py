@@ -25,7 +25,11 @@ def resolve(name: str, wires: Any, ports: Any) -> str:
         if found and (len(found) == 1 or (group is wires and len({wires[n] for n in found}) == 1)):
             return str(found[0])
         if found:
-            raise UnknownNameError(f"{name!r} stands for several signals: {', '.join(found)}. Write more of the path.")
+            error = UnknownNameError(
+                f"{name!r} stands for several signals: {', '.join(found)}. Write more of the path."
+            )
+            error.candidates = tuple(found)
+            raise error
     short = {n.rpartition(".")[2] for n in (*wires, *ports)}
     raise UnknownNameError(f"no signal {name!r} was recorded. {near(name, short | set(wires) | set(ports))}")
 

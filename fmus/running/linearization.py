@@ -13,6 +13,7 @@ import numpy as np
 from ...blocks.core.errors import FmuError, ParameterError, UnknownNameError, near
 from ..archive.description import FmuVariable
 from ..calls.loaded_library import LoadedFmu
+from .derivation import Derivation, DerivativeMethod
 from .differences import Column, columns
 
 if TYPE_CHECKING:
@@ -48,10 +49,15 @@ class FmuLinearization:
     u0: np.ndarray
     f: np.ndarray
     y0: np.ndarray
-    how: str
-    """How the derivatives were found."""
+    derivation: Derivation
+    """The way in which the derivatives were found."""
     uncertainty: np.ndarray
     """Of each entry of [[A, B], [C, D]], its estimated error; zero where the FMU computed the derivatives."""
+
+    @property
+    def how(self) -> str:
+        """The text of `derivation`, such as ``"differences of steps"``."""
+        return str(self.derivation)
 
 
 class _Point:
@@ -251,8 +257,8 @@ def _directional(point: _Point, instance: LoadedFmu) -> FmuLinearization:
             size = about.variables[name].size
             found += [instance.directional_derivative(unknowns, [name], seed) for seed in np.eye(size).tolist()]
     J = np.array(found).reshape(len(found), values.size).T
-    how = f"directional derivatives in {_name(instance.model_exchange).replace('_', '-')}"
-    return point.model(J, x, u, values, h=None, how=how, uncertainty=np.zeros(J.shape))
+    derivation = Derivation(DerivativeMethod.DIRECTIONAL, _name(instance.model_exchange))
+    return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=np.zeros(J.shape))
 
 
 @contextmanager
@@ -290,8 +296,8 @@ def _differenced(point: _Point, instance: LoadedFmu) -> FmuLinearization:
         return found
 
     J, uncertainty = columns(column, values, evaluate)
-    how = f"differences in {_name(instance.model_exchange).replace('_', '-')}"
-    return point.model(J, x, u, values, h=None, how=how, uncertainty=uncertainty)
+    derivation = Derivation(DerivativeMethod.DIFFERENCES, _name(instance.model_exchange))
+    return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=uncertainty)
 
 
 # ---- of a step ----
@@ -354,7 +360,8 @@ def _stepped(point: _Point, instance: LoadedFmu, h: float, relative_step: float)
     finally:
         if saved is not None:
             instance._fmu.freeFMUState(saved)
-    return point.model(J, x, u, values, h=h, how="differences of steps", uncertainty=uncertainty)
+    derivation = Derivation(DerivativeMethod.STEP_DIFFERENCES)
+    return point.model(J, x, u, values, h=h, derivation=derivation, uncertainty=uncertainty)
 
 
 def _parts(about: Any, names: list[str], vector: np.ndarray) -> Iterator[np.ndarray]:

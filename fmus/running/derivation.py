@@ -1,0 +1,64 @@
+"""The way in which the derivatives of a linear model were found."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class DerivativeMethod(Enum):
+    """A method that finds the derivatives of an FMU, or of a block that can't be traced."""
+
+    DIRECTIONAL = "directional derivatives"
+    """The FMU computes them itself: they are exact."""
+    DIFFERENCES = "differences"
+    """Differences of the FMU's equations at the point."""
+    STEP_DIFFERENCES = "differences of steps"
+    """Differences of a communication step, with the FMU's own solver."""
+    IDENTIFIED = "identified from pulse responses"
+    """A model that is fitted to responses from rest, without the FMU's states."""
+    BLOCK_DIFFERENCES = "differences of the block"
+    """Differences of the function of an opaque block."""
+
+
+@dataclass(frozen=True)
+class Derivation:
+    """The way in which derivatives were found; ``str(…)`` is its text.
+
+    Attributes
+    ----------
+    method : DerivativeMethod
+        The method.
+    interface : str
+        The interface of FMI that was asked, ``"model_exchange"`` or ``"co_simulation"``; empty where the method has
+        only one.
+    held : bool
+        Whether a step was made of the equations, by a matrix exponential with held inputs.
+    order : int, optional
+        Number of states of a model that was identified.
+
+    Examples
+    --------
+    >>> str(Derivation(DerivativeMethod.DIRECTIONAL, "model_exchange"))
+    'directional derivatives in model-exchange'
+    """
+
+    method: DerivativeMethod
+    interface: str = ""
+    held: bool = False
+    order: int | None = None
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the derivatives have no error but rounding."""
+        return self.method is DerivativeMethod.DIRECTIONAL
+
+    def __str__(self) -> str:
+        text = self.method.value
+        if self.interface:
+            text += f" in {self.interface.replace('_', '-')}"
+        if self.order is not None:
+            text += f", order {self.order}"
+        if self.held:
+            text += ", held over a step by a matrix exponential"
+        return text
