@@ -32,8 +32,8 @@ _ABSENT |= {"inputs", "outputs", "states", "events"}
 class Block(Value, Wireable):
     """A signal-flow block: parameters, ports, and equations that are written once.
 
-    A subclass declares ports and parameters and writes its equations as plain functions of ``(t, x, u)`` with NumPy's
-    names; the same functions are run, traced, differentiated and compiled::
+    A subclass declares ports and parameters, and writes its equations as plain functions of ``(t, x, u)`` with NumPy's
+    names. The same functions are run, traced, differentiated and compiled::
 
         class Lag(Block):
             '''First-order lag: T₁ ẏ = u − y.'''
@@ -46,17 +46,20 @@ class Block(Value, Wireable):
                 return (u.u - x.y) / self.time_constant
 
     ``x`` and ``u`` are named tuples of the states and the inputs, in the order of declaration. A function returns one
-    value for one port (or state), else a tuple in the order of declaration. None of them may change its arguments or
-    depend on anything but them and the parameters. Vectors are built with ``np.stack``; branches with ``np.where``.
+    value for one port (or state), else a tuple in the order of declaration. It must not change its arguments, nor
+    depend on anything but them and the parameters. Build vectors with ``np.stack``, and branches with ``np.where``.
 
     A block has continuous states if it has a ``derivative``, sampled ones if it has an ``update`` alone. A continuous
     block in a sampled subsystem is discretized by the subsystem's method, unless it has an ``update`` of its own.
     A continuous block may declare events and discrete states, which its ``jump`` changes. With an ``update`` as well it
-    stands in both kinds of frames: its events act in a continuous one, its ``update`` in a sampled one.
+    works in both kinds of subsystem: its events act in a continuous one, its ``update`` in a sampled one. The diagram
+    itself counts as the outermost subsystem.
 
-    Equations (all optional; ``T`` may be declared as a last argument of ``output``, ``update`` and ``guards`` and is
-    then the sample time in s; declared as ``T=None`` it is None in a continuous frame)
-    ----------------------------------------------------------------------------------------------------------------
+    All equations are optional. ``output``, ``update`` and ``guards`` may take ``T`` as a last argument: the sample time
+    in s. Declared as ``T=None``, it is None in a continuous subsystem.
+
+    Equations
+    ---------
     output(t, x, u)
         The outputs that are not states.
     derivative(t, x, u)
@@ -75,8 +78,8 @@ class Block(Value, Wireable):
         Numbers computed from the parameters in plain Python, which the equations then read as attributes.
     next_instant(t)
         The next time strictly after t at which the outputs or their derivatives are not smooth, ``math.inf`` if there
-        is none: plain Python, not traced. A solver lands there, and takes its left limits just before; it is not asked
-        for in a sampled frame.
+        is none: plain Python, not traced. A solver lands there, and takes its left limits just before. A sampled
+        subsystem does not call it.
 
     Parameters
     ----------
@@ -92,11 +95,11 @@ class Block(Value, Wireable):
     same_units: ClassVar[bool] = False
     """True where all inputs must be in one unit, as in a sum."""
     stops: ClassVar[str | None] = None
-    """Name of a scalar output that ends the run, normally, at the first instant at which it is above 0.5."""
+    """Name of a scalar output that ends the run, without an error, at the first instant at which it is above 0.5."""
     transport: ClassVar[bool] = False
-    """True where, in continuous time, the output ``y`` is the input ``u`` a time ``delay`` ago, kept by the solver."""
+    """True where, in continuous time, the solver gives ``y`` as the input ``u`` a time ``delay`` ago."""
     stepped: ClassVar[bool] = False
-    """True where a run steps it from one tick to the next, as it does an FMU.
+    """True where a run steps the block from one tick to the next, as it does an FMU.
 
     Instead of equations it has ``instantiate(wired, stop_time, start_time=t)``, a context manager: ``wired`` names the
     inputs that the run sets, times are in s. It yields a plant, with the methods of the simulation's ``Plant``.
@@ -143,7 +146,7 @@ class Block(Value, Wireable):
 
     @property
     def label(self) -> str:
-        """Name for messages and for numbering: the given one, else the class name in snake case."""
+        """Name for messages and for numbering: the name given, else the class name in snake case."""
         return self.name or self._hint or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", type(self).__name__).lower()
 
     @property
@@ -161,9 +164,10 @@ class Block(Value, Wireable):
         return math.inf
 
     def time_scale(self) -> float:
-        """Return the time in s within which the outputs change by themselves, a tenth of a period say: any, by default.
+        """Return the time in s within which the outputs change by themselves, such as a tenth of a period.
 
-        In a continuous frame events are looked for as often, and no step of a solver is longer than five of them.
+        In a continuous subsystem events are looked for once in that time, and no step of a solver is longer than five
+        times it. The default is infinity: no limit.
         """
         return math.inf
 
@@ -183,9 +187,9 @@ class Block(Value, Wireable):
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or name in _ABSENT or name in self.parameter_specs:
-            raise AttributeError(name)  # what is not written is asked for often; the rest would come back here
+            raise AttributeError(name)  # optional equations are probed with hasattr; anything else would recurse
         if isinstance(port := getattr(type(self), name, None), Port):
-            return port.__get__(self)  # type: ignore[attr-defined]  # its own error: it is no signal
+            return port.__get__(self)  # type: ignore[attr-defined]  # raises the port's own error: it is no signal
         known = {*self.outputs, *self.parameter_specs}
         raise UnknownAttributeError(f"it has no output or parameter {name!r}. {near(name, known)}", block=self.label)
 
@@ -197,7 +201,7 @@ class Block(Value, Wireable):
     def __iter__(self) -> Iterator[Signal]:
         names = primary_outputs(self)
         if len(names) < 2 or any(port.default is None for port in self.inputs.values()):
-            return iter(self._signal())  # one signal, or none: its error says what to do
+            return iter(self._signal())  # one signal, or none: the error says what to do
         return iter([Signal(self, name) for name in names])
 
     def __repr__(self) -> str:
@@ -205,11 +209,11 @@ class Block(Value, Wireable):
         return text if self.name is None else f"{text[:-1]}{', ' if text[-2] != '(' else ''}name={self.name!r})"
 
     def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
-        """Return the error for a failed guard; ``u``, ``y``, ``x`` are named tuples of inputs, outputs, states then."""
+        """Return the error of a failed guard; ``u``, ``y``, ``x`` are named tuples of inputs, outputs and states."""
         if name == SOLVED:
             return GuardError(
-                f"its trapezoidal step is not solved: after the last of Newton's steps a state is still about "
-                f"{-value:.3g} away. Take a smaller sample time, or another method."
+                f"its trapezoidal step is not solved: after the last Newton step a state is still about {-value:.3g} "
+                "away; expected less than 1e-9 of the state. Take a smaller sample time, or another method."
             )
         return GuardError(
             f"guard {name!r} is {value:.6g}; expected a positive value. Check what its inputs are: "
@@ -225,16 +229,17 @@ def _is_kind(port: Port, attribute: str) -> bool:
 
 
 def as_signal_error(block: Block) -> Signal:
-    """Raise the error of a block used as a signal that isn't one."""
+    """Raise the error of a block that is used as a signal and has inputs, or not exactly one output."""
     outputs = ", ".join(primary_outputs(block)) or "none"
     needed = [name for name, port in block.inputs.items() if port.default is None]
     if needed:
         raise WiringError(
-            f"a block is used as a signal before it is wired; call it first, or name an output ({outputs}): "
+            f"it is used as a signal before it is wired; call it first, or name an output ({outputs}): "
             f"{block.label}({', '.join(f'{n}=…' for n in needed)}).",
             block=block.label,
         )
-    raise WiringError(f"it has not one output ({outputs}); name one.", block=block.label)
+    found, step = len(primary_outputs(block)), "Name one." if block.outputs else "Declare one."
+    raise WiringError(f"found {found} outputs ({outputs}); expected one, as a signal. {step}", block=block.label)
 
 
 __all__ = ["Block", "as_signal"]

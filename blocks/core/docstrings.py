@@ -1,6 +1,6 @@
-"""What a notebook shows of a class: its constructor's signature, and sections of its docstring.
+"""Signatures and docstring sections of classes, for notebooks and ``help``.
 
-Both are made from the declarations of parameters and ports, so that no class repeats them in words.
+Both are made from the declarations of parameters and ports, so that no class repeats these in words.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _NAME = ("name : str, optional", "Name in the diagram; without one the class nam
 
 
 class ParameterSignature:
-    """The ``__signature__`` of a value: on the class that of its constructor, on a block that of its call."""
+    """Signature shown for a value: a class shows its constructor's, a block its call's."""
 
     def __get__(self, instance: Any, owner: type[Value]) -> inspect.Signature:
         if instance is None:
@@ -49,21 +49,22 @@ def _constructor(cls: type[Value]) -> inspect.Signature:
 
 
 def with_section(text: str, title: str, entries: Iterable[tuple[str, str]]) -> str:
-    """Return a docstring with a numpydoc section at its end, unless it is empty or written there already."""
+    """Return a docstring with a numpydoc section at its end; without entries or with that section, unchanged."""
     header = f"{title}\n{'-' * len(title)}\n"
     lines = [line if not more else f"{line}\n    {more}" for line, more in entries]
     return text if not lines or header in text else f"{text}\n\n{header}" + "\n".join(lines)
 
 
 def parameter_section(cls: type[Value]) -> list[tuple[str, str]]:
-    """Return the entries of a class's parameters: type, unit, range and default, and the description."""
+    """Return an entry for each parameter of a class: type, unit, range and default, then the description."""
     entries = [
-        (f"{name} : {', '.join(_of_parameter(spec))}", spec.description) for name, spec in cls.parameter_specs.items()
+        (f"{name} : {', '.join(_describe_parameter(spec))}", spec.description)
+        for name, spec in cls.parameter_specs.items()
     ]
     return [*entries, _NAME] if "name" in cls._keywords else entries
 
 
-def _of_parameter(spec: ParameterSpec) -> list[str]:
+def _describe_parameter(spec: ParameterSpec) -> list[str]:
     words = [spec.annotation]
     if spec.shape is not None:
         words.append(f"shape {spec.shape}")
@@ -77,16 +78,16 @@ def _of_parameter(spec: ParameterSpec) -> list[str]:
 
 
 def port_section(ports: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return the entries of ports: shape, unit, range, default, start or direction, and the description."""
-    return [(f"{name} : {', '.join(_of_port(port))}", port.description) for name, port in ports.items()]
+    """Return an entry for each port: shape, unit, range, default, start or direction, then the description."""
+    return [(f"{name} : {', '.join(_describe_port(port))}", port.description) for name, port in ports.items()]
 
 
-def _of_port(port: Any) -> list[str]:
+def _describe_port(port: Any) -> list[str]:
     like = getattr(port, "like", None)
     if hasattr(port, "direction"):
         return [port.direction]
     if hasattr(port, "start"):
-        words = _of_start(port)
+        words = _describe_start(port)
     elif port.shape is None:
         words = ["any shape" if hasattr(port, "default") else "shape from the equations"]
     else:
@@ -104,7 +105,7 @@ def _of_port(port: Any) -> list[str]:
     return words
 
 
-def _of_start(port: Any) -> list[str]:
+def _describe_start(port: Any) -> list[str]:
     if isinstance(port.start, str):
         start = f"start {port.start}"
     elif callable(port.start):

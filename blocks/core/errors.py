@@ -1,4 +1,4 @@
-"""Every error that Loopwright raises, as one tree.
+"""Errors that Loopwright raises, as one tree.
 
 ::
 
@@ -11,7 +11,7 @@
     │   ├── UnwiredInputError
     │   ├── DoubleDriveError              an input driven twice, a block called twice
     │   ├── DuplicateNameError
-    │   ├── UnknownNameError (KeyError)   a path, port, signal or parameter that isn't there
+    │   ├── UnknownNameError (KeyError)   a path, port, signal or parameter that doesn't exist
     │   ├── ShapeError
     │   ├── UnitError
     │   ├── SampleTimeError
@@ -26,7 +26,8 @@
     │   └── CompilerError
     └── ConfirmationError (RuntimeError)  two independent computations of one number disagree
 
-Each says who (block path, port), when (t), what was found, what was expected, and one next step.
+Each error names the block (its path), the port and the time, then says what was found, what was expected, and one next
+step.
 """
 
 from __future__ import annotations
@@ -42,9 +43,9 @@ class LoopwrightError(Exception):
     Parameters
     ----------
     message : str
-        What was found, what was expected, and the next step.
+        Found, expected, and one next step.
     block : str, optional
-        Dotted path of the block concerned; put in front of the message.
+        Dotted path of the block concerned; the message begins with it.
     port : str, optional
         Port concerned.
     t : float, optional
@@ -65,7 +66,7 @@ class LoopwrightError(Exception):
         return _rebuild, (type(self), self.__dict__.copy())
 
     def at(self, *, block: str | None = None, port: str | None = None, t: float | None = None) -> LoopwrightError:
-        """Fill in who and when where they are not known yet, and return self."""
+        """Fill in block, port and time where they are not known yet, and return self."""
         self.block, self.port = self.block or block, self.port or port
         self.t = t if self.t is None else self.t
         return self
@@ -107,11 +108,11 @@ class DoubleDriveError(WiringError):
 
 
 class DuplicateNameError(WiringError):
-    """Two blocks or wires of one frame carry the same name."""
+    """Two blocks or wires of one subsystem carry the same name."""
 
 
 class UnknownNameError(WiringError, KeyError):
-    """A path, port, signal or parameter is not there, or a short name stands for several.
+    """A path, port, signal or parameter of that name does not exist, or a short name stands for several.
 
     Attributes
     ----------
@@ -182,11 +183,11 @@ class FmuError(LoopwrightError, RuntimeError):
 
 
 class FmuFileError(FmuError):
-    """A file is no FMU, or one that can't be used here."""
+    """A file is no FMU, or an FMU that can't be used here."""
 
 
 class CompilerError(FmuError):
-    """No C compiler was found, or it failed; its own message is quoted."""
+    """No C compiler was found, or it failed; the message quotes it."""
 
 
 class ConfirmationError(LoopwrightError, RuntimeError):
@@ -194,7 +195,7 @@ class ConfirmationError(LoopwrightError, RuntimeError):
 
 
 def near(name: str, known: Iterable[str]) -> str:
-    """Say which known names are close to ``name``, for the end of an error message."""
+    """Name the known names that are close to ``name``, for the end of an error message."""
     known = sorted({str(k) for k in known})
     close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
     if close:

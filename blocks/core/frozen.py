@@ -1,4 +1,4 @@
-"""Read-only copies of what a parameter may hold: mappings, lists, sets and arrays."""
+"""Read-only copies of mappings, lists, sets and arrays, as parameters hold them."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from .errors import ParameterError
 class FrozenMapping(Mapping[Any, Any]):
     """A read-only mapping of read-only values that can be compared, hashed and pickled.
 
-    `types.MappingProxyType` would be the standard library's, but it can't be pickled and shows changes of the mapping
-    behind it.
+    The standard library's `types.MappingProxyType` can't be pickled, and shows changes of the mapping behind it.
     """
 
     __slots__ = ("_items",)
@@ -35,7 +34,7 @@ class FrozenMapping(Mapping[Any, Any]):
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Mapping):
             return NotImplemented
-        return self.keys() == other.keys() and all(_same(value, other[key]) for key, value in self.items())
+        return self.keys() == other.keys() and all(_are_equal(value, other[key]) for key, value in self.items())
 
     def __hash__(self) -> int:
         return hash(frozenset(self._items))  # equal mappings have equal keys; arrays among the values have no hash
@@ -55,15 +54,15 @@ class FrozenMapping(Mapping[Any, Any]):
     __setitem__ = __delitem__ = __setattr__ = _refuse
 
 
-def _same(a: Any, b: Any) -> bool:
+def _are_equal(a: Any, b: Any) -> bool:
     arrays = isinstance(a, np.ndarray) or isinstance(b, np.ndarray)
     return bool(np.array_equal(a, b) if arrays else a == b)
 
 
 def freeze(value: Any) -> Any:
-    """Return a value that can't be changed through it; other objects are returned as they are."""
+    """Return a read-only copy of an array, mapping, list, tuple or set; other objects are returned as they are."""
     if isinstance(value, np.ndarray):
-        if value.flags.writeable or value.base is not None:  # a read-only view may still change below
+        if value.flags.writeable or value.base is not None:  # the array behind a read-only view may still change
             value = value.copy()
             value.flags.writeable = False
         return value

@@ -1,6 +1,6 @@
-"""What can be done with numbers, but not with signals, whose values come with the run: NumPy's functions, powers, ….
+"""Refusal of NumPy's functions, powers and other operations on signals, whose values come with the run.
 
-NumPy's operators with an array on the left, which it would take for itself, are left to the signals' own.
+An operator with an array on the left would be NumPy's; it is passed on to the signal's own.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from .errors import WiringError
 
-_OPERATORS: dict[Any, tuple[str, str]] = {  # array * signal is a Gain: NumPy's operators are ours, from either side
+_OPERATORS: dict[Any, tuple[str, str]] = {  # array * signal is a Gain, as signal * array is
     np.add: ("__add__", "__radd__"),
     np.subtract: ("__sub__", "__rsub__"),
     np.multiply: ("__mul__", "__rmul__"),
@@ -28,7 +28,7 @@ _OPERATORS: dict[Any, tuple[str, str]] = {  # array * signal is a Gain: NumPy's 
 
 
 class NoNumber:
-    """Base of what stands for numbers that are not there yet: refuses what needs them, and says what to write."""
+    """Base of signals, calls and blocks: refuses operations that need numbers, and says what to write instead."""
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
         if ufunc in _OPERATORS and method == "__call__" and not options:
@@ -43,40 +43,40 @@ class NoNumber:
                 return result
             if own in ("__eq__", "__ne__"):
                 return own == "__ne__"
-        raise self._no_number(f"np.{ufunc.__name__}", f"Function(np.{ufunc.__name__})({_arguments(ufunc.nin)})")
+        raise self._number_error(f"np.{ufunc.__name__}", f"Function(np.{ufunc.__name__})({_arguments(ufunc.nin)})")
 
-    def _no_number(self, what: str, instead: str) -> WiringError:
-        """Return the error for what can be done with numbers only."""
+    def _number_error(self, operation: str, instead: str) -> WiringError:
+        """Return the error of an operation that needs numbers."""
         return WiringError(
-            f"{what} can't be applied to a signal: its values come with the run. Use {instead}, or write a Block whose "
-            "equation does it.",
-            block=self._who(),
+            f"{operation} can't be applied to a signal: its values come with the run. Use {instead}, or write a Block "
+            "whose equation does it.",
+            block=self._source_name(),
         )
 
-    def _who(self) -> str | None:
-        """Return the name of the block that it comes from, for messages."""
+    def _source_name(self) -> str | None:
+        """Return the name of the block that the signal comes from, for messages."""
         source = getattr(self, "source", None) or getattr(self, "block", self)
         return getattr(source, "label", None)
 
     def __pow__(self, other: Any) -> NoReturn:
         if isinstance(other, NoNumber):
-            raise self._no_number("**", "Function(np.power)(a, b)")
-        raise self._no_number("**", f"Function(lambda u: u**{other!r})(u)")
+            raise self._number_error("**", "Function(np.power)(a, b)")
+        raise self._number_error("**", f"Function(lambda u: u**{other!r})(u)")
 
     def __rpow__(self, other: Any) -> NoReturn:
-        raise self._no_number("**", f"Function(lambda u: {other!r}**u)(u)")
+        raise self._number_error("**", f"Function(lambda u: {other!r}**u)(u)")
 
     def __rtruediv__(self, other: Any) -> NoReturn:
-        raise self._no_number("a division by it", f"Function(lambda u: {other!r} / u)(u)")
+        raise self._number_error("/", f"Function(lambda u: {other!r} / u)(u)")
 
     def __abs__(self) -> NoReturn:
-        raise self._no_number("abs", "Function(np.abs)(u)")
+        raise self._number_error("abs", "Function(np.abs)(u)")
 
     def __mod__(self, other: Any) -> NoReturn:
-        raise self._no_number("%", "Function(lambda u: np.mod(u, …))(u)")
+        raise self._number_error("%", "Function(lambda u: np.mod(u, …))(u)")
 
     def __floordiv__(self, other: Any) -> NoReturn:
-        raise self._no_number("//", "Function(lambda u: np.floor(u / …))(u)")
+        raise self._number_error("//", "Function(lambda u: np.floor(u / …))(u)")
 
 
 def _unknown(left: Any, right: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Ports: what a block declares of its inputs, outputs and states."""
+"""Ports: declarations of a block's inputs, outputs, states and events."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ if TYPE_CHECKING:
     from .signals import Signal
 
 Shape = tuple[int, ...]
-Unit = str | tuple[str, ...] | None
+PortUnit = str | tuple[str, ...] | None
 
 
 class Port:
-    """An input, an output or a state, declared on a block's class: ``position = Input(shape=(2,), unit="m")``.
+    """An input, output, state or event, declared on a block's class: ``position = Input(shape=(2,), unit="m")``.
 
     Parameters
     ----------
     shape : tuple of int or None
-        Shape of the signal, ``()`` for a scalar. None takes any shape (an input), or that which the equations give (an
-        output).
+        Shape of the signal, ``()`` for a scalar. None means any shape for an input, and the shape that the equations
+        return for an output.
     unit : str, tuple of str or None
-        Unit as FMI spells it; a tuple gives one per entry. None: not declared, and not checked.
+        Unit as FMI spells it; a tuple gives one for each entry. None: not declared, and not checked.
     description : str
         One line for people.
     nominal : float, optional
-        Typical size, positive, in its unit: what tolerances of a solver are relative to.
+        Typical size, positive, in its unit; a solver's tolerances are relative to it.
     minimum, maximum : float, optional
         Range in its unit; an FMU refuses values outside.
     """
@@ -39,7 +39,7 @@ class Port:
     def __init__(
         self,
         shape: Shape | None = (),
-        unit: Unit = None,
+        unit: PortUnit = None,
         description: str = "",
         name: str = "",
         *,
@@ -55,7 +55,7 @@ class Port:
             raise DefinitionError(f"found nominal {nominal!r}; expected a positive number.")
 
     def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name  # checked once the class is made: Python wraps what is raised here in a RuntimeError
+        self.name = name  # checked by check_port_names: Python would wrap an error raised here in a RuntimeError
 
     def __repr__(self) -> str:
         unit = "" if self.unit is None else f", unit={self.unit!r}"
@@ -66,12 +66,12 @@ _TAKEN = frozenset({"name", "inputs", "outputs", "states", "events", "replace", 
 
 
 def check_port_names(cls: type) -> None:
-    """Refuse ports of a class whose names mean something else.
+    """Refuse ports of a class whose names have another meaning already.
 
     Raises
     ------
     DefinitionError
-        The name of an attribute of every block, T, or a name that begins with an underscore.
+        For ``T``, an attribute of every block, and a name that begins with an underscore.
     """
     for name in (n for n, item in vars(cls).items() if isinstance(item, Port)):
         if name == "T":
@@ -91,7 +91,7 @@ class Input(Port):
     def __init__(
         self,
         shape: Shape | None = (),
-        unit: Unit = None,
+        unit: PortUnit = None,
         description: str = "",
         *,
         default: Any = None,
@@ -105,7 +105,7 @@ class Input(Port):
         if instance is None:
             return self
         raise AttributeError(
-            f"{self.name!r} is an input of {instance!r}: it is wired by calling the block, and can't be read."
+            f"{self.name!r} is an input of {instance!r} and can't be read; wire it by calling the block."
         )
 
 
@@ -115,17 +115,17 @@ class Output(Port):
     Parameters
     ----------
     like : str, optional
-        Name of the input whose unit it takes over. The shape, where none is given, is what the equations give: a sum
-        of a scalar and a vector is a vector.
+        Name of the input whose unit it takes over. A shape that is not given follows from the equations: a sum of a
+        scalar and a vector is a vector.
     secondary : bool, optional
-        True for an output that is read by name only (``saturation.excess``): it is recorded as any other, but the
-        block's call neither unpacks into it nor stands for it.
+        True for an output that is read by name only (``saturation.excess``). It is recorded like any other, but a call
+        of the block neither unpacks into it nor stands for it.
     """
 
     def __init__(
         self,
         shape: Shape | None = (),
-        unit: Unit = None,
+        unit: PortUnit = None,
         description: str = "",
         *,
         like: str | None = None,
@@ -154,8 +154,8 @@ class State(Port):
     Parameters
     ----------
     start : float, array_like, str or callable
-        Start value; a string names the parameter that holds it, a callable computes it from the block. It sets the
-        shape.
+        Start value, which sets the shape. A string names the parameter that holds it; a callable computes it from the
+        block.
     like : str, optional
         Name of the input whose shape the state takes.
     output : bool, optional
@@ -166,7 +166,7 @@ class State(Port):
 
     def __init__(
         self,
-        unit: Unit = None,
+        unit: PortUnit = None,
         description: str = "",
         *,
         start: float | Any | str | Callable[[Any], Any] = 0.0,
@@ -180,7 +180,7 @@ class State(Port):
         self.start, self.like, self.output, self.discrete = start, like, output, discrete
 
     def start_value(self, block: Block, shapes: Mapping[str, Shape]) -> np.ndarray:
-        """Return the start value on ``block``, with inputs of the given shapes, as a float64 array."""
+        """Return the start value for ``block``, with inputs of the given shapes, as a float64 array."""
         start = self.start
         if isinstance(start, str):
             start = getattr(block, start)
@@ -203,7 +203,7 @@ class Event(Port):
     """An event of a continuous block: one of its ``indicators`` crosses zero in a direction.
 
     An indicator is in one of two domains, z > 0 or z ≤ 0. A change of domain in the declared direction fires the event,
-    and the block's ``jump`` gives the states after it. At the start domains are taken as they are, and nothing fires.
+    and the block's ``jump`` gives the states after it. No event fires at the start, whatever the domains are.
 
     Parameters
     ----------
@@ -212,10 +212,10 @@ class Event(Port):
     description : str
         One line for people.
     nominal : float
-        Typical size of the indicator, positive: what "close to zero" is measured by.
+        Typical size of the indicator, positive; "close to zero" is relative to it.
     hysteresis : float
-        How far beyond zero, in the indicator's unit, it must go for the event to fire. It ends chattering, and is used
-        in diagrams; an exported FMU has its own.
+        Distance beyond zero, in the indicator's unit, at which the event fires; it ends chattering. It is used in
+        diagrams; an exported FMU has its own.
     """
 
     def __init__(

@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from .block import Block
 
 recorder: ContextVar[list[Any] | None] = ContextVar("loopwright_calls", default=None)
-"""The calls made while a subsystem's function runs: a closing call whose result nobody uses still counts."""
+"""Calls made while a subsystem's function runs: a call that closes a loop counts even if its result is not used."""
 
 
 class Wireable(NoNumber):
-    """What can stand at the source end of a wire: a signal, a call, a block with one output."""
+    """Source of a wire: a signal, a call, or a block with one output."""
 
     def _signal(self) -> Signal:
         raise NotImplementedError
@@ -51,9 +51,9 @@ class Wireable(NoNumber):
         return _sum(other, self, "+-")
 
     def __neg__(self) -> Signal:
-        from ..library.algebra import Sum  # it keeps the unit, which a gain would not
+        from ..library.algebra import Sum  # keeps the unit, which a Gain would not
 
-        return hinted(Sum(signs="-"), f"minus_{_operand(self, 'constant')}")(self)._signal()
+        return with_hint(Sum(signs="-"), f"minus_{_operand(self, 'constant')}")(self)._signal()
 
     def __mul__(self, other: Any) -> Signal:
         return _product(self, other)
@@ -64,21 +64,21 @@ class Wireable(NoNumber):
     def __rmatmul__(self, matrix: Any) -> Signal:
         from ..library.algebra import Gain
 
-        return hinted(Gain(gain=matrix), f"gain_of_{_operand(self, 'constant')}")(self)._signal()
+        return with_hint(Gain(gain=matrix), f"gain_of_{_operand(self, 'constant')}")(self)._signal()
 
     def __truediv__(self, other: Any) -> Signal:
         if isinstance(other, Wireable):
             raise WiringError(
                 "a signal can't be divided by a signal; use Function(np.divide)(a, b), or write a Block whose equation "
                 "does it.",
-                block=self._who(),
+                block=self._source_name(),
             )
         return self * (1.0 / np.asarray(other, dtype=float))
 
     def __getitem__(self, index: int | slice) -> Signal:
         return self._signal()[index]
 
-    def __iter__(self) -> Iterator[Signal]:  # without it Python would index from 0 on and never stop
+    def __iter__(self) -> Iterator[Signal]:  # without it Python would index from 0 on, without end
         return iter(self._signal())
 
     def __dir__(self) -> list[str]:
@@ -89,27 +89,28 @@ class Wireable(NoNumber):
 
 
 class Wired(Wireable):
-    """A signal or a call: its values are those of a run, so nothing can be decided on it while wiring."""
+    """A signal or a call. Its values come with a run, so nothing can be decided on them while wiring."""
 
     __hash__ = object.__hash__
 
-    def _undecided(self, what: str) -> WiringError:
+    def _decision_error(self, quantity: str) -> WiringError:
+        """Return the error of a decision that needs numbers."""
         return WiringError(
-            f"{self!r} has no {what} while the diagram is wired: its values come with the run. Write the decision as a "
-            "block's equation, with np.where(…).",
-            block=self._who(),
+            f"{self!r} has no {quantity} while the diagram is wired: its values come with the run. Write the decision "
+            "as a block's equation, with np.where(…).",
+            block=self._source_name(),
         )
 
     def __bool__(self) -> bool:
-        raise self._undecided("truth value")
+        raise self._decision_error("truth value")
 
     def __eq__(self, other: object) -> bool:
         if isinstance(other, int | float | np.number | np.ndarray):
-            raise self._undecided("value to compare")
+            raise self._decision_error("value to compare")
         return self is other
 
     def __lt__(self, other: object) -> bool:
-        raise self._undecided("value to compare")
+        raise self._decision_error("value to compare")
 
     __le__ = __gt__ = __ge__ = __lt__
 
@@ -119,16 +120,16 @@ class Signal(Wired):
 
     Attributes
     ----------
-    source : Block or frame input
-        Who makes it.
+    source : Block or subsystem input
+        The block that makes it, or the input of the subsystem that it enters by.
     port : str
         Output port.
     index : int, slice or None
-        The part of the port.
+        The part of the port; None for the whole.
     wire : str or None
         Name given by `named`.
     call : Call or None
-        The call that it came from, where there was one.
+        The call that it came from; None if it was read from the block.
     """
 
     __slots__ = ("call", "index", "port", "source", "wire")
@@ -143,7 +144,7 @@ class Signal(Wired):
 
     def __getitem__(self, index: int | slice) -> Signal:
         if self.index is not None:
-            raise WiringError("a part of a part of a signal; index the port once.", port=self.port)
+            raise WiringError("it is a part of a signal already; index the whole port, once.", port=self.port)
         return Signal(self.source, self.port, _index(index, self.port), None, self.call)
 
     def __iter__(self) -> Iterator[Signal]:
@@ -151,9 +152,9 @@ class Signal(Wired):
         raise WiringError("this is one signal and can't be unpacked; index it, as in y[0].", block=who, port=self.port)
 
     def named(self, name: str) -> Signal:
-        """Name the wire: a log channel, and a point at which the loop can be opened.
+        """Name the wire, which makes it a log channel and a point at which the loop can be opened.
 
-        The signal that is returned must be the one that is used on; it is the same port.
+        Use the signal that is returned from here on: it is the same port, with the name.
         """
         return Signal(self.source, self.port, self.index, check_name(name), self.call)
 
@@ -163,7 +164,7 @@ class Signal(Wired):
 
 
 def _index(index: Any, port: str) -> int | slice:
-    """Return an index of plain integers, so that NumPy's integers wire (and compare) as Python's do."""
+    """Return an index of Python's integers, so that NumPy's integers wire and compare alike."""
 
     def integer(value: Any) -> int:
         if isinstance(value, bool | np.bool_):
@@ -181,7 +182,7 @@ def _index(index: Any, port: str) -> int | slice:
 
 
 def _outputs(source: Wireable) -> list[str]:
-    """Return the names that complete in a notebook; nothing where they can't be had, for completion never fails."""
+    """Return the output names that a notebook completes; none where they can't be found: completion must not fail."""
     with suppress(LoopwrightError):
         if not isinstance(source, Signal):
             return list(getattr(source.block if isinstance(source, Call) else source, "outputs", ()))
@@ -203,7 +204,7 @@ class Call(Wired):
 
     @property
     def primary(self) -> list[str]:
-        """Names of the outputs that the call unpacks into."""
+        """Names of the outputs that the call unpacks into, without the secondary ones."""
         return primary_outputs(self.block)
 
     def named(self, *names: str) -> Call:
@@ -248,7 +249,7 @@ class Call(Wired):
 
 
 class UnknownAttributeError(UnknownNameError, AttributeError):
-    """An output that is not there, asked for as an attribute."""
+    """An unknown output or parameter was read as an attribute."""
 
 
 def primary_outputs(block: Block) -> list[str]:
@@ -262,7 +263,7 @@ def check_name(name: Any) -> str:
     Raises
     ------
     WiringError
-        If it is no identifier (letters, digits, underscores).
+        For anything but an identifier (letters, digits, underscores).
     """
     if not (isinstance(name, str) and name.isidentifier()):
         raise WiringError(f"found the name {name!r}; expected letters, digits and underscores, such as 'v_perp'.")
@@ -275,7 +276,7 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
     Raises
     ------
     WiringError
-        If it stands for none.
+        For anything else.
     """
     from ..library.sources import Constant
 
@@ -297,7 +298,7 @@ def bind(block: Block, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[st
     Raises
     ------
     UnwiredInputError, DoubleDriveError, UnknownNameError, WiringError
-        A required input left out, given twice, one that isn't there, too many.
+        For a required input left out, an input given twice, an unknown input, too many signals.
     """
     inputs, who = block.inputs, block.label
     if len(args) > len(inputs):
@@ -330,8 +331,8 @@ def _operand(value: Any, default: str) -> str:
     return signal.source.label if len(outputs) == 1 else signal.port
 
 
-def hinted(block: Block, hint: str) -> Block:
-    """Give a block that the library makes a name to be numbered where it repeats, and return it."""
+def with_hint(block: Block, hint: str) -> Block:
+    """Set the name of a block that an operator makes, numbered where it repeats, and return the block."""
     object.__setattr__(block, "_hint", hint)
     return block
 
@@ -341,7 +342,7 @@ def _sum(left: Any, right: Any, signs: str) -> Signal:
 
     word = {"++": "plus", "+-": "minus"}[signs]
     name = f"{_operand(left, 'constant')}_{word}_{_operand(right, 'constant')}"
-    return hinted(Sum(signs=signs), name)(left, right)._signal()
+    return with_hint(Sum(signs=signs), name)(left, right)._signal()
 
 
 def _product(left: Any, right: Any) -> Signal:
@@ -349,9 +350,10 @@ def _product(left: Any, right: Any) -> Signal:
 
     if isinstance(right, Wireable):
         name = f"{_operand(left, 'constant')}_times_{_operand(right, 'constant')}"
-        return hinted(Product(), name)(left, right)._signal()
+        return with_hint(Product(), name)(left, right)._signal()
     if not isinstance(right, int | float | np.number | np.ndarray) or np.ndim(right) > 1:
         raise ShapeError(
-            "a signal is multiplied by a number, a vector or another signal; a matrix is applied as K @ signal."
+            f"found a factor of shape {np.shape(right)}; expected a number, a vector or another signal. Apply a matrix "
+            "as K @ signal."
         )
-    return hinted(Gain(gain=right), f"gain_of_{_operand(left, 'constant')}")(left)._signal()
+    return with_hint(Gain(gain=right), f"gain_of_{_operand(left, 'constant')}")(left)._signal()

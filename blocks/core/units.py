@@ -1,8 +1,8 @@
-"""Unit strings, as FMI and Modelica write them, read into SI base units.
+"""Units: strings as FMI and Modelica write them, read into SI base units.
 
-The grammar is that of the Modelica specification (chapter 19), which FMI 3.0 (2.4.3, Units) leans on: factors joined
+The grammar is that of the Modelica specification (chapter 19), which FMI 3.0 (2.4.3, Units) builds on: factors joined
 by a dot (``N.s/m``), one ``/`` at most, a denominator of several factors in parentheses (``J/(kg.K)``), integer
-exponents with or without ``^`` (``m/s2``, ``m^2``, ``s-1``). A space or ``*`` between two factors is read as the dot.
+exponents with or without ``^`` (``m/s2``, ``m^2``, ``s-1``). A space or ``*`` between two factors is read as a dot.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class Unit:
     Parameters
     ----------
     text : str
-        As it was written.
+        The unit as it was written.
     exponents : tuple of int
-        Of kg, m, s, A, K, mol, cd, rad.
+        Exponents of kg, m, s, A, K, mol, cd, rad.
     factor, offset : float
         Conversion to base units.
     """
@@ -128,7 +128,7 @@ def parse_unit(text: str) -> Unit:
     Raises
     ------
     UnitError
-        If it can't be read; the message says where, and how to write it.
+        For a unit that can't be read; the message says where, and how to write it.
 
     Examples
     --------
@@ -166,7 +166,7 @@ def same_unit(a: Unit | str, b: Unit | str) -> bool:
 
 
 def describe_mismatch(a: Unit | str, b: Unit | str) -> str:
-    """Say how ``a`` (where a wire starts) differs from ``b`` (where it ends), and what to do.
+    """Name the difference between ``a`` (where a wire starts) and ``b`` (where it ends), and the remedy.
 
     Examples
     --------
@@ -186,7 +186,7 @@ def describe_mismatch(a: Unit | str, b: Unit | str) -> str:
 
 
 def rate_of(text: str) -> str:
-    """Write the unit of the time derivative: ``m`` gives ``m/s``, ``m/s`` gives ``m/s2``."""
+    """Return the unit of the time derivative: ``m/s`` for ``m``, ``m/s2`` for ``m/s``."""
     if parse_unit(text).offset:
         return "K/s"
     top, slash, bottom = (part.strip() for part in text.partition("/"))

@@ -1,7 +1,7 @@
 """Values: frozen objects whose parameters are their attributes.
 
-Blocks, paths and models are values. The constructor takes parameters and nothing else, `==` compares them,
-`replace` gives a variant, and pickling is that of a plain object.
+Blocks, paths and models are values. The constructor takes parameters and nothing else, `==` compares them, `replace`
+makes a variant, and they pickle like plain objects.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ else:
     class Array:
         """A number or a NumPy array of floats; inside an equation that is being traced, its symbolic stand-in.
 
-        It stands in annotations only: ``mass: Array = parameter(…)``. Type checkers take it for ``Any``.
+        Used in annotations only: ``mass: Array = parameter(…)``. Type checkers take it for ``Any``.
         """
 
 
@@ -38,7 +38,7 @@ _MISSING: Any = object()
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """What is declared of one parameter; made by `parameter`."""
+    """Declaration of one parameter, made by `parameter`."""
 
     default: Any = _MISSING
     unit: str | None = None
@@ -54,7 +54,7 @@ class ParameterSpec:
 
     @property
     def required(self) -> bool:
-        """Whether the constructor must be given it."""
+        """Whether the constructor needs a value for it."""
         return self.default is _MISSING
 
 
@@ -82,21 +82,21 @@ def parameter(
     description : str, optional
         One line for people.
     above, minimum, maximum : float, optional
-        Bounds that every entry must respect: strictly above, at least, at most.
+        Bounds of every entry: strictly above, at least, at most.
     shape : tuple of int, optional
         Shape that a numeric value is broadcast to.
     structural : bool, optional
         True when the equations branch on the value in Python; it is then a constant of the trace and not a symbol.
-        Values that are no floats are structural by nature.
+        Values other than floats are always structural.
     kw_only : bool, optional
-        False for the one defining object that may come first by position.
+        False for the one object that defines the value and may come first, by position.
     tunable : bool, optional
         False when an FMU made from it must not change the value during a run (FMI's variability "fixed").
 
     Raises
     ------
     UnitError
-        A unit that can't be read.
+        For a unit that can't be read.
     """
     if unit is not None:
         parse_unit(unit)
@@ -105,11 +105,11 @@ def parameter(
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(parameter,))
 class Value:
-    """Base of everything that is given by its parameters: blocks, paths, models."""
+    """Base of objects that are defined by their parameters: blocks, paths, models."""
 
     parameter_specs: ClassVar[Mapping[str, ParameterSpec]] = {}
     _keywords: ClassVar[frozenset[str]] = frozenset()  # constructor keywords that are no parameters (a block's name)
-    _content: ClassVar[Any] = None  # what else tells two values apart, such as the digest of a file
+    _content: ClassVar[Any] = None  # a further part of equality, such as the digest of a file
     __signature__ = ParameterSignature()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -122,7 +122,7 @@ class Value:
             declared = cls.__dict__.get(name, _MISSING)
             spec = declared if isinstance(declared, ParameterSpec) else ParameterSpec(default=declared)
             if name in cls.__dict__:
-                delattr(cls, name)  # the instance attribute is the only one
+                delattr(cls, name)  # the value is an attribute of the instance alone
             specs[name] = replace_fields(spec, annotation=text, default=freeze(spec.default))
         for name, declared in vars(cls).items():
             if isinstance(declared, ParameterSpec):
@@ -148,9 +148,7 @@ class Value:
             )
         for name, value in zip(positional, args, strict=False):
             if name in kwargs:
-                raise ParameterError(
-                    "it is given twice, by position and by keyword; give it once.", block=who, port=name
-                )
+                raise ParameterError("found two values, by position and by keyword; give one.", block=who, port=name)
             kwargs[name] = value
         for name in kwargs:
             if name not in cls.parameter_specs and name not in cls._keywords:
@@ -169,7 +167,7 @@ class Value:
         self.check()
 
     def check(self) -> None:
-        """Check what concerns several parameters at once; override it and raise `ParameterError`."""
+        """Check conditions on several parameters together; override it and raise `ParameterError`."""
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -214,7 +212,7 @@ class Value:
         return not spec.required and identity(value) == identity(convert(spec.default, spec, "", name))
 
     def __repr__(self) -> str:
-        shown = (f"{n}={short(v)}" for n, v in self.parameters.items() if not self._is_default(n, v))
+        shown = (f"{n}={shorten(v)}" for n, v in self.parameters.items() if not self._is_default(n, v))
         return f"{type(self).__name__}({', '.join(shown)})"
 
 
@@ -237,8 +235,8 @@ def identity(value: Any) -> Any:
     return type(value), value
 
 
-def short(value: Any) -> str:
-    """Write a parameter value in a few characters, numbers as people type them."""
+def shorten(value: Any) -> str:
+    """Return a parameter value as a short text, with numbers as people type them."""
     if isinstance(value, np.ndarray):
         return repr(value.tolist()) if value.size <= 12 else f"<{'×'.join(map(str, value.shape))} numbers>"
     if isinstance(value, float) and value == int(value or 0) and abs(value) < 1e6:
@@ -255,10 +253,10 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
     Raises
     ------
     ParameterError
-        Wrong kind, wrong shape, not finite, out of bounds, or nothing that can be hashed.
+        For a value of the wrong kind or shape, not finite, out of bounds, or not hashable.
     """
 
-    def bad(found: str, expected: str) -> ParameterError:
+    def error(found: str, expected: str) -> ParameterError:
         unit = f" in {spec.unit}" if spec.unit else ""
         return ParameterError(
             f"found {found}; expected {expected}{unit}. {spec.description}".rstrip(), block=who, port=name
@@ -271,37 +269,37 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
         return None
     for kind, accepted, word in (("bool", bool | np.bool_, "True or False"), ("str", str, "a text")):
         if kinds - {"None"} == {kind} and not isinstance(value, accepted):
-            raise bad(repr(value), word)
+            raise error(repr(value), word)
     if "int" in kinds and not numeric:
         if isinstance(value, bool) or not isinstance(value, numbers.Integral):
-            raise bad(repr(value), "an integer")
+            raise error(repr(value), "an integer")
         result: Any = int(value)
     elif numeric and not isinstance(value, str | Value):
         try:
             result = np.array(value, dtype=float)
         except (TypeError, ValueError):
-            raise bad(repr(value), "numbers") from None
+            raise error(repr(value), "numbers") from None
         if spec.shape is not None:
             try:
                 result = np.array(np.broadcast_to(result, spec.shape))
             except ValueError:
-                raise bad(f"shape {result.shape}", f"shape {spec.shape}") from None
+                raise error(f"shape {result.shape}", f"shape {spec.shape}") from None
         elif result.ndim and not array:
-            raise bad(f"{result.size} numbers", "a single number")
+            raise error(f"{result.size} numbers", "a single number")
         if not np.all(np.isfinite(result)):
-            raise bad(repr(value), "finite numbers")
+            raise error(repr(value), "finite numbers")
     elif numeric:
-        raise bad(repr(value), "a number")
+        raise error(repr(value), "a number")
     else:
-        return _frozen(value, bad)
+        return _freeze_hashable(value, error)
     for bound, holds, words in (
         (spec.above, np.greater, "above"),
         (spec.minimum, np.greater_equal, "at least"),
         (spec.maximum, np.less_equal, "at most"),
     ):
         if bound is not None and not np.all(holds(result, bound)):
-            shown = short(result if np.ndim(result) else result.item() if isinstance(result, np.ndarray) else result)
-            raise bad(shown, f"a value {words} {bound:g}")
+            shown = shorten(result if np.ndim(result) else result.item() if isinstance(result, np.ndarray) else result)
+            raise error(shown, f"a value {words} {bound:g}")
     if isinstance(result, np.ndarray):
         if result.ndim == 0:
             return float(result)
@@ -310,7 +308,7 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
 
 
 def _annotation_text(annotation: Any) -> str:
-    """Return an annotation as it is written; ``float | None`` and ``NDArray[…]`` have no name of their own."""
+    """Return an annotation as it is written, since ``float | None`` and ``NDArray[…]`` have no ``__name__``."""
     if isinstance(annotation, type):
         return annotation.__name__
     return re.sub(r"\b(?:\w+\.)+(?=\w)", "", str(annotation))
@@ -329,14 +327,14 @@ def _kinds(annotation: str) -> frozenset[str]:
     return frozenset(part.partition("[")[0].strip().rpartition(".")[2] for part in parts)
 
 
-def _frozen(value: Any, bad: Callable[[str, str], ParameterError]) -> Any:
-    """Return a read-only copy of a value that is no number."""
+def _freeze_hashable(value: Any, error: Callable[[str, str], ParameterError]) -> Any:
+    """Return a read-only copy of a value that is no number, and refuse one that can't be hashed."""
     frozen = freeze(value)
     try:
         hash(identity(frozen))
-    except TypeError:  # it could be compared with nothing, and its trace not be found again
-        raise bad(
-            f"{short(value)} of type {type(value).__name__}, which can't be hashed",
+    except TypeError:  # neither == nor the cache of traces could find such a value again
+        raise error(
+            f"{shorten(value)} of type {type(value).__name__}, which can't be hashed",
             "a number, a text, a tuple, a mapping, a function or an object that is hashable and never changes, such as "
             "one of a @dataclass(frozen=True)",
         ) from None

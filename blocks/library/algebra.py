@@ -10,7 +10,7 @@ import numpy as np
 from ..core.block import Block
 from ..core.errors import ParameterError, ShapeError
 from ..core.ports import Input, Output
-from ..core.values import Array, parameter, short
+from ..core.values import Array, parameter, shorten
 from .branching import Numbered, check_shapes, shape_of
 
 
@@ -172,7 +172,7 @@ class Limited(Block):
             check_shapes(**sides)
             if np.any(np.asarray(self.lower) >= np.asarray(self.upper)):
                 raise bad(
-                    f"found lower={short(self.lower)} and upper={short(self.upper)}; expected lower below upper. "
+                    f"found lower={shorten(self.lower)} and upper={shorten(self.upper)}; expected lower below upper. "
                     "Exchange them, or move one.",
                     "lower",
                 )

@@ -11,7 +11,7 @@ import numpy as np
 from ..core.block import Block
 from ..core.errors import ParameterError, ShapeError
 from ..core.ports import Event, Input, Output, State
-from ..core.values import Array, parameter, short
+from ..core.values import Array, parameter, shorten
 from .branching import check_fits, shape_of
 from .sources import smooth_step
 
@@ -99,7 +99,7 @@ class Wall(Block):
         """Refuse a normal of length zero, or of another shape than the point's."""
         if np.ndim(self.normal) > 1 or np.shape(self.normal) != np.shape(self.point) or not np.any(self.normal):
             raise ParameterError(
-                f"found normal={short(self.normal)} for point={short(self.point)}; expected a direction out of the "
+                f"found normal={shorten(self.normal)} for point={shorten(self.point)}; expected a direction out of the "
                 "wall with as many entries as the point has. Give the normal, such as (0, −1).",
                 block=self.label,
                 port="normal",
@@ -183,8 +183,8 @@ class HandProfile(Block):
         """Refuse a direction of length zero."""
         if np.ndim(self.direction) > 1 or not np.any(self.direction):
             raise ParameterError(
-                f"found {short(self.direction)}; expected a direction, such as (1, 0), or 1 or −1 for a scalar force. "
-                "Give one that is not zero.",
+                f"found {shorten(self.direction)}; expected a direction that is not zero, such as (1, 0), or 1 or −1 "
+                "for a scalar force. Give one.",
                 block=self.label,
                 port="direction",
             )

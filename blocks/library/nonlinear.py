@@ -14,7 +14,7 @@ import numpy as np
 from ..core.block import Block
 from ..core.errors import ParameterError, SampleTimeError
 from ..core.ports import Event, Input, Output, State
-from ..core.values import Array, parameter, short
+from ..core.values import Array, parameter, shorten
 from .branching import check_shapes, single
 
 
@@ -96,7 +96,7 @@ class Relay(Block):
         check_shapes(on_point=self.on_point, off_point=self.off_point)
         if np.any(np.asarray(self.off_point) > np.asarray(self.on_point)):
             raise ParameterError(
-                f"found off_point={short(self.off_point)} above on_point={short(self.on_point)}; expected it at or "
+                f"found off_point={shorten(self.off_point)} above on_point={shorten(self.on_point)}; expected it at or "
                 "below. Exchange them; for a relay that turns on below a point, exchange its values as well.",
                 block=self.label,
                 port="off_point",

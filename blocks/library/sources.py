@@ -13,7 +13,7 @@ import numpy as np
 
 from ..core.block import Block
 from ..core.errors import ParameterError, UnitError
-from ..core.ports import Output, Unit
+from ..core.ports import Output, PortUnit
 from ..core.units import parse_unit, rate_of
 from ..core.values import Array, parameter
 from .instants import earliest
@@ -61,7 +61,7 @@ class Source(Block):
     def outputs(self) -> dict[str, Output]:  # type: ignore[override]
         """The output in the declared unit."""
         declared, unit = type(self).y, self.unit
-        each: Unit = unit
+        each: PortUnit = unit
         if unit is not None and declared.shape == (3,):
             each = (unit, rate_of(unit), rate_of(rate_of(unit)))
         return {"y": Output(declared.shape, each, declared.description, name="y")}

@@ -15,7 +15,7 @@ import numpy as np
 from ..core.block import Block
 from ..core.errors import GuardError, ParameterError, PathDomainError
 from ..core.ports import Input, Output, State
-from ..core.values import Array, parameter, short
+from ..core.values import Array, parameter, shorten
 from ..paths import Path, limited
 from .planar_model import PlanarModel
 
@@ -35,7 +35,7 @@ def expect_path(block: Block) -> None:
     if not isinstance(path, Path):
         hint = " The path comes first, then the model." if isinstance(path, PlanarModel) else ""
         raise ParameterError(
-            f"found {short(path)}; expected a Path, such as Ellipse(semi_axes=(0.3, 0.15)).{hint}",
+            f"found {shorten(path)}; expected a Path, such as Ellipse(semi_axes=(0.3, 0.15)).{hint}",
             block=block.label,
             port="path",
         )
@@ -51,7 +51,7 @@ def expect_model(block: Block, model: Any) -> None:
     """
     if not isinstance(model, PlanarModel):
         raise ParameterError(
-            f"found {short(model)}; expected a PlanarModel, such as gantry.nominal.", block=block.label, port="model"
+            f"found {shorten(model)}; expected a PlanarModel, such as gantry.nominal.", block=block.label, port="model"
         )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...blocks.core.block import Block
 from ...blocks.core.errors import OptionError, ShapeError, near
-from ...blocks.core.ports import Output, Shape, Unit
+from ...blocks.core.ports import Output, PortUnit, Shape
 from ...blocks.core.signals import Signal, as_signal
 from ...blocks.core.values import Array, parameter
 from ...blocks.library.branching import shape_of
@@ -34,7 +34,7 @@ class Wander(Block):
     high: Array = parameter(description="largest values")
     duration: float = parameter(unit="s", above=0.0, description="time in which it comes around")
     seed: tuple[int, ...] = parameter(description="what frequencies and phases are drawn with")
-    unit: Unit = parameter(default=None, description="unit of the signal")
+    unit: PortUnit = parameter(default=None, description="unit of the signal")
     y = Output(shape=None, description="the signal")
 
     @property

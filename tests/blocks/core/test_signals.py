@@ -70,9 +70,9 @@ def test_a_block_without_unwired_inputs_unpacks_into_its_primary_outputs():
     ("block", "text"),
     [
         (STEP, r"step\.y: this is one signal and can't be unpacked; index it"),
-        (Gain(gain=2, name="twice"), r"twice: a block is used as a signal before it is wired; call it first"),
-        (Saturation(limit=1.0), r"saturation: a block is used as a signal before it is wired"),
-        (Silent(), r"silent: it has not one output \(none\)"),
+        (Gain(gain=2, name="twice"), r"twice: it is used as a signal before it is wired; call it first"),
+        (Saturation(limit=1.0), r"saturation: it is used as a signal before it is wired"),
+        (Silent(), r"silent: found 0 outputs \(none\); expected one, as a signal. Declare one"),
     ],
     ids=["one output", "unwired", "unwired, two outputs", "no output"],
 )

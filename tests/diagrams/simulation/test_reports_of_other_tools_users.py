@@ -167,9 +167,7 @@ def test_an_input_that_is_not_wired_is_an_error_when_the_diagram_is_built_and_no
 
 
 def test_an_output_that_needs_its_input_says_so_instead_of_an_assertion():
-    with pytest.raises(
-        WiringError, match=r"^g: a block is used as a signal before it is wired; call it first.*g\(u=…\)"
-    ):
+    with pytest.raises(WiringError, match=r"^g: it is used as a signal before it is wired; call it first.*g\(u=…\)"):
         Diagram("d", Lag(name="lag")(Gain(gain=2.0, name="g")))
 
 

@@ -137,7 +137,7 @@ def test_naming_needs_one_name_for_each_output():
 
 
 def test_a_block_used_as_a_signal_before_it_is_wired():
-    with pytest.raises(WiringError, match=r"gain: a block is used as a signal before it is wired"):
+    with pytest.raises(WiringError, match=r"gain: it is used as a signal before it is wired"):
         Gain(gain=1)(Gain(gain=2))
 
 
@@ -405,7 +405,7 @@ def test_signals_in_sums_products_and_quotients():
     assert run["y"][-1].tolist() == [0.0, 4.0]
     with pytest.raises(WiringError, match="can't be divided by a signal"):
         _ = a / b
-    with pytest.raises(ShapeError, match=r"a matrix is applied as K @ signal"):
+    with pytest.raises(ShapeError, match=r"Apply a matrix as K @ signal"):
         _ = a.y * np.eye(2)
 
 
