@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
-from .order import Node, cut_loops, order_layers, place_layers
+from .order import Node, Pin, cut_loops, order_layers, place_layers
 
 GAP, LANE, TRACK, LEAST = 22.0, 12.0, 9.0, 26.0
 """Between nodes; around a wire that passes a layer; between parallel wires; the narrowest channel."""
@@ -34,8 +34,8 @@ class Net:
     """
 
     key: str
-    source: tuple[str, str]
-    sinks: list[tuple[str, str]]
+    source: tuple[str, Pin]
+    sinks: list[tuple[str, Pin]]
     label: float = 0.0
     below: float = 0.0
     runs: list[list[Point]] = field(default_factory=list)
@@ -145,14 +145,14 @@ def _lanes(nets: Sequence[Net], by_key: dict[str, Node], layers: list[list[Node]
         start = by_key[net.source[0]].layer
         end = max((by_key[s].layer for s, _ in net.sinks), default=start)
         for i in range(start + 1, end):
-            node = Node(f"{net.key} {i}", 0.0, 0.0, {"": 0.0}, {"": 0.0}, lane=True, layer=i)
+            node = Node(f"{net.key} {i}", 0.0, 0.0, {Pin(""): 0.0}, {Pin(""): 0.0}, lane=True, layer=i)
             node.loose = by_key[net.source[0]].loose
             lanes[net.key, i] = node
             layers[i].append(node)
     return lanes
 
 
-def _ends(net: Net, by_key: dict[str, Node], layer: int) -> Iterable[tuple[Node, str]]:
+def _ends(net: Net, by_key: dict[str, Node], layer: int) -> Iterable[tuple[Node, Pin]]:
     """Yield the sinks of a net in a layer."""
     return ((by_key[s], pin) for s, pin in net.sinks if by_key[s].layer == layer)
 

@@ -4,6 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
+
+
+class Pin(NamedTuple):
+    """A pin of a block, by its port, or of a box, by the output that makes the signal.
+
+    Attributes
+    ----------
+    port : str
+        The block's port; at a box, the output's.
+    maker : str
+        Path of the block that makes the signal, at a box; empty at a block.
+    control : bool
+        Whether it enables or triggers the box.
+    """
+
+    port: str
+    maker: str = ""
+    control: bool = False
 
 
 @dataclass(eq=False)
@@ -25,8 +44,8 @@ class Node:
     key: str
     width: float
     height: float
-    ins: dict[str, float] = field(default_factory=dict)
-    outs: dict[str, float] = field(default_factory=dict)
+    ins: dict[Pin, float] = field(default_factory=dict)
+    outs: dict[Pin, float] = field(default_factory=dict)
     side: int = 0
     plant: bool = False
     lane: bool = False

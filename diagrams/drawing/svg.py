@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING
 
 from ...blocks.core.errors import OptionError, near
 from ...blocks.library.algebra import Sum
-from ..wiring.structure import Structure, Wire, stepped_blocks
+from ..wiring.structure import Structure, stepped_blocks
 from .layout import Net, arrange
-from .order import Node
+from .nets import Border, Nets, Place
+from .order import Node, Pin
 from .shapes import BORDER, GREY, INK, NAME, PLANT, WIRE, line, rect, seconds, text_at, width
 
 if TYPE_CHECKING:
@@ -92,57 +93,7 @@ class _Picture:
         self.closed = closed
         rates = sorted({f.sample_time for f in table.frames.values() if f.sample_time is not None})
         self.tints = {rate: TINTS[i % len(TINTS)] for i, rate in enumerate(rates)}
-        self.nets: dict[str, dict[tuple[str, str], list[tuple[str, str]]]] = {path: {} for path in table.frames}
-        self.parts: dict[str, int | slice] = {}  # what of a wire an input takes, by "block port"
-        self.ins: dict[str, list[str]] = {}
-        self.outs: dict[str, list[str]] = {}
-        self.names: dict[tuple[str, str], list[str]] = {}
-        for name, wire in table.names.items():
-            short = name.rpartition(".")[2]
-            if short not in self.names.setdefault((wire.block, wire.port), []):
-                self.names[wire.block, wire.port].append(short)
-        for (path, port), wire in table.wires.items():
-            self._thread(wire, table.frame_of[path], path, port)
-        for box, wire in table.controls.items():
-            self._thread(wire, box.rpartition(".")[0], box, f"{wire.block} {wire.port} control")
-        for source in self.names:
-            self.nets[table.frame_of[source[0]]].setdefault((source[0], source[1]), [])
-            self._pin(self.outs, *source)
-
-    def _thread(self, wire: Wire, frame: str, item: str, port: str) -> None:
-        """Lead a wire from its block through the borders of boxes to a consumer in a frame."""
-        key = f"{wire.block} {wire.port}"
-        here = self.table.frame_of[wire.block]
-        end = (wire.block, wire.port)
-        self._pin(self.outs, *end)
-        while not (here == frame or not here or frame.startswith(here + ".")):
-            self._join(here, end, (f">{here}", key))
-            end, here = (here, key), here.rpartition(".")[0]
-            self._pin(self.outs, *end)
-        for box in self._between(here, frame):
-            self._join(here, end, (box, key))
-            self._pin(self.ins, box, key)
-            end, here = (f"<{box}", key), box
-        self._join(here, end, (item, port))
-        self._pin(self.ins, item, port)
-        if wire.index is not None:
-            self.parts[f"{item} {port}"] = wire.index
-
-    @staticmethod
-    def _between(outer: str, inner: str) -> list[str]:
-        parts = inner.split(".") if inner else []
-        start = len(outer.split(".")) if outer else 0
-        return [".".join(parts[: i + 1]) for i in range(start, len(parts))]
-
-    def _join(self, frame: str, source: tuple[str, str], sink: tuple[str, str]) -> None:
-        sinks = self.nets[frame].setdefault(source, [])
-        if sink not in sinks:
-            sinks.append(sink)
-
-    @staticmethod
-    def _pin(pins: dict[str, list[str]], item: str, pin: str) -> None:
-        if pin not in pins.setdefault(item, []):
-            pins[item].append(pin)
+        self.nets = Nets(table)
 
     # --- layout -----------------------------------------------------------------------------------------------------
 
@@ -156,7 +107,7 @@ class _Picture:
             left, right, top = left + wide[0] + 16 + MARGIN, right + wide[1] + 16 + MARGIN, top + HEADER
             border = self._border(frame, -MARGIN, -HEADER, w + 2 * MARGIN, h + HEADER + MARGIN)
             for pin in pins:
-                name = pin.key.split(" ", 1)[1]
+                (name,) = (*pin.ins, *pin.outs)
                 start, end = (-MARGIN - 14, 0.0) if pin.side < 0 else (pin.x, w + MARGIN + 14)
                 anchor, at = ("end", start - 4) if pin.side < 0 else ("", end + 4)
                 border += line([(start, pin.y), (end, pin.y)])
@@ -185,72 +136,62 @@ class _Picture:
             else:
                 body, w, h, pins = self._inside(path)
                 node = Node(path, max(w + 2 * MARGIN, width(self._header(path), 10, True) + 20), h + HEADER + MARGIN)
-                node.ins = {p.key[len(path) + 2 :]: p.y + HEADER for p in pins if p.side < 0}
-                node.outs = {p.key[len(path) + 2 :]: p.y + HEADER for p in pins if p.side > 0}
+                node.ins = {name: p.y + HEADER for p in pins for name in p.outs}
+                node.outs = {name: p.y + HEADER for p in pins for name in p.ins}
                 self._control_pins(node)
                 drawn[path] = (body, pins)
                 nodes.append(node)
             nodes[-1].plant = self._has_plant(path)
         borders = []
         if frame:
+            entering, leaving = Place(frame, Border.INPUTS), Place(frame, Border.OUTPUTS)
             borders = [
-                Node(f"<{frame} {n}", 0, 0, {}, {n: 0.0}, -1) for n in self.ins.get(frame, []) if " control" not in n
+                Node(entering.key(n), 0, 0, {}, {n: 0.0}, -1) for n in self.nets.ins.get(frame, []) if not n.control
             ]
-            borders += [Node(f">{frame} {n}", 0, 0, {n: 0.0}, {}, 1) for n in self.outs.get(frame, [])]
-        nets = []
-        for (item, pin), sinks in self.nets[frame].items():
-            source = (f"{item} {pin}", pin) if item.startswith("<") else (item, pin)
-            ends = [(f"{i} {p}", p) if i.startswith(">") else (i, p) for i, p in sinks]
-            name = self._written(item, pin, ends)
-            label = (width(name, 9) + 10 if name else 0.0) + max(
-                (14.0 for i, p in sinks if f"{i} {p}" in self.parts), default=0.0
-            )
-            nets.append(Net(f"{item} {pin}", source, ends, label))
+            borders += [Node(leaving.key(n), 0, 0, {n: 0.0}, {}, 1) for n in self.nets.outs.get(frame, [])]
+        nets, names = [], []
+        for (place, pin), sinks in self.nets.of[frame].items():
+            name = self.nets.written_at(place, pin, sinks)
+            part = any(self.nets.is_part(*sink) for sink in sinks)
+            label = (width(name, 9) + 10 if name else 0.0) + (14.0 if part else 0.0)
+            ends = [(end.key(p), p) for end, p in sinks]
+            nets.append(Net(f"{place} {pin}", (place.key(pin), pin), ends, label))
+            names.append(name)
         w, h = arrange([*borders, *nodes], nets)
         out = [self._wire(net) for net in nets]
         out += [self._item(node, drawn.get(node.key)) for node in nodes]
-        out += [self._label(net, nodes) for net in nets]
+        out += [self._label(net, name, nodes) for net, name in zip(nets, names, strict=True)]
         return "".join(out), w, h, borders
 
     def _control_pins(self, node: Node) -> None:
-        extra = [n for n in self.ins.get(node.key, []) if n.endswith(" control")]
-        for name in extra:
-            node.ins[name] = HEADER / 2
+        for pin in self.nets.ins.get(node.key, []):
+            if pin.control:
+                node.ins[pin] = HEADER / 2
 
     def _has_plant(self, path: str) -> bool:
         return bool(stepped_blocks(self.table, path))
 
-    def _name(self, item: str, pin: str) -> str:
-        """Return the names of a wire as written where it begins, in a frame."""
-        block, port = (item, pin) if item in self.table.blocks else tuple(pin.split(" ", 1))
-        return ", ".join(self.names.get((block, port), []))
-
-    def _written(self, item: str, pin: str, sinks: list[tuple[str, str]]) -> str:
-        """Return what is written at a wire; one that only leaves the box is named outside."""
-        if item.startswith("<") or (sinks and all(i.startswith(">") for i, _ in sinks)):
-            return ""
-        return self._name(item, pin)
-
-    def _pin_texts(self, path: str) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
+    def _pin_texts(self, path: str) -> tuple[list[tuple[Pin, str]], list[tuple[Pin, str]]]:
         """Return pins and their texts, inputs and outputs, in the order in which they stand."""
-        ins, outs = self.ins.get(path, []), self.outs.get(path, [])
+        ins, outs = self.nets.ins.get(path, []), self.nets.outs.get(path, [])
         block = self.table.blocks.get(path)
         if block is None:
 
-            def text(pin: str) -> str:
-                made, port = pin.split(" ", 1)
-                if pin.endswith(" control"):
+            def text(pin: Pin) -> str:
+                if pin.control:
                     return {"enabled": "enable", "triggered": "trigger"}[self.table.frames[path].control]
-                alone = len(self.table.blocks[made].outputs) == 1
-                return self._name(made, port) or (made.rpartition(".")[2] if alone else port)
+                alone = len(self.table.blocks[pin.maker].outputs) == 1
+                return self.nets.name_of(path, pin) or (pin.maker.rpartition(".")[2] if alone else pin.port)
 
             return [(n, text(n)) for n in ins], [(n, text(n)) for n in outs]
         declared_in, declared_out = list(block.inputs), list(block.outputs)
-        ins, outs = sorted(ins, key=declared_in.index), sorted(outs, key=declared_out.index)
+        ins = sorted(ins, key=lambda pin: declared_in.index(pin.port))
+        outs = sorted(outs, key=lambda pin: declared_out.index(pin.port))
         if isinstance(block, Sum):
-            return [(n, block.signs[declared_in.index(n)].replace("-", "−")) for n in ins], [(n, "") for n in outs]
+            signs = [block.signs[declared_in.index(n.port)].replace("-", "−") for n in ins]
+            return list(zip(ins, signs, strict=True)), [(n, "") for n in outs]
         plain_in, plain_out = len(declared_in) == 1, len(declared_out) == 1
-        return [(n, "" if plain_in else n) for n in ins], [(n, "" if plain_out else n) for n in outs]
+        return [(n, "" if plain_in else n.port) for n in ins], [(n, "" if plain_out else n.port) for n in outs]
 
     def _block(self, path: str) -> Node:
         ins, outs = self._pin_texts(path)
@@ -286,6 +227,10 @@ class _Picture:
         return path.rpartition(".")[2], kind if len(kind) < 36 else kind[:33] + "…"
 
     def _header(self, path: str) -> str:
+        return " · ".join(self._headings(path))
+
+    def _headings(self, path: str) -> list[str]:
+        """Return the texts at a box's upper edge: its name, its rate, its conditions."""
         frame = self.table.frames[path]
         texts = [path.rpartition(".")[2]]
         if frame.sample_time is not None:
@@ -296,7 +241,7 @@ class _Picture:
             texts.append(f"delay {frame.delay} sample{'s' if frame.delay > 1 else ''}")
         if frame.control:
             texts.append(f"{frame.control}, {frame.when}")
-        return " · ".join(texts)
+        return texts
 
     # --- drawing ----------------------------------------------------------------------------------------------------
 
@@ -320,7 +265,7 @@ class _Picture:
         """Return a box without what is in it."""
         rate = self.table.rate(path)
         tint = self.tints[rate] if rate is not None else "#f5f6f7"
-        name, *rest = self._header(path).split(" · ")
+        name, *rest = self._headings(path)
         more = f'<tspan fill="{GREY}" font-weight="normal"> · {escape(" · ".join(rest))}</tspan>' if rest else ""
         dash = ' stroke-dasharray="5 3"' if self.table.frames[path].control else ""
         return (
@@ -365,14 +310,13 @@ class _Picture:
         out += [f'<circle cx="{x:g}" cy="{y:g}" r="2.2" fill="{WIRE}"/>\n' for x, y in net.dots]
         return "".join(out)
 
-    def _label(self, net: Net, nodes: list[Node]) -> str:
+    def _label(self, net: Net, name: str, nodes: list[Node]) -> str:
         """Write a wire's name behind its source, arrows and parts ahead of its sinks."""
         out = []
         by_key = {node.key: node for node in nodes}
         source = by_key.get(net.source[0])
         if source is not None:
             x, y = source.x + source.width, source.y + source.outs[net.source[1]]
-            name = self._written(*net.source, net.sinks)
             if name:
                 out.append(text_at(x + 5, y - 3.5, name, 9, fill=NAME, italic=True))
         for item, pin in net.sinks:
@@ -380,7 +324,7 @@ class _Picture:
                 node = by_key[item]
                 x, y = node.x, node.y + node.ins[pin]
                 out.append(f'<path d="M{x:g} {y:g}l-6.5 -3v6z" fill="{WIRE}"/>\n')
-                part = self.parts.get(f"{item} {pin}")
+                part = self.nets.parts.get((item, pin))
                 if part is not None:
                     text = f"[{part.start or ''}:{part.stop or ''}]" if isinstance(part, slice) else f"[{part}]"
                     out.append(text_at(x - 8, y - 3.5, text, 8, anchor="end", fill=GREY))

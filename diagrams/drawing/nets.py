@@ -1,0 +1,126 @@
+"""Wires of every frame for a drawing, led from their blocks through the borders of boxes to their consumers."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import NamedTuple
+
+from ..wiring.structure import Structure, Wire
+from .order import Pin
+
+
+class Border(Enum):
+    """The inner side of a box's border, where its wires begin and end."""
+
+    INPUTS = "inputs"
+    """Signals come into the box there."""
+    OUTPUTS = "outputs"
+    """Signals leave the box there."""
+
+
+class Place(NamedTuple):
+    """An end of a wire within a frame: a block or box, or the border of the frame's own box.
+
+    Attributes
+    ----------
+    path : str
+        Path of the block or box.
+    border : Border, optional
+        The side of the border; None where the wire ends at the block or box itself.
+    """
+
+    path: str
+    border: Border | None = None
+
+    def key(self, pin: Pin) -> str:
+        """Return the key of the node at this place: on a border every pin is a node of its own."""
+        return self.path if self.border is None else f"{self.border.value} of {self.path}: {pin.maker} {pin.port}"
+
+
+PlacedPin = tuple[Place, Pin]
+
+
+class Nets:
+    """All wires of a diagram by frame.
+
+    Attributes
+    ----------
+    of : dict
+        For each frame the sources, with all their sinks there.
+    parts : dict
+        The index of a wire that leads a part of its signal, by the path and pin at which it ends.
+    ins, outs : dict
+        Pins of every block and box.
+    names : dict
+        Names of the wires that begin at a block's port.
+    """
+
+    def __init__(self, table: Structure):
+        self.table = table
+        self.of: dict[str, dict[PlacedPin, list[PlacedPin]]] = {path: {} for path in table.frames}
+        self.parts: dict[tuple[str, Pin], int | slice] = {}
+        self.ins: dict[str, list[Pin]] = {}
+        self.outs: dict[str, list[Pin]] = {}
+        self.names: dict[tuple[str, str], list[str]] = {}
+        for name, wire in table.names.items():
+            short = name.rpartition(".")[2]
+            if short not in self.names.setdefault((wire.block, wire.port), []):
+                self.names[wire.block, wire.port].append(short)
+        for (path, port), wire in table.wires.items():
+            self._thread(wire, table.frame_of[path], path, Pin(port))
+        for box, wire in table.controls.items():
+            self._thread(wire, box.rpartition(".")[0], box, Pin(wire.port, wire.block, control=True))
+        for block, port in self.names:
+            self.of[table.frame_of[block]].setdefault((Place(block), Pin(port)), [])
+            _add(self.outs, block, Pin(port))
+
+    def name_of(self, path: str, pin: Pin) -> str:
+        """Return the names of the wire that begins at a pin of a block or a box."""
+        block = path if path in self.table.blocks else pin.maker
+        return ", ".join(self.names.get((block, pin.port), []))
+
+    def written_at(self, place: Place, pin: Pin, sinks: list[PlacedPin]) -> str:
+        """Return the name that is written at a wire; one that only leaves the box is named outside."""
+        if place.border is Border.INPUTS or (sinks and all(end.border is Border.OUTPUTS for end, _ in sinks)):
+            return ""
+        return self.name_of(place.path, pin)
+
+    def is_part(self, place: Place, pin: Pin) -> bool:
+        """Whether only a part of the wire's signal goes into this end."""
+        return place.border is None and (place.path, pin) in self.parts
+
+    def _thread(self, wire: Wire, frame: str, item: str, pin: Pin) -> None:
+        """Lead a wire from its block through the borders of boxes to a consumer in a frame."""
+        crossing = Pin(wire.port, wire.block)
+        here = self.table.frame_of[wire.block]
+        end = (Place(wire.block), Pin(wire.port))
+        _add(self.outs, wire.block, end[1])
+        while not (here == frame or not here or frame.startswith(here + ".")):
+            self._join(here, end, (Place(here, Border.OUTPUTS), crossing))
+            _add(self.outs, here, crossing)
+            end, here = (Place(here), crossing), here.rpartition(".")[0]
+        for box in _between(here, frame):
+            self._join(here, end, (Place(box), crossing))
+            _add(self.ins, box, crossing)
+            end, here = (Place(box, Border.INPUTS), crossing), box
+        self._join(here, end, (Place(item), pin))
+        _add(self.ins, item, pin)
+        if wire.index is not None:
+            self.parts[item, pin] = wire.index
+
+    def _join(self, frame: str, source: PlacedPin, sink: PlacedPin) -> None:
+        sinks = self.of[frame].setdefault(source, [])
+        if sink not in sinks:
+            sinks.append(sink)
+
+
+def _between(outer: str, inner: str) -> list[str]:
+    """Return the boxes from a frame down to one inside it."""
+    parts = inner.split(".") if inner else []
+    start = len(outer.split(".")) if outer else 0
+    return [".".join(parts[: i + 1]) for i in range(start, len(parts))]
+
+
+def _add(pins: dict[str, list[Pin]], item: str, pin: Pin) -> None:
+    if pin not in pins.setdefault(item, []):
+        pins[item].append(pin)
