@@ -25,7 +25,8 @@ import fmpy.fmi3
 import numpy as np
 
 from loopwright.fmus import gantry
-from loopwright.fmus.export.compiler import SUFFIXES, compile_shared, find_compiler, flags, native_platform
+from loopwright.fmus.export.compiler import SUFFIXES, compile_shared, find_compiler, flags
+from loopwright.fmus.platform import native_platform
 
 TICK = 1e-3
 SUBSTEPS = 5

@@ -4,6 +4,7 @@ A block's equations are written once, as NumPy-style functions of (t, x, u), and
 compiled from there. Everything here is public; nothing here imports the rooms above.
 """
 
+from .core.arithmetic import Gain, Product, Sum
 from .core.block import Block
 from .core.errors import (
     AlgebraicLoopError,
@@ -32,9 +33,10 @@ from .core.errors import (
 )
 from .core.ports import Event, Input, Output, State
 from .core.signals import Call, Signal
+from .core.source import Constant
 from .core.units import Unit, parse_unit
 from .core.values import Array, Value, parameter
-from .library.algebra import DeadZone, Gain, Maximum, Minimum, Product, Saturation, Sum
+from .library.algebra import DeadZone, Maximum, Minimum, Saturation
 from .library.contact import HandProfile, SpringDamper, Wall
 from .library.delays import Delay, PadeDelay, TransportDelay
 from .library.filters import FIR, IIR, DiscreteIntegrator, MovingAverage
@@ -48,7 +50,7 @@ from .library.nonlinear import Backlash, Quantizer, RateLimiter, Relay
 from .library.pid import PID
 from .library.requirements import Requirement, StopCondition
 from .library.sampled import Encoder, ForceSensor, Hold, UnitDelay
-from .library.sources import Constant, Pulse, Reference, Sine, SmoothStep, Step
+from .library.sources import Pulse, Reference, Sine, SmoothStep, Step
 from .library.state_machine import StateMachine
 from .library.zero_pole import DiscreteZeroPoleGain, ZeroPoleGain
 from .path_following.compliance import AdmittanceFilter, ErrorDynamics

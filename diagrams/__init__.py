@@ -38,15 +38,16 @@ from .frequency.sensitivities import (
     sensitivity,
 )
 from .linearization.linearize import Linearization
-from .linearization.operating_point import OperatingPoint
 from .measure.frequency_response import FrequencyResponse
 from .paper import experiments
 from .paper.fig3 import Channel, Rig, fig3
 from .report.analyse import analyse
 from .report.model import Plot, Report, Section, Table
+from .results.operating_point import OperatingPoint
 from .results.run import Run, Snapshot
 from .results.saved_state import RunState
 from .results.stored import Occurrence, Stopped
+from .simulation.run_options import RunOptions
 from .simulation.simulation import Simulation
 from .wiring.structure import Frame, Wire
 from .wiring.subsystem import Subsystem, subsystem
@@ -77,6 +78,7 @@ __all__ = [
     "Report",
     "Rig",
     "Run",
+    "RunOptions",
     "RunState",
     "SampledDesign",
     "Section",

@@ -1,36 +1,25 @@
-"""The diagram: blocks and wires as one value."""
+"""The diagram: blocks and wires as one value, with all that is done with it."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
-from dataclasses import replace as replace_fields
-from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import Any, Unpack
 
-from ..blocks.core.block import Block
-from ..blocks.core.errors import OptionError, WiringError
-from ..blocks.core.signals import check_name
-from ..blocks.tracing.discretization import check_method
-from .analysis import Analysis
-from .flat.flat_diagram import FlatDiagram
-from .flat.flatten import flatten
+from .drawing.svg import Drawing, draw
+from .flat.wired_diagram import WiredDiagram
+from .linearization.linearize import Linearization, batch, linearize
+from .linearization.operating_point import at_time
+from .linearization.trim import given, trim
+from .measure.frequency_response import FrequencyResponse, frequency_response
+from .report.model import Report
+from .results.operating_point import OperatingPoint
 from .results.run import Run
-from .wiring.check import Checked, check
-from .wiring.delay_blocks import lowered
-from .wiring.evaluation_order import evaluation_order
-from .wiring.structure import Collector, Frame, Structure, Wire, stepped_blocks
-from .wiring.subsystem import exact_time
-from .wiring.variants import replaced, unique
-
-if TYPE_CHECKING:
-    from .linearization.operating_point import OperatingPoint
-    from .results.saved_state import RunState
-    from .simulation.simulation import Simulation
-
-LOOPS = ("error", "solve")
+from .simulation.run_options import RunKeywords, RunOptions
+from .simulation.simulation import Simulation, simulate
 
 
-class Diagram(Analysis):
+class Diagram(WiredDiagram):
     """A diagram: what its last calls need, found by walking the wires backwards.
 
     Building it checks everything: unwired inputs, double drives, shapes, units, names, algebraic loops.
@@ -62,194 +51,9 @@ class Diagram(Analysis):
     [0.0, 1.414214, 2.0, 1.414214, 0.0]
     """
 
-    def __init__(self, name: str, *roots: Any, loops: str = "error"):
-        if not isinstance(name, str):
-            raise WiringError(
-                f'found {name!r} where the name is expected; write Diagram("name", …), the calls after the name.'
-            )
-        if not roots:
-            raise WiringError("a diagram needs at least one call, such as plant(motor_force=u).", block=name)
-        if loops not in LOOPS:
-            raise OptionError(
-                f"found loops={loops!r}; expected {' or '.join(map(repr, LOOPS))}.", block=name, port="loops"
-            )
-        self._set(check_name(name), Collector(roots).structure(), loops)
+    # --- simulation ---------------------------------------------------------------------------------------------------
 
-    name: str
-    loops: str
-    _table: Structure
-    _lowered: Structure
-    _checked: Checked
-    _flat: dict[Fraction | None, FlatDiagram]
-
-    def _set(self, name: str, table: Structure, loops: str) -> None:
-        runs = lowered(table)
-        checked = check(runs)
-        for start in (False, True):
-            evaluation_order(runs, checked.traced, start=start, solve=loops == "solve")
-        self.__dict__.update(name=name, loops=loops, _table=table, _lowered=runs, _checked=checked, _flat={})
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        raise AttributeError(f"a diagram is a value: {name!r} can't be set. Use replace(…), or build another one.")
-
-    @classmethod
-    def _of(cls, name: str, table: Structure, loops: str = "error") -> Diagram:
-        diagram = cls.__new__(cls)
-        diagram._set(name, table, loops)
-        return diagram
-
-    def __reduce__(self) -> Any:
-        return Diagram._of, (self.name, self._table, self.loops)
-
-    def __repr__(self) -> str:
-        boxes = [path for path in self._table.frames if path]
-        return f"<diagram {self.name}: {len(self.blocks)} blocks{', in ' + ', '.join(boxes) if boxes else ''}>"
-
-    @property
-    def blocks(self) -> Mapping[str, Block]:
-        """Every block by its dotted path."""
-        return dict(self._table.blocks)
-
-    @property
-    def frames(self) -> Mapping[str, Frame]:
-        """Every subsystem by its dotted path; the diagram itself is ""."""
-        return dict(self._table.frames)
-
-    @property
-    def wires(self) -> Mapping[tuple[str, str], Wire]:
-        """The source of every wired input, by (block path, input)."""
-        return dict(self._table.wires)
-
-    @property
-    def names(self) -> Mapping[str, Wire]:
-        """Every named wire."""
-        return dict(self._table.names)
-
-    def __getitem__(self, path: str) -> Block:
-        """Return the block at a path, or at the unique end of one."""
-        return self._table.blocks[unique(path, self._table.blocks, "block", self.name)]
-
-    def replace(self, changes: Mapping[str, Any] | None = None, /, **more: Any) -> Diagram:
-        """Return a variant: other blocks, parameters or sample times.
-
-        Parameters
-        ----------
-        changes : mapping, optional
-            By dotted path, or its unique end: a block (``"plant"``), a parameter
-            (``"controller.admittance_par.stiffness"``), a subsystem's ``sample_time``, ``method``, ``offset`` or
-            ``delay`` (``"controller.sample_time"``; None: that of what surrounds it), a plant's start value
-            (``"plant.start.position"``).
-        **more
-            The same, for paths that are identifiers: ``replace(plant=Fmu("other.fmu"))``.
-
-        Raises
-        ------
-        UnknownNameError, ParameterError, WiringError
-            A name that isn't there, a value out of bounds, a block that doesn't fit the wires.
-        """
-        table = replaced(self._table, {**(changes or {}), **more}, self.name)
-        return Diagram._of(self.name, table, self.loops)
-
-    def continuous(self) -> Diagram:
-        """Return the diagram with every sampled subsystem taken as ideal: continuous, without sampling, hold or delay.
-
-        A projection then solves its equation at each evaluation, from the foot point of the last accepted step. With an
-        FMU, a run still exchanges signals with it at multiples of ``step`` only, and holds its inputs between; the
-        linear model, of its equations, has no such hold.
-
-        Raises
-        ------
-        SampleTimeError
-            A block that has a meaning at samples only, such as a `UnitDelay`.
-        """
-        table = Structure(**{k: dict(v) for k, v in vars(self._table).items()})
-        for path, frame in table.frames.items():
-            table.frames[path] = replace_fields(frame, sample_time=None, offset=Fraction(0), delay=0)
-        return Diagram._of(self.name, table, self.loops)
-
-    def sampled(self, sample_time: float | Fraction, method: str = "exact") -> Diagram:
-        """Return the diagram with everything that is continuous sampled.
-
-        Each block is discretized by itself, and what it reads from others is held over a sample: a plant drawn with
-        `Integrator` blocks becomes forward Euler between them, of first order, whatever the method. To have a method
-        act on a plant as a whole, write it as one block: a `StateSpace`, a `TransferFunction`, a `Block` of one's own.
-
-        Parameters
-        ----------
-        sample_time : float or Fraction
-            Sample time in s. Subsystems that have one of their own keep it.
-        method : {"exact", "forward", "semi_implicit", "trapezoidal"}
-            How the blocks are discretized that were continuous; see `loopwright.blocks.hold`. As inputs are held,
-            ``trapezoidal`` is not Tustin's method, python-control's ``c2d(…, "bilinear")``, which averages them too.
-
-        Raises
-        ------
-        SampleTimeError
-            A sample time that is not positive, or an unknown method.
-        """
-        check_method(method)
-        table = Structure(**{k: dict(v) for k, v in vars(self._table).items()})
-        for path, frame in sorted(table.frames.items()):
-            if self._table.clock(path) is None:
-                table.frames[path] = replace_fields(frame, method=method)
-        top = replace_fields(table.frames[""], sample_time=exact_time(sample_time, block=self.name))
-        table.frames[""] = top
-        return Diagram._of(self.name, table, self.loops)
-
-    @property
-    def is_continuous(self) -> bool:
-        """Whether something happens between ticks: continuous states, events, or a transport delay."""
-        table = self._lowered
-        traces = self._checked.traced
-        return (
-            any(t.advance == "derivative" or t.indicators is not None for t in traces.values())
-            or any(table.blocks[p].transport for p in table.blocks if p not in traces)
-            or any(table.is_event(box) for box in table.controls)
-        )
-
-    @property
-    def has_clock(self) -> bool:
-        """Whether a subsystem, or the diagram itself, has a sample time."""
-        return any(frame.sample_time is not None for frame in self._lowered.frames.values())
-
-    @property
-    def has_fmu(self) -> bool:
-        """Whether an FMU is in it."""
-        return bool(stepped_blocks(self._table))
-
-    def flatten(self, step: float | Fraction | None = None) -> FlatDiagram:
-        """Return the diagram as one CasADi function of a tick.
-
-        Parameters
-        ----------
-        step : float or Fraction, optional
-            Seconds between two ticks, where no subsystem has a sample time (or to look between samples).
-        """
-        return self._flattened(None if step is None else exact_time(step, block=self.name))
-
-    def _flattened(self, key: Fraction | None) -> FlatDiagram:
-        if key not in self._flat:
-            solve = self.loops == "solve"
-            self._flat[key] = flatten(self._lowered, self._checked, key, name=self.name, solve=solve)
-        return self._flat[key]
-
-    def simulate(
-        self,
-        duration: float,
-        *,
-        step: float | Fraction | None = None,
-        solver: str = "auto",
-        rtol: float = 1e-6,
-        atol: float = 1e-9,
-        max_step: float | None = None,
-        record: Iterable[str] | None = None,
-        every: int = 1,
-        states: bool = True,
-        to: Any = None,
-        overwrite: bool = False,
-        start: RunState | OperatingPoint | None = None,
-        progress: bool | None = None,
-    ) -> Run:
+    def simulate(self, duration: float, *, progress: bool | None = None, **options: Unpack[RunKeywords]) -> Run:
         """Run the diagram and return what it recorded: from t = 0, or from a saved state.
 
         What happens in which order is said in `loopwright.diagrams.Simulation`'s module, in one page.
@@ -258,34 +62,11 @@ class Diagram(Analysis):
         ----------
         duration : float
             Simulated time in s, a multiple of the step between ticks.
-        step : float or Fraction, optional
-            Seconds between two ticks (samples, steps of a solver of fixed step, communication points of FMUs). Without
-            one it is the greatest common divisor of all sample times, of which those are visited at which a box acts;
-            for a diagram without any, a thousandth of the duration.
-        solver : str
-            What integrates continuous states: "auto", of fixed step "euler", "heun", "rk4", of variable step "RK23",
-            "RK45", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams". The default changes from an explicit
-            to an implicit method where the diagram turns out to be stiff.
-        rtol, atol : float
-            Relative and absolute tolerance of a step of a solver of variable step; the absolute one is multiplied with
-            the nominal value of a state that declares one.
-        max_step : float, optional
-            Longest step of a solver of variable step in s.
-        record : list of str, optional
-            Signals, blocks and subsystems to record; everything without it.
-        every : int
-            Record one of so many samples; the first and the last always.
-        states : bool
-            Record the states, too.
-        to : path, optional
-            Folder to which the samples are streamed, with bounded memory; `Run.open` opens it later.
-        overwrite : bool
-            Replace a run that is stored there.
-        start : RunState or OperatingPoint, optional
-            State to go on from: ``run.final_state``, that of `Simulation.save`, or an operating point, such as
-            `trim` finds one, with the parameters that belong to it.
         progress : bool, optional
             Show a progress bar; by default on a terminal, and in a notebook where ipywidgets is installed.
+        **options
+            Options of the run by name: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step``, ``record``, ``every``,
+            ``states``, ``to``, ``overwrite``, ``start``. `RunOptions` says what each means, and its default.
 
         Returns
         -------
@@ -298,36 +79,347 @@ class Diagram(Analysis):
             `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`, a solver that can't go on, events
             that pile up, an algebraic loop without a solution; ``error.run`` holds what was recorded until then.
         OptionError
-            A duration that is not positive, or no multiple of the step; an unknown solver, a tolerance out of range.
+            A duration that is not positive, or no multiple of the step; an unknown option or solver, a tolerance out of
+            range.
         """
-        from .simulation.simulate import simulate
+        return simulate(self, duration, RunOptions.of(options, block=self.name), progress=progress)
 
-        return simulate(
-            self,
-            duration,
-            step=step,
-            solver=solver,
-            rtol=rtol,
-            atol=atol,
-            max_step=max_step,
-            record=record,
-            every=every,
-            states=states,
-            to=to,
-            overwrite=overwrite,
-            start=start,
-            progress=progress,
-        )
-
-    def simulation(self, **options: Any) -> Simulation:
+    def simulation(self, **options: Unpack[RunKeywords]) -> Simulation:
         """Return a run in the making, to go on step by step, to save and to restore; see `Simulation`.
 
         Parameters
         ----------
         **options
-            ``step``, ``solver``, ``rtol``, ``atol``, ``max_step``, ``record``, ``every``, ``states``, ``to``,
-            ``overwrite`` and ``start`` of `simulate`.
-        """
-        from .simulation.simulation import Simulation
+            As for `simulate`; see `RunOptions`.
 
-        return Simulation(self, **options)
+        Raises
+        ------
+        OptionError
+            An unknown option or solver, a tolerance out of range.
+        """
+        return Simulation(self, RunOptions.of(options, block=self.name))
+
+    # --- analysis -----------------------------------------------------------------------------------------------------
+
+    def operating_point(
+        self, t: float = 0.0, *, states: Mapping[str, Any] | None = None, **options: Any
+    ) -> OperatingPoint:
+        """Run to a time, and return everything that a linear model at that instant depends on.
+
+        Parameters
+        ----------
+        t : float
+            Time in s, a tick.
+        states : mapping, optional
+            Values of states of blocks and FMUs that are given, by path: ``{"plant.position": 0.2}``. Signals, and the
+            FMUs' outputs, are then what follows from them.
+        **options
+            How to run: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step`` and ``start`` of `simulate`.
+
+        Raises
+        ------
+        UnknownNameError
+            A state that isn't there.
+        """
+        if states:
+            return given(self, t, states, options)
+        return at_time(self, t, options)
+
+    def trim(
+        self,
+        free: Mapping[str, Any] | Iterable[str] | None = None,
+        targets: Mapping[str, Any] | None = None,
+        *,
+        rates: Mapping[str, Any] | None = None,
+        fixed: Iterable[str] = (),
+        at: Any = None,
+        tolerance: float = 1e-9,
+        **options: Any,
+    ) -> OperatingPoint:
+        """Find an operating point: the states and parameters at which signals have given values, and all is at rest.
+
+        Every state of a block or an FMU is unknown, unless it is fixed, and is asked to stay: rates are zero, sampled
+        states repeat. The equations are solved by least squares within bounds, with the exact derivatives of the
+        diagram and the linear models of its FMUs. A state that nothing determines stays near where the search begins.
+
+        Parameters
+        ----------
+        free : mapping of str to (low, high), or list of str, optional
+            Parameters that may change, by the paths of `replace`, with their bounds in their units, or None:
+            ``{"force.value": (-10, 10)}``. An FMU's are ``"plant.start.mass"``. A state that is named here gets bounds.
+        targets : mapping, optional
+            Values that signals are to have, by the names of wires or ports: ``{"position": 0.2}``.
+        rates : mapping, optional
+            Rates of states in their unit per second that are not zero, by path; None where any rate will do.
+        fixed : list of str, optional
+            States that keep the value with which the search begins.
+        at : OperatingPoint, Snapshot or float, optional
+            Where the search begins, as in `linearize`; also the time at which sources are taken, and what discrete
+            states and enabled boxes are. Without it, the start.
+        tolerance : float
+            Largest residual of an equation, relative to 1 + the size of what it belongs to.
+        **options
+            How to run to where the search begins, as in `operating_point`; ``step`` is needed where only an FMU steps.
+
+        Returns
+        -------
+        OperatingPoint
+            With ``parameters``, the values found, and ``residuals``, what is left of each equation by name. `linearize`
+            takes it with its parameters, ``simulate(…, start=point)`` runs from it.
+
+        Raises
+        ------
+        SimulationError
+            If no such point is found; the message has the largest residuals, and the parameters at a bound.
+        UnknownNameError, OptionError, ParameterError
+            A name that isn't there, bounds or values that don't fit, a parameter that can't change.
+        FmuError
+            An FMU without a linear model.
+
+        Examples
+        --------
+        >>> from loopwright.blocks import Constant, Integrator
+        >>> from loopwright.diagrams import Diagram
+        >>> level, inflow = Integrator(name="level"), Constant(value=1.0, name="inflow")
+        >>> tank = Diagram("tank", level(inflow - 0.5 * level.y))
+        >>> point = tank.trim(free={"inflow.value": (0, 10)}, targets={"level.y": 3.0})
+        >>> round(point.parameters["inflow.value"], 12)
+        1.5
+        """
+        return trim(self, free, targets, rates=rates, fixed=fixed, at=at, tolerance=tolerance, **options)
+
+    def linearize(
+        self,
+        point: Any = None,
+        *,
+        inputs: str | Iterable[str] = (),
+        outputs: str | Iterable[str] = (),
+        openings: str | Iterable[str] = (),
+        plants: str | None = None,
+        **options: Any,
+    ) -> Linearization:
+        """Return the linear model of this very diagram at an operating point.
+
+        It is continuous where everything is continuous. With sampled subsystems it is discrete, over one base period
+        or, with several rates, their least common one; hold, delay and the time between ticks are exact. What it does
+        not follow, such as a quantizer or an event within the period, is said in its ``notes``.
+
+        Parameters
+        ----------
+        point : OperatingPoint, Snapshot or float, optional
+            Where: ``run.at(t)``, a time in s, `operating_point`, `trim`; the start without it.
+        inputs : str or list of str
+            Wires or ports at which a signal is injected: added to what the consumers get; over a period it is held.
+        outputs : str or list of str
+            Wires or ports that are measured: what the block puts out, ahead of an injection there.
+        openings : str or list of str
+            Wires that are cut behind the port, for all its consumers, which get its value at the operating point: that
+            stays what it is.
+        plants : {"equations", "step", "identified"}, optional
+            How an FMU's step is linearized: by its equations' Jacobian and a matrix exponential, right at an
+            equilibrium; by differences of the step itself; or from its pulse responses from rest, without its states.
+            Without it the first at an equilibrium, else the second, and the third where the FMU allows neither.
+        **options
+            How to run to the operating point, where it is a time: see `operating_point`. With ``step`` a diagram that
+            is continuous but for an FMU is linearized over its communication step.
+
+        Returns
+        -------
+        Linearization
+            With `Linearization.system`, a `control.StateSpace` with names, and the loops: ``.loop("v_perp")``.
+
+        Raises
+        ------
+        UnknownNameError
+            A signal that isn't there.
+        WiringError
+            An opening at which nothing is wired, or a transport delay in continuous time.
+        FmuError
+            An FMU that can't be linearized; the error says what it lacks.
+        """
+        return linearize(self, point, inputs=inputs, outputs=outputs, openings=openings, plants=plants, **options)
+
+    def linearize_batch(
+        self,
+        points: Iterable[Any] = (None,),
+        variants: Iterable[Mapping[str, Any]] = ({},),
+        **options: Any,
+    ) -> list[Linearization]:
+        """Return the linear models at several operating points and with several parameters.
+
+        Parameters
+        ----------
+        points : iterable
+            Operating points, as `linearize` takes them. A time, or an instant of a run, is run to with each variant
+            anew; an `OperatingPoint` is taken as it is, with the variant's parameters.
+        variants : iterable of mapping
+            What `replace` changes: ``[{"controller.pid_par.poles": (-30, -30, -30)}, …]``.
+        **options
+            As for `linearize`.
+
+        Returns
+        -------
+        list of Linearization
+            All points of the first variant, then those of the second one, and so on; ``found.diagram`` is the variant.
+
+        Raises
+        ------
+        LoopwrightError
+            As `linearize` and `replace`; the message says with which variant, and at which point.
+        """
+        return batch(self, points, variants, **options)
+
+    def report(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        pdf: bool = False,
+        json: bool = False,
+        **options: Any,
+    ) -> Report:
+        """Analyse the diagram for design, and write the report; see docs/reports.md.
+
+        Parameters
+        ----------
+        path : path, optional
+            File to write, ``.html``; without it nothing is written. A notebook shows what is returned.
+        pdf, json : bool
+            Write ``.pdf`` (which needs ``pip install 'loopwright[pdf]'``) and ``.json`` beside it, too.
+        **options
+            What `loopwright.diagrams.report.analyse.analyse` takes, such as ``point`` and ``loops``.
+
+        Returns
+        -------
+        Report
+            Its sections, and ``.numbers()`` by dotted path.
+
+        Raises
+        ------
+        OptionError
+            A path that does not end in ``.html``, or a PDF without the library that makes it.
+        ConfirmationError
+            A number that its independent confirmation does not bear out.
+        """
+        from .report.analyse import analyse
+        from .report.figures import with_drawing
+        from .report.files import check_files, write_report
+
+        check_files(path, pdf=pdf, json=json)
+        made = with_drawing(analyse(self, **options), self)
+        write_report(made, path, pdf=pdf, json=json)
+        return made
+
+    def draw(
+        self,
+        path: str | os.PathLike[str] | None = None,
+        *,
+        box: str = "",
+        closed: bool | Iterable[str] | None = None,
+    ) -> Drawing:
+        """Draw the diagram itself: blocks, boxes with their rates, wires with their names, FMUs marked.
+
+        Signals run from left to right; what closes a loop runs back below. Nothing but Python is needed.
+
+        Parameters
+        ----------
+        path : path, optional
+            File to write, ``.svg``.
+        box : str
+            Path of the subsystem whose inside is drawn; the whole diagram without it.
+        closed : bool or list of str, optional
+            Subsystems that are drawn closed: all of them, or those of the list. Without it all are open, in a diagram
+            of more than 40 blocks closed.
+
+        Returns
+        -------
+        Drawing
+            A notebook shows it; ``.svg`` is its text.
+
+        Raises
+        ------
+        OptionError
+            No such subsystem, or a file that is no ``.svg``.
+
+        Examples
+        --------
+        >>> from loopwright.blocks import Gain, Sine
+        >>> from loopwright.diagrams import Diagram
+        >>> Diagram("demo", Gain(gain=2)(Sine(frequency=1))).draw().svg[:4]
+        '<svg'
+        """
+        drawing = Drawing(draw(self, box=box, closed=closed))
+        if path is not None:
+            drawing.save(path)
+        return drawing
+
+    def _repr_svg_(self) -> str:
+        return str(self.draw().svg)
+
+    def frequency_response(
+        self,
+        wire: str,
+        frequencies: Any,
+        *,
+        amplitude: float,
+        kind: str = "sine",
+        at: Any = 0.0,
+        outputs: str | Iterable[str] = (),
+        windows: int = 40,
+        agreement: float = 1e-6,
+        **options: Any,
+    ) -> FrequencyResponse:
+        """Measure a frequency response on the running diagram: a test signal d is added at a wire.
+
+        With v what the wire's port puts out, and u = v + d what all its consumers get, S = u/d, T = −v/d and L = −v/u,
+        which is what `Linearization.sensitivity`, `complementary` and `loop` say of the same wire. All are sampled
+        where the linear model is, at the ticks of the least common period of what is sampled, and d is held between
+        them; in a diagram that is continuous throughout, d is continuous. So the phasors are those of what is sampled:
+        a plant's velocity, read at 1 kHz, holds the aliased ripple of the controller's hold, and its fundamental in
+        continuous time is another by 1e-4 to 1e-3.
+
+        The signal is ramped in; then windows of whole periods follow until two agree. Sources go on meanwhile: take a
+        diagram whose references stand still, or a time from which on they do, and look at ``moved``.
+
+        Parameters
+        ----------
+        wire : str
+            A wire or port, or an entry of it, ``"motor_force[0]"``. Of one with several entries, each is excited in a
+            run of its own, and the responses are matrices.
+        frequencies : array_like
+            In rad/s. They are moved by less than half a sample in a window, so that whole periods fit into it.
+        amplitude : float
+            Largest value of the test signal, in the wire's unit: small enough that nothing saturates.
+        kind : {"sine", "multisine", "chirp"}
+            One sine after the other; all at once, with Schroeder's phases; a linear sweep over their range, repeated.
+        at : OperatingPoint, Snapshot or float
+            Where: `trim`, ``run.at(t)``, or a time in s that is run to first.
+        outputs : str or list of str
+            Further signals to be measured: `FrequencyResponse.response`, from the test signal to them.
+        windows : int
+            Most windows that are waited for.
+        agreement : float
+            Relative difference of two windows at which a frequency is done.
+        **options
+            How to run, as in `operating_point`. A continuous diagram is run with rtol = 1e-9, atol = 1e-12, and sampled
+            16 times in a period of the highest frequency, if nothing else is said.
+
+        Returns
+        -------
+        FrequencyResponse
+            ``S``, ``T``, ``L`` and ``response`` as `control.FrequencyResponseData`, with the estimate's own
+            ``uncertainty`` and ``distortion``; ``compare(linearization)`` is the largest relative deviation from a
+            linear model.
+
+        Raises
+        ------
+        UnknownNameError
+            A signal that isn't there.
+        WiringError
+            A port that nothing is wired to.
+        OptionError
+            Frequencies that are not positive or too high for the samples, no amplitude, an unknown kind.
+        """
+        return frequency_response(
+            self, wire, frequencies, amplitude=amplitude, kind=kind, at=at, outputs=outputs, windows=windows,
+            agreement=agreement, **options,
+        )  # fmt: skip

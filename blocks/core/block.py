@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from ..tracing.trapezoid import SOLVED
 from .docstrings import port_section, with_section
 from .errors import DefinitionError, GuardError, WiringError, near
 from .ports import Event, Input, Output, Port, State, check_port_names
@@ -24,6 +23,9 @@ from .signals import (
     primary_outputs,
 )
 from .values import Value
+
+SOLVED = "trapezoidal step"
+"""Name of the guard that a block sampled by the trapezoidal method has for Newton's steps."""
 
 _ABSENT = frozenset({"output", "derivative", "update", "indicators", "jump", "guards", "initial", "constants"})
 _ABSENT |= {"inputs", "outputs", "states", "events"}
@@ -111,6 +113,10 @@ class Block(Value, Wireable):
     events: ClassVar[Mapping[str, Event]] = {}
     name: str | None = None
     _hint: ClassVar[str | None] = None
+    traced_of: ClassVar[str] = "(t, x, u)"
+    """Arguments of its equations, for messages."""
+    untraced_twin: ClassVar[str] = ""
+    """Name of the block that takes what this one can't trace, for messages."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         check_port_names(cls)
@@ -207,6 +213,10 @@ class Block(Value, Wireable):
     def __repr__(self) -> str:
         text = super().__repr__()
         return text if self.name is None else f"{text[:-1]}{', ' if text[-2] != '(' else ''}name={self.name!r})"
+
+    def written(self, equation: str) -> Callable[..., Any]:
+        """Return the function in which a user has written an equation, for messages."""
+        return getattr(type(self), equation)  # type: ignore[no-any-return]
 
     def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
         """Return the error of a failed guard; ``u``, ``y``, ``x`` are named tuples of inputs, outputs and states."""

@@ -7,10 +7,10 @@ one. Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` an
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,24 @@ from .numpy_guard import NoNumber
 
 if TYPE_CHECKING:
     from .block import Block
+
+B = TypeVar("B", bound="Block")
+
+_OPERATOR_BLOCKS: dict[str, type[Block]] = {}
+
+
+def made_by_operators(name: str) -> Callable[[type[B]], type[B]]:
+    """Declare the class of the blocks that an operator on signals makes: ``sum``, ``gain``, ``product``, ``constant``.
+
+    Blocks need signals, and signals make blocks: the classes are declared from above, so that imports run one way.
+    """
+
+    def declare(cls: type[B]) -> type[B]:
+        _OPERATOR_BLOCKS[name] = cls
+        return cls
+
+    return declare
+
 
 recorder: ContextVar[list[Any] | None] = ContextVar("loopwright_calls", default=None)
 """Calls made while a subsystem's function runs: a call that closes a loop counts even if its result is not used."""
@@ -51,9 +69,8 @@ class Wireable(NoNumber):
         return _sum(other, self, "+-")
 
     def __neg__(self) -> Signal:
-        from ..library.algebra import Sum  # keeps the unit, which a Gain would not
-
-        return with_hint(Sum(signs="-"), f"minus_{_operand(self, 'constant')}")(self)._signal()
+        total = _OPERATOR_BLOCKS["sum"](signs="-")  # it keeps the unit, which a gain would not
+        return with_hint(total, f"minus_{_operand(self, 'constant')}")(self)._signal()
 
     def __mul__(self, other: Any) -> Signal:
         return _product(self, other)
@@ -62,9 +79,7 @@ class Wireable(NoNumber):
         return _product(self, other)
 
     def __rmatmul__(self, matrix: Any) -> Signal:
-        from ..library.algebra import Gain
-
-        return with_hint(Gain(gain=matrix), f"gain_of_{_operand(self, 'constant')}")(self)._signal()
+        return with_hint(_OPERATOR_BLOCKS["gain"](gain=matrix), f"gain_of_{_operand(self, 'constant')}")(self)._signal()
 
     def __truediv__(self, other: Any) -> Signal:
         if isinstance(other, Wireable):
@@ -278,13 +293,11 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
     WiringError
         For anything else.
     """
-    from ..library.sources import Constant
-
     if isinstance(value, Wireable):
         return value._signal()
     if isinstance(value, int | float | np.number | np.ndarray | list | tuple) and not isinstance(value, bool):
         try:
-            return Constant(value=value)._signal()
+            return _OPERATOR_BLOCKS["constant"](value=value)._signal()
         except ValueError:
             pass
     raise WiringError(
@@ -338,22 +351,18 @@ def with_hint(block: Block, hint: str) -> Block:
 
 
 def _sum(left: Any, right: Any, signs: str) -> Signal:
-    from ..library.algebra import Sum
-
     word = {"++": "plus", "+-": "minus"}[signs]
     name = f"{_operand(left, 'constant')}_{word}_{_operand(right, 'constant')}"
-    return with_hint(Sum(signs=signs), name)(left, right)._signal()
+    return with_hint(_OPERATOR_BLOCKS["sum"](signs=signs), name)(left, right)._signal()
 
 
 def _product(left: Any, right: Any) -> Signal:
-    from ..library.algebra import Gain, Product
-
     if isinstance(right, Wireable):
         name = f"{_operand(left, 'constant')}_times_{_operand(right, 'constant')}"
-        return with_hint(Product(), name)(left, right)._signal()
+        return with_hint(_OPERATOR_BLOCKS["product"](), name)(left, right)._signal()
     if not isinstance(right, int | float | np.number | np.ndarray) or np.ndim(right) > 1:
         raise ShapeError(
             f"found a factor of shape {np.shape(right)}; expected a number, a vector or another signal. Apply a matrix "
             "as K @ signal."
         )
-    return with_hint(Gain(gain=right), f"gain_of_{_operand(left, 'constant')}")(left)._signal()
+    return with_hint(_OPERATOR_BLOCKS["gain"](gain=right), f"gain_of_{_operand(left, 'constant')}")(left)._signal()

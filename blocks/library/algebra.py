@@ -2,114 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from ..core.arithmetic import check_shapes
 from ..core.block import Block
-from ..core.errors import ParameterError, ShapeError
+from ..core.errors import ParameterError
 from ..core.ports import Input, Output
 from ..core.values import Array, parameter, shorten
-from .branching import Numbered, check_shapes, shape_of
-
-
-class Sum(Block):
-    """Sum with signs: y = ± u₁ ± u₂ ….
-
-    Inputs ``u1``, ``u2``, …, one for each sign, are of one shape and unit (a scalar goes with any); the output ``y``
-    has them too.
-
-    Raises
-    ------
-    ParameterError
-        Anything but plus and minus among the signs.
-    ShapeError
-        Inputs of different shapes, when the diagram is built.
-    """
-
-    same_units = True
-    signs: str = parameter(default="++", description="one + or - for each input")
-    y = Output(like="u1")
-
-    def check(self) -> None:
-        """Refuse anything but plus and minus signs."""
-        if not self.signs or set(self.signs) - {"+", "-"}:
-            raise ParameterError(
-                f"found {self.signs!r}; expected a + or - for each input, such as '+-'.", block=self.label, port="signs"
-            )
-
-    @property
-    def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
-        """One input per sign."""
-        return {f"u{i}": Input(shape=None, name=f"u{i}") for i in range(1, len(self.signs) + 1)}
-
-    def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the sum."""
-        check_shapes(**u._asdict())
-        total = u[0] if self.signs[0] == "+" else -u[0]
-        for sign, value in zip(self.signs[1:], u[1:], strict=True):
-            total = total + value if sign == "+" else total - value
-        return total
-
-
-class Gain(Block):
-    """Gain: y = k u, element by element, or the matrix product y = K u for a matrix K.
-
-    The output's unit is not declared: a gain may convert one.
-
-    Raises
-    ------
-    ParameterError
-        A gain of more than two dimensions.
-    ShapeError
-        An input with another number of entries than the vector or the matrix takes, when the diagram is built.
-    """
-
-    gain: Array = parameter(description="number, array of the signal's shape, or matrix")
-    u = Input(shape=None, description="what is multiplied, of any shape")
-    y = Output(shape=None, description="the product")
-
-    def check(self) -> None:
-        """Refuse a gain of more than two dimensions."""
-        if np.ndim(self.gain) > 2:
-            raise ParameterError(
-                f"found an array of shape {np.shape(self.gain)}; expected a number, a vector or a matrix.",
-                block=self.label,
-                port="gain",
-            )
-
-    def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the product."""
-        gain, found = shape_of(self.gain), shape_of(u.u)
-        if len(gain) < 2:
-            check_shapes(gain=self.gain, u=u.u)
-        elif found[:1] != gain[1:]:
-            raise ShapeError(
-                f"found shape {found}; the gain is a matrix of {gain[0]} × {gain[1]} and takes {gain[1]} entries. "
-                "Take a part of the signal, or give another matrix.",
-                port="u",
-            )
-        return self.gain @ u.u if getattr(self.gain, "ndim", 0) == 2 else self.gain * u.u
-
-
-class Product(Block):
-    """Product, element by element: y = u₁ u₂.
-
-    Raises
-    ------
-    ShapeError
-        Inputs of different shapes (a scalar goes with any), when the diagram is built.
-    """
-
-    u1 = Input(shape=None, description="first factor, of any shape")
-    u2 = Input(shape=None, description="second factor, of the same shape or a scalar")
-    y = Output(shape=None, description="the product")
-
-    def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the product."""
-        check_shapes(**u._asdict())
-        return u.u1 * u.u2
+from .branching import Numbered
 
 
 class Minimum(Numbered):

@@ -7,33 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from ..core.arithmetic import check_shapes, shape_of
 from ..core.block import Block
 from ..core.errors import ShapeError
-from ..core.ports import Input, Shape
+from ..core.ports import Input
 from ..core.values import Array, parameter
-
-
-def shape_of(value: Array) -> Shape:
-    """Return the shape of numbers or of a traced value."""
-    return tuple(getattr(value, "shape", ()))
-
-
-def check_shapes(**values: Array) -> None:
-    """Refuse values of different shapes; a scalar goes with any.
-
-    Raises
-    ------
-    ShapeError
-        Two shapes that differ.
-    """
-    first = next(((name, shape_of(v)) for name, v in values.items() if shape_of(v)), ("", ()))
-    for name, value in values.items():
-        if shape_of(value) not in ((), first[1]):
-            raise ShapeError(
-                f"found shape {shape_of(value)} beside {first[0]} of shape {first[1]}; expected one shape for both, or "
-                "a scalar. Take a part of the longer one, such as signal[0:2], or wire another.",
-                port=name,
-            )
 
 
 def check_fits(value: Array, port: str, main: Array, main_port: str) -> None:

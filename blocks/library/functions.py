@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,13 @@ class Function(Block):
             raise self._refuse("function", repr(self.function), "a function, such as np.sin or lambda a, b: a * b")
         for name in self.inputs.keys() & self.outputs.keys():
             raise self._refuse("results", f"{name!r}, the name of an input too", "another name")
+
+    traced_of = "its arguments"
+    untraced_twin = "PythonFunction"
+
+    def written(self, equation: str) -> Callable[..., Any]:
+        """Return the function."""
+        return self.function  # type: ignore[return-value]
 
     @property
     def label(self) -> str:

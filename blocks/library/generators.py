@@ -16,11 +16,11 @@ from typing import Any, Self
 import numpy as np
 
 from ..core.errors import ParameterError
+from ..core.instants import earliest, next_edge, period_of
 from ..core.ports import Output
+from ..core.source import Source
 from ..core.values import Array, parameter
-from .instants import earliest, next_edge, period_of
 from .piecewise import piecewise
-from .sources import Source
 
 _HALF = 2.0**24  # counters are mixed in two halves: products of two such numbers are exact
 _ROUNDS = 10

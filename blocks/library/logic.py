@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from ..core.arithmetic import check_shapes
 from ..core.block import Block
 from ..core.errors import ParameterError, near
 from ..core.ports import Event, Input, Output, State
 from ..core.values import Array, parameter
-from .branching import Numbered, check_fits, check_shapes, single, truth
+from .branching import Numbered, check_fits, single, truth
 
 _OPERATORS = {">": (1.0, 1.0), "<": (-1.0, 1.0), "<=": (1.0, 0.0), ">=": (-1.0, 0.0)}
 """Each relation as the sign of u₁ − u₂ that is looked at, and what holds where that is positive."""

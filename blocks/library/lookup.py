@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from ..core.arithmetic import shape_of
 from ..core.block import Block
 from ..core.errors import GuardError, ParameterError, ShapeError, near
 from ..core.ports import Input, Output
 from ..core.values import Array, parameter
-from .branching import shape_of
 from .piecewise import bilinear, piecewise
 
 _BEYOND = ("hold", "extrapolate", "error")

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from ..core.arithmetic import check_shapes
 from ..core.block import Block
 from ..core.errors import ParameterError, SampleTimeError
 from ..core.ports import Event, Input, Output, State
 from ..core.values import Array, parameter, shorten
-from .branching import check_shapes, single
+from .branching import single
 
 
 class Quantizer(Block):

@@ -11,12 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import ParameterError, UnitError
-from ..core.ports import Output, PortUnit
-from ..core.units import parse_unit, rate_of
+from ..core.errors import ParameterError
+from ..core.instants import earliest
+from ..core.ports import Output
+from ..core.source import Source
 from ..core.values import Array, parameter
-from .instants import earliest
 
 
 def smooth_step(
@@ -34,61 +33,6 @@ def smooth_step(
     rate = rise / duration * 140.0 * z**3 * (1.0 - z) ** 3
     acceleration = rise / duration**2 * 420.0 * z**2 * (1.0 - z) ** 2 * (1.0 - 2.0 * z)
     return value, rate, acceleration
-
-
-class Source(Block):
-    """Base of the sources: one output, ``y``, in the unit that the parameter ``unit`` declares.
-
-    Where y holds a value with its first two time derivatives, ``unit`` is that of the value.
-    """
-
-    unit: str | None = parameter(default=None, description="unit of the output, where it is to be checked")
-    y = Output(shape=None)
-
-    def check(self) -> None:
-        """Refuse a unit that can't be read."""
-        if self.unit is not None and not isinstance(self.unit, str):
-            raise ParameterError(
-                f"found {self.unit!r}; expected a unit as FMI spells it, such as 'm/s2'.", block=self.label, port="unit"
-            )
-        try:
-            parse_unit(self.unit or "1")
-        except UnitError as error:
-            error.at(block=self.label, port="unit")
-            raise
-
-    @property
-    def outputs(self) -> dict[str, Output]:  # type: ignore[override]
-        """The output in the declared unit."""
-        declared, unit = type(self).y, self.unit
-        each: PortUnit = unit
-        if unit is not None and declared.shape == (3,):
-            each = (unit, rate_of(unit), rate_of(rate_of(unit)))
-        return {"y": Output(declared.shape, each, declared.description, name="y")}
-
-    def instants(self) -> Array:
-        """Return the times at which the output or its derivatives are not smooth, in any order: none."""
-        return np.zeros(0)
-
-    def next_instant(self, t: float) -> float:
-        """Return the first of `instants` after t, without one that t counts as."""
-        times = np.ravel(self.instants())
-        return float(np.min(times[earliest(times) > t], initial=math.inf))
-
-
-class Constant(Source):
-    """A constant number or array."""
-
-    value: Array = parameter(description="number or array")
-
-    @property
-    def outputs(self) -> dict[str, Output]:  # type: ignore[override]
-        """The output in the declared unit, of the value's shape."""
-        return {"y": Output(shape=np.shape(self.value), unit=self.unit, name="y")}
-
-    def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the constant."""
-        return self.value
 
 
 class Reference(Source):

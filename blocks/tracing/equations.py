@@ -15,7 +15,6 @@ from casadi import ArrayInterface
 from ..core.block import Block
 from ..core.errors import DefinitionError, LoopwrightError, ShapeError, TraceError
 from ..core.ports import Port, Shape, State
-from ..library.functions import Function
 from .symbols import flat_column, size
 
 _ARGUMENTS = {
@@ -76,8 +75,7 @@ def takes_update(block: Block, sampled: bool) -> bool:
 def untraceable(error: Exception, block: Block, what: str) -> str:
     """Say which line of the user's equations an operation failed on."""
     # by the code's own file, which a notebook's cell and a script have too; helpers beside the equation count as well
-    written: Any = block.function if isinstance(block, Function) else getattr(type(block), what)
-    equation: Any = inspect.unwrap(written)
+    equation: Any = inspect.unwrap(block.written(what))
     while isinstance(equation, functools.partial):
         equation = equation.func
     if not hasattr(equation, "__code__"):  # an object that can be called
@@ -92,14 +90,10 @@ def untraceable(error: Exception, block: Block, what: str) -> str:
     text = f"its {what} can't be traced{line}: {type(error).__name__}: {error}."
     if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
         return f"{text} Correct the equation there."
-    arguments, instead = (
-        ("its arguments", ", or PythonFunction, which is not traced")
-        if isinstance(block, Function)
-        else ("(t, x, u)", "")
-    )
+    arguments, instead = block.traced_of, block.untraced_twin
     return (
         f"{text} Use NumPy functions of {arguments}: np.where for branches, np.stack for vectors, np.sqrt and not "
-        f"math.sqrt{instead}."
+        f"math.sqrt{f', or {instead}, which is not traced' if instead else ''}."
     )
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..core.block import Block
+from ..core.block import SOLVED, Block
 from ..core.errors import LoopwrightError, SampleTimeError, TraceError
 from ..core.ports import Shape
 from ..core.values import Value, identity
@@ -31,7 +31,7 @@ from .equations import check_definition, guards_of, split, start_values, takes_u
 from .numpy_check import GUARDS, NEXT, compare
 from .opaque_equations import Foreign
 from .symbols import bundle, expanded, flat_column, size, with_values, wrap
-from .trapezoid import SOLVED, trapezoidal
+from .trapezoid import trapezoidal
 
 
 @dataclass(frozen=True, eq=False)

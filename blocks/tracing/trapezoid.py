@@ -7,8 +7,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-SOLVED = "trapezoidal step"
-"""Name of the guard that fails where the step is not solved."""
 _STEPS = 5
 _TOLERANCE = 1e-9  # of what is left after the last step, relative to each state and to its nominal value
 

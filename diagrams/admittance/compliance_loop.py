@@ -42,7 +42,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, cast
+from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
 
@@ -52,9 +52,7 @@ from ...blocks.core.values import Array, Value, parameter
 from ...blocks.path_following.transverse import expect_model, expect_path
 from ...blocks.tracing.discretization import check_method
 from ...blocks.tracing.symbols import flat_column, wrap
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
+from ..flat.wired_diagram import WiredDiagram
 
 SIDES = ("par", "perp")
 IMPLEMENTATIONS = ("ideal", "continuous", "sampled")
@@ -112,7 +110,7 @@ class AdmittanceLoop(Value):
     tool_mass: float = parameter(default=0.0, unit="kg", minimum=0.0, description="mass beyond the force sensor, of M")
 
     @classmethod
-    def of(cls, diagram: Diagram, side: str = "perp", **changes: Any) -> Self:
+    def of(cls, diagram: WiredDiagram, side: str = "perp", **changes: Any) -> Self:
         """Return the loop of a diagram that `fig3` made, with its parameters.
 
         Parameters

@@ -18,10 +18,11 @@ from ...blocks.core.block import Block
 from ...blocks.core.errors import FmuFileError, LoopwrightError, OptionError, TraceError, near
 from ...fmus.checks.summary import INTERFACES, summarize
 from ...fmus.checks.validation import validate
-from ...fmus.export.compiler import TARGETS, native_platform
+from ...fmus.export.compiler import TARGETS
 from ...fmus.export.from_block import build as build_model
 from ...fmus.export.python_fmu import build_python
 from ...fmus.models import gantry
+from ...fmus.platform import native_platform
 from .text import fit, say
 from .user_models import user_model
 

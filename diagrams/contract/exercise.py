@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from ...blocks.core.arithmetic import shape_of
 from ...blocks.core.block import Block
 from ...blocks.core.errors import OptionError, ShapeError, near
 from ...blocks.core.ports import Output, PortUnit, Shape
 from ...blocks.core.signals import Signal, as_signal
 from ...blocks.core.values import Array, parameter
-from ...blocks.library.branching import shape_of
 from ...blocks.tracing.equations import initial_state, start_values
 from ...blocks.tracing.numpy_check import GUARDS, NEXT, evaluate
 from ...blocks.tracing.symbols import bundle, size

@@ -6,18 +6,15 @@ import os
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from ...blocks.core.arithmetic import Sum
 from ...blocks.core.errors import OptionError, near
-from ...blocks.library.algebra import Sum
+from ..wiring.checked_diagram import CheckedDiagram
 from ..wiring.structure import Structure, stepped_blocks
 from .layout import Net, arrange
 from .nets import Border, Nets, Place
 from .order import Node, Pin
 from .shapes import BORDER, GREY, INK, NAME, PLANT, WIRE, line, rect, seconds, text_at, width
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
 
 MANY = 40
 """Blocks above which boxes are drawn closed unless told otherwise."""
@@ -54,7 +51,7 @@ class Drawing:
         return file
 
 
-def draw(diagram: Diagram, *, box: str = "", closed: bool | Iterable[str] | None = None) -> str:
+def draw(diagram: CheckedDiagram, *, box: str = "", closed: bool | Iterable[str] | None = None) -> str:
     """Return the drawing of a diagram, or of the inside of one of its boxes, as SVG.
 
     Parameters
@@ -64,7 +61,7 @@ def draw(diagram: Diagram, *, box: str = "", closed: bool | Iterable[str] | None
     closed : bool or list of str, optional
         Boxes that are drawn closed, all or some; without it all of them in a diagram of more than 40 blocks.
     """
-    table = diagram._table
+    table = diagram.structure
     boxes = [path for path in table.frames if path]
     shut = _closed(table, box, closed, who=diagram.name)
     if box not in table.frames:

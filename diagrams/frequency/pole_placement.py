@@ -78,7 +78,7 @@ def place(A: Any, B: Any, poles: Sequence[complex]) -> np.ndarray:
     else:
         _controllable(A, B)
         K = _chains(A, B, wanted)
-        if K is None or _difference(np.poly(A - B @ K), polynomial, float(np.linalg.norm(A))) > AGREE:
+        if K is None or relative_difference(np.poly(A - B @ K), polynomial, float(np.linalg.norm(A))) > AGREE:
             K = _heymann(A, B, polynomial)
     _confirm_polynomial(np.poly(A - B @ K), polynomial, "place", float(np.linalg.norm(A)))
     return np.asarray(K)
@@ -185,7 +185,7 @@ def _heymann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarray
         except np.linalg.LinAlgError:
             continue
         cost = float(np.linalg.norm(K)) * (
-            1 + 1e6 * _difference(np.poly(A - B @ K), polynomial, float(np.linalg.norm(A)))
+            1 + 1e6 * relative_difference(np.poly(A - B @ K), polynomial, float(np.linalg.norm(A)))
         )
         if best is None or cost < best[0]:
             best = cost, K
@@ -194,7 +194,7 @@ def _heymann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarray
     return best[1]
 
 
-def _difference(found: np.ndarray, wanted: np.ndarray, size: float = 0.0) -> float:
+def relative_difference(found: np.ndarray, wanted: np.ndarray, size: float = 0.0) -> float:
     """Return the largest difference of two monic polynomials' coefficients, time scaled by the size of the roots.
 
     ``size`` is taken where all roots that are wanted are at zero.
@@ -206,7 +206,7 @@ def _difference(found: np.ndarray, wanted: np.ndarray, size: float = 0.0) -> flo
 
 
 def _confirm_polynomial(found: np.ndarray, wanted: np.ndarray, who: str, size: float = 0.0) -> None:
-    difference = _difference(found, wanted, size)
+    difference = relative_difference(found, wanted, size)
     if not difference < AGREE:
         raise ConfirmationError(
             f"the characteristic polynomial that was found differs from the one asked for by {difference:.3g} of its "

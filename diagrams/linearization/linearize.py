@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,16 +17,15 @@ from ...blocks.core.errors import LoopwrightError, OptionError, WiringError
 from ...fmus.running.derivation import Derivation, DerivativeMethod
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.functions import NONE
+from ..flat.wired_diagram import WiredDiagram
+from ..results.operating_point import OperatingPoint
 from ..wiring.subsystem import exact_time
 from .derivatives import Parts, Signal, find_signal, steps_only
 from .findings import Finding
 from .loops_over_a_period import confirm_closed, loop_model, moved, period_of, ticks_to_renewal
-from .operating_point import OperatingPoint, check_options, names_of_states, operating_point
+from .operating_point import check_options, names_of_states, operating_point
 from .over_a_period import EQUILIBRIUM, Model, discrete, moves_between
 from .plant_models import continuous_models, joined, states_of
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +60,7 @@ class Linearization:
         How it was asked for; its loops are made in the same way.
     """
 
-    diagram: Diagram
+    diagram: WiredDiagram
     A: np.ndarray = field(repr=False)
     B: np.ndarray = field(repr=False)
     C: np.ndarray = field(repr=False)
@@ -198,7 +197,7 @@ class Linearization:
 
 
 def linearize(
-    diagram: Diagram,
+    diagram: WiredDiagram,
     point: Any = None,
     *,
     inputs: str | Iterable[str] = (),
@@ -215,7 +214,7 @@ def linearize(
 
 
 def _linearize(
-    diagram: Diagram,
+    diagram: WiredDiagram,
     at: OperatingPoint,
     inputs: str | Iterable[str],
     outputs: str | Iterable[str],
@@ -318,7 +317,9 @@ def _check_opening(flat: FlatDiagram, signal: Signal) -> None:
     )
 
 
-def _continuous(diagram: Diagram, flat: FlatDiagram, parts: Parts, at: OperatingPoint, plants: str | None) -> Model:
+def _continuous(
+    diagram: WiredDiagram, flat: FlatDiagram, parts: Parts, at: OperatingPoint, plants: str | None
+) -> Model:
     """Return the model of a diagram that is continuous throughout."""
     J = parts.at(NONE, at.t, at.x, at.w)
     models = continuous_models(flat, at, plants)
@@ -360,7 +361,10 @@ def _continuous(diagram: Diagram, flat: FlatDiagram, parts: Parts, at: Operating
 
 
 def batch(
-    diagram: Diagram, points: Iterable[Any] = (None,), variants: Iterable[Mapping[str, Any]] = ({},), **options: Any
+    diagram: WiredDiagram,
+    points: Iterable[Any] = (None,),
+    variants: Iterable[Mapping[str, Any]] = ({},),
+    **options: Any,
 ) -> list[Linearization]:
     """Linearize at several operating points, and with several parameters; see `Diagram.linearize_batch`."""
     made, points = [], list(points)

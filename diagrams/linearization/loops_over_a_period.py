@@ -17,8 +17,8 @@ import numpy as np
 from ...blocks.core.errors import ConfirmationError, WiringError
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.layout import Clock
+from ..results.operating_point import OperatingPoint
 from .derivatives import Parts
-from .operating_point import OperatingPoint
 from .over_a_period import Chain, Model, needed, own_states, state_names, ticks
 
 SAME_ROWS = 1e-12

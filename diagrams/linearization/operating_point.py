@@ -3,108 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from enum import StrEnum
+from dataclasses import replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ...blocks.core.errors import OptionError, UnknownNameError, near
 from ..flat.flat_diagram import FlatDiagram
+from ..flat.wired_diagram import WiredDiagram
+from ..results.operating_point import OperatingPoint, PointOrigin
 from ..results.run import Snapshot
 from ..results.saved_state import layout_of
 from ..wiring.structure import join
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
 
 OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start")
 """How to run to an operating point."""
 AGAIN = 1e-3
 """How far a run may be from where it was the first time, as its solver takes other steps; relative to 1 + its size."""
 MORE = {"linearize": ("inputs", "outputs", "openings", "plants"), "operating_point": ("t",)}
-
-
-class PointOrigin(StrEnum):
-    """The way in which an operating point was made."""
-
-    RUN = "run"
-    """A run has reached it."""
-    TRIM = "trim"
-    """A trim has found it."""
-    GIVEN = "given"
-    """Its states were given."""
-
-
-@dataclass(frozen=True, eq=False)
-class OperatingPoint:
-    """An instant of a diagram: everything that its linear model depends on.
-
-    Made by `Diagram.operating_point` (from a run), `Diagram.trim`, or from a recorded instant, ``run.at(t)``.
-
-    Attributes
-    ----------
-    t : float
-        Time in s.
-    tick : int
-        Its tick, on the base ``base`` (seconds, exact).
-    x : ndarray
-        The vector x of the flattened diagram, as it is before the tick.
-    w, z : ndarray
-        Outputs of the FMUs then, and their inputs from then on.
-    plants : mapping
-        Time, states and inputs of each FMU by path, as `Fmu.linear_model` takes them.
-    residual : float
-        How far it is from an equilibrium: the largest change of a state over the next tick, and of a continuous state
-        in one second, relative to 1 + its size. States of FMUs count: by their rates, or by their change over a step
-        where the rates are not to be had. It means the same however the point was found; what a trim has left of its
-        equations is in ``residuals``.
-    largest : str
-        The block with that residual, of an FMU its state; empty where nothing moves.
-    how : PointOrigin
-        The way in which it was made: "run", "trim" or "given".
-    """
-
-    t: float
-    tick: int
-    base: Fraction
-    x: np.ndarray = field(repr=False)
-    w: np.ndarray = field(repr=False)
-    z: np.ndarray = field(repr=False)
-    plants: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    residual: float = float("nan")
-    largest: str = ""
-    how: PointOrigin = PointOrigin.RUN
-    values: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    """Every signal by its path, then."""
-    layout: tuple[Any, ...] = field(default=(), repr=False)
-    """What its vectors mean: two diagrams with one of these can exchange operating points."""
-
-    def check_fits(self, flat: FlatDiagram, name: str) -> None:
-        """Refuse the operating point of a diagram with other blocks, states or ports.
-
-        Raises
-        ------
-        OptionError
-            If it is one.
-        """
-        sizes = (self.x.size, self.w.size, self.z.size)
-        needed = (flat.width, flat.plant_outputs.total, flat.plant_inputs.total)
-        if sizes == needed and (not self.layout or self.layout == layout_of(flat)):
-            return
-        raise OptionError(
-            "it is the operating point of a diagram with other blocks or wires. Make one of this diagram: "
-            "diagram.operating_point(t), or linearize(t).",
-            block=name,
-            port="operating point",
-        )
-
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters that belong to it, where a trim has found them, by path, as `Diagram.replace` takes them."""
-    residuals: Mapping[str, float] = field(default_factory=dict, repr=False)
-    """What a trim has left of each of its equations, by name, largest first, relative to 1 + the size of what they
-    belong to."""
 
 
 def capture(simulation: Any, how: PointOrigin = PointOrigin.RUN) -> OperatingPoint:
@@ -152,7 +69,7 @@ def judged(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) -> Oper
     return replace(point, residual=found, largest=who)
 
 
-def check_options(diagram: Diagram, options: Mapping[str, Any], what: str) -> None:
+def check_options(diagram: WiredDiagram, options: Mapping[str, Any], what: str) -> None:
     """Refuse what is no option of how to run to an operating point.
 
     Raises
@@ -167,7 +84,7 @@ def check_options(diagram: Diagram, options: Mapping[str, Any], what: str) -> No
             )
 
 
-def operating_point(diagram: Diagram, point: Any, options: Mapping[str, Any]) -> OperatingPoint:
+def operating_point(diagram: WiredDiagram, point: Any, options: Mapping[str, Any]) -> OperatingPoint:
     """Return an operating point from what a user gives: one, a recorded instant, a time in s, or None for the start.
 
     Raises
@@ -196,7 +113,7 @@ def operating_point(diagram: Diagram, point: Any, options: Mapping[str, Any]) ->
     )
 
 
-def _check_whose(diagram: Diagram, given: Snapshot) -> None:
+def _check_whose(diagram: WiredDiagram, given: Snapshot) -> None:
     """Refuse an instant of a run of a diagram that has nothing to do with this one."""
     whose = getattr(given.run, "diagram_name", diagram.name)
     if whose != diagram.name and not {path.partition(".")[0] for path in given.values} <= _tops(diagram):
@@ -208,11 +125,11 @@ def _check_whose(diagram: Diagram, given: Snapshot) -> None:
         )
 
 
-def _tops(diagram: Diagram) -> set[str]:
+def _tops(diagram: WiredDiagram) -> set[str]:
     return {path.partition(".")[0] for path in diagram.blocks}
 
 
-def _check_found_again(diagram: Diagram, given: Snapshot, found: OperatingPoint) -> None:
+def _check_found_again(diagram: WiredDiagram, given: Snapshot, found: OperatingPoint) -> None:
     """Refuse an instant of a run that does not come again: one that was restored from a state on the way."""
     if getattr(given.run, "diagram", None) is not diagram or given.state.shape != found.x.shape:
         return
@@ -227,8 +144,9 @@ def _check_found_again(diagram: Diagram, given: Snapshot, found: OperatingPoint)
         )
 
 
-def at_time(diagram: Diagram, t: float, options: Mapping[str, Any]) -> OperatingPoint:
+def at_time(diagram: WiredDiagram, t: float, options: Mapping[str, Any]) -> OperatingPoint:
     """Run a diagram to a time, and return the operating point there."""
+    from ..simulation.run_options import RunOptions
     from ..simulation.simulation import Simulation
 
     check_options(diagram, options, "operating_point")
@@ -247,7 +165,7 @@ def at_time(diagram: Diagram, t: float, options: Mapping[str, Any]) -> Operating
         elif not _is_tick(options, t, diagram.has_fmu):
             options["step"] = _any_step(diagram, t)
             t = 0.0 if t == 0 else float(options["step"])
-    with Simulation(diagram, **options) as simulation:
+    with Simulation(diagram, RunOptions.of(options, block=diagram.name)) as simulation:
         if t > first:
             _check_tick(diagram, simulation.flat.base, t)
             simulation.advance(t - first)
@@ -277,7 +195,7 @@ def _is_tick(options: Mapping[str, Any], t: float, has_fmu: bool) -> bool:
     return has_fmu or options.get("solver") in ("euler", "heun", "rk4") or abs(steps - round(steps)) <= 1e-12 * steps
 
 
-def _check_tick(diagram: Diagram, base: Fraction, t: float) -> None:
+def _check_tick(diagram: WiredDiagram, base: Fraction, t: float) -> None:
     n = round(Fraction(t) / base)
     if abs(Fraction(t) - n * base) > Fraction(t) * Fraction(1, 10**12):
         raise OptionError(
@@ -288,7 +206,7 @@ def _check_tick(diagram: Diagram, base: Fraction, t: float) -> None:
         )
 
 
-def _any_step(diagram: Diagram, t: float) -> Fraction:
+def _any_step(diagram: WiredDiagram, t: float) -> Fraction:
     """Return a step on which a time is a tick, where nothing else asks for one."""
     if not t > 0:
         return Fraction(1, 1000)

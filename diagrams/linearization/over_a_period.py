@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core.block import Block
-from ...blocks.library.instants import left_of
+from ...blocks.core.instants import left_of
 from ...fmus.running.derivation import Derivation
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.functions import NONE
+from ..results.operating_point import OperatingPoint
 from .derivatives import Parts, Signal
 from .findings import EventWithinPeriod, Finding, MemoryActs, UnusualStart
-from .operating_point import OperatingPoint, elements, names_of_states
+from .operating_point import elements, names_of_states
 from .plant_models import PlantModel, inputs_before, joined, states_of, step_models
 
 EQUILIBRIUM = 1e-9

@@ -11,9 +11,9 @@ import numpy as np
 from ...blocks.core.errors import FmuError, LoopwrightError, OptionError
 from ...fmus.running.derivation import Derivation
 from ..flat.flat_diagram import FlatDiagram
+from ..results.operating_point import OperatingPoint
 from ..wiring.structure import join, stepped_blocks
 from .identification import identified
-from .operating_point import OperatingPoint
 
 WAYS = ("equations", "step", "identified")
 EQUILIBRIUM = 1e-9

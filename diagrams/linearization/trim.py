@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,12 +18,11 @@ import numpy as np
 from ...blocks.core.errors import OptionError, SimulationError
 from ..flat.evaluate import Pass
 from ..flat.flat_diagram import FlatDiagram
-from .operating_point import OperatingPoint, PointOrigin, elements, judged, names_of_states, operating_point
+from ..flat.wired_diagram import WiredDiagram
+from ..results.operating_point import OperatingPoint, PointOrigin
+from .operating_point import elements, judged, names_of_states, operating_point
 from .trim_plants import Plants
 from .trim_request import Free, Target, free_parameters, known_states, named_states, targets_of
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
 
 TOLERANCE = 1e-9
 """Largest residual that counts as solved, relative to 1 + the size of what it belongs to."""
@@ -36,7 +35,7 @@ class _Equations:
     that are free, free parameters.
     """
 
-    def __init__(self, diagram: Diagram, flat: FlatDiagram, at: OperatingPoint, free: list[Free], target: Target):
+    def __init__(self, diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, free: list[Free], target: Target):
         self.diagram, self.flat, self.at, self.parameters, self.target = diagram, flat, at, free, target
         self.plants = Plants(flat, at, diagram)
         steady = {path: flat.checked.traced[path].advance for path in flat.states.slices}
@@ -236,7 +235,7 @@ def solve(equations: _Equations) -> np.ndarray:
 
 
 def trim(
-    diagram: Diagram,
+    diagram: WiredDiagram,
     free: Any = None,
     targets: Mapping[str, Any] | None = None,
     *,
@@ -265,7 +264,7 @@ def trim(
     return _found(base, diagram, flat, guess, parameters, target, tolerance, PointOrigin.TRIM)
 
 
-def given(diagram: Diagram, t: float, states: Mapping[str, Any], options: Mapping[str, Any]) -> OperatingPoint:
+def given(diagram: WiredDiagram, t: float, states: Mapping[str, Any], options: Mapping[str, Any]) -> OperatingPoint:
     """Return the operating point with states that are given by name, the others as they are at the time t.
 
     Signals and the FMUs' outputs follow from the states. See `Diagram.operating_point`.
@@ -280,7 +279,7 @@ def given(diagram: Diagram, t: float, states: Mapping[str, Any], options: Mappin
 
 
 def _found(
-    base: Diagram, diagram: Diagram, flat: FlatDiagram, guess: OperatingPoint,
+    base: WiredDiagram, diagram: WiredDiagram, flat: FlatDiagram, guess: OperatingPoint,
     parameters: list[Free], target: Target, tolerance: float, how: PointOrigin,
 ) -> OperatingPoint:  # fmt: skip
     equations = _Equations(base, flat, guess, parameters, target)
@@ -310,7 +309,7 @@ def _found(
 
 
 def _completed(
-    diagram: Diagram,
+    diagram: WiredDiagram,
     guess: OperatingPoint,
     x: np.ndarray,
     w: np.ndarray,

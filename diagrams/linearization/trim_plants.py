@@ -10,11 +10,12 @@ import numpy as np
 
 from ...blocks.core.errors import FmuError
 from ..flat.flat_diagram import FlatDiagram
+from ..flat.wired_diagram import WiredDiagram
+from ..results.operating_point import OperatingPoint
 from ..wiring.structure import join
-from .operating_point import OperatingPoint, elements
+from .operating_point import elements
 
 if TYPE_CHECKING:
-    from ..diagram import Diagram
     from .trim_request import Free
 
 
@@ -35,7 +36,7 @@ class PlantValues:
 class Plants:
     """All FMUs of a diagram, their states one after the other."""
 
-    def __init__(self, flat: FlatDiagram, at: OperatingPoint, diagram: Diagram):
+    def __init__(self, flat: FlatDiagram, at: OperatingPoint, diagram: WiredDiagram):
         self.flat, self.at_start, self.h = flat, at, float(flat.base)
         self.blocks: dict[str, Any] = {path: diagram.blocks[path] for path in sorted(at.plants)}
         self.own: dict[str, slice] = {}
@@ -102,12 +103,12 @@ class Plants:
 
     def changed(self, free: list[Free], q: list[np.ndarray]) -> dict[str, Any]:
         """Return the FMUs whose parameters are free, with these values."""
-        from ..wiring.variants import _changed
+        from ..wiring.variants import change_parameter
 
         found: dict[str, Any] = {}
         for f, value in zip(free, q, strict=True):
             if f.path in self.blocks:
-                found[f.path] = _changed(found.get(f.path, self.blocks[f.path]), f.keys, f.shaped(value))
+                found[f.path] = change_parameter(found.get(f.path, self.blocks[f.path]), f.keys, f.shaped(value))
         return found
 
     def at(self, xp: np.ndarray, z: np.ndarray, free: list[Free], q: list[np.ndarray]) -> PlantValues:

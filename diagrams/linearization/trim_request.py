@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,13 +13,11 @@ from ...blocks.core.values import Value
 from ...blocks.tracing.symbols import size
 from ...blocks.tracing.trace import traced_parameters
 from ..flat.flat_diagram import FlatDiagram
+from ..flat.wired_diagram import WiredDiagram
+from ..results.operating_point import OperatingPoint, PointOrigin
 from ..wiring.structure import join
-from ..wiring.variants import _changed, _split
+from ..wiring.variants import change_parameter, split_path
 from .derivatives import find_signal
-from .operating_point import OperatingPoint, PointOrigin
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
 
 
 @dataclass(eq=False)
@@ -72,7 +70,7 @@ class Free:
 
     def changed(self, value: np.ndarray) -> Any:
         """Return the block with another value."""
-        return _changed(self.block, self.keys, self.shaped(value))
+        return change_parameter(self.block, self.keys, self.shaped(value))
 
     def packed(self, value: np.ndarray) -> np.ndarray:
         """Return the numbers of the block's parameters, as the traced functions take them."""
@@ -204,7 +202,7 @@ def named_states(flat: FlatDiagram, at: OperatingPoint, states: Mapping[str, Any
 # --- parameters ------------------------------------------------------------------------------------------------------
 
 
-def free_parameters(diagram: Diagram, asked: Mapping[str, Any]) -> tuple[list[Free], Diagram]:
+def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[list[Free], WiredDiagram]:
     """Return the parameters that are free, and the diagram in which all of them are symbols.
 
     An exact zero is structure in a trace, so a parameter that begins there is moved off it.
@@ -218,8 +216,8 @@ def free_parameters(diagram: Diagram, asked: Mapping[str, Any]) -> tuple[list[Fr
     """
     found, moved = [], {}
     for name, given in asked.items():
-        path, keys = _split(diagram._table, name, diagram.name)
-        block: Any = diagram._table.blocks[path]
+        path, keys = split_path(diagram.structure, name, diagram.name)
+        block: Any = diagram.structure.blocks[path]
         value = _value(block, keys)
         low, high = _bounds(given, np.shape(value), name)
         low, high = _declared(block, keys, low, high)
@@ -238,8 +236,8 @@ def free_parameters(diagram: Diagram, asked: Mapping[str, Any]) -> tuple[list[Fr
     return found, diagram
 
 
-def _place(free: Free, diagram: Diagram, flat: FlatDiagram) -> None:
-    trace, free.block = flat.checked.traced[free.path], diagram._table.blocks[free.path]
+def _place(free: Free, diagram: WiredDiagram, flat: FlatDiagram) -> None:
+    trace, free.block = flat.checked.traced[free.path], diagram.structure.blocks[free.path]
     rate = flat.table.rate(flat.table.frame_of[free.path])
     period = np.nan if rate is None or flat.table.triggered(flat.table.frame_of[free.path]) else float(rate)
     if ".".join(free.keys) not in dict(traced_parameters(free.block)):

@@ -31,15 +31,16 @@ from ...blocks.core.errors import OptionError
 from ..flat.evaluate import Pass
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.functions import NONE
+from ..flat.wired_diagram import WiredDiagram
 from ..linearization.derivatives import find_signal
 from ..linearization.loops_over_a_period import ticks_to_renewal
-from ..linearization.operating_point import OperatingPoint, PointOrigin, operating_point
+from ..linearization.operating_point import operating_point
+from ..results.operating_point import OperatingPoint, PointOrigin
 from ..results.run import Snapshot
 from .injection import Experiment, injected
 from .waveforms import KINDS, Part, phasors_of, plan_of, step_for
 
 if TYPE_CHECKING:
-    from ..diagram import Diagram
     from ..linearization.linearize import Linearization
 
 
@@ -71,7 +72,7 @@ class FrequencyResponse:
         output, from before the test signal to a window after its end, relative to 1 + its size.
     """
 
-    diagram: Diagram = field(repr=False)
+    diagram: WiredDiagram = field(repr=False)
     wire: str
     kind: str
     amplitude: float
@@ -183,7 +184,7 @@ class FrequencyResponse:
 
 
 def frequency_response(
-    diagram: Diagram, wire: str, frequencies: Any, *, amplitude: float, kind: str = "sine", at: Any = 0.0,
+    diagram: WiredDiagram, wire: str, frequencies: Any, *, amplitude: float, kind: str = "sine", at: Any = 0.0,
     outputs: str | Iterable[str] = (), windows: int = 40, agreement: float = 1e-6, **options: Any,
 ) -> FrequencyResponse:  # fmt: skip
     """Measure a frequency response; see `Diagram.frequency_response`."""
@@ -238,7 +239,7 @@ def frequency_response(
     )  # fmt: skip
 
 
-def _checked(diagram: Diagram, frequencies: Any, amplitude: Any, kind: str, windows: Any) -> np.ndarray:
+def _checked(diagram: WiredDiagram, frequencies: Any, amplitude: Any, kind: str, windows: Any) -> np.ndarray:
     try:
         omega = np.unique(np.atleast_1d(np.asarray(frequencies, dtype=float)))
     except (TypeError, ValueError):
@@ -265,7 +266,7 @@ def _checked(diagram: Diagram, frequencies: Any, amplitude: Any, kind: str, wind
 
 
 def _beginning(
-    diagram: Diagram, at: Any, options: dict[str, Any]
+    diagram: WiredDiagram, at: Any, options: dict[str, Any]
 ) -> tuple[dict[str, Any], OperatingPoint | None, float]:
     """Return how to run, and where to begin: a point to be started at, or a time to run to."""
     if isinstance(at, Snapshot):

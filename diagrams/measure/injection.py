@@ -5,24 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from ...blocks.core.arithmetic import Sum
 from ...blocks.core.block import Block
 from ...blocks.core.errors import WiringError
 from ...blocks.core.ports import Output
 from ...blocks.core.values import Array, parameter
-from ...blocks.library.algebra import Sum
 from ..flat.flat_diagram import FlatDiagram
+from ..flat.wired_diagram import WiredDiagram
 from ..linearization.derivatives import Signal
-from ..linearization.operating_point import OperatingPoint
+from ..results.operating_point import OperatingPoint
+from ..simulation.run_options import RunOptions
 from ..simulation.simulation import Simulation
 from ..simulation.start_at_point import carried
 from ..wiring.structure import Frame, Structure, Wire
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
 
 NEVER = 1e12
 """A time in s that no run reaches."""
@@ -70,13 +69,13 @@ class Waveform:
 class Injected:
     """A diagram with a test signal added at one of its ports; all other blocks keep their paths."""
 
-    diagram: Diagram
+    diagram: WiredDiagram
     source: str
     sum: str
     lines: int
 
 
-def injected(diagram: Diagram, signal: Signal, lines: int, held: tuple[Fraction, Fraction] | None) -> Injected:
+def injected(diagram: WiredDiagram, signal: Signal, lines: int, held: tuple[Fraction, Fraction] | None) -> Injected:
     """Return the diagram in which every consumer of a port gets the port's signal plus a test signal.
 
     Parameters
@@ -91,7 +90,7 @@ def injected(diagram: Diagram, signal: Signal, lines: int, held: tuple[Fraction,
     WiringError
         A port that nothing is wired to.
     """
-    lowered = diagram._lowered
+    lowered = diagram.scheduled
     table = Structure(**{k: dict(v) for k, v in vars(lowered).items()})
     for path, frame in table.frames.items():
         table.frames[path] = replace(frame, delay=0)  # the delays have become blocks
@@ -107,7 +106,7 @@ def injected(diagram: Diagram, signal: Signal, lines: int, held: tuple[Fraction,
     taken = {*table.blocks, *table.frames}
     frame_path, total = _free("injection", taken), _free("injection_sum", taken)
     source = f"{frame_path}.signal"
-    shape = diagram._checked.shapes[signal.port]
+    shape = diagram.checked.shapes[signal.port]
     ones = np.ones(lines)
     table.blocks[source] = Excitation(
         direction=np.ones(shape) if shape else 1.0, amplitude=ones, frequency=ones, sweep=ones, phase=ones,
@@ -122,7 +121,7 @@ def injected(diagram: Diagram, signal: Signal, lines: int, held: tuple[Fraction,
         wire: Wire = group[key]  # type: ignore[index]
         group[key] = Wire(total, "y", wire.index)  # type: ignore[index]
     table.wires[total, "u1"], table.wires[total, "u2"] = Wire(block, port), Wire(source, "y")
-    return Injected(type(diagram)._of(diagram.name, table, diagram.loops), source, total, lines)
+    return Injected(diagram.with_structure(table), source, total, lines)
 
 
 def _free(name: str, taken: set[str]) -> str:
@@ -150,7 +149,7 @@ class Experiment:
     """
 
     def __init__(
-        self, diagram: Diagram, made: Injected, signal: Signal, outputs: Any, point: OperatingPoint | None,
+        self, diagram: WiredDiagram, made: Injected, signal: Signal, outputs: Any, point: OperatingPoint | None,
         options: Mapping[str, Any],
     ):  # fmt: skip
         self.made, self.signal, self.outputs = made, signal, list(outputs)
@@ -160,7 +159,10 @@ class Experiment:
         if point is not None:
             before = diagram.replace(point.parameters) if point.parameters else diagram
             start["start"] = _translated(point, before.flatten(point.base), made, signal)
-        self.simulation = Simulation(made.diagram, record=record, states=False, **{**options, **start})
+        self.simulation = Simulation(
+            made.diagram,
+            RunOptions.of({**options, **start, "record": record, "states": False}, block=made.diagram.name),
+        )
         self.flat: FlatDiagram = self.simulation.flat
         self.held = True
         """Whether the signal has never changed between two samples that were recorded, at the ticks there."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path as File
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -27,11 +27,12 @@ from ...blocks import (
     SmoothStep,
     Step,
 )
-from ...blocks.core.errors import near
 from ...fmus import Fmu
 from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..results.run import Run
+from ..simulation.run_options import RunKeywords, RunOptions
+from ..simulation.simulation import simulate
 from .fig3 import IMPEDANCE_PAR, IMPEDANCE_PERP, Channel, Rig, check_plant, fig3
 from .options import DEFAULTS, ELLIPSE, merge
 
@@ -78,13 +79,15 @@ class Experiment:
     def __reduce__(self) -> tuple[Any, ...]:
         return Experiment, (self.letter, self.title, self.diagram, self.duration, dict(self.options), self.path)
 
-    def simulate(self, **run_options: Any) -> Run:
+    def simulate(self, *, progress: bool | None = None, **options: Unpack[RunKeywords]) -> Run:
         """Run it to its end.
 
         Parameters
         ----------
-        **run_options
-            What concerns the run alone: ``progress`` and ``step`` of `Diagram.simulate`.
+        progress : bool, optional
+            Show a progress bar; see `Diagram.simulate`.
+        **options
+            Options of the run, such as ``record`` and ``every``; see `RunOptions`.
 
         Raises
         ------
@@ -93,11 +96,10 @@ class Experiment:
         SimulationError
             As in `Diagram.simulate`.
         """
-        for name in run_options:
-            if name not in ("progress", "step"):
-                hint = "Give it to the experiment." if name in DEFAULTS else near(name, ("progress", "step"))
-                raise OptionError(f"it is no option of a run. {hint}", block=self.letter, port=name)
-        return self.diagram.simulate(self.duration, **run_options)
+        for name in options:
+            if name in DEFAULTS:
+                raise OptionError("it is no option of a run. Give it to the experiment.", block=self.letter, port=name)
+        return simulate(self.diagram, self.duration, RunOptions.of(options, block=self.letter), progress=progress)
 
 
 def _gantry() -> File:

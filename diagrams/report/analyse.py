@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from ...blocks.core.errors import OptionError
+from ..flat.wired_diagram import WiredDiagram
 from ..frequency.one_thread import on_one_thread
 from ..linearization.derivatives import find_signal
 from ..paper.report_admittance import admittance
@@ -22,7 +23,6 @@ from .terms import DEFINITIONS
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from ..diagram import Diagram
     from ..paper.experiments import Experiment
 
 SECTIONS = ("subject", "operating_points", "poles", "inner", "admittance", "time_domain", "injection", "limits")
@@ -31,7 +31,7 @@ SECTIONS = ("subject", "operating_points", "poles", "inner", "admittance", "time
 
 @on_one_thread
 def analyse(
-    diagram: Diagram | Experiment,
+    diagram: WiredDiagram | Experiment,
     *,
     point: Any = None,
     loops: Iterable[str] | None = None,
@@ -76,9 +76,7 @@ def analyse(
     UnknownNameError
         If there is no wire with a name in ``loops``.
     """
-    from ..diagram import Diagram
-
-    if not isinstance(diagram, Diagram):
+    if not isinstance(diagram, WiredDiagram):
         experiment, diagram = diagram, diagram.diagram
     for key in only or ():
         if key not in SECTIONS:

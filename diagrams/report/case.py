@@ -12,12 +12,12 @@ import numpy as np
 from ...blocks import ErrorDynamics, FeedbackLinearization, Gain, Reference
 from ...blocks.core.errors import LoopwrightError
 from ...fmus.models.gantry import Gantry
-from ..linearization.linearize import Linearization
-from ..linearization.operating_point import OperatingPoint
+from ..flat.wired_diagram import WiredDiagram
+from ..linearization.linearize import Linearization, linearize
+from ..results.operating_point import OperatingPoint
 from .points import point_of
 
 if TYPE_CHECKING:
-    from ..diagram import Diagram
     from ..paper.experiments import Experiment
 
 FRICTION = "_friction"
@@ -50,11 +50,11 @@ class Variant:
 
     key: str
     title: str
-    diagram: Diagram
+    diagram: WiredDiagram
     where: Any
     delay: int = 0
     problem: str = ""
-    source: Diagram | None = None
+    source: WiredDiagram | None = None
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
     loops: dict[tuple[str, ...], Any] = field(default_factory=dict)
@@ -68,7 +68,7 @@ class Variant:
     @cached_property
     def model(self) -> Linearization:
         """Its linear model."""
-        return self.diagram.linearize(self.point, inputs=self.inputs, outputs=self.outputs)
+        return linearize(self.diagram, self.point, inputs=self.inputs, outputs=self.outputs)
 
     def loop(self, *wires: str) -> Any:
         """Return the loop transfer function at wires, computed once."""
@@ -101,7 +101,9 @@ class Case:
         Wires at which loops are looked at, instead of all named ones on loops.
     """
 
-    def __init__(self, diagram: Diagram, point: Any = None, experiment: Experiment | None = None, wires: Any = None):
+    def __init__(
+        self, diagram: WiredDiagram, point: Any = None, experiment: Experiment | None = None, wires: Any = None
+    ):
         self.diagram, self.point, self.experiment = diagram, point, experiment
         self.wires: tuple[str, ...] | None = wires
         self.notes: list[str] = []
@@ -174,14 +176,14 @@ class Case:
             variant.elsewhere[eta, xi] = found
         return variant.elsewhere[eta, xi]
 
-    def _plants(self, base: Diagram, smooth: Diagram | None) -> Iterator[tuple[Diagram, str, str]]:
+    def _plants(self, base: WiredDiagram, smooth: WiredDiagram | None) -> Iterator[tuple[WiredDiagram, str, str]]:
         if smooth is None:
             yield base, "", ""
         else:
             yield smooth, "", ""
             yield base, FRICTION, ", with friction"
 
-    def _smooth(self, base: Diagram) -> Diagram | None:
+    def _smooth(self, base: WiredDiagram) -> WiredDiagram | None:
         """Return Fig. 3 without friction in plant and model, None where there is none, or it can't be taken out."""
         if not self.is_fig3 or self.plant_model is None:
             return None
@@ -192,7 +194,7 @@ class Case:
         changes["controller.feedback_linearization.model"] = self.model.replace(**NO_FRICTION)
         return base.replace(changes)
 
-    def _without_delay(self) -> Diagram:
+    def _without_delay(self) -> WiredDiagram:
         """Return the diagram without its computational delay, as far as that is known."""
         if "controller.computation" not in self.diagram.blocks or not self.is_fig3:
             return self.diagram
@@ -202,7 +204,7 @@ class Case:
             self.notes.append(f"Its own delay could not be taken out: {error.message}")
             return self.diagram
 
-    def _resting(self, base: Diagram) -> Diagram:
+    def _resting(self, base: WiredDiagram) -> WiredDiagram:
         """Return Fig. 3 at rest where its references begin, where it starts elsewhere and no point was given."""
         if not self.is_fig3 or self.point is not None:
             return base
@@ -222,7 +224,7 @@ class Case:
         )
         return found
 
-    def _implementations(self, plain: Diagram) -> Iterator[tuple[str, Any, int]]:
+    def _implementations(self, plain: WiredDiagram) -> Iterator[tuple[str, Any, int]]:
         if not plain.has_clock:
             yield "continuous", plain, 0
             return
@@ -264,9 +266,9 @@ def _tried(make: Any) -> Any:
         return error
 
 
-def delayed_boxes(diagram: Diagram) -> list[str]:
+def delayed_boxes(diagram: WiredDiagram) -> list[str]:
     """Return the sampled subsystems that act on what is continuous: a delay of the computation is a delay of theirs."""
-    table = diagram._table
+    table = diagram.structure
     found: set[str] = set()
     for (block, _), wire in table.wires.items():
         clock = table.clock(table.frame_of[wire.block])

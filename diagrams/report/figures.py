@@ -6,13 +6,11 @@ import io
 import re
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..drawing.svg import draw
+from ..flat.wired_diagram import WiredDiagram
 from .model import Plot, Report
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
 
 DRAWING = "diagram"
 """How the keys of a diagram's drawings begin; they stand ahead of the tables."""
@@ -66,7 +64,7 @@ def _drawn(figure: Any) -> str:
     return buffer.getvalue()
 
 
-def with_drawing(report: Report, diagram: Diagram) -> Report:
+def with_drawing(report: Report, diagram: WiredDiagram) -> Report:
     """Return a report with the drawing of its diagram in its first section.
 
     A large one is drawn with closed boxes, and the inside of each box by itself.
@@ -78,7 +76,7 @@ def with_drawing(report: Report, diagram: Diagram) -> Report:
     return replace(report, sections=(replace(first, plots=plots), *others))
 
 
-def _drawings(diagram: Diagram) -> Iterator[Plot]:
+def _drawings(diagram: WiredDiagram) -> Iterator[Plot]:
     legend = "Boxes are subsystems with their rates; FMUs have a double border; names of wires are in italics."
     whole = draw(diagram, closed=False)
     found = re.search(r'width="([\d.]+)"', whole)

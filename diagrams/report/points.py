@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ...blocks.core.errors import OptionError
-from ..linearization.operating_point import OperatingPoint, capture, operating_point
+from ..flat.wired_diagram import WiredDiagram
+from ..linearization.operating_point import capture, operating_point
+from ..results.operating_point import OperatingPoint
 from ..results.run import Snapshot
 from ..simulation.start_at_point import carried, placed
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
 
 STEP = Fraction(1, 1000)
 """Communication step in s at which a diagram without a clock is run to its operating point."""
@@ -22,7 +21,7 @@ PASSES = 120
 """How many ticks states without a value, such as those of a delay, are given to take theirs."""
 
 
-def point_of(diagram: Diagram, where: Any, source: Diagram | None = None) -> OperatingPoint:
+def point_of(diagram: WiredDiagram, where: Any, source: WiredDiagram | None = None) -> OperatingPoint:
     """Return the operating point of a variant.
 
     Parameters
@@ -49,18 +48,21 @@ def point_of(diagram: Diagram, where: Any, source: Diagram | None = None) -> Ope
     return where
 
 
-def taken_over(diagram: Diagram, point: OperatingPoint, source: Diagram, options: dict[str, Any]) -> OperatingPoint:
+def taken_over(
+    diagram: WiredDiagram, point: OperatingPoint, source: WiredDiagram, options: dict[str, Any]
+) -> OperatingPoint:
     """Return a point of another diagram as one of this diagram: its FMUs', and its blocks' states by their names.
 
     States that only this diagram has, such as those of a delay, take the values that they settle at while all others
     are held.
     """
+    from ..simulation.run_options import RunOptions
     from ..simulation.simulation import Simulation
 
     old = source.flatten(point.base)
     if not diagram.has_clock:
         options = {**options, "step": point.base}
-    with Simulation(placed(diagram, point), **options) as simulation:
+    with Simulation(placed(diagram, point), RunOptions.of(options, block=diagram.name)) as simulation:
         machine, flat = simulation._machine, simulation.flat
         x, marked = machine.here.x, np.zeros(flat.width)
         carried(point.x, old, flat, x)

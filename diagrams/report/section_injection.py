@@ -9,6 +9,7 @@ import numpy as np
 from ...blocks import Constant, Reference, Step
 from ...blocks.core.errors import LoopwrightError
 from ..frequency.number import Number
+from ..measure.frequency_response import frequency_response
 from . import plots as figures
 from .case import FRICTION, Case, Variant, in_s, with_parameters
 from .model import Plot, Section, Table
@@ -100,7 +101,7 @@ def _measured(case: Case, v: Variant, wire: str) -> tuple[Any, Any]:
         frequencies = np.geomspace(centre / 10, min(centre * 3, 0.5 * np.pi / v.model.dt), 5)
         value = np.ravel(v.point.values.get(_source(v, wire), 0.0))
         amplitude = AMPLITUDE * (1.0 + float(np.max(np.abs(value), initial=0.0)))
-    found = v.diagram.frequency_response(wire, frequencies, amplitude=amplitude, at=v.point.t)
+    found = frequency_response(v.diagram, wire, frequencies, amplitude=amplitude, at=v.point.t)
     return found, v.model
 
 

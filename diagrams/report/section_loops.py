@@ -58,7 +58,7 @@ def wires_on_loops(case: Case) -> dict[str, str]:
             seen.add(where)
             names[name] = name
     if not names:  # nothing on a loop has a name: what drives the FMUs, else all outputs on loops
-        table = diagram._table
+        table = diagram.structure
         sources = {f"{w.block}.{w.port}" for w in table.wires.values() if w.block in inside}
         driving = {
             f"{w.block}.{w.port}"
@@ -300,7 +300,7 @@ def _on_cycles(diagram: Any) -> set[str]:
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import connected_components
 
-    table = diagram._table
+    table = diagram.structure
     index = {path: i for i, path in enumerate(sorted(table.blocks))}
     edges = [(index[w.block], index[block]) for (block, _), w in table.wires.items()]
     if not edges:

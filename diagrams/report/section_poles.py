@@ -10,7 +10,7 @@ import numpy as np
 from ...blocks import ErrorDynamics
 from ...blocks.core.errors import LoopwrightError
 from ..frequency.number import Number
-from ..frequency.pole_placement import _difference, sampled_gains, sampled_poles
+from ..frequency.pole_placement import relative_difference, sampled_gains, sampled_poles
 from ..frequency.realization import Realization
 from .case import COORDINATES, FRICTION, SIDES, Case, Variant, in_s, with_parameters
 from .model import Section, Table
@@ -103,7 +103,7 @@ def _asked(case: Case, side: str, wire: str, block: Any, numbers: dict[str, Numb
             continue
         if not r.dt:
             got = np.poly(r.closed())
-            same = _difference(got, asked) if len(got) == len(asked) else np.nan
+            same = relative_difference(got, asked) if len(got) == len(asked) else np.nan
             how = "characteristic polynomials of the loop at the virtual input"
             numbers[f"{side}.{v.key}.polynomial_difference"] = Number(same, "1", 1e-9, how)
             if len(got) == len(asked):
@@ -116,7 +116,7 @@ def _asked(case: Case, side: str, wire: str, block: Any, numbers: dict[str, Numb
         design = sampled_poles([block.a0, block.a1, block.a2], r.dt, delay=v.delay)
         got, formula = np.poly(r.closed()), np.array(design.polynomial) * r.dt ** np.arange(len(design.polynomial))
         formula = formula / formula[0]  # in z − 1 in place of (z − 1)/T
-        same = _difference(got, formula) if len(got) == len(formula) else np.nan
+        same = relative_difference(got, formula) if len(got) == len(formula) else np.nan
         how = "closed form of the sampled chain of integrators against the diagram's own loop"
         numbers[f"{side}.{v.key}.polynomial_difference"] = Number(same, "1", 1e-9, how)
         for i, s in enumerate(design.poles[:3], 1):
@@ -147,7 +147,7 @@ def _cleaned(polynomial: np.ndarray, roots: np.ndarray) -> np.ndarray:
     """Return roots with a triple one exact where the polynomial is its cube, else as they are."""
     p = -polynomial[1] / 3
     exact = np.array([p, p, p], dtype=complex)
-    return exact if _difference(np.poly(exact), polynomial) < 1e-12 else roots
+    return exact if relative_difference(np.poly(exact), polynomial) < 1e-12 else roots
 
 
 def _listed(values: Any) -> str:
@@ -224,7 +224,7 @@ class _Claims:
         if not at:
             return
         self.matched.setdefault(key, polynomials)
-        spread = max(_difference(p, polynomials[0]) for p in polynomials)
+        spread = max(relative_difference(p, polynomials[0]) for p in polynomials)
         found = {
             "coupling": Number(max(coupled), "1", 1e-9, "frequency responses on a grid, at all the points"),
             "polynomial_spread": Number(spread, "1", 1e-9, "characteristic polynomials at all the points"),
@@ -236,7 +236,7 @@ class _Claims:
             ),
         }
         if base is not None and len(self.matched.get(base, ())) == len(at):
-            away = max(_difference(p, q) for p, q in zip(polynomials, self.matched[base], strict=True))
+            away = max(relative_difference(p, q) for p, q in zip(polynomials, self.matched[base], strict=True))
             found["from_matched"] = Number(away, "1", 1e-9, "characteristic polynomials at all the points")
         self.numbers |= {f"{key}.{name}": number for name, number in found.items()}
         shown = (found.get(name, "–") for name in ("coupling", "polynomial_spread", "from_matched", "slowest"))

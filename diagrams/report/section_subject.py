@@ -33,7 +33,7 @@ def subject(case: Case) -> Section:
     numbers: dict[str, Number] = {}
     frames, parameters, plants = [], [], []
     for path, frame in sorted(diagram.frames.items()):
-        rate = diagram._table.rate(path)
+        rate = diagram.structure.rate(path)
         name = path or diagram.name
         if rate is not None and frame.sample_time is not None:
             numbers[f"{path or 'diagram'}.sample_time"] = Number(float(rate), "s", 0.0, "given, exact")

@@ -12,6 +12,7 @@ import numpy as np
 from ...blocks.core.errors import LoopwrightError
 from ..frequency.margins import margins
 from ..frequency.number import Number
+from ..linearization.linearize import linearize
 from .case import Case, Variant
 from .model import Section, Table
 
@@ -113,7 +114,7 @@ def _relative_error(v: Variant, wire: str, w: np.ndarray) -> tuple[float, str]:
     if not any("differences of steps" in how for how in v.model.how.values()):
         return error, ""
     try:
-        held = v.diagram.linearize(v.point, plants="equations").loop(wire)
+        held = linearize(v.diagram, v.point, plants="equations").loop(wire)
     except LoopwrightError:
         return error, "an FMU tells no equations, so that its own solver's error is not in the tolerances."
     solver = off(held)

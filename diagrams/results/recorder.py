@@ -12,8 +12,8 @@ import numpy as np
 
 from ...blocks.core.errors import OptionError, SimulationError, UnknownNameError
 from ..flat.layout import Layout
-from ..simulation.duration import memory
 from ..wiring.structure import Wire
+from .memory import memory
 from .signal_names import entries, resolve
 from .stored import END, Occurrence, create, line, prepare, read, split, write_json
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from ...blocks.core.errors import OptionError
 from ..flat.flat_diagram import FlatDiagram
-from ..simulation.duration import check_memory
 from ..wiring.structure import join
+from .memory import check_memory
 from .recorder import Recorder, check_every, select
 from .stored import header
 
@@ -55,7 +55,7 @@ class Recording:
         return {join(*port): unit for port, unit in self.flat.checked.units.items()}
 
     def check_memory(self, ticks: int, *, every_tick: bool) -> None:
-        """Refuse a run whose samples can't fit; see `_duration.check_memory`.
+        """Refuse a run whose samples can't fit; see `check_memory`.
 
         Parameters
         ----------

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...blocks.core.block import Block
 from ...blocks.core.errors import NonFiniteError, OptionError, SimulationError
-from ...blocks.library.instants import is_before, left_of
+from ...blocks.core.instants import is_before, left_of
 from ..flat.functions import active_loops
 from ..results.stored import Occurrence
 from ..solvers.base import Problem, make_solver

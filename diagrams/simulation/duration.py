@@ -1,18 +1,13 @@
-"""How many ticks a run has, and whether its samples fit."""
+"""Ticks of a run: their number, and the step between them."""
 
 from __future__ import annotations
 
 import math
-import os
-import shutil
 from fractions import Fraction
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ...blocks.core.errors import OptionError
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
+from ..flat.wired_diagram import WiredDiagram
 
 FIXED_STEP = ("euler", "heun", "rk4")
 
@@ -36,7 +31,7 @@ def ticks_in(duration: Any, base: Fraction, name: str) -> int:
     return n
 
 
-def default_step(diagram: Diagram, step: Any, duration: float | None, solver: str, start: Any = None) -> Any:
+def default_step(diagram: WiredDiagram, step: Any, duration: float | None, solver: str, start: Any = None) -> Any:
     """Return the seconds between two samples of a run that has neither a ``step`` nor a clock.
 
     That of the run that is gone on from; else a thousandth of the duration, in whole nanoseconds where it has them,
@@ -62,57 +57,3 @@ def default_step(diagram: Diagram, step: Any, duration: float | None, solver: st
     if ticks.denominator != 1:
         return span / 1000
     return next((span / n for n in (1000, 500, 200, 100, 10, 1) if (ticks / n).denominator == 1), span)
-
-
-def memory() -> int:
-    """Return the bytes of memory of this machine."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, OSError, ValueError):  # not on Windows
-        return 16 * 2**30
-
-
-def check_memory(samples: int, width: int, base: Fraction, name: str, *, every: int = 1, to: Any = None) -> None:
-    """Refuse a run whose samples can't fit, before it takes the machine down.
-
-    Parameters
-    ----------
-    samples : int
-        Samples of the run, one more than its ticks.
-    width : int
-        Numbers that are recorded of each, without the time.
-    base : Fraction
-        Seconds between two ticks.
-    name : str
-        The diagram's name.
-    every : int
-        Of so many samples one is recorded.
-    to : path, optional
-        Folder on disk that they go to.
-
-    Raises
-    ------
-    OptionError
-        If more than 80 % of the memory were needed, or more than is free on the disk.
-    """
-    needed = -(-samples // every) * 8 * (width + 1)
-    if to is None:
-        there, most, place = memory(), 0.8 * memory(), "this machine has"
-        remedy = "record less with record=[…] or every=…, or stream to disk with to=path"
-    else:
-        there = most = free_on_disk(Path(to))
-        place, remedy = "the disk has free", "record less with record=[…] or every=…, or choose another disk"
-    if needed > most:
-        kept = f"{width} numbers each" if every == 1 else f"{width} numbers of each {every}th"
-        raise OptionError(
-            f"found {samples - 1} ticks of {float(base):g} s; {kept} need {needed / 2**30:.0f} GiB, "
-            f"and {place} {there / 2**30:.0f}. Is the duration in s? Take a shorter one or a larger step, {remedy}.",
-            block=name,
-            port="duration",
-        )
-
-
-def free_on_disk(path: Path) -> int:
-    """Return the bytes that are free where a path is to be created."""
-    path = path.absolute()
-    return shutil.disk_usage(next(p for p in (path, *path.parents) if p.exists())).free

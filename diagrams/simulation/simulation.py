@@ -42,32 +42,32 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable
 from contextlib import ExitStack
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ...blocks.core.errors import SimulationError
 from ..flat.evaluate import TRUE
 from ..flat.flat_diagram import FlatDiagram
-from ..linearization.operating_point import OperatingPoint
+from ..flat.wired_diagram import WiredDiagram
+from ..results.operating_point import OperatingPoint
 from ..results.recorder import Recorder
 from ..results.recording import Recording
 from ..results.run import Run
 from ..results.saved_state import RunState, check_fits, layout_of, not_open
 from ..results.stored import Occurrence, Stopped
+from ..solvers.base import solver_name
 from ..wiring.structure import join
 from .continuous import Continuous, check_solver
 from .diagnosis import failure
 from .duration import default_step, ticks_in
 from .initialize import initialize
 from .plants import bind, has_plants, loaded
+from .progress import progress_bar
+from .run_options import RunOptions
 from .start_at_point import place, placed
 from .ticks import CHUNK, run_ticks
 from .workspace import Machine
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
 
 
 class Simulation:
@@ -93,36 +93,28 @@ class Simulation:
 
     def __init__(
         self,
-        diagram: Diagram,
+        diagram: WiredDiagram,
+        options: RunOptions | None = None,
         *,
-        step: float | Fraction | None = None,
-        solver: str = "auto",
-        rtol: float = 1e-6,
-        atol: float = 1e-9,
-        max_step: float | None = None,
-        record: Iterable[str] | None = None,
-        every: int = 1,
-        states: bool = True,
-        to: Any = None,
-        overwrite: bool = False,
-        start: RunState | OperatingPoint | None = None,
         duration: float | None = None,
     ):
-        given: Any = step
+        options = options or RunOptions()
+        start, step = options.start, options.step
         self._point = start if isinstance(start, OperatingPoint) else None
         if self._point is not None:
             diagram = placed(diagram, self._point)
             if not diagram.is_continuous and not diagram.has_clock:
-                given = step or self._point.base
+                step = step or self._point.base
         self.diagram = diagram
         saved = None if isinstance(start, OperatingPoint) else start
-        base = default_step(diagram, given, duration, solver, saved)
-        options = {"step": base, "solver": solver, "rtol": rtol, "atol": atol, "max_step": max_step, "start": start}
-        self.recipe = {name: value for name, value in options.items() if value is not None}
-        self.flat: FlatDiagram = diagram.flatten(base) if base is given else diagram._flattened(base)
+        base = default_step(diagram, step, duration, options.solver, saved)
+        self.recipe = options.with_step(base).recipe
+        self.flat: FlatDiagram = diagram.flatten(base) if base is step else diagram.flattened(base)
         if saved is not None:
             check_fits(saved, self.flat, diagram.name)
-        self._recording = Recording(self.flat, diagram.name, record, every, states, to, overwrite)
+        self._recording = Recording(
+            self.flat, diagram.name, options.record, options.every, options.states, options.to, options.overwrite
+        )
         self._stack = ExitStack()
         self._start_state = saved
         self._machine = Machine(self.flat)
@@ -136,13 +128,19 @@ class Simulation:
             self._recording.check_memory(self._last - first, every_tick=self._every_tick)
         self._continuous: Continuous | None = None
         if self.flat.hybrid:
-            self._continuous = Continuous(self._machine, diagram.name, solver, rtol, atol, max_step, self._on_event)
+            self._continuous = Continuous(
+                self._machine,
+                diagram.name,
+                options.solver,
+                options.rtol,
+                options.atol,
+                options.max_step,
+                self._on_event,
+            )
             self._continuous.is_stopped = self._is_stopped
             self._every_tick |= self._continuous.fixed
-        elif solver != "auto":
-            from ..solvers.base import solver_name
-
-            solver_name(solver)  # an unknown one is an error here, too
+        elif options.solver != "auto":
+            solver_name(options.solver)  # an unknown one is an error here, too
         self._stops = self._stop_ports()
         self._tick, self._count, self._elapsed, self._begun = 0, 0, 0.0, False
         self._stopped: Stopped | None = None
@@ -475,3 +473,16 @@ class Simulation:
             self._recording.overwrite = True
         self._recorder = self._new_recorder()
         self._recorder.row(state.t, machine.log)
+
+
+def simulate(diagram: WiredDiagram, duration: float, options: RunOptions, *, progress: bool | None = None) -> Run:
+    """Run a diagram; see `Diagram.simulate`."""
+    span: float | None = duration  # None is a user's slip, and no run without an end
+    if span is None:
+        ticks_in(span, Fraction(1), diagram.name)  # refused
+    with Simulation(diagram, options, duration=duration) as simulation:
+        first = simulation.t
+        with progress_bar(diagram.name, first, first + float(duration), progress) as show:
+            if simulation.stopped is None:
+                simulation.advance(duration, progress=show)
+        return simulation.run()

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ...blocks.core.errors import FmuError, LoopwrightError, OptionError
 from ..flat.flat_diagram import FlatDiagram
-from ..linearization.operating_point import OperatingPoint
-
-if TYPE_CHECKING:
-    from ..diagram import Diagram
+from ..flat.wired_diagram import WiredDiagram
+from ..results.operating_point import OperatingPoint
 
 
-def placed(diagram: Diagram, point: OperatingPoint) -> Diagram:
+def placed(diagram: WiredDiagram, point: OperatingPoint) -> WiredDiagram:
     """Return the diagram with the parameters of an operating point, and with its FMUs started in their states there.
 
     Raises

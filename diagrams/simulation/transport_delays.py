@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core.errors import ShapeError
-from ...blocks.library.instants import is_before
+from ...blocks.core.instants import is_before
 from ..flat.flat_diagram import FlatDiagram
 from ..wiring.structure import join
 

@@ -39,7 +39,7 @@ def _change(table: Structure, path: str, value: Any, diagram: str) -> None:
         full = unique(path, table.blocks, "block", diagram)
         table.blocks[full] = value.replace(name=full.rpartition(".")[2])
     elif last in _OF_A_BOX and (frame := _frame(table, head, last, diagram)) is not None:
-        table.frames[frame] = _changed_box(table.frames[frame], last, value)
+        table.frames[frame] = _change_subsystem(table.frames[frame], last, value)
     elif path in table.blocks:
         raise WiringError(
             f"found {value!r}; expected a block in its place, such as Fmu('other.fmu'), or the name of a parameter "
@@ -47,8 +47,8 @@ def _change(table: Structure, path: str, value: Any, diagram: str) -> None:
             block=path,
         )
     else:
-        full, keys = _split(table, path, diagram)
-        table.blocks[full] = _changed(table.blocks[full], keys, value)
+        full, keys = split_path(table, path, diagram)
+        table.blocks[full] = change_parameter(table.blocks[full], keys, value)
 
 
 def _frame(table: Structure, path: str, what: str, diagram: str) -> str | None:
@@ -63,7 +63,7 @@ def _frame(table: Structure, path: str, what: str, diagram: str) -> str | None:
     raise UnknownNameError(f"a diagram has no {what!r} of its own; its subsystems have: {offered}.")
 
 
-def _split(table: Structure, path: str, diagram: str) -> tuple[str, list[str]]:
+def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str]]:
     """Return the block and the parameter path that a dotted path means."""
     parts = path.split(".")
     for cut in range(len(parts) - 1, 0, -1):
@@ -82,7 +82,7 @@ def _split(table: Structure, path: str, diagram: str) -> tuple[str, list[str]]:
     raise UnknownNameError(f"nothing is called {path!r} in diagram {diagram!r}. {near(path, known)}")
 
 
-def _changed_box(frame: Frame, what: str, value: Any) -> Frame:
+def _change_subsystem(frame: Frame, what: str, value: Any) -> Frame:
     """Return a box with another sample time, method, offset or delay."""
     new, path = value, frame.path
     if what == "sample_time" and value is not None:
@@ -114,14 +114,14 @@ def unique(path: str, known: Mapping[str, Any], kind: str, diagram: str) -> str:
     raise UnknownNameError(f"no {kind} {path!r} in diagram {diagram!r}. {near(path, known)}")
 
 
-def _changed(block: Value, keys: list[str], value: Any) -> Any:
+def change_parameter(block: Value, keys: list[str], value: Any) -> Any:
     """Return ``block`` with the parameter at a path of attribute names or mapping keys changed."""
     name = keys[0]
     if len(keys) == 1:
         return block.replace(**{name: value})
     inner = block.__dict__.get(name)
     if isinstance(inner, Value):
-        return block.replace(**{name: _changed(inner, keys[1:], value)})
+        return block.replace(**{name: change_parameter(inner, keys[1:], value)})
     if isinstance(inner, Mapping):
         return block.replace(**{name: {**inner, ".".join(keys[1:]): value}})
     raise UnknownNameError(f"it has no parameter {'.'.join(keys)!r}. {near(name, type(block).parameter_specs)}")

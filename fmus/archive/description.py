@@ -15,7 +15,7 @@ import numpy as np
 
 from ...blocks.core.errors import FmuFileError, UnitError
 from ...blocks.core.units import parse_unit
-from ..export.compiler import native_platform
+from ..platform import native_platform
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +75,15 @@ class FmuDescription:
     def of(self, causality: str) -> dict[str, FmuVariable]:
         """Return the variables of a causality, in the file's order."""
         return {name: v for name, v in self.variables.items() if v.causality == causality}
+
+    @property
+    def discrete_states(self) -> tuple[str, ...]:
+        """Names of the variables that hold discrete states: given at the start, changed at events."""
+        return tuple(
+            v.name
+            for v in self.variables.values()
+            if v.causality in ("output", "local") and v.variability == "discrete" and v.initial == "exact"
+        )
 
 
 def read_description(file: str | os.PathLike[str]) -> FmuDescription:

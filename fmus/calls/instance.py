@@ -5,19 +5,16 @@ from __future__ import annotations
 import ctypes
 import struct
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ...blocks.core.errors import FmuError, FmuRuntimeError
-from ..export.compiler import native_platform
-from ..running.linearization import operating_point
+from ..platform import native_platform
+from .fmu_block import FmuBlock
 from .loaded_library import LoadedFmu, status_of
-
-if TYPE_CHECKING:
-    from ..running.fmu import Fmu
 
 _HEADER = struct.Struct("<8s32s24sd?")  # of a serialized state: what it is, whose, made where, when, in a run?
 _MAGIC = b"lw-fmu-1"
@@ -60,7 +57,7 @@ class FmuInstance(LoadedFmu):
     exchange: Callable[[], None]
     """In Initialization Mode: set the inputs and get the outputs (after `bind`)."""
 
-    def __init__(self, block: Fmu, wired: Sequence[str]):
+    def __init__(self, block: FmuBlock, wired: Sequence[str]):
         super().__init__(block)
         back = {new: old for old, new in block.rename.items()}
         self._inputs = [self.description.variables[back.get(name, name)] for name in wired]
@@ -176,7 +173,13 @@ class FmuInstance(LoadedFmu):
 
     def operating_point(self) -> dict[str, Any]:
         """Return the present ``t``, ``state`` and ``inputs``, for `Fmu.linear_model` and `Fmu.step_difference`."""
-        return operating_point(self)
+        about, rename = self.description, self.block.rename
+
+        def read(names: Iterable[str]) -> dict[str, np.ndarray]:
+            return {name: self.values([name]).reshape(about.variables[name].shape) for name in names}
+
+        inputs = {rename.get(name, name): value for name, value in read(about.of("input")).items()}
+        return {"t": self.t, "state": read((*about.states, *about.discrete_states)), "inputs": inputs}
 
     # ---- saved states (FMI 3.0, 2.2.6.4) ----
 

@@ -8,16 +8,14 @@ import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ...blocks.core.errors import FmuError, FmuFileError, FmuRuntimeError, UnknownNameError, near
 from ..archive.description import FmuDescription
-from ..export.compiler import cache_folder, check_cache
-
-if TYPE_CHECKING:
-    from ..running.fmu import Fmu
+from ..platform import cache_folder, check_cache
+from .fmu_block import FmuBlock
 
 _STATUS = ("OK", "warning", "discard", "error", "fatal")
 _FATAL = 4
@@ -26,7 +24,7 @@ _FATAL = 4
 class LoadedFmu:
     """An instance of an FMU: what it logs, its initialization, its variables, its end."""
 
-    def __init__(self, block: Fmu, *, model_exchange: bool = False):
+    def __init__(self, block: FmuBlock, *, model_exchange: bool = False):
         from fmpy.fmi3 import FMU3Model, FMU3Slave
 
         self.block, self.description = block, block.description

@@ -19,7 +19,8 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ...blocks.core.errors import FmuFileError
-from ..export.compiler import SUFFIXES, native_platform
+from ..export.compiler import SUFFIXES
+from ..platform import native_platform
 
 INTERFACES = {
     "CoSimulation": "co-simulation",

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ...blocks.core.errors import FmuFileError
-from ..export.compiler import native_platform
+from ..platform import native_platform
 from .summary import INTERFACES, binaries_of, library_name, platforms_of_binary, read_archive, tuple_of
 from .trial import STAGES
 

@@ -24,18 +24,9 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core.errors import FmuError
+from ..platform import cache_folder, native_platform
 from .c_code import generate, runtime
-from .compiler import (
-    SUFFIXES,
-    TARGETS,
-    Compiler,
-    cache_folder,
-    check_platform,
-    compile_shared,
-    find_compiler,
-    flags,
-    native_platform,
-)
+from .compiler import SUFFIXES, TARGETS, Compiler, check_platform, compile_shared, find_compiler, flags
 from .html_page import index_html
 from .model import ModelSpec
 from .scalars import scalarized

@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib.metadata
 import importlib.util
 import os
-import platform as _platform
 import shlex
 import shutil
 import signal
@@ -23,9 +22,8 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import platformdirs
-
-from ...blocks.core.errors import CompilerError, FmuError, near
+from ...blocks.core.errors import CompilerError, near
+from ..platform import cache_folder, check_cache, native_platform
 
 #: FMI 3.0 platform tuples (2.5.1.4) that can be built for, and zig's name of each with the oldest system:
 #: glibc 2.17, macOS 11. On Windows the C library is the system's own since version 10.
@@ -63,41 +61,6 @@ class Compiler:
     command: tuple[str, ...]
     identity: str
     zig: bool = False
-
-
-def native_platform() -> str:
-    """Name this machine's platform as FMI 3.0 does (2.5.1.4), such as ``x86_64-linux``."""
-    machine = _platform.machine().lower()
-    arch = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}.get(machine, machine)
-    system = {"linux": "linux", "windows": "windows", "darwin": "darwin"}.get(_platform.system().lower(), sys.platform)
-    return f"{arch}-{system}"
-
-
-def cache_folder() -> Path:
-    """Folder of everything that can be built again: LOOPWRIGHT_CACHE, else the user's cache folder."""
-    given = os.environ.get("LOOPWRIGHT_CACHE")
-    return Path(given).expanduser() if given else Path(platformdirs.user_cache_dir("loopwright", appauthor=False))
-
-
-def check_cache() -> Path:
-    """Return the cache folder, after making it and writing to it.
-
-    Raises
-    ------
-    FmuError
-        If it can't be written.
-    """
-    folder = cache_folder()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise FmuError(
-            f"can't write the cache folder {str(folder)!r}: {error}. Set LOOPWRIGHT_CACHE to a folder that can be "
-            "written."
-        ) from error
-    return folder
 
 
 def find_compiler() -> Compiler:

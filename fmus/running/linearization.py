@@ -71,7 +71,9 @@ class _Point:
         if not np.isfinite(self.t):
             raise ParameterError(f"found {t!r}; expected a time in s.", block=block.label, port="t")
         ports = {block.rename.get(name, name): name for name in self.inputs}
-        given_state = self._named(state, {name: name for name in self.states}, "state", _discrete_states(block))
+        given_state = self._named(
+            state, {name: name for name in self.states}, "state", block.description.discrete_states
+        )
         given_inputs = self._named(inputs, ports, "inputs", ())
         self.given = {n: block._start_value(about, n, v) for n, v in {**given_state, **given_inputs}.items()}
 
@@ -130,26 +132,6 @@ def _elements(name: str, variable: FmuVariable) -> list[str]:
     return [
         f"{name}[{','.join(str(i + 1) for i in index)}]" if index else name for index in np.ndindex(*variable.shape)
     ]
-
-
-def _discrete_states(block: Fmu) -> tuple[str, ...]:
-    """Name the variables that hold discrete states: given at the start, changed at events."""
-    return tuple(
-        v.name
-        for v in block.description.variables.values()
-        if v.causality in ("output", "local") and v.variability == "discrete" and v.initial == "exact"
-    )
-
-
-def operating_point(instance: LoadedFmu) -> dict[str, Any]:
-    """Return time, states and inputs of an instance, as `linear_model` and `step_difference` take them."""
-    block, about = instance.block, instance.description
-
-    def read(names: Any) -> dict[str, np.ndarray]:
-        return {name: instance.values([name]).reshape(about.variables[name].shape) for name in names}
-
-    ports = {block.rename.get(name, name): value for name, value in read(about.of("input")).items()}
-    return {"t": instance.t, "state": read((*about.states, *_discrete_states(block))), "inputs": ports}
 
 
 # ---- of the equations ----

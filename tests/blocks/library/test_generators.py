@@ -25,7 +25,7 @@ from loopwright.blocks import (
     SmoothStep,
     Step,
 )
-from loopwright.blocks.library.instants import left_of
+from loopwright.blocks.core.instants import left_of
 from loopwright.blocks.tracing.trace import trace
 from loopwright.diagrams import Diagram, subsystem
 

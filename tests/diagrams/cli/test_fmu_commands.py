@@ -19,7 +19,8 @@ from loopwright.diagrams.cli.main import main
 from loopwright.fmus.checks import summary as _summary
 from loopwright.fmus.checks import validation as _validation
 from loopwright.fmus.export.build import _zip
-from loopwright.fmus.export.compiler import find_compiler, native_platform
+from loopwright.fmus.export.compiler import find_compiler
+from loopwright.fmus.platform import native_platform
 
 LINUX = pytest.mark.skipif(
     native_platform() != "x86_64-linux", reason="makes broken libraries with Linux's own tools, for x86_64"

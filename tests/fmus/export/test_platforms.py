@@ -12,7 +12,8 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from loopwright.fmus.export.build import build_fmu
-from loopwright.fmus.export.compiler import TARGETS, native_platform
+from loopwright.fmus.export.compiler import TARGETS
+from loopwright.fmus.platform import native_platform
 from support import TESTS
 from support.exported import pendulums
 

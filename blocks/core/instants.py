@@ -7,7 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from ..core.values import Array
+from .values import Array
 
 _TOLERANCE = 4.0 * float(np.finfo(float).eps)  # of t: t, the period and their ratio are rounded once each
 

@@ -1,0 +1,72 @@
+"""The base of all sources, and a constant, which numbers on a wire become."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from .block import Block
+from .errors import ParameterError, UnitError
+from .instants import earliest
+from .ports import Output, PortUnit
+from .signals import made_by_operators
+from .units import parse_unit, rate_of
+from .values import Array, parameter
+
+
+class Source(Block):
+    """Base of the sources: one output, ``y``, in the unit that the parameter ``unit`` declares.
+
+    Where y holds a value with its first two time derivatives, ``unit`` is that of the value.
+    """
+
+    unit: str | None = parameter(default=None, description="unit of the output, where it is to be checked")
+    y = Output(shape=None)
+
+    def check(self) -> None:
+        """Refuse a unit that can't be read."""
+        if self.unit is not None and not isinstance(self.unit, str):
+            raise ParameterError(
+                f"found {self.unit!r}; expected a unit as FMI spells it, such as 'm/s2'.", block=self.label, port="unit"
+            )
+        try:
+            parse_unit(self.unit or "1")
+        except UnitError as error:
+            error.at(block=self.label, port="unit")
+            raise
+
+    @property
+    def outputs(self) -> dict[str, Output]:  # type: ignore[override]
+        """The output in the declared unit."""
+        declared, unit = type(self).y, self.unit
+        each: PortUnit = unit
+        if unit is not None and declared.shape == (3,):
+            each = (unit, rate_of(unit), rate_of(rate_of(unit)))
+        return {"y": Output(declared.shape, each, declared.description, name="y")}
+
+    def instants(self) -> Array:
+        """Return the times at which the output or its derivatives are not smooth, in any order: none."""
+        return np.zeros(0)
+
+    def next_instant(self, t: float) -> float:
+        """Return the first of `instants` after t, without one that t counts as."""
+        times = np.ravel(self.instants())
+        return float(np.min(times[earliest(times) > t], initial=math.inf))
+
+
+@made_by_operators("constant")
+class Constant(Source):
+    """A constant number or array."""
+
+    value: Array = parameter(description="number or array")
+
+    @property
+    def outputs(self) -> dict[str, Output]:  # type: ignore[override]
+        """The output in the declared unit, of the value's shape."""
+        return {"y": Output(shape=np.shape(self.value), unit=self.unit, name="y")}
+
+    def output(self, t: Array, x: Any, u: Any) -> Array:
+        """Return the constant."""
+        return self.value

@@ -1,0 +1,108 @@
+"""Options of a run: their defaults and their meaning, in one place."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from fractions import Fraction
+from typing import Any, Self, TypedDict
+
+from ...blocks.core.errors import OptionError, near
+from ..results.operating_point import OperatingPoint
+from ..results.saved_state import RunState
+
+
+class RunKeywords(TypedDict, total=False):
+    """The options of a run as keywords, for type checkers; `RunOptions` says what they mean."""
+
+    step: float | Fraction | None
+    solver: str
+    rtol: float
+    atol: float
+    max_step: float | None
+    record: Iterable[str] | None
+    every: int
+    states: bool
+    to: str | os.PathLike[str] | None
+    overwrite: bool
+    start: RunState | OperatingPoint | None
+
+
+@dataclass(frozen=True, eq=False)
+class RunOptions:
+    """Options of a run, as `Diagram.simulate`, `Diagram.simulation` and `Experiment.simulate` take them.
+
+    Attributes
+    ----------
+    step : float or Fraction, optional
+        Seconds between two ticks (samples, steps of a solver of fixed step, communication points of FMUs). Without
+        one it is the greatest common divisor of all sample times, of which those are visited at which a subsystem
+        acts; for a diagram without any, a thousandth of the duration.
+    solver : str
+        Solver of the continuous states: "auto", of fixed step "euler", "heun", "rk4", of variable step "RK23",
+        "RK45", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "CVODE_Adams". The default changes from an explicit
+        to an implicit method where the diagram turns out to be stiff.
+    rtol, atol : float
+        Relative and absolute tolerance of a step of a solver of variable step; the absolute one is multiplied with
+        the nominal value of a state that declares one.
+    max_step : float, optional
+        Longest step of a solver of variable step in s.
+    record : list of str, optional
+        Signals, blocks and subsystems to record; everything without it.
+    every : int
+        Record one of so many samples; the first and the last always.
+    states : bool
+        Record the states, too.
+    to : path, optional
+        Folder to which the samples are streamed, with bounded memory; `Run.open` opens it later.
+    overwrite : bool
+        Replace a run that is stored there.
+    start : RunState or OperatingPoint, optional
+        State to go on from: ``run.final_state``, that of `Simulation.save`, or an operating point, such as
+        `trim` finds one, with the parameters that belong to it.
+    """
+
+    step: float | Fraction | None = None
+    solver: str = "auto"
+    rtol: float = 1e-6
+    atol: float = 1e-9
+    max_step: float | None = None
+    record: Iterable[str] | None = None
+    every: int = 1
+    states: bool = True
+    to: str | os.PathLike[str] | None = None
+    overwrite: bool = False
+    start: RunState | OperatingPoint | None = None
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any], *, block: str) -> Self:
+        """Return the options with given names.
+
+        Parameters
+        ----------
+        options : mapping
+            Values by name.
+        block : str
+            Path or name for the error.
+
+        Raises
+        ------
+        OptionError
+            A name that is no option of a run.
+        """
+        known = [f.name for f in fields(cls)]
+        for name in options:
+            if name not in known:
+                raise OptionError(f"it is no option of a run. {near(name, known)}", block=block, port=name)
+        return cls(**options)
+
+    def with_step(self, step: float | Fraction | None) -> Self:
+        """Return the options with another step."""
+        return replace(self, step=step)
+
+    @property
+    def recipe(self) -> dict[str, Any]:
+        """The options that a later run to an instant of this one is made with, those that are given."""
+        names = ("step", "solver", "rtol", "atol", "max_step", "start")
+        return {name: value for name in names if (value := getattr(self, name)) is not None}

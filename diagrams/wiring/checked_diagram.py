@@ -1,0 +1,203 @@
+"""A diagram as a value: its structure, checked, and its variants."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace as replace_fields
+from fractions import Fraction
+from typing import Any, Self
+
+from ...blocks.core.block import Block
+from ...blocks.core.errors import OptionError, WiringError
+from ...blocks.core.signals import check_name
+from ...blocks.tracing.discretization import check_method
+from .check import Checked, check
+from .delay_blocks import lowered
+from .evaluation_order import evaluation_order
+from .structure import Collector, Frame, Structure, Wire, stepped_blocks
+from .subsystem import exact_time
+from .variants import replaced, unique
+
+LOOPS = ("error", "solve")
+
+
+class CheckedDiagram:
+    """Blocks and wires as one value; `loopwright.diagrams.Diagram` adds the ways of using it.
+
+    Parameters
+    ----------
+    name : str
+        Name of the diagram.
+    *roots : Call
+        The calls that close it.
+    loops : {"error", "solve"}
+        Whether algebraic loops are an error or solved.
+
+    Raises
+    ------
+    WiringError
+        One of its kinds, with the path of the block and its port.
+    TraceError
+        A block whose equations can't be traced.
+    """
+
+    def __init__(self, name: str, *roots: Any, loops: str = "error"):
+        if not isinstance(name, str):
+            raise WiringError(
+                f'found {name!r} where the name is expected; write Diagram("name", …), the calls after the name.'
+            )
+        if not roots:
+            raise WiringError("a diagram needs at least one call, such as plant(motor_force=u).", block=name)
+        if loops not in LOOPS:
+            raise OptionError(
+                f"found loops={loops!r}; expected {' or '.join(map(repr, LOOPS))}.", block=name, port="loops"
+            )
+        self._set(check_name(name), Collector(roots).structure(), loops)
+
+    name: str
+    loops: str
+    structure: Structure
+    """Blocks, wires and subsystems as they were wired."""
+    scheduled: Structure
+    """The structure that the scheduler sees: computational delays have become blocks."""
+    checked: Checked
+    """Traces of the blocks, and shapes and units of the ports, of what is scheduled."""
+
+    def _set(self, name: str, table: Structure, loops: str) -> None:
+        runs = lowered(table)
+        checked = check(runs)
+        for start in (False, True):
+            evaluation_order(runs, checked.traced, start=start, solve=loops == "solve")
+        self.__dict__.update(name=name, loops=loops, structure=table, scheduled=runs, checked=checked)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise AttributeError(f"a diagram is a value: {name!r} can't be set. Use replace(…), or build another one.")
+
+    @classmethod
+    def _of(cls, name: str, table: Structure, loops: str = "error") -> Self:
+        diagram = cls.__new__(cls)
+        diagram._set(name, table, loops)
+        return diagram
+
+    def with_structure(self, structure: Structure) -> Self:
+        """Return the diagram of another structure, under the same name."""
+        return type(self)._of(self.name, structure, self.loops)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self)._of, (self.name, self.structure, self.loops)
+
+    def __repr__(self) -> str:
+        boxes = [path for path in self.structure.frames if path]
+        return f"<diagram {self.name}: {len(self.blocks)} blocks{', in ' + ', '.join(boxes) if boxes else ''}>"
+
+    @property
+    def blocks(self) -> Mapping[str, Block]:
+        """Every block by its dotted path."""
+        return dict(self.structure.blocks)
+
+    @property
+    def frames(self) -> Mapping[str, Frame]:
+        """Every subsystem by its dotted path; the diagram itself is ""."""
+        return dict(self.structure.frames)
+
+    @property
+    def wires(self) -> Mapping[tuple[str, str], Wire]:
+        """The source of every wired input, by (block path, input)."""
+        return dict(self.structure.wires)
+
+    @property
+    def names(self) -> Mapping[str, Wire]:
+        """Every named wire."""
+        return dict(self.structure.names)
+
+    def __getitem__(self, path: str) -> Block:
+        """Return the block at a path, or at the unique end of one."""
+        return self.structure.blocks[unique(path, self.structure.blocks, "block", self.name)]
+
+    def replace(self, changes: Mapping[str, Any] | None = None, /, **more: Any) -> Self:
+        """Return a variant: other blocks, parameters or sample times.
+
+        Parameters
+        ----------
+        changes : mapping, optional
+            By dotted path, or its unique end: a block (``"plant"``), a parameter
+            (``"controller.admittance_par.stiffness"``), a subsystem's ``sample_time``, ``method``, ``offset`` or
+            ``delay`` (``"controller.sample_time"``; None: that of what surrounds it), a plant's start value
+            (``"plant.start.position"``).
+        **more
+            The same, for paths that are identifiers: ``replace(plant=Fmu("other.fmu"))``.
+
+        Raises
+        ------
+        UnknownNameError, ParameterError, WiringError
+            A name that isn't there, a value out of bounds, a block that doesn't fit the wires.
+        """
+        table = replaced(self.structure, {**(changes or {}), **more}, self.name)
+        return self.with_structure(table)
+
+    def continuous(self) -> Self:
+        """Return the diagram with every sampled subsystem taken as ideal: continuous, without sampling, hold or delay.
+
+        A projection then solves its equation at each evaluation, from the foot point of the last accepted step. With an
+        FMU, a run still exchanges signals with it at multiples of ``step`` only, and holds its inputs between; the
+        linear model, of its equations, has no such hold.
+
+        Raises
+        ------
+        SampleTimeError
+            A block that has a meaning at samples only, such as a `UnitDelay`.
+        """
+        table = Structure(**{k: dict(v) for k, v in vars(self.structure).items()})
+        for path, frame in table.frames.items():
+            table.frames[path] = replace_fields(frame, sample_time=None, offset=Fraction(0), delay=0)
+        return self.with_structure(table)
+
+    def sampled(self, sample_time: float | Fraction, method: str = "exact") -> Self:
+        """Return the diagram with everything that is continuous sampled.
+
+        Each block is discretized by itself, and what it reads from others is held over a sample: a plant drawn with
+        `Integrator` blocks becomes forward Euler between them, of first order, whatever the method. To have a method
+        act on a plant as a whole, write it as one block: a `StateSpace`, a `TransferFunction`, a `Block` of one's own.
+
+        Parameters
+        ----------
+        sample_time : float or Fraction
+            Sample time in s. Subsystems that have one of their own keep it.
+        method : {"exact", "forward", "semi_implicit", "trapezoidal"}
+            How the blocks are discretized that were continuous; see `loopwright.blocks.hold`. As inputs are held,
+            ``trapezoidal`` is not Tustin's method, python-control's ``c2d(…, "bilinear")``, which averages them too.
+
+        Raises
+        ------
+        SampleTimeError
+            A sample time that is not positive, or an unknown method.
+        """
+        check_method(method)
+        table = Structure(**{k: dict(v) for k, v in vars(self.structure).items()})
+        for path, frame in sorted(table.frames.items()):
+            if self.structure.clock(path) is None:
+                table.frames[path] = replace_fields(frame, method=method)
+        top = replace_fields(table.frames[""], sample_time=exact_time(sample_time, block=self.name))
+        table.frames[""] = top
+        return self.with_structure(table)
+
+    @property
+    def is_continuous(self) -> bool:
+        """Whether something happens between ticks: continuous states, events, or a transport delay."""
+        table = self.scheduled
+        traces = self.checked.traced
+        return (
+            any(t.advance == "derivative" or t.indicators is not None for t in traces.values())
+            or any(table.blocks[p].transport for p in table.blocks if p not in traces)
+            or any(table.is_event(box) for box in table.controls)
+        )
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether a subsystem, or the diagram itself, has a sample time."""
+        return any(frame.sample_time is not None for frame in self.scheduled.frames.values())
+
+    @property
+    def has_fmu(self) -> bool:
+        """Whether an FMU is in it."""
+        return bool(stepped_blocks(self.structure))
