@@ -40,7 +40,6 @@ are the limits of an `AdmittanceFilter`, which small motions don't reach.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, NamedTuple, Self, cast
 
@@ -51,8 +50,11 @@ from ...blocks.core.errors import ParameterError, UnknownNameError
 from ...blocks.core.values import Array, Value, parameter
 from ...blocks.path_following.transverse import expect_model, expect_path
 from ...blocks.tracing.discretization import check_method
-from ...blocks.tracing.symbols import flat_column, wrap
 from ..flat.wired_diagram import WiredDiagram
+from ..results.operating_point import OperatingPoint
+from .fig3_parts import check_wires, delay_of, plant_path
+from .planar import slopes
+from .shown_plant import show_plant
 
 SIDES = ("par", "perp")
 IMPLEMENTATIONS = ("ideal", "continuous", "sampled")
@@ -110,8 +112,13 @@ class AdmittanceLoop(Value):
     tool_mass: float = parameter(default=0.0, unit="kg", minimum=0.0, description="mass beyond the force sensor, of M")
 
     @classmethod
-    def of(cls, diagram: WiredDiagram, side: str = "perp", **changes: Any) -> Self:
+    def of(
+        cls, diagram: WiredDiagram, side: str = "perp", *, point: OperatingPoint | None = None, **changes: Any
+    ) -> Self:
         """Return the loop of a diagram that `fig3` made, with its parameters.
+
+        The diagram's plant is compared with the reduced model: its own linear model, at the point and velocity of the
+        loop, with M and C. A plant that is not shown to be the reduced model has no such loop.
 
         Parameters
         ----------
@@ -119,13 +126,21 @@ class AdmittanceLoop(Value):
             A diagram of Fig. 3 with an admittance in both directions.
         side : str, optional
             ``"par"`` or ``"perp"``.
+        point : OperatingPoint, optional
+            An instant of the diagram. From it come the states of the plant that its position doesn't tell, such as
+            contact; without it they are those of the start.
         **changes
-            Parameters that the diagram does not hold (``plant``, ``eta``, ``xi``), or that are to differ.
+            Parameters that the diagram does not hold (``eta``, ``xi``; ``plant``, a model with which the diagram's
+            plant agrees, where the controller inverts another one), or that are to differ.
 
         Raises
         ------
         UnknownNameError
             If a block of Fig. 3 is missing.
+        ParameterError
+            If there is more in the loop than in Fig. 3 (an encoder, a filter), or if the plant has no linear model,
+            hidden states, a stiffness, or another mass or friction slope than the model. A loop of parameters that no
+            diagram holds is made by hand: ``AdmittanceLoop(path, model, …)``.
         """
         names = (*(f"{kind}_{s}" for kind in ("admittance", "pid") for s in SIDES),)
         linearization, frame = diagram["controller.feedback_linearization"], diagram.frames["controller"]
@@ -139,10 +154,22 @@ class AdmittanceLoop(Value):
             "model": linearization.model,
             "sample_time": float(frame.sample_time),
             "method": frame.method,
-            "delay": int("controller.computation" in diagram.blocks),
+            "delay": delay_of(diagram),
             "tool_mass": diagram["sensors.force_sensor"].tool_mass,
         }
-        return cls(**{**found, "side": side, **changes})
+        check_wires(diagram)
+        loop = cls(**{**found, "side": side, **changes})
+        show_plant(
+            diagram,
+            plant_path(diagram),
+            loop.true_plant,
+            rate=loop.rate,
+            frame=loop.frame,
+            position=loop.path.to_plane(loop.eta, loop.xi),
+            velocity=loop.velocity,
+            point=point,
+        )
+        return loop
 
     def check(self) -> None:
         """Refuse what can't be reduced."""
@@ -207,6 +234,11 @@ class AdmittanceLoop(Value):
     def scale(self) -> float:
         """Metres of motion per unit of the coordinate: q along the path, 1 across it (E22)."""
         return self.q if self.side == "par" else 1.0
+
+    @property
+    def rate(self) -> float:
+        """Rate of the slower error dynamics in 1/s, beside which an error of a slope is small or not."""
+        return min(control_rate(pid) for pid in (self.pid_par, self.pid_perp))
 
     @property
     def label(self) -> str:
@@ -296,6 +328,11 @@ class AdmittanceLoop(Value):
         return Linear(A, B, C_, D)
 
 
+def control_rate(pid: ErrorDynamics) -> float:
+    """Return the rate of an error dynamics in 1/s: the largest of a₂, √a₁ and ∛a₀."""
+    return float(max(abs(pid.a2), np.sqrt(abs(pid.a1)), np.cbrt(abs(pid.a0))))
+
+
 def check_environment(**values: Any) -> None:
     """Refuse an environment that is not one: NaN, infinite or negative."""
     for name, value in values.items():
@@ -332,29 +369,16 @@ def _wrong(port: str, found: Any, expected: str) -> ParameterError:
     return ParameterError(f"found {found!r}; expected {expected}.", block=AdmittanceLoop.__name__, port=port)
 
 
-def _slopes(model: PlanarModel, position: np.ndarray, velocity: np.ndarray) -> Mapping[str, np.ndarray]:
-    """Return G_v, ∂f_v/∂x_v, and whether anything changes with the position; traced, so that slopes are exact."""
-    import casadi as ca
-
-    x_c, x_v = ca.MX.sym("x_c", 2), ca.MX.sym("x_v", 2)
-    f = flat_column(model.f_v(wrap(x_c, (2,)), wrap(x_v, (2,))))
-    G = flat_column(model.G_v(wrap(x_c, (2,))))
-    moved = ca.vertcat(ca.vec(ca.jacobian(f, x_c)), ca.vec(ca.jacobian(G, x_c)))
-    made = ca.Function("slopes", [x_c, x_v], [G, ca.jacobian(f, x_v), moved])(position, velocity)
-    values = [np.array(v.full()) for v in made]
-    return {"G_v": values[0].reshape(2, 2), "slope": values[1], "moved": values[2]}
-
-
 def _motion(loop: AdmittanceLoop, model: PlanarModel) -> Motion:
     """Return M and C in the frame of the path, after refusing a model that is not Cartesian."""
     E = loop.frame
-    made = _slopes(model, loop.path.to_plane(loop.eta, loop.xi), loop.velocity)
-    if type(model).h is not PlanarModel.h or np.any(made["moved"]):
+    made = slopes(model, loop.path.to_plane(loop.eta, loop.xi), loop.velocity)
+    if type(model).h is not PlanarModel.h or np.any(made.moved):
         raise ParameterError(
             f"found {type(model).__name__}, which is not Cartesian; expected a model whose output is its position, and "
             "whose f_v and G_v don't change with it, such as gantry.nominal. Linearize the diagram instead.",
             block=type(loop).__name__,
             port="model",
         )
-    M = np.linalg.inv(E.T @ made["G_v"] @ E)
-    return Motion(M, -M @ E.T @ made["slope"] @ E)
+    M = np.linalg.inv(E.T @ made.G_v @ E)
+    return Motion(M, -M @ E.T @ made.slope @ E)

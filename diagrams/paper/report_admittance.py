@@ -25,6 +25,12 @@ VARIANTS: Mapping[str, Mapping[str, Any]] = {
     "sampled_d0": {"implementation": "sampled", "delay": 0},
     "sampled_d1": {"implementation": "sampled", "delay": 1},
 }
+TITLE = "Admittance and coupled stability"
+WITHOUT = (
+    "This report has no admittances, no limits of coupled stability, and none tried in time domain. They would be "
+    "those of a rigid robot, M p̈ = u − C ṗ + F, under Fig. 3's controller. This diagram is not shown to be that: the "
+    "plant's own linear model is compared with M and C, and the wires with those of Fig. 3. Found was this:"
+)
 TEXT = (
     (
         "What an environment feels of the robot, at rest at the operating point: Y(jω) is velocity over "
@@ -46,7 +52,13 @@ TEXT = (
 
 
 class Loops:
-    """The reduced loops of a case: by direction, with or without friction, impedance control or force tracking."""
+    """The reduced loops of a case: by direction, with or without friction, impedance control or force tracking.
+
+    Raises
+    ------
+    ParameterError
+        If the plant is not shown to be the reduced model.
+    """
 
     def __init__(self, case: Case):
         self.case = case
@@ -54,18 +66,18 @@ class Loops:
         values = where.point.values
         eta, xi = (float(np.ravel(values[f"controller.transverse_transform.{n}"])[0]) for n in ("eta", "xi"))
         period = case.path.length if case.path.period is not None else None
-        at = {"eta": eta % period if period else eta, "xi": xi, "implementation": "sampled", "delay": 0}
-        model, plant = case.model, case.plant_model
+        at: dict[str, Any] = {"eta": eta % period if period else eta, "xi": xi, "implementation": "sampled", "delay": 0}
+        at["point"] = where.point
+        plant = case.plant_model
         self.plain: dict[str, AdmittanceLoop] = {}
         self.rough: dict[str, AdmittanceLoop] = {}
         for side in SIDES:
-            if case.has_friction:
-                smooth = model.replace(**NO_FRICTION)
+            if case.smooth is not None:
                 bare = plant.replace(**NO_FRICTION)
-                self.plain[side] = AdmittanceLoop.of(case.diagram, side, model=smooth, plant=bare, **at)
-                self.rough[side] = AdmittanceLoop.of(case.diagram, side, plant=plant, **at)
+                self.plain[side] = AdmittanceLoop.of(case.smooth, side, plant=bare, **at)
+                self.rough[side] = AdmittanceLoop.of(case.base, side, plant=plant, **at)
             else:
-                self.plain[side] = AdmittanceLoop.of(case.diagram, side, plant=plant, **at)
+                self.plain[side] = AdmittanceLoop.of(case.base, side, plant=plant, **at)
 
     def kinds(self, side: str) -> Iterator[tuple[str, str, AdmittanceLoop]]:
         """Yield the key of the limits, a title and the loop."""
@@ -86,20 +98,23 @@ def tracking(loop: AdmittanceLoop) -> AdmittanceLoop:
     return loop.replace(**{f"admittance_{loop.side}": free})
 
 
-def admittance(case: Case) -> tuple[Section, Loops] | None:
+def admittance(case: Case) -> tuple[Section, Loops | None] | None:
     """Return the section about the admittances, and their loops; None where the diagram has none.
 
     Where the diagram has friction, ``ke_limit`` is that of the design without it, and ``ke_limit_friction`` that of
-    ``stiffness_limits(AdmittanceLoop.of(diagram))``.
+    ``stiffness_limits(AdmittanceLoop.of(diagram))``. Where the plant is not shown to be the reduced model, there are no
+    loops, and the section says why in place of numbers.
     """
     if not case.is_fig3 or any(f"controller.admittance_{s}" not in case.diagram.blocks for s in SIDES):
         return None
     try:
         loops = Loops(case)
-    except (LoopwrightError, StopIteration):
+    except StopIteration:  # no variant could be analysed, which the notes say
         return None
+    except LoopwrightError as error:
+        return Section("admittance", TITLE, (WITHOUT, str(error))), None
     parts = tuple(_side(loops, side) for side in SIDES)
-    return Section("admittance", "Admittance and coupled stability", TEXT, sections=parts), loops
+    return Section("admittance", TITLE, TEXT, sections=parts), loops
 
 
 def _side(loops: Loops, side: str) -> Section:

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from typing import Any
 
 from ...blocks.core.errors import ConfirmationError, LoopwrightError
-from ...fmus.models.gantry import Gantry
 from ..admittance.compliance_loop import AdmittanceLoop
 from ..admittance.coupled import growth_rate
 from ..frequency.number import Number
@@ -16,6 +15,7 @@ from ..report.model import Section, Table
 from .moored_gantry import deviation, measured_growth, moored_diagram
 from .report_admittance import VARIANTS, Loops
 
+TITLE = "Limits tried in time domain"
 FACTORS = {"below": 0.97, "above": 1.03}
 START, SPAN, WINDOW = 3.5, 1.0, 1.0  # s: when the growth is taken, over what, in windows of which length
 WITHIN = 0.01  # 1/s: the growth factor over 1 s is then within 1 %
@@ -48,16 +48,19 @@ def time_domain(case: Case, loops: Loops, limits: dict[str, Number]) -> Section:
     """
     text = [
         (
-            "The nonlinear co-simulation of the same controller and robot, with the environment inside "
-            "the plant's FMU in "
+            "A gantry with the plant's parameters, whose linear model is the plant's own, under the same controller, "
+            "with the environment inside its FMU in "
             "continuous time, is pushed by 1e-5 m/s at 0.97 and at 1.03 of a limit. Its growth rate is "
             "read off the energy "
             "of the position in two like windows 1 s apart; predicted is the real part of the slowest pole."
         ),
     ]
-    if not isinstance(loops.plain["par"].true_plant, Gantry) or case.plant_model is None:
+    if case.plant_model is None:
         text.append("Not done: the plant is not the gantry, and has no variant with an environment inside.")
-        return Section("time_domain", "Limits tried in time domain", tuple(text))
+        return Section("time_domain", TITLE, tuple(text))
+    if case.has_events:
+        text.append("Not done: the plant has discrete states, which the gantry with an environment inside does not.")
+        return Section("time_domain", TITLE, tuple(text))
     numbers: dict[str, Number] = {}
     rows: list[tuple[Any, ...]] = []
     for side, key, name, damping in TRIED:
@@ -77,9 +80,12 @@ def time_domain(case: Case, loops: Loops, limits: dict[str, Number]) -> Section:
         except LoopwrightError as error:
             text.append(f"{path}: {error}")
     columns = ("limit", "of it", "k_e", "growth rate, measured", "predicted")
-    return Section(
-        "time_domain", "Limits tried in time domain", tuple(text), (Table("Growth", columns, tuple(rows)),), (), numbers
-    )
+    return Section("time_domain", TITLE, tuple(text), (Table("Growth", columns, tuple(rows)),), (), numbers)
+
+
+def not_tried(text: tuple[str, ...]) -> Section:
+    """Return the section where there are no limits to try; ``text`` says why."""
+    return Section("time_domain", TITLE, text)
 
 
 def _tried(loop: AdmittanceLoop, limit: Number, damping: float, path: str) -> Iterator[tuple[str, Number, float]]:

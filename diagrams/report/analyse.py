@@ -10,7 +10,7 @@ from ..flat.wired_diagram import WiredDiagram
 from ..frequency.one_thread import on_one_thread
 from ..linearization.derivatives import find_signal
 from ..paper.report_admittance import admittance
-from ..paper.report_limits_tried import not_modelled, time_domain
+from ..paper.report_limits_tried import not_modelled, not_tried, time_domain
 from .case import Case
 from .model import Report, Section
 from .points import STEP
@@ -44,7 +44,8 @@ def analyse(
     Any diagram gets its parameters, operating points, poles, and the margins at every named wire on a loop: continuous,
     and sampled without and with a sample of delay. Fig. 3 gets besides what the paper claims, its admittances, the
     environments that they can touch, and these limits tried in the co-simulation. Sections that don't apply are left
-    out.
+    out. Where the plant is not shown to be the rigid robot that admittances and limits are reduced to, the section on
+    them has no numbers, and says why.
 
     Parameters
     ----------
@@ -89,6 +90,7 @@ def analyse(
         find_signal(diagram.flatten(None if diagram.has_clock else STEP), wire)
     case = Case(diagram, point, experiment, wires)
     sections: list[Section | None] = []
+    found: Any = None
     reduced: Any = None
     limits: dict[str, Any] = {}
     for key in SECTIONS:
@@ -110,7 +112,10 @@ def analyse(
                 limits = {f"{part.key}.{path}": n for part in found[0].sections for path, n in part.numbers.items()}
                 sections.append(found[0] if key in wanted else None)
         elif key == "time_domain":
-            sections.append(time_domain(case, reduced, limits) if reduced is not None else None)
+            if reduced is not None:
+                sections.append(time_domain(case, reduced, limits))
+            elif found is not None and "admittance" not in wanted:
+                sections.append(not_tried(found[0].text))
         elif key == "injection":
             sections.append(injected(case))
         else:

@@ -12,6 +12,8 @@ import numpy as np
 from ...blocks import ErrorDynamics, FeedbackLinearization, Gain, Reference
 from ...blocks.core.errors import LoopwrightError
 from ...fmus.models.gantry import Gantry
+from ..admittance.compliance_loop import control_rate
+from ..admittance.shown_plant import is_discrete, show_plant
 from ..flat.wired_diagram import WiredDiagram
 from ..linearization.linearize import Linearization, linearize
 from ..results.operating_point import OperatingPoint
@@ -108,9 +110,9 @@ class Case:
         self.wires: tuple[str, ...] | None = wires
         self.notes: list[str] = []
         self.variants: dict[str, Variant] = {}
-        base = self._resting(self._without_delay())
-        smooth = self._smooth(base)
-        for plain, suffix, title in self._plants(base, smooth):
+        self.base = self._resting(self._without_delay())
+        self.smooth = self._smooth(self.base)
+        for plain, suffix, title in self._plants(self.base, self.smooth):
             for key, variant, delay in self._implementations(plain):
                 name = key + suffix
                 self._add(name, NAMES[key] + title, variant, delay)
@@ -128,6 +130,11 @@ class Case:
         return any(key.endswith(FRICTION) for key in self.variants)
 
     @property
+    def has_events(self) -> bool:
+        """Whether the plant has discrete states, such as contact."""
+        return "plant" in self.diagram.blocks and is_discrete(self.diagram, "plant")
+
+    @property
     def model(self) -> Any:
         """The model that the feedback linearization inverts."""
         block: Any = self.diagram["controller.feedback_linearization"]
@@ -139,20 +146,36 @@ class Case:
         block: Any = self.diagram["controller.feedback_linearization"]
         return block.path
 
-    @property
+    @cached_property
     def plant_model(self) -> Any:
-        """The plant as the model that the admittance is reduced with, None where it is no gantry."""
+        """The plant as the model that the admittance is reduced with, None where it is not shown to be such a gantry.
+
+        Its parameters are read from the FMU by their names. Names promise nothing, so that the plant's own linear model
+        is compared with the model that they make.
+        """
         plant: Any = self.diagram.blocks.get("plant")
-        if not isinstance(self.model, Gantry) or plant is None or not hasattr(plant, "description"):
+        if not self.is_fig3 or not isinstance(self.model, Gantry) or not hasattr(plant, "description"):
             return None
         variables = plant.description.variables
         if not {"coulomb_friction", "translational_mass", "equivalent_mass", "coulomb_scale"} <= set(variables):
             return None
-        if len(plant.description.states) not in (0, 2, 4):  # more states than a gantry's
-            return None
         names = [n for n in self.model.parameter_specs if n in variables and not n.startswith("start_")]
         values = {n: plant.start.get(n, variables[n].start) for n in names}
-        return self.model.replace(**{n: v for n, v in values.items() if v is not None})
+        try:
+            found = self.model.replace(**{n: v for n, v in values.items() if v is not None})
+            point = point_of(self.base, self.point, self.diagram)
+        except LoopwrightError:
+            return None
+        return found if self._is_plant(found, self.base, point) else None
+
+    def _is_plant(self, model: Any, diagram: WiredDiagram, point: OperatingPoint | None = None) -> bool:
+        """Return whether the plant of a variant is shown to be a model, where and as fast as it is."""
+        pids: Any = [self.diagram.blocks[f"controller.pid_{s}"] for s in SIDES]
+        try:
+            show_plant(diagram, "plant", model, rate=min(map(control_rate, pids)), point=point)
+        except LoopwrightError:
+            return False
+        return True
 
     def usable(self, *keys: str) -> Iterator[Variant]:
         """Yield the variants that can be analysed, all or those with given keys."""
@@ -185,14 +208,21 @@ class Case:
 
     def _smooth(self, base: WiredDiagram) -> WiredDiagram | None:
         """Return Fig. 3 without friction in plant and model, None where there is none, or it can't be taken out."""
-        if not self.is_fig3 or self.plant_model is None:
+        if self.plant_model is None:
+            plant: Any = self.diagram.blocks.get("plant")
+            if self.is_fig3 and hasattr(plant, "description") and set(NO_FRICTION) <= set(plant.description.variables):
+                self.notes.append(
+                    "The plant is not shown to be the gantry, so that its friction is left in: all keys without "
+                    "_friction are the diagram's as it is."
+                )
             return None
         rough = any(getattr(m, "friction", None) is not None for m in (self.model,))
         if not rough:
             return None
         changes: dict[str, Any] = {f"plant.start.{name}": 0.0 for name in NO_FRICTION}
         changes["controller.feedback_linearization.model"] = self.model.replace(**NO_FRICTION)
-        return base.replace(changes)
+        found = base.replace(changes)
+        return found if self._is_plant(self.plant_model.replace(**NO_FRICTION), found) else None
 
     def _without_delay(self) -> WiredDiagram:
         """Return the diagram without its computational delay, as far as that is known."""

@@ -30,7 +30,7 @@ DEFINITIONS: Mapping[str, str] = MappingProxyType(
         "gain_crossover": "A frequency at which |L| = 1.",
         "phase_crossover": "A frequency at which L is real and negative.",
         "ke_limit": "The first environment stiffness, on a scan from below, at which contact is no longer stable; of "
-        "the design without friction, where the diagram has some.",
+        "the design without friction, where the plant has some that its parameters take out.",
         "ke_limit_friction": "The same limit of the diagram as it is, with its friction and the compensation, as "
         "stiffness_limits(AdmittanceLoop.of(diagram)) returns it.",
         "me_limit": "The first environment mass, on a scan from below, at which contact is no longer stable.",

@@ -28,7 +28,7 @@ DEFINITIONS: Mapping[str, str] = MappingProxyType(
         "phase_deg": "Largest rotation in all channels at once within the disk.",
         "ke_frequency": "Frequency at which the coupled loop oscillates at the limit of stiffness.",
         "ke_limit": "First stiffness of the environment at which contact is no longer stable; none up to 1e8 N/m: ∞. "
-        "Of the design without friction, where the diagram has some.",
+        "Of the design without friction, where the plant has some that its parameters take out.",
         "ke_limit_friction": "The same with the slope that the friction has at rest, and with its compensation: of the "
         "diagram as it is, as stiffness_limits(AdmittanceLoop.of(diagram)) returns it.",
         "me_limit": "First mass of the environment, from below up to 1e4 kg, at which contact is no longer stable.",

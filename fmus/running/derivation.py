@@ -19,6 +19,8 @@ class DerivativeMethod(Enum):
     """A model that is fitted to responses from rest, without the FMU's states."""
     BLOCK_DIFFERENCES = "differences of the block"
     """Differences of the function of an opaque block."""
+    TRACED = "the traced Jacobian"
+    """Algorithmic differentiation of a block's trace: exact."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class Derivation:
     @property
     def is_exact(self) -> bool:
         """Whether the derivatives have no error but rounding."""
-        return self.method is DerivativeMethod.DIRECTIONAL
+        return self.method in (DerivativeMethod.DIRECTIONAL, DerivativeMethod.TRACED)
 
     def __str__(self) -> str:
         text = self.method.value

@@ -1,5 +1,8 @@
 """The equations of the plants to swap, written once more with NumPy from their docstrings, and a run of an FMU."""
 
+import re
+import zipfile
+
 import numpy as np
 
 from loopwright.fmus import Fmu
@@ -63,3 +66,19 @@ def sticking(x, u, f, *scales):
     v, z = x[2:4], x[4:]
     rate, force = lugre(v, z, *scales)
     return np.concatenate([v, (u - force - WEIGHT + f) / M, rate])
+
+
+def hidden(file, folder, *, saves=True):
+    """The same FMU, that doesn't say which its states are, and has no derivatives."""
+    path = folder / f"hidden_{saves}_{file.name}"
+    with zipfile.ZipFile(file) as old, zipfile.ZipFile(path, "w") as new:
+        for item in old.namelist():
+            data = old.read(item)
+            if item == "modelDescription.xml":
+                text = re.sub(r"<ContinuousStateDerivative[^>]*/>", "", data.decode())
+                text = text.replace('providesDirectionalDerivatives="true"', "")
+                if not saves:
+                    text = re.sub(r'can(GetAndSet|Serialize)FMUState="true"', "", text)
+                data = text.encode()
+            new.writestr(item, data)
+    return path

@@ -1,8 +1,5 @@
 """FMUs that give neither derivatives nor their states: linear models from pulse responses, against closed forms."""
 
-import re
-import zipfile
-
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -12,24 +9,9 @@ from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.linearization import identification as _identification
 from loopwright.diagrams.linearization.identification import identified, realization
 from loopwright.fmus import Fmu, dc_motor, gantry, mass_spring_damper
+from support.plants import hidden
 
 H = 1e-3
-
-
-def hidden(file, folder, *, saves=True):
-    """The same FMU, that doesn't say which its states are, and has no derivatives."""
-    path = folder / f"hidden_{saves}_{file.name}"
-    with zipfile.ZipFile(file) as old, zipfile.ZipFile(path, "w") as new:
-        for item in old.namelist():
-            data = old.read(item)
-            if item == "modelDescription.xml":
-                text = re.sub(r"<ContinuousStateDerivative[^>]*/>", "", data.decode())
-                text = text.replace('providesDirectionalDerivatives="true"', "")
-                if not saves:
-                    text = re.sub(r'can(GetAndSet|Serialize)FMUState="true"', "", text)
-                data = text.encode()
-            new.writestr(item, data)
-    return path
 
 
 def held(A, B, h=H):

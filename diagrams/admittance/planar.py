@@ -1,0 +1,34 @@
+"""Slopes of a planar model, equation (2)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...blocks import PlanarModel
+from ...blocks.tracing.symbols import flat_column, wrap
+
+
+class Slopes(NamedTuple):
+    """A planar model at a position and a velocity."""
+
+    G_v: np.ndarray
+    """Input matrix G_v."""
+    slope: np.ndarray
+    """Derivative of f_v by the velocity."""
+    moved: np.ndarray
+    """Derivatives of f_v and G_v by the position, one after the other."""
+
+
+def slopes(model: PlanarModel, position: Any, velocity: Any) -> Slopes:
+    """Return G_v, ∂f_v/∂x_v, and the derivatives by the position; traced, so that slopes are exact."""
+    import casadi as ca
+
+    x_c, x_v = ca.MX.sym("x_c", 2), ca.MX.sym("x_v", 2)
+    f = flat_column(model.f_v(wrap(x_c, (2,)), wrap(x_v, (2,))))
+    G = flat_column(model.G_v(wrap(x_c, (2,))))
+    moved = ca.vertcat(ca.vec(ca.jacobian(f, x_c)), ca.vec(ca.jacobian(G, x_c)))
+    made = ca.Function("slopes", [x_c, x_v], [G, ca.jacobian(f, x_v), moved])(position, velocity)
+    values = [np.array(v.full()) for v in made]
+    return Slopes(values[0].reshape(2, 2), values[1], values[2])
