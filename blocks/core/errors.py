@@ -92,7 +92,15 @@ class OptionError(DefinitionError):
 
 
 class TraceError(DefinitionError):
-    """An equation can't be traced, or its traced result differs from NumPy's."""
+    """An equation can't be traced, or its traced result differs from NumPy's.
+
+    Attributes
+    ----------
+    is_mistake : bool
+        Whether the equation would fail in Python, too, such as by a name that isn't there.
+    """
+
+    is_mistake: bool = False
 
 
 class WiringError(LoopwrightError, ValueError):
@@ -140,9 +148,18 @@ class AlgebraicLoopError(WiringError):
 
 
 class SimulationError(LoopwrightError, RuntimeError):
-    """A run stopped. ``run`` holds every sample recorded until then (None before the first)."""
+    """A run stopped.
+
+    Attributes
+    ----------
+    run : Run, optional
+        Every sample recorded until then; None before the first.
+    state : str, optional
+        Name of the continuous state at which a solver failed, such as ``"plant.position[0]"``.
+    """
 
     run: Any = None
+    state: str | None = None
 
 
 class NonFiniteError(SimulationError):
@@ -194,10 +211,15 @@ class ConfirmationError(LoopwrightError, RuntimeError):
     """A number and its independent confirmation (eigenvalues, encirclements, another algorithm) disagree."""
 
 
+def close_names(name: str, known: Iterable[str]) -> list[str]:
+    """Return the known names that are close to ``name``, at most three."""
+    return difflib.get_close_matches(name, sorted({str(k) for k in known}), n=3, cutoff=0.5)
+
+
 def near(name: str, known: Iterable[str]) -> str:
     """Name the known names that are close to ``name``, for the end of an error message."""
     known = sorted({str(k) for k in known})
-    close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    close = close_names(name, known)
     if close:
         return f"Did you mean {' or '.join(repr(c) for c in close)}?"
     return f"Known: {', '.join(known)}." if known else "There are none."

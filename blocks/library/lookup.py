@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,26 +45,43 @@ def _held(points: np.ndarray, u: Array) -> Array:
     return np.where(u < low, low, np.where(u > high, high, u))
 
 
+class _End(NamedTuple):
+    """An end of a table that an entry of an input can leave it by."""
+
+    entry: str
+    position: int
+    side: str
+
+    @property
+    def guard(self) -> str:
+        """The name of its guard."""
+        return f"{self.entry} {self.side}"
+
+
+def _ends(port: str, shape: tuple[int, ...]) -> list[_End]:
+    """Return the two ends for every entry of an input."""
+    entries = [f"{port}[{i}]" for i in range(shape[0])] if shape else [port]
+    return [_End(entry, i, side) for i, entry in enumerate(entries) for side in ("below", "above")]
+
+
 def _margins(points: np.ndarray, name: str, u: Array) -> dict[str, Array]:
     """Return, for every entry of u, its distance from the table's ends, positive within."""
     slack = _SLACK * float(points[-1] - points[0])
-    entries = {f"{name}[{i}]": u[i] for i in range(shape_of(u)[0])} if shape_of(u) else {name: u}
     low, high = float(points[0]) - slack, float(points[-1]) + slack
-    return {
-        f"{entry} {side}": margin
-        for entry, value in entries.items()
-        for side, margin in (("below", value - low), ("above", high - value))
-    }
+    shape, margins = shape_of(u), {}
+    for end in _ends(name, shape):
+        value = u[end.position] if shape else u
+        margins[end.guard] = value - low if end.side == "below" else high - value
+    return margins
 
 
 def _outside(name: str, points: dict[str, np.ndarray], u: Any) -> GuardError:
     """Return the error of an input beyond the table."""
-    entry, side = name.rsplit(" ", 1)
-    port, _, index = entry.partition("[")
-    value = np.ravel(getattr(u, port))[int(index.rstrip("]") or 0) if index else 0]
-    ends = points[port]
+    ends = ((port, end) for port in points for end in _ends(port, np.shape(getattr(u, port))))
+    port, (entry, position, side) = next((port, end) for port, end in ends if end.guard == name)
+    value, table = np.ravel(getattr(u, port))[position], points[port]
     return GuardError(
-        f"found {entry} = {value:.9g}, {side} the table's range; expected {ends[0]:g} to {ends[-1]:g}. Extend the "
+        f"found {entry} = {value:.9g}, {side} the table's range; expected {table[0]:g} to {table[-1]:g}. Extend the "
         "table, or give beyond='hold' or beyond='extrapolate'.",
         port=port,
     )

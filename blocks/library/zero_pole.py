@@ -26,12 +26,16 @@ from .python_control import (
 Numbers = tuple[complex, ...]
 
 
+class UnpairedRootError(ValueError):
+    """A complex root whose conjugate is missing."""
+
+
 def real_factors(roots: Sequence[complex]) -> list[list[complex]]:
     """Return roots in groups of real polynomials: conjugate pairs, and real roots one by one.
 
     Raises
     ------
-    ValueError
+    UnpairedRootError
         A complex root whose conjugate is missing.
     """
     rest = sorted((complex(r) for r in roots), key=lambda r: (r.real, abs(r.imag), r.imag))
@@ -44,7 +48,7 @@ def real_factors(roots: Sequence[complex]) -> list[list[complex]]:
             continue
         partner = min(rest, key=lambda r: abs(r - root.conjugate()), default=None)
         if partner is None or abs(partner - root.conjugate()) > close:
-            raise ValueError(f"{root} without its conjugate")
+            raise UnpairedRootError(f"{root} without its conjugate")
         rest.remove(partner)
         mean = 0.5 * (root + partner.conjugate())
         groups.append([mean, mean.conjugate()])
@@ -79,8 +83,10 @@ def _unfit(roots: Any) -> str | None:
         if not np.all(np.isfinite([complex(r) for r in roots])):
             return ""
         real_factors(roots)
-    except (TypeError, ValueError) as error:
-        return f": {error}" if str(error).endswith("conjugate") else ""
+    except UnpairedRootError as error:
+        return f": {error}"
+    except (TypeError, ValueError):
+        return ""
     return None
 
 

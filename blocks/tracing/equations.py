@@ -72,8 +72,8 @@ def takes_update(block: Block, sampled: bool) -> bool:
     return sampled or not (hasattr(block, "derivative") or (block.events and not block.memory))
 
 
-def untraceable(error: Exception, block: Block, what: str) -> str:
-    """Say which line of the user's equations an operation failed on."""
+def untraceable(error: Exception, block: Block, what: str) -> TraceError:
+    """Return the error that says which line of the user's equations an operation failed on."""
     # by the code's own file, which a notebook's cell and a script have too; helpers beside the equation count as well
     equation: Any = inspect.unwrap(block.written(what))
     while isinstance(equation, functools.partial):
@@ -89,9 +89,11 @@ def untraceable(error: Exception, block: Block, what: str) -> str:
         step = step.tb_next
     text = f"its {what} can't be traced{line}: {type(error).__name__}: {error}."
     if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
-        return f"{text} Correct the equation there."
+        mistake = TraceError(f"{text} Correct the equation there.")
+        mistake.is_mistake = True
+        return mistake
     arguments, instead = block.traced_of, block.untraced_twin
-    return (
+    return TraceError(
         f"{text} Use NumPy functions of {arguments}: np.where for branches, np.stack for vectors, np.sqrt and not "
         f"math.sqrt{f', or {instead}, which is not traced' if instead else ''}."
     )

@@ -265,7 +265,7 @@ class _Tracer:
         except LoopwrightError:
             raise
         except Exception as error:
-            raise TraceError(untraceable(error, self.block, what)) from error
+            raise untraceable(error, self.block, what) from error
 
     def _wants_sample_time(self, what: str) -> bool:
         declared = inspect.signature(getattr(type(self.block), what)).parameters.get("T")

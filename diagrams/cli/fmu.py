@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ...blocks.core.block import Block
-from ...blocks.core.errors import FmuFileError, LoopwrightError, OptionError, TraceError, near
+from ...blocks.core.errors import FmuFileError, LoopwrightError, OptionError, TraceError, close_names, near
 from ...fmus.checks.summary import INTERFACES, summarize
 from ...fmus.checks.validation import validate
 from ...fmus.export.compiler import TARGETS
@@ -132,8 +132,7 @@ def run_build(arguments: argparse.Namespace) -> int:
     except OptionError:
         raise
     except TraceError as error:
-        mistake = str(error).endswith("Correct the equation there.")  # it would fail as Python, too
-        hint = "" if arguments.python or mistake else " Or put its Python code inside: --python."
+        hint = "" if arguments.python or error.is_mistake else " Or put its Python code inside: --python."
         return _complain(f"{error}{hint}")
     except LoopwrightError as error:
         return _complain(error)
@@ -193,8 +192,8 @@ def _model(arguments: argparse.Namespace) -> Iterator[Make]:
         with user_model(text) as model:
             yield _maker(model.block, arguments.python, build_model, type(model.block).__name__.lower(), model.beside)
     else:
-        hint = near(text, plants())
-        known = "" if hint.startswith("Known") else f" The plants: {', '.join(plants())}."
+        hint = near(text, plants())  # it names all of them where none is close
+        known = f" The plants: {', '.join(plants())}." if close_names(text, plants()) else ""
         raise OptionError(f"there is no model {text!r}. {hint}{known} A model of yours is FILE.py:Name.", port="MODEL")
 
 

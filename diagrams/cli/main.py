@@ -46,7 +46,6 @@ SIGNALS = (
 )
 """Signals of the CSV file, in order."""
 
-_INTERRUPTED = "interrupted"
 _WORDS: Mapping[str, bool | None] = MappingProxyType(
     {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False, "none": None, "null": None}
 )
@@ -246,9 +245,10 @@ def _run(arguments: argparse.Namespace) -> int:
     table: dict[str, dict[str, float | None]] = {}
     written: list[list[str]] = []
     failed: dict[str, str] = {}
+    interrupted = False
     for experiment in experiments:
         letter = experiment.letter
-        run, problem = _simulate(experiment)
+        run, problem, interrupted = _simulate(experiment)
         if run is not None and len(run.t):
             _say(f"{letter}: {run.t[-1]:g} s simulated in {run.elapsed:.2f} s", sys.stderr)
         if problem is not None:
@@ -256,35 +256,31 @@ def _run(arguments: argparse.Namespace) -> int:
             _say(f"loopwright: experiment {letter} failed: {problem}", sys.stderr)
         if run is None or not len(run.t):
             _say(f"{letter}: nothing was recorded, so nothing is written{_kept(letter, folder)}.", sys.stderr)
-            if problem == _INTERRUPTED:
-                break
-            continue
-        try:
-            numbers, names = _write(experiment, run, problem, folder)
-        except OSError as error:
-            failed[letter] = f"its files can't be written: {error}"
-            _say(f"loopwright: experiment {letter}: {failed[letter]}", sys.stderr)
-            continue
-        table[letter] = numbers
-        written.append(names)
-        if problem == _INTERRUPTED:
+        else:
+            try:
+                table[letter], names = _write(experiment, run, problem, folder)
+                written.append(names)
+            except OSError as error:
+                failed[letter] = f"its files can't be written: {error}"
+                _say(f"loopwright: experiment {letter}: {failed[letter]}", sys.stderr)
+        if interrupted:
             break
     _print_table(table, failed)
     if written:
         _say(f"Written to {folder}:")
     for names in written:
         _say(f"  {'  '.join(names)}")
-    return 130 if _INTERRUPTED in failed.values() else int(bool(failed))
+    return 130 if interrupted else int(bool(failed))
 
 
-def _simulate(experiment: Experiment) -> tuple[Run | None, str | None]:
-    """Run an experiment; return what it recorded and, where it failed, why."""
+def _simulate(experiment: Experiment) -> tuple[Run | None, str | None, bool]:
+    """Run an experiment; return its record, the reason where it failed, and whether it was interrupted."""
     try:
-        return experiment.simulate(), None
+        return experiment.simulate(), None, False
     except LoopwrightError as error:
-        return getattr(error, "run", None), str(error)
+        return getattr(error, "run", None), str(error), False
     except KeyboardInterrupt as interrupt:
-        return getattr(interrupt, "run", None), _INTERRUPTED
+        return getattr(interrupt, "run", None), "interrupted", True
 
 
 def _write(

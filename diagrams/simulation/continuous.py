@@ -373,17 +373,15 @@ def _next_instant(path: str, block: Block, t: float) -> float:
 def check_solver(error: SimulationError, machine: Machine, continuous: Continuous | None = None) -> SimulationError:
     """Return the error behind that of a solver: what an opaque block raised, or the block that made a trial not finite.
 
-    Else say which block its message names.
+    Else say which block has the state at which the solver failed.
     """
     opaque = opaque_failure(machine)
     if opaque is not None:
         return opaque.at(t=error.t)  # type: ignore[return-value]
     if error.block is not None:
         return error
-    for name in sorted(state_names(machine.flat), key=len, reverse=True):
-        if f" {name} " in f" {error.message} ":
-            error.block = name.rpartition(".")[0]
-            break
+    if error.state is not None:
+        error.block = error.state.rpartition(".")[0]
     made = continuous.made_by() if continuous is not None and error.block is not None else None
     if made is None or made.block == error.block:
         return error

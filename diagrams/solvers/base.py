@@ -130,11 +130,13 @@ class Solver(ABC):
         if not np.isfinite(values).all():
             i = int(np.flatnonzero(~np.isfinite(values))[0])
             growth = "a step too long for a fast mode (try a tenth of it)" if self.fixed else "unbounded growth"
-            raise NonFiniteError(
+            error = NonFiniteError(
                 f"The {what} of {self.problem.names[i]} is {values[i]:g} with solver={self.name!r}; expected a finite "
                 f"number. Look for a division by zero, a root or a logarithm of a negative number, or {growth}.",
                 t=t,
             )
+            error.state = self.problem.names[i]
+            raise error
 
     def failure(self, t: float, x: np.ndarray, h: float, found: str = "") -> SimulationError:
         """Return the error of a step that can't be made small enough, at the accepted point (t, x).
@@ -154,13 +156,15 @@ class Solver(ABC):
         found = found or f"can't meet rtol = {self.rtol:g} even with a step of {h:.2g} s"
         beyond = "changes fastest" if np.isfinite(weighted[i]) else "is not finite just beyond"
         other = "a larger atol" if self.stiff else "a larger atol or, if it is stiff, solver='Radau'"
-        return SimulationError(
+        stuck = SimulationError(
             f"{self.name} {found}: the rate of {self.problem.names[i]} = {x[i]:.6g} is {f[i]:.6g} there and {beyond}. "
             "Expected rates that are finite, and smooth between events; look for growth to infinity, a root or a "
             "logarithm that leaves its domain, a jump that is no event, or noise in an opaque block. If there is none, "
             f"try {other}.",
             t=t,
         )
+        stuck.state = self.problem.names[i]
+        return stuck
 
 
 class VariableStep(Solver):

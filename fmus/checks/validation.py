@@ -135,12 +135,16 @@ def _description(file: Path, again: str) -> Iterator[Problem]:
     from fmpy.validation import validate_fmu
 
     for found in validate_fmu(str(file)):
-        step = again
-        if "has no start value" in found:
-            step = "Give the variable a start value and export it again."
-        elif "is not defined" in found and "unit" in found:
-            step = "Define the unit in UnitDefinitions, or leave it out, and export it again."
-        yield Problem(_end(found), step)
+        yield Problem(_end(found), _next_step(found, again))
+
+
+def _next_step(found: str, again: str) -> str:
+    """Return the next step for a problem that FMPy found; its text is read, as FMPy gives nothing else."""
+    if "has no start value" in found:
+        return "Give the variable a start value and export it again."
+    if "is not defined" in found and "unit" in found:
+        return "Define the unit in UnitDefinitions, or leave it out, and export it again."
+    return again
 
 
 def _end(text: str) -> str:
