@@ -38,6 +38,8 @@ from loopwright.blocks import (
     WiringError,
 )
 from loopwright.diagrams import Diagram, Linearization, OperatingPoint, subsystem
+from loopwright.diagrams.linearization.findings import EventWithinPeriod, StepsOnly, UnusualStart
+from loopwright.fmus.running.derivation import Derivation, DerivativeMethod
 from support.linear import by_simulation, differences
 
 T = 0.05
@@ -361,6 +363,9 @@ def test_an_event_within_the_period_is_told():
     assert re.match(
         r"relay: its event '\w+' comes within the period from t = 0 s; the model is that of the motion", note
     )
+    (finding,) = lin.findings
+    assert isinstance(finding, EventWithinPeriod)
+    assert (finding.block, finding.t, str(finding)) == ("relay", 0.0, note)
 
 
 def test_names_are_those_of_wires_and_states():
@@ -402,6 +407,7 @@ def test_an_encoder_linearizes_to_zero_and_says_so():
         "box.encoder.measured_velocity follows 'position' in steps only: it linearizes to zero",
         "box.quantizer.y follows 'u' in steps only: it linearizes to zero",
     )
+    assert lin.findings[-1] == StepsOnly("box.quantizer", "y", "u")
     assert lin.A[-1, -1] == 1.0
 
 
@@ -414,6 +420,7 @@ def test_a_start_that_is_unlike_every_later_tick_is_told():
 
     diagram = Diagram("d", x(box(x.y, Clock())))
     assert diagram.linearize().notes[-1].startswith("the start is unlike every later tick")
+    assert isinstance(diagram.linearize().findings[-1], UnusualStart)
     assert diagram.linearize(T).notes == ("box.function.y follows 't' in steps only: it linearizes to zero",)
 
 
@@ -423,6 +430,8 @@ def test_an_opaque_block_is_differenced_and_it_says_so():
     lin = Diagram("d", x(f(x.y))).linearize()
     assert pytest.approx(np.array([[-np.cos(0.5)]]), rel=1e-9) == lin.A
     assert lin.how == {"foreign": "differences of the block"}
+    assert lin.derivations == {"foreign": Derivation(DerivativeMethod.BLOCK_DIFFERENCES)}
+    assert not lin.derivations["foreign"].is_exact
 
 
 # --- operating points ------------------------------------------------------------------------------------------------------

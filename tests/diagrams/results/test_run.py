@@ -34,8 +34,9 @@ def run():
 
 def test_a_snapshot_refuses_a_name_that_stands_for_two_wires_as_the_run_does(run):
     for recorded in (run, run.at(0.5)):
-        with pytest.raises(UnknownNameError, match=r"'w' stands for several signals: a\.w, b\.w\. Write more"):
+        with pytest.raises(UnknownNameError, match=r"'w' stands for several signals: a\.w, b\.w\. Write more") as error:
             recorded["w"]
+        assert error.value.candidates == ("a.w", "b.w")
 
 
 def test_a_snapshot_takes_the_names_that_the_run_takes(run):

@@ -11,9 +11,11 @@ from loopwright.blocks import (
     Ellipse,
     FmuFileError,
     FmuRuntimeError,
+    Function,
     Gain,
     GuardError,
     Input,
+    Integrator,
     LoopwrightError,
     NonFiniteError,
     OptionError,
@@ -22,6 +24,7 @@ from loopwright.blocks import (
     PathDomainError,
     PathProjection,
     Saturation,
+    SimulationError,
     SmoothStep,
     Step,
     UnitDelay,
@@ -69,6 +72,19 @@ def test_a_nan_stops_the_run_at_the_first_block_that_made_it():
     assert (error.value.block, error.value.port, error.value.t) == ("root", "y", 1.1)
     assert len(error.value.run.t) == 11
     assert error.value.run["after.y"][:3] == pytest.approx([1.0, np.sqrt(0.9), np.sqrt(0.8)], abs=1e-15)
+
+
+@pytest.mark.parametrize("solver", ["auto", "RK45"])
+def test_a_solver_that_gets_no_further_names_the_block_of_the_state(solver):
+    @subsystem
+    def tank(u):
+        level = Integrator(initial_value=1.0, name="level")
+        return level(Function(lambda x, u: x * x + u, name="square")(level.y, u))
+
+    diagram = Diagram("d", tank(Constant(value=0.0)))
+    with pytest.raises(SimulationError, match=r"^tank\.level, t = 1\.0000") as error:  # ẋ = x²: infinite at t = 1
+        diagram.simulate(3.0, progress=False, solver=solver)
+    assert (error.value.block, error.value.state) == ("tank.level", "tank.level.y")
 
 
 def test_saturation_passes_nan_on():

@@ -366,6 +366,7 @@ def test_growth_to_infinity_ends_in_an_error_that_names_the_state(name):
     with pytest.raises(SimulationError, match=r"block\.x\[1\]") as caught:
         run(make_solver(name, of), [0.0, 1.0], [3.0])  # infinite at t = 1
     assert caught.value.t == pytest.approx(1.0, abs=1e-3)
+    assert caught.value.state == "block.x[1]"
 
 
 @pytest.mark.parametrize("name", FIXED)
