@@ -1,5 +1,6 @@
 """Diagrams: wiring, scheduling, simulation; linearization and margins; Fig. 3 and its experiments; the command line."""
 
+from ..blocks.core.layout import Layout
 from .admittance.compliance_loop import AdmittanceLoop
 from .admittance.coupled import crossing_frequency, growth_rate, poles
 from .admittance.rendered import (
@@ -22,7 +23,6 @@ from .contract.check_block import BlockReport, check_block
 from .diagram import Diagram
 from .drawing.svg import Drawing
 from .flat.flat_diagram import FlatDiagram
-from .flat.layout import Layout
 from .frequency.disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
 from .frequency.margins import GainCrossover, Margins, PhaseCrossover, margins
 from .frequency.number import Number

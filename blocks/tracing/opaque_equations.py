@@ -15,6 +15,7 @@ import numpy as np
 
 from ..core.block import Block
 from ..core.errors import LoopwrightError, ShapeError, SimulationError, TraceError
+from ..core.layout import Layout
 from ..core.ports import Shape
 from .equations import parts_of
 from .symbols import bundle, size, with_values, wrap
@@ -272,11 +273,7 @@ def _shaped(flat: np.ndarray, shape: Shape) -> Any:
 
 
 def _parts(flat: np.ndarray, shapes: Mapping[str, Shape]) -> dict[str, Any]:
-    parts, position = {}, 0
-    for name, shape in shapes.items():
-        parts[name] = _shaped(flat[position : position + size(shape)], shape)
-        position += size(shape)
-    return parts
+    return {name: _shaped(flat[where], shapes[name]) for name, where in Layout.of(shapes).slices.items()}
 
 
 def _array(value: Any, name: str, what: str) -> np.ndarray:

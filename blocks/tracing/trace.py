@@ -24,6 +24,7 @@ import numpy as np
 
 from ..core.block import SOLVED, Block
 from ..core.errors import LoopwrightError, SampleTimeError, TraceError
+from ..core.layout import Layout
 from ..core.ports import Shape
 from ..core.values import Value, identity
 from .discretization import hold
@@ -237,16 +238,15 @@ class _Tracer:
 
     def _shadow(self) -> Block:
         """Return the block with symbols for its numbers; exact zeros are structure."""
+        numbers = [*self.entries, ("", 0.0), *self.constants.items()]  # in between, the sample time's place
+        slices = Layout.of({str(i): np.shape(value) for i, (_, value) in enumerate(numbers)}).slices
         values: dict[str, Any] = {}
-        position = 0
-        for name, value in (*self.entries, ("", 0.0), *self.constants.items()):
-            part = self.p[position : position + np.size(value)]
-            position += np.size(value)
-            zero = np.ravel(value) == 0
+        for (name, value), where in zip(numbers, slices.values(), strict=True):
+            part, zero = self.p[where], np.ravel(value) == 0
             if self.zeros and zero.any() and name not in self.constants:
                 part = ca.vertcat(*(ca.MX(0.0) if z else part[i] for i, z in enumerate(zero)))
             values[name] = wrap(part, np.shape(value))
-        del values[""]  # the sample time's place
+        del values[""]
         shadow: Block = with_values(self.block, values)
         return shadow
 
@@ -281,11 +281,7 @@ class _Tracer:
 
     @staticmethod
     def _columns(shapes: Mapping[str, Shape], flat: Any) -> dict[str, Any]:
-        values, position = {}, 0
-        for name, shape in shapes.items():
-            values[name] = wrap(flat[position : position + size(shape)], shape)
-            position += size(shape)
-        return values
+        return {name: wrap(flat[where], shapes[name]) for name, where in Layout.of(shapes).slices.items()}
 
     def _outputs(self) -> tuple[dict[str, Any], dict[str, Shape]]:
         """Return columns and shapes of all outputs."""

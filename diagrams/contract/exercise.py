@@ -13,12 +13,13 @@ import numpy as np
 from ...blocks.core.arithmetic import shape_of
 from ...blocks.core.block import Block
 from ...blocks.core.errors import OptionError, ShapeError, near
+from ...blocks.core.layout import Layout
 from ...blocks.core.ports import Output, PortUnit, Shape
 from ...blocks.core.signals import Signal, as_signal
 from ...blocks.core.values import Array, parameter
 from ...blocks.tracing.equations import initial_state, start_values
 from ...blocks.tracing.numpy_check import GUARDS, NEXT, evaluate
-from ...blocks.tracing.symbols import bundle, size
+from ...blocks.tracing.symbols import bundle
 from ...blocks.tracing.trace import Traced, constants_of, traced_parameters
 from ..diagram import Diagram
 from ..wiring.structure import Collector
@@ -274,9 +275,7 @@ def points(exercise: Exercise, rng: np.random.Generator, count: int) -> Iterator
         if block.starts_from_inputs:
             bundled = bundle("u", {n: np.asarray(v, dtype=float) for n, v in u.items()})
             flat = initial_state(block, {n: v.shape for n, v in starts.items()}, bundled)
-            ends = np.cumsum([size(v.shape) for v in starts.values()])
-            parts = np.split(flat, ends[:-1]) if len(ends) else []
-            x = {n: p.reshape(v.shape) for (n, v), p in zip(starts.items(), parts, strict=True)}
+            x = Layout.of({n: v.shape for n, v in starts.items()}).split(flat)
         if number and not block.memory:
             x = {n: v + _off(rng, block.states[n], v.shape) for n, v in x.items()}
         fired = {name: float(rng.integers(2)) for name in block.events}

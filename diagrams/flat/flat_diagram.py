@@ -23,12 +23,13 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ...blocks.core.layout import Layout
 from ...blocks.tracing.numpy_check import GUARDS, NEXT
 from ...blocks.tracing.symbols import size
 from ..wiring.check import Checked
 from ..wiring.evaluation_order import Order
 from ..wiring.structure import Structure, Wire
-from .layout import Clock, FlatEvent, Layout, rows
+from .layout import Clock, FlatEvent, StateLayout, rows
 
 LARGEST = float(np.finfo(float).max)
 
@@ -47,8 +48,10 @@ class FlatDiagram:
         Seconds between two ticks.
     clocks : dict
         For every frame that is sampled: at which ticks it acts.
-    states, held, gates, starts, loops : Layout
-        Where the parts of x stand.
+    states : StateLayout
+        Where the states of the blocks stand in x: by block, and by state.
+    held, gates, starts, loops : Layout
+        Where the other parts of x stand.
     plant_outputs, plant_inputs, parameters, log : Layout
         Where things stand in w, z, p and log.
     continuous : ndarray of int
@@ -61,7 +64,7 @@ class FlatDiagram:
     checked: Checked
     base: Fraction
     clocks: dict[str, Clock]
-    states: Layout
+    states: StateLayout
     held: Layout
     gates: Layout
     starts: Layout
@@ -85,6 +88,17 @@ class FlatDiagram:
     def width(self) -> int:
         """Number of entries of x."""
         return self.x0.size
+
+    @cached_property
+    def labels(self) -> list[str]:
+        """Names of all entries of x: ``path.state`` of states, ``held(path.port)``, ``gate(path)`` and so on."""
+        others = ((self.held, "held"), (self.gates, "gate"), (self.starts, "start"), (self.loops, "loop"))
+        return self.states.labels + [f"{kind}({label})" for layout, kind in others for label in layout.labels]
+
+    @property
+    def continuous_labels(self) -> list[str]:
+        """Names of the entries of x that are integrated."""
+        return [self.labels[i] for i in self.continuous]
 
     @property
     def function(self) -> Any:

@@ -9,13 +9,13 @@ from fractions import Fraction
 import numpy as np
 
 from ...blocks.core.errors import SampleTimeError
+from ...blocks.core.layout import Layout
 from ...blocks.core.ports import Shape
-from ...blocks.tracing.symbols import size
 from ..wiring.check import Checked
 from ..wiring.evaluation_order import evaluation_order
 from ..wiring.structure import Structure, join
 from .flat_diagram import FlatDiagram
-from .layout import Clock, FlatEvent, Layout
+from .layout import Clock, FlatEvent, StateLayout
 
 
 def flatten(
@@ -49,7 +49,7 @@ def flatten(
     between = between or any(block.transport and path not in traced for path, block in blocks.items())
     gated = {path: table.gates(table.frame_of[path]) for path in paths}
 
-    states = Layout.of({path: (sum(size(s) for s in traced[path].states.values()),) for path in paths})
+    states = StateLayout.of_blocks({path: traced[path].states for path in paths})
     position = states.total
 
     def lay(shapes: Mapping[str, Shape]) -> Layout:
@@ -120,19 +120,13 @@ def _input_shape(table: Structure, checked: Checked, path: str, port: str) -> Sh
     return shape if wire.index is None else np.empty(shape)[wire.index].shape
 
 
-def _continuous(checked: Checked, table: Structure, states: Layout) -> np.ndarray:
+def _continuous(checked: Checked, table: Structure, states: StateLayout) -> np.ndarray:
     """Return the entries of x that a solver integrates."""
     found: list[int] = []
-    for path, where in states.slices.items():
-        trace = checked.traced[path]
-        if trace.advance != "derivative":
-            continue
-        position = where.start
-        for name, shape in trace.states.items():
-            n = size(shape)
-            if not table.blocks[path].states[name].discrete:
-                found += range(position, position + n)
-            position += n
+    for path, own in states.of_block.items():
+        if checked.traced[path].advance == "derivative":
+            ports = table.blocks[path].states
+            found += own.entries(name for name in own.slices if not ports[name].discrete)
     return np.array(found, dtype=int)
 
 

@@ -9,31 +9,45 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ...blocks.core.layout import Layout
 from ...blocks.core.ports import Shape
-from ...blocks.tracing.symbols import size
+from ..wiring.structure import join
 
 
 @dataclass(frozen=True)
-class Layout:
-    """Where things stand in a flat vector: slice and shape by dotted path."""
+class StateLayout(Layout):
+    """Where the states of blocks stand: by the block's path, and within a block by the state's name.
 
-    slices: dict[str, slice]
-    shapes: dict[str, Shape]
+    Attributes
+    ----------
+    slices, shapes : dict
+        All states of a block together: a slice, and the shape (n,), by path.
+    of_block : dict
+        By path, the layout of a block's states in the same vector: ``of_block["pid"].slices["integral"]``.
+    """
+
+    of_block: dict[str, Layout]
 
     @classmethod
-    def of(cls, shapes: Mapping[str, Shape], offset: int = 0) -> Layout:
-        """Lay out the given shapes one after the other."""
-        slices = {}
-        for name, shape in shapes.items():
-            slices[name] = slice(offset, offset + size(shape))
-            offset += size(shape)
-        return cls(slices, dict(shapes))
+    def of_blocks(cls, shapes: Mapping[str, Mapping[str, Shape]], offset: int = 0) -> StateLayout:
+        """Lay out the states of blocks, whose shapes are given by path and name, one block after the other."""
+        of_block, first = {}, offset
+        for path, states in shapes.items():
+            of_block[path] = Layout.of(states, offset)
+            offset += of_block[path].total
+        blocks = Layout.of({path: (own.total,) for path, own in of_block.items()}, first)
+        return cls(blocks.slices, blocks.shapes, of_block)
 
     @property
-    def total(self) -> int:
-        """Number of entries, counted from the first slice."""
-        bounds = [*self.slices.values()]
-        return bounds[-1].stop - bounds[0].start if bounds else 0
+    def each(self) -> Layout:
+        """The layout of all states, by ``path.name``."""
+        names = [(join(path, name), own, name) for path, own in self.of_block.items() for name in own.slices]
+        return Layout({full: own.slices[n] for full, own, n in names}, {full: own.shapes[n] for full, own, n in names})
+
+    @property
+    def labels(self) -> list[str]:
+        """Names of all entries: ``path.name``, with the index of an element behind it."""
+        return self.each.labels
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core.errors import NonFiniteError, UnknownNameError, near
+from ...blocks.core.layout import Layout, elements
 from ...blocks.tracing.symbols import size
 from ..flat.evaluate import Pass
 from ..flat.flat_diagram import FlatDiagram
@@ -19,9 +20,8 @@ from ..flat.functions import active_loops
 from ..flat.layout import Clock
 from ..results.signal_names import resolve
 from ..simulation.workspace import Machine
-from ..wiring.structure import Wire
+from ..wiring.structure import Wire, join
 from .findings import Finding, StepsOnly
-from .operating_point import elements
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,8 @@ class Parts:
         self, flat: FlatDiagram, inputs: Sequence[Signal], outputs: Sequence[Signal], openings: Sequence[Signal]
     ):
         self.flat, self.inputs, self.outputs, self.openings = flat, inputs, outputs, openings
-        self.n_inputs = sum(len(s.entries) for s in inputs)
+        lengths = Layout.of({str(i): (len(s.entries),) for i, s in enumerate(inputs)})
+        self.n_inputs, self.injected = lengths.total, [*lengths.slices.values()]
         self.cut: dict[tuple[str, str], set[int]] = {}
         for s in openings:
             self.cut.setdefault(s.port, set()).update(s.entries)
@@ -111,17 +112,11 @@ class Parts:
 
     def _taps(self, d: Any, c: Any) -> dict[tuple[str, str], Any]:
         injected: dict[tuple[str, str], list[tuple[int, int]]] = {}
-        position = 0
-        for signal in self.inputs:
-            for entry in signal.entries:
-                injected.setdefault(signal.port, []).append((entry, position))
-                position += 1
-        kept: dict[tuple[str, str], Any] = {}
-        position = 0
-        for port in self.cut:
-            n = size(self.flat.checked.shapes[port])
-            kept[port] = c[position : position + n]
-            position += n
+        for signal, where in zip(self.inputs, self.injected, strict=True):
+            places = range(where.start, where.stop)
+            injected.setdefault(signal.port, []).extend(zip(signal.entries, places, strict=True))
+        cut = Layout.of({join(*port): self.flat.checked.shapes[port] for port in self.cut})
+        kept = {port: c[cut.slices[join(*port)]] for port in self.cut}
 
         def tap(port: tuple[str, str]) -> Any:
             def change(column: Any) -> Any:

@@ -23,7 +23,7 @@ from ..wiring.subsystem import exact_time
 from .derivatives import Parts, Signal, find_signal, steps_only
 from .findings import Finding
 from .loops_over_a_period import confirm_closed, loop_model, moved, period_of, ticks_to_renewal
-from .operating_point import check_options, names_of_states, operating_point
+from .operating_point import check_options, operating_point
 from .over_a_period import EQUILIBRIUM, Model, discrete, moves_between
 from .plant_models import continuous_models, joined, states_of
 
@@ -349,11 +349,10 @@ def _continuous(
     yx, yp, yd = through("y")
     A = np.block([[fx, fp], [Bp @ z_of["x"], Ap + Bp @ z_of["p"]]])
     B = np.vstack([fd, Bp @ z_of["d"]])
-    names = names_of_states(flat)
     return Model(
         (A, B, np.hstack([yx, yp]), yd),
         0.0,
-        [names[i] for i in xc] + states_of(models),
+        flat.continuous_labels + states_of(models),
         np.concatenate([J["dx"], *(m.f for m in models)]),
         {m.path: m.derivation for m in models},
         max((m.uncertainty for m in models), default=0.0),

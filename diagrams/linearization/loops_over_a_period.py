@@ -19,7 +19,7 @@ from ..flat.flat_diagram import FlatDiagram
 from ..flat.layout import Clock
 from ..results.operating_point import OperatingPoint
 from .derivatives import Parts
-from .over_a_period import Chain, Model, needed, own_states, state_names, ticks
+from .over_a_period import Chain, Model, needed, own_states, ticks
 
 SAME_ROWS = 1e-12
 """Relative difference up to which a wire counts as unchanged from one tick to the next."""
@@ -104,7 +104,7 @@ def loop_model(
     A, B, C, D = _each_tick(chain)
     plants = set(range(flat.width, flat.width + chain.n_p))
     keep = needed(A, C, own_states(flat), plants)
-    names, labels = state_names(flat, chain.models), [e for s in parts.inputs for e in s.labels]
+    names, labels = chain.labels, [e for s in parts.inputs for e in s.labels]
     A, B, C = A[np.ix_(keep, keep)], B[keep], C[:, keep]
     groups = _channels(A, B, C, D, m)
     many = [e for e in range(m) if len(groups[e]) > 1]

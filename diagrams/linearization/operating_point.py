@@ -15,7 +15,6 @@ from ..flat.wired_diagram import WiredDiagram
 from ..results.operating_point import OperatingPoint, PointOrigin
 from ..results.run import Snapshot
 from ..results.saved_state import layout_of
-from ..wiring.structure import join
 
 OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start")
 """How to run to an operating point."""
@@ -218,20 +217,3 @@ def _any_step(diagram: WiredDiagram, t: float) -> Fraction:
             port="step",
         )
     return Fraction(max(1, round(t * 10**9)), 10**9)
-
-
-def names_of_states(flat: FlatDiagram) -> list[str]:
-    """Return what every entry of x is: ``block.state[i]``, ``held(port)[i]``, and so on."""
-    names: list[str] = []
-    for path in flat.states.slices:
-        for name, shape in flat.checked.traced[path].states.items():
-            names += elements(join(path, name), shape)
-    for layout, kind in ((flat.held, "held"), (flat.gates, "gate"), (flat.starts, "start"), (flat.loops, "loop")):
-        for name, shape in layout.shapes.items():
-            names += [f"{kind}({e})" for e in elements(name, shape)]
-    return names
-
-
-def elements(name: str, shape: tuple[int, ...]) -> list[str]:
-    """Return the names of the elements of an array, counted from 0."""
-    return [f"{name}[{','.join(map(str, index))}]" if index else name for index in np.ndindex(*shape)]

@@ -23,7 +23,6 @@ from ..flat.functions import NONE
 from ..results.operating_point import OperatingPoint
 from .derivatives import Parts, Signal
 from .findings import EventWithinPeriod, Finding, MemoryActs, UnusualStart
-from .operating_point import elements, names_of_states
 from .plant_models import PlantModel, inputs_before, joined, states_of, step_models
 
 EQUILIBRIUM = 1e-9
@@ -53,7 +52,7 @@ def discrete(flat: FlatDiagram, parts: Parts, at: OperatingPoint, way: str | Non
     for k, following in ticks(flat, at.tick, period):
         chain.go(k, following - k)
     A, B = chain.M, chain.N
-    names = state_names(flat, chain.models)
+    names = chain.labels
     keep = needed(A, chain.C, own_states(flat), set(range(flat.width, flat.width + chain.n_p)))
     memory, findings = _memory(flat, A, names)
     findings += chain.findings(at.tick + period)
@@ -69,12 +68,6 @@ def discrete(flat: FlatDiagram, parts: Parts, at: OperatingPoint, way: str | Non
         tuple(m for m in memory if m in labels),
         tuple(findings),
     )
-
-
-def state_names(flat: FlatDiagram, models: Sequence[PlantModel]) -> list[str]:
-    """Return the names of a chain's states: of blocks, of FMUs, and of what FMUs are given."""
-    names = names_of_states(flat) + states_of(models)
-    return names + [f"held({e})" for name, shape in flat.plant_inputs.shapes.items() for e in elements(name, shape)]
 
 
 def ticks(flat: FlatDiagram, first: int, period: int) -> Iterator[tuple[int, int]]:
@@ -179,6 +172,12 @@ class Chain:
             plants[m.path] = m.next
         t = self.first.t + float((k - self.first.tick) * self.flat.base)
         self.here = replace(self.here, t=t, tick=k, x=x, w=w, z=z, plants=plants)
+
+    @property
+    def labels(self) -> list[str]:
+        """Names of its states: of blocks, of FMUs, and of the inputs that FMUs hold."""
+        held = [f"held({label})" for label in self.flat.plant_inputs.labels]
+        return self.flat.labels + states_of(self.models) + held
 
     def affine(self) -> np.ndarray:
         """Return by how much the states change over the period at the operating point itself."""
@@ -291,13 +290,8 @@ def moves_between(flat: FlatDiagram, parts: Parts, at: OperatingPoint) -> tuple[
     if not flat.continuous.size:
         return ()
     by_d = parts.at(NONE, at.t, at.x, at.w)["dx", "d"]
-    found, position = [], 0
-    for signal in parts.inputs:
-        columns = by_d[:, position : position + len(signal.entries)]
-        position += len(signal.entries)
-        if np.any(columns) and _moves(flat, signal):
-            found.append(signal.name)
-    return tuple(found)
+    injected = zip(parts.inputs, parts.injected, strict=True)
+    return tuple(signal.name for signal, where in injected if np.any(by_d[:, where]) and _moves(flat, signal))
 
 
 def _moves(flat: FlatDiagram, signal: Signal) -> bool:

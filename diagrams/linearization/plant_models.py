@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core.errors import FmuError, LoopwrightError, OptionError
+from ...blocks.core.layout import Layout
 from ...fmus.running.derivation import Derivation
 from ..flat.flat_diagram import FlatDiagram
+from ..flat.layout import StateLayout
 from ..results.operating_point import OperatingPoint
 from ..wiring.structure import join, stepped_blocks
 from .identification import identified
@@ -53,22 +55,21 @@ def plants(flat: FlatDiagram) -> list[str]:
     return list(stepped_blocks(flat.table))
 
 
+def plant_layout(blocks: Mapping[str, Any], points: Mapping[str, Any], offset: int = 0) -> StateLayout:
+    """Return where the states of FMUs stand, one FMU after the other by path, from an operating point's ``plants``."""
+    states = {path: points[path]["state"] for path in sorted(points)}
+    shapes = {path: {n: np.shape(state[n]) for n in blocks[path].description.states} for path, state in states.items()}
+    return StateLayout.of_blocks(shapes, offset)
+
+
 def entries(flat: FlatDiagram, path: str) -> tuple[list[int], list[int], list[int]]:
     """Return the entries of z and w that are an FMU's own, and the columns of its own inputs that are wired."""
     block: Any = flat.table.blocks[path]
-    z, w, wired = list[int](), list[int](), list[int]()
-    position = 0
-    for port, spec in block.inputs.items():
-        n = int(np.prod(spec.shape or (), dtype=int))
-        where = flat.plant_inputs.slices.get(join(path, port))
-        if where is not None:
-            z += range(where.start, where.stop)
-            wired += range(position, position + n)
-        position += n
-    for port in block.outputs:
-        where = flat.plant_outputs.slices[join(path, port)]
-        w += range(where.start, where.stop)
-    return z, w, wired
+    inputs = Layout.of({port: spec.shape or () for port, spec in block.inputs.items()})
+    wired = [port for port in block.inputs if join(path, port) in flat.plant_inputs.slices]
+    z = flat.plant_inputs.entries(join(path, port) for port in wired)
+    w = flat.plant_outputs.entries(join(path, port) for port in block.outputs)
+    return z, w, inputs.entries(wired)
 
 
 def inputs_before(flat: FlatDiagram, at: OperatingPoint) -> np.ndarray:
@@ -84,13 +85,12 @@ def inputs_before(flat: FlatDiagram, at: OperatingPoint) -> np.ndarray:
 
 def joined(flat: FlatDiagram, models: Sequence[PlantModel], which: str) -> np.ndarray:
     """Return one matrix of all FMUs side by side: rows and columns as x_p, z and w are ordered."""
-    n = sum(len(m.A) for m in models)
-    many = {"x": n, "z": flat.plant_inputs.total, "w": flat.plant_outputs.total}
+    states = Layout.of({m.path: (len(m.A),) for m in models})
+    many = {"x": states.total, "z": flat.plant_inputs.total, "w": flat.plant_outputs.total}
     row_of, column_of = {"A": ("x", "x"), "B": ("x", "z"), "C": ("w", "x"), "D": ("w", "z")}[which]
-    M, position = np.zeros((many[row_of], many[column_of])), 0
+    M = np.zeros((many[row_of], many[column_of]))
     for m in models:
-        own = {"x": list(range(position, position + len(m.A))), "z": m.inputs, "w": m.outputs}
-        position += len(m.A)
+        own = {"x": states.entries([m.path]), "z": m.inputs, "w": m.outputs}
         M[np.ix_(own[row_of], own[column_of])] = getattr(m, which)
     return M
 
@@ -293,12 +293,8 @@ def _inputs(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> 
 
 def _after(block: Any, at: OperatingPoint, path: str, f: np.ndarray) -> dict[str, Any]:
     """Return an FMU's states after a step, discrete ones as they are."""
-    state, position = dict(at.plants[path]["state"]), 0
-    for name in block.description.states:
-        n = int(np.size(state[name]))
-        state[name] = f[position : position + n].reshape(np.shape(state[name]))
-        position += n
-    return state
+    moved = plant_layout({path: block}, {path: at.plants[path]}).of_block[path].split(f)
+    return {**at.plants[path]["state"], **moved}
 
 
 def _named(path: str, states: Sequence[str]) -> tuple[str, ...]:

@@ -16,11 +16,12 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core.errors import OptionError, SimulationError
+from ...blocks.core.layout import Layout
 from ..flat.evaluate import Pass
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.wired_diagram import WiredDiagram
 from ..results.operating_point import OperatingPoint, PointOrigin
-from .operating_point import elements, judged, names_of_states, operating_point
+from .operating_point import judged, operating_point
 from .trim_plants import Plants
 from .trim_request import Free, Target, free_parameters, known_states, named_states, targets_of
 
@@ -49,7 +50,10 @@ class _Equations:
         self.free_x = np.array([i for i in movable if i not in target.fixed] + loops, dtype=int)
         n = self.plants.total
         self.free_p = np.array([i for i in range(n) if flat.width + i not in target.fixed], dtype=int)
-        self.sizes = [len(self.free_x), at.w.size, len(self.free_p), sum(f.start.size for f in free)]
+        self.free_q = Layout.of({f.name: (f.start.size,) for f in free})
+        """Where the entries of each free parameter stand among those of all."""
+        sizes = {"x": len(self.free_x), "w": at.w.size, "plants": len(self.free_p), "q": self.free_q.total}
+        self.unknowns = Layout.of({name: (size,) for name, size in sizes.items()})
         self.function = self._function()
         self._memory: tuple[bytes | None, Any] = (None, None)
         self.names, self.wanted, self.keep = self._rows()
@@ -75,15 +79,14 @@ class _Equations:
 
     def _rows(self) -> tuple[list[str], np.ndarray, np.ndarray]:
         """Return for every equation its name, what is wanted, and whether it counts."""
-        flat, states, target = self.flat, names_of_states(self.flat), self.target
+        flat, states, target = self.flat, self.flat.labels, self.target
         loops = self.function.numel_out(2)
-        outputs = [e for name, shape in flat.plant_outputs.shapes.items() for e in elements(name, shape)]
         names = [
             *(f"d/dt {states[i]}" for i in flat.continuous),
             *(f"{states[i]} per tick" for i in self.sampled),
             *(f"loop[{i}]" for i in range(loops)),
             *target.labels,
-            *outputs,
+            *flat.plant_outputs.labels,
             *self.plants.equations,
         ]
 
@@ -115,23 +118,21 @@ class _Equations:
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower and upper bounds of the unknowns."""
-        low, high = np.full(sum(self.sizes), -np.inf), np.full(sum(self.sizes), np.inf)
+        low, high = np.full(self.unknowns.total, -np.inf), np.full(self.unknowns.total, np.inf)
         for i, where in enumerate([*self.free_x, *([-1] * self.at.w.size), *(self.flat.width + self.free_p)]):
             if where in self.target.bounds:
                 low[i], high[i] = self.target.bounds[int(where)]
         if self.parameters:
-            first = sum(self.sizes[:3])
-            low[first:] = np.concatenate([f.low for f in self.parameters])
-            high[first:] = np.concatenate([f.high for f in self.parameters])
+            low[self.unknowns.slices["q"]] = np.concatenate([f.low for f in self.parameters])
+            high[self.unknowns.slices["q"]] = np.concatenate([f.high for f in self.parameters])
         return low, high
 
     def split(self, unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
         """Return x, w, states of the FMUs and values of the free parameters."""
-        parts = np.split(unknown, np.cumsum(self.sizes)[:-1])
+        parts = self.unknowns.split(unknown)
         x, xp = self.at.x.copy(), self.plants.x0.copy()
-        x[self.free_x], xp[self.free_p] = parts[0], parts[2]
-        sizes = [f.start.size for f in self.parameters]
-        return x, parts[1], xp, np.split(parts[3], np.cumsum(sizes)[:-1]) if sizes else []
+        x[self.free_x], xp[self.free_p] = parts["x"], parts["plants"]
+        return x, parts["w"], xp, [*self.free_q.split(parts["q"]).values()]
 
     def at_unknown(self, unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the residual, its derivative, and z."""
@@ -143,41 +144,39 @@ class _Equations:
 
     def _evaluate(self, unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         flat, (x, w, xp, q) = self.flat, self.split(unknown)
-        p, by_q = flat.p.copy(), np.zeros((flat.p.size, self.sizes[3]))
-        column = 0
-        for f, value in zip(self.parameters, q, strict=True):
+        p, by_q = flat.p.copy(), np.zeros((flat.p.size, self.free_q.total))
+        for f, value, columns in zip(self.parameters, q, self.free_q.slices.values(), strict=True):
             if f.where is not None:
                 p[f.where] = f.packed(value)
-                by_q[f.where, column : column + value.size] = f.slope(value)
-            column += value.size
+                by_q[f.where, columns] = f.slope(value)
         numbers = [np.array(v) for v in self.function.call([self.at.t, x, w, p])]
         values, rest = [np.ravel(v) for v in numbers[:5]], numbers[5:]
-        many = 3 if self.parameters else 2
+        many, where = 3 if self.parameters else 2, self.unknowns.slices
 
         def derivative(i: int) -> np.ndarray:
-            J = np.zeros((values[i].size, sum(self.sizes)))
+            J = np.zeros((values[i].size, self.unknowns.total))
             found = zip(rest[many * i : many * (i + 1)], (x.size, w.size, p.size), strict=False)
             by = [b.reshape(values[i].size, n) for b, n in found]
-            J[:, : self.sizes[0]] = by[0][:, self.free_x]
-            J[:, self.sizes[0] : sum(self.sizes[:2])] = by[1]
+            J[:, where["x"]] = by[0][:, self.free_x]
+            J[:, where["w"]] = by[1]
             if self.parameters:
-                J[:, sum(self.sizes[:3]) :] = by[2] @ by_q
+                J[:, where["q"]] = by[2] @ by_q
             return J
 
         rows, slopes = values[:4], [derivative(i) for i in range(4)]
         z = values[4]
         m = self.plants.at(xp, z, self.parameters, q)
         z_by = derivative(4)
-        own = slice(sum(self.sizes[:2]), sum(self.sizes[:3]))
-        of_w = np.zeros((w.size, sum(self.sizes)))
-        of_w[:, self.sizes[0] : sum(self.sizes[:2])] = np.eye(w.size)
+        own = where["plants"]
+        of_w = np.zeros((w.size, self.unknowns.total))
+        of_w[:, where["w"]] = np.eye(w.size)
         of_w -= m.D @ z_by
         of_w[:, own] -= m.C[:, self.free_p]
         of_f = m.B @ z_by
         of_f[:, own] += m.A[:, self.free_p]
         if self.parameters:
-            of_w[:, sum(self.sizes[:3]) :] -= m.y_by_q
-            of_f[:, sum(self.sizes[:3]) :] += m.f_by_q
+            of_w[:, where["q"]] -= m.y_by_q
+            of_f[:, where["q"]] += m.f_by_q
         rows, slopes = [*rows, w - m.y, m.f], [*slopes, of_w, of_f]
         r, keep = np.concatenate(rows) - self.wanted, self.keep
         return np.where(keep, r, 0.0), np.where(keep[:, None], np.vstack(slopes), 0.0), z

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core.errors import FmuError
+from ...blocks.core.layout import elements
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.wired_diagram import WiredDiagram
 from ..results.operating_point import OperatingPoint
 from ..wiring.structure import join
-from .operating_point import elements
+from .plant_models import entries, plant_layout
 
 if TYPE_CHECKING:
     from .trim_request import Free
@@ -39,21 +40,23 @@ class Plants:
     def __init__(self, flat: FlatDiagram, at: OperatingPoint, diagram: WiredDiagram):
         self.flat, self.at_start, self.h = flat, at, float(flat.base)
         self.blocks: dict[str, Any] = {path: diagram.blocks[path] for path in sorted(at.plants)}
-        self.own: dict[str, slice] = {}
-        self.equations: list[str] = []
-        self.by_step: dict[str, bool] = {}
-        states, position = [], 0
-        for path, block in self.blocks.items():
-            names = list(block.description.states)
-            x = [np.ravel(at.plants[path]["state"][n]) for n in names]
-            states += x
-            n = sum(v.size for v in x)
-            self.own[path], position = slice(position, position + n), position + n
-            self.by_step[path] = self._needs_step(path)
-            for name in names:
-                labels = elements(join(path, name), np.shape(at.plants[path]["state"][name]))
-                self.equations += [f"{e} per step" if self.by_step[path] else f"d/dt {e}" for e in labels]
-        self.x0 = np.concatenate([*states, np.zeros(0)])
+        self.states = plant_layout(self.blocks, at.plants)
+        self.own = self.states.slices
+        self.by_step = {path: self._needs_step(path) for path in self.blocks}
+        self.x0 = np.zeros(self.states.total)
+        for path, layout in self.states.of_block.items():
+            for name, where in layout.slices.items():
+                self.x0[where] = np.ravel(at.plants[path]["state"][name])
+
+    @property
+    def equations(self) -> list[str]:
+        """Names of the equations of their states: of rates, or of changes over a step."""
+        return [
+            f"{label} per step" if self.by_step[path] else f"d/dt {label}"
+            for path, layout in self.states.of_block.items()
+            for name, shape in layout.shapes.items()
+            for label in elements(join(path, name), shape)
+        ]
 
     @property
     def total(self) -> int:
@@ -83,11 +86,7 @@ class Plants:
     def point(self, path: str, block: Any, xp: np.ndarray, z: np.ndarray) -> dict[str, Any]:
         """Return time, states and inputs of an FMU, as its linear models take them."""
         start, flat = self.at_start.plants[path], self.flat
-        state, inputs, position = dict(start["state"]), dict(start["inputs"]), self.own[path].start
-        for name in block.description.states:
-            n = int(np.size(state[name]))
-            state[name] = xp[position : position + n].reshape(np.shape(state[name]))
-            position += n
+        state, inputs = {**start["state"], **self.states.of_block[path].split(xp)}, dict(start["inputs"])
         back = {new: old for old, new in block.rename.items()}
         for port in block.inputs:
             where = flat.plant_inputs.slices.get(join(path, port))
@@ -135,27 +134,9 @@ class Plants:
         m = self._model(path, block, self.point(path, block, xp, z), step=self.by_step[path])
         return m, m.f - m.x0 if self.by_step[path] else m.f
 
-    def _places(self, path: str) -> tuple[list[int], list[int], list[int]]:
-        """Return the entries of z and w that are an FMU's own, and the columns of its own inputs that are wired."""
-        z: list[int] = []
-        wired: list[int] = []
-        w: list[int] = []
-        position, block, flat = 0, self.blocks[path], self.flat
-        for port in block.inputs:
-            n = int(np.size(self.at_start.plants[path]["inputs"][port]))
-            where = flat.plant_inputs.slices.get(join(path, port))
-            if where is not None:
-                z += range(where.start, where.stop)
-                wired += range(position, position + n)
-            position += n
-        for port in block.outputs:
-            where = flat.plant_outputs.slices[join(path, port)]
-            w += range(where.start, where.stop)
-        return z, w, wired
-
     def _one(self, v: PlantValues, path: str, block: Any, xp: np.ndarray, z: np.ndarray) -> None:
         m, f = self._numbers(path, block, xp, z)
-        own, (mine, w, wired) = self.own[path], self._places(path)
+        own, (mine, w, wired) = self.own[path], entries(self.flat, path)
         v.f[own], v.y[w] = f, m.y0
         v.A[own, own] = m.A - np.eye(len(f)) if self.by_step[path] else m.A
         v.B[own, mine] = m.B[:, wired]
@@ -174,4 +155,4 @@ class Plants:
             m, rates = self._numbers(f.path, self.changed(free, moved)[f.path], xp, z)
             found.append((rates, m.y0))
         v.f_by_q[self.own[f.path], column] = (found[0][0] - found[1][0]) / (2 * d)
-        v.y_by_q[self._places(f.path)[1], column] = (found[0][1] - found[1][1]) / (2 * d)
+        v.y_by_q[entries(self.flat, f.path)[1], column] = (found[0][1] - found[1][1]) / (2 * d)

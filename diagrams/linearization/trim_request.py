@@ -10,14 +10,13 @@ import numpy as np
 
 from ...blocks.core.errors import OptionError, ParameterError, UnknownNameError, near
 from ...blocks.core.values import Value
-from ...blocks.tracing.symbols import size
 from ...blocks.tracing.trace import traced_parameters
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.wired_diagram import WiredDiagram
 from ..results.operating_point import OperatingPoint, PointOrigin
-from ..wiring.structure import join
 from ..wiring.variants import change_parameter, split_path
 from .derivatives import find_signal
+from .plant_models import plant_layout
 
 
 @dataclass(eq=False)
@@ -91,20 +90,8 @@ class Free:
 
 def known_states(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray]:
     """Return the numbers of the entries of all states, by name, in the states' shapes."""
-    known: dict[str, np.ndarray] = {}
-    for path, where in flat.states.slices.items():
-        position = where.start
-        for name, shape in flat.checked.traced[path].states.items():
-            known[join(path, name)] = np.arange(position, position + size(shape)).reshape(shape)
-            position += size(shape)
-    position = flat.width
-    for path in sorted(at.plants):
-        block: Any = flat.table.blocks[path]
-        for name in block.description.states:
-            shape = np.shape(at.plants[path]["state"][name])
-            known[join(path, name)] = np.arange(position, position + size(shape)).reshape(shape)
-            position += size(shape)
-    return known
+    states = (flat.states.each, plant_layout(flat.table.blocks, at.plants, flat.width).each)
+    return {name: layout.index(name) for layout in states for name in layout.slices}
 
 
 def _state(name: str, known: Mapping[str, Any], what: str) -> str:

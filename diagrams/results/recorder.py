@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core.errors import OptionError, SimulationError, UnknownNameError
-from ..flat.layout import Layout
+from ...blocks.core.layout import Layout
 from ..wiring.structure import Wire
 from .memory import memory
 from .signal_names import entries, resolve

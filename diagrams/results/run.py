@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core.errors import OptionError, UnknownNameError
-from ..flat.layout import Layout
+from ...blocks.core.layout import Layout
 from ..wiring.structure import Wire
 from .signal_names import entries, resolve
 from .stored import Occurrence, Stopped, read, write

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core.errors import UnknownNameError, near
-from ..flat.layout import Layout
+from ...blocks.core.layout import Layout
 
 
 def resolve(name: str, wires: Any, ports: Any) -> str:
@@ -38,6 +38,5 @@ def entries(full: str, layout: Layout, wires: Any) -> np.ndarray:
     """Return where a signal stands in the vector of a sample, in the signal's shape."""
     wire = wires.get(full)
     port = full if wire is None else f"{wire.block}.{wire.port}"
-    where = layout.slices[port]
-    whole = np.arange(where.start, where.stop).reshape(layout.shapes[port])
+    whole = layout.index(port)
     return whole if wire is None or wire.index is None else np.asarray(whole[wire.index])

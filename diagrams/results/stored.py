@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core.errors import OptionError
-from ..flat.layout import Layout
+from ...blocks.core.layout import Layout
 from ..wiring.structure import Wire
 
 FORMAT, VERSION = "loopwright run", 1

@@ -16,7 +16,7 @@ from ..results.stored import Occurrence
 from ..solvers.base import Problem, make_solver
 from .diagnosis import failure, forget_trials, opaque_failure, state_values
 from .events import Domains
-from .solver_setup import absolute_tolerances, recall, remembers, solver_memory, state_names, time_scale_of
+from .solver_setup import absolute_tolerances, recall, remembers, solver_memory, time_scale_of
 from .transport_delays import delays_of, driven_function, step_inputs
 from .workspace import Machine
 
@@ -61,7 +61,7 @@ class Continuous:
         self._opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
         self.delays = delays_of(flat)
         self._flow, self._jacobian = machine.flow(), None
-        problem = Problem(self.where.size, self._rate, self._slope, state_names(flat))
+        problem = Problem(self.where.size, self._rate, self._slope, flat.continuous_labels)
         self.time_scale = time_scale_of(flat)
         longest = max_step
         if longest is None and remembers(flat):

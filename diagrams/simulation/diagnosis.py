@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -94,12 +93,7 @@ def states_of(flat: FlatDiagram, path: str, x: np.ndarray) -> Any:
 
 def state_values(flat: FlatDiagram, path: str, x: np.ndarray) -> dict[str, np.ndarray]:
     """Return the states of a block by name."""
-    part, position, parts = x[flat.states.slices[path]], 0, {}
-    for name, shape in flat.checked.traced[path].states.items():
-        n = math.prod(shape)
-        parts[name] = part[position : position + n].reshape(shape).copy()
-        position += n
-    return parts
+    return {name: part.copy() for name, part in flat.states.of_block[path].split(x).items()}
 
 
 def _overflow(machine: Machine) -> NonFiniteError:

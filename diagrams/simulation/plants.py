@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...blocks.core.errors import LoopwrightError, SimulationError
+from ...blocks.core.layout import Layout
 from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import Layout
 from ..wiring.structure import stepped_blocks
 from .workspace import Machine
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from ..flat.flat_diagram import FlatDiagram
-from ..wiring.structure import join
 
 _MEMORY = ("planned", "_hits", "_misses", "_easy")
 
@@ -48,27 +47,12 @@ def remembers(flat: FlatDiagram) -> bool:
     return any(table.blocks[p].memory and not table.sampled(table.frame_of[p]) for p in flat.checked.traced)
 
 
-def state_names(flat: FlatDiagram) -> list[str]:
-    """Return what each continuous state is: ``block.state``, with an index where it has several entries."""
-    found: dict[int, str] = {}
-    for path, where in flat.states.slices.items():
-        position = where.start
-        for name, shape in flat.checked.traced[path].states.items():
-            n = math.prod(shape)
-            for i in range(n):
-                found[position + i] = join(path, name) + (f"[{i}]" if shape else "")
-            position += n
-    return [found[int(i)] for i in flat.continuous]
-
-
 def absolute_tolerances(flat: FlatDiagram, atol: float) -> Any:
     """Return the absolute tolerance of each continuous state: ``atol`` times its nominal value."""
     scale = np.ones(flat.width)
-    for path, where in flat.states.slices.items():
-        position = where.start
-        for name, shape in flat.checked.traced[path].states.items():
-            n, nominal = math.prod(shape), flat.table.blocks[path].states[name].nominal
-            scale[position : position + n] = 1.0 if nominal is None else nominal
-            position += n
+    for path, own in flat.states.of_block.items():
+        for name, where in own.slices.items():
+            nominal = flat.table.blocks[path].states[name].nominal
+            scale[where] = 1.0 if nominal is None else nominal
     scale = scale[flat.continuous]
     return atol if np.all(scale == 1.0) or np.ndim(atol) else atol * scale

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, cast
@@ -12,10 +11,10 @@ import numpy as np
 
 from ...blocks.core.block import Block
 from ...blocks.core.errors import DefinitionError, LoopwrightError
+from ...blocks.core.layout import Layout
 from ...blocks.core.ports import Port, Shape
 from ...blocks.core.values import ParameterSpec
 from ...blocks.tracing.numpy_check import GUARDS, NEXT
-from ...blocks.tracing.symbols import size
 from ...blocks.tracing.trace import Traced, trace, traced_parameters
 from .build import build_fmu
 from .html_page import block_text
@@ -97,15 +96,13 @@ class _Equations:
         self.block, self.traced = block, traced
         states = block.states
         self.order = sorted(states, key=lambda n: states[n].discrete)
-        sizes = {n: size(shape) for n, shape in traced.states.items()}
-        first = dict(zip(sizes, itertools.accumulate(sizes.values(), initial=0), strict=False))
-        self._rows = [first[n] + i for n in self.order for i in range(sizes[n])]
-        self._n_continuous = sum(sizes[n] for n in self.order if not states[n].discrete)
+        layout, inputs = Layout.of(traced.states), Layout.of(traced.inputs)
+        self._rows = layout.entries(self.order)
+        self._n_continuous = len(layout.entries(n for n in self.order if not states[n].discrete))
         f = traced.function
-        n_u = [f.numel_in(2 + i) for i in range(len(traced.inputs))]
-        self.t, self.x, self.u = ca.MX.sym("t"), ca.MX.sym("x", len(self._rows)), ca.MX.sym("u", sum(n_u))
+        self.t, self.x, self.u = ca.MX.sym("t"), ca.MX.sym("x", len(self._rows)), ca.MX.sym("u", inputs.total)
         self.p = ca.MX.sym("p", sum(np.size(v) for _, v in traced_parameters(block)))
-        columns = ca.vertsplit(self.u, [0, *itertools.accumulate(n_u)]) if n_u else []
+        columns = ca.vertsplit(self.u, inputs.cuts) if traced.inputs else []
         x = self.x[[self._rows.index(i) for i in range(len(self._rows))]] if self._rows else self.x
         # the sample time does not enter a continuous model
         self._arguments = [self.t, x, *columns, ca.vertcat(self.p, 0.0)]

@@ -6,7 +6,6 @@ Both are functions of the model alone: no time stamp, no random identifier.
 from __future__ import annotations
 
 import importlib.metadata
-import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,6 +14,7 @@ from xml.sax.saxutils import quoteattr
 
 import casadi as ca
 
+from ...blocks.core.layout import Layout
 from ...blocks.core.units import BASE_UNITS, parse_unit
 from .c_code import Entry, layout, scalar, symbolic
 from .model import ModelSpec
@@ -188,8 +188,8 @@ def _reinitialized(spec: ModelSpec) -> set[str]:
     args = jump.sx_in()
     after = ca.densify(ca.reshape(jump.call(args, True, False)[0], jump.numel_out(0), 1))
     changed = [not ca.is_equal(after[i], args[1][i], 2) for i in range(after.numel())]
-    offsets = [0, *itertools.accumulate(v.size for v in spec.continuous)]
-    return {v.name for v, first in zip(spec.continuous, offsets, strict=False) if any(changed[first : first + v.size])}
+    places = Layout.of({v.name: v.shape for v in spec.continuous})
+    return {name for name, where in places.slices.items() if any(changed[where])}
 
 
 # ---- variables and units ----

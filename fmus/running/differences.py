@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from ...blocks.core.layout import Layout
 from ..archive.description import FmuDescription
 
 _EPS = float(np.finfo(float).eps)
@@ -28,9 +29,7 @@ class Column:
 
     def __init__(self, about: FmuDescription, names: list[str], at: np.ndarray, relative: float):
         self.variables, self.at, self.relative = {name: about.variables[name] for name in names}, at, relative
-        sizes = [v.size for v in self.variables.values()]
-        first = np.cumsum([0, *sizes])
-        self._slices = {n: slice(int(a), int(b)) for n, a, b in zip(names, first, first[1:], strict=False)}
+        self._slices = Layout.of({n: v.shape for n, v in self.variables.items()}).slices
 
     def part(self, name: str, values: np.ndarray) -> np.ndarray:
         """Return the elements of one variable."""

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core.errors import FmuError, ParameterError, UnknownNameError, near
-from ..archive.description import FmuVariable
+from ...blocks.core.layout import Layout, elements
+from ..archive.description import FmuDescription
 from ..calls.loaded_library import LoadedFmu
 from .derivation import Derivation, DerivativeMethod
 from .differences import Column, columns
@@ -94,20 +95,16 @@ class _Point:
                 block=self.block.label,
                 port=what,
             )
-        parts = np.split(vector, np.cumsum(sizes)[:-1]) if sizes else []
-        return {v.name: part.reshape(v.shape) for v, part in zip(variables, parts, strict=True)}
+        return Layout.of({v.name: v.shape for v in variables}).split(vector)
 
     def check(self, found: np.ndarray) -> None:
         """Refuse an operating point that the FMU does not take over."""
-        at = 0
-        for name in self.states:
-            part = found[at : at + self.about.variables[name].size]
-            at += part.size
-            if name in self.given and not np.allclose(part, np.ravel(self.given[name]), rtol=1e-9, atol=0.0):
+        for name, part in _layout(self.about, self.states).split(found).items():
+            if name in self.given and not np.allclose(part, self.given[name], rtol=1e-9, atol=0.0):
                 raise FmuError(
-                    f"its state was set to {self.given[name].tolist()}, but is {part.tolist()} when the FMU has "
-                    f"initialized at t = {self.t:.9g} s: an event there changes it, or its start value is no more than "
-                    "a guess. Choose a point that is not on an event.",
+                    f"its state was set to {self.given[name].tolist()}, but is {np.ravel(part).tolist()} when the FMU "
+                    f"has initialized at t = {self.t:.9g} s: an event there changes it, or its start value is no more "
+                    "than a guess. Choose a point that is not on an event.",
                     block=self.block.label,
                     port=name,
                 )
@@ -115,7 +112,8 @@ class _Point:
     def elements(self, names: list[str], *, ports: bool = False) -> tuple[str, ...]:
         """Name each element of variables."""
         rename = self.block.rename if ports else {}
-        return tuple(e for n in names for e in _elements(rename.get(n, n), self.about.variables[n]))
+        shapes = ((rename.get(n, n), self.about.variables[n].shape) for n in names)
+        return tuple(label for name, shape in shapes for label in elements(name, shape, first=1))  # FMI counts from 1
 
     def model(self, J: np.ndarray, x: np.ndarray, u: np.ndarray, values: np.ndarray, **more: Any) -> FmuLinearization:
         """Return the linear model with this matrix [[A, B], [C, D]]."""
@@ -125,13 +123,6 @@ class _Point:
             J[:n, :n], J[:n, n:], J[n:, :n], J[n:, n:], self.elements(self.states), inputs, outputs, self.t,
             x0=x, u0=u, f=values[:n], y0=values[n:], **more,
         )  # fmt: skip
-
-
-def _elements(name: str, variable: FmuVariable) -> list[str]:
-    """Name elements as FMI does, from 1 on."""
-    return [
-        f"{name}[{','.join(str(i + 1) for i in index)}]" if index else name for index in np.ndindex(*variable.shape)
-    ]
 
 
 # ---- of the equations ----
@@ -204,12 +195,9 @@ def _enter_continuous_time(point: _Point, instance: LoadedFmu) -> None:
     guessed = [n for n in point.states if n in point.given and point.about.variables[n].initial != "exact"]
     if guessed:
         x = instance.values(point.states)
-        at = 0
-        for name in point.states:
-            size = point.about.variables[name].size
-            if name in guessed:
-                x[at : at + size] = np.ravel(point.given[name])
-            at += size
+        where = _layout(point.about, point.states).slices
+        for name in guessed:
+            x[where[name]] = np.ravel(point.given[name])
         _set_states(instance, x)
 
 
@@ -309,7 +297,7 @@ def _stepped(point: _Point, instance: LoadedFmu, h: float, relative_step: float)
     instance.begin()
     x, u = instance.values(point.states), instance.values(point.inputs)
     point.check(x)
-    at = dict(zip(known, _parts(about, known, np.concatenate([x, u])), strict=True))
+    at = _layout(about, known).split(np.concatenate([x, u]))
     saved = instance.call("saving its state", "getFMUState") if about.can_save else None
 
     def go(set_before: Mapping[str, Any], set_after: Mapping[str, Any], *, first: bool = False) -> np.ndarray:
@@ -346,9 +334,6 @@ def _stepped(point: _Point, instance: LoadedFmu, h: float, relative_step: float)
     return point.model(J, x, u, values, h=h, derivation=derivation, uncertainty=uncertainty)
 
 
-def _parts(about: Any, names: list[str], vector: np.ndarray) -> Iterator[np.ndarray]:
-    at = 0
-    for name in names:
-        variable = about.variables[name]
-        yield vector[at : at + variable.size].reshape(variable.shape)
-        at += variable.size
+def _layout(about: FmuDescription, names: list[str]) -> Layout:
+    """Return where variables stand that come one after the other."""
+    return Layout.of({name: about.variables[name].shape for name in names})

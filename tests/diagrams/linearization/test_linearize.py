@@ -90,9 +90,8 @@ def test_away_from_an_equilibrium_the_transition_is_the_derivative_of_the_motion
 
 
 def names(lin):
-    from loopwright.diagrams.linearization.operating_point import names_of_states
 
-    return names_of_states(lin.diagram.flatten(lin.point.base))
+    return lin.diagram.flatten(lin.point.base).labels
 
 
 def test_a_source_that_jumps_within_the_period_is_followed():

@@ -11,7 +11,6 @@ from scipy.linalg import block_diag, expm
 
 from loopwright.blocks import Constant, DiscreteStateSpace, Function, Gain, StateSpace
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.linearization.operating_point import names_of_states
 from support.linear import by_simulation
 
 NEAR = 1e-10
@@ -290,7 +289,7 @@ def test_bent_ones_on_the_move_against_differences_of_the_simulation(seed, clock
     period = float(lcm(*(every for every, _ in clocks))) * 1e-2
     A, moved = by_simulation(diagram, t, period)
     lin = diagram.linearize(t, rtol=1e-11, atol=1e-13)
-    everything = names_of_states(diagram.flatten())
+    everything = diagram.flatten().labels
     keep = [everything.index(name) for name in lin.states]
     gone = [i for i in range(len(A)) if i not in keep]
     close(lin.A, A[np.ix_(keep, keep)], 1e-7)

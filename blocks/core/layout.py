@@ -1,0 +1,84 @@
+"""Where named arrays stand in a flat vector: the one place in which offsets are counted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from .ports import Shape
+
+
+def elements(name: str, shape: Shape, first: int = 0) -> list[str]:
+    """Return the names of the elements of an array, in C order: ``name[i,j]``, or ``name`` of a scalar.
+
+    Parameters
+    ----------
+    first : int, default: 0
+        The number of the first element: FMI counts from 1.
+    """
+    return [f"{name}[{','.join(str(i + first) for i in index)}]" if index else name for index in np.ndindex(*shape)]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where things stand in a flat vector: slice and shape by dotted path, in C order, one after the other.
+
+    Examples
+    --------
+    >>> layout = Layout.of({"position": (2,), "angle": ()})
+    >>> layout.slices["angle"], layout.total, layout.labels
+    (slice(2, 3, None), 3, ['position[0]', 'position[1]', 'angle'])
+    """
+
+    slices: dict[str, slice]
+    shapes: dict[str, Shape]
+
+    @staticmethod
+    def of(shapes: Mapping[str, Shape], offset: int = 0) -> Layout:
+        """Lay out the given shapes one after the other.
+
+        Parameters
+        ----------
+        shapes : mapping
+            Shape of everything, by name.
+        offset : int, default: 0
+            Where the first one begins.
+        """
+        slices = {}
+        for name, shape in shapes.items():
+            end = offset + int(np.prod(shape, dtype=int))
+            slices[name] = slice(offset, end)
+            offset = end
+        return Layout(slices, dict(shapes))
+
+    @property
+    def total(self) -> int:
+        """Number of entries, counted from the first slice."""
+        bounds = [*self.slices.values()]
+        return bounds[-1].stop - bounds[0].start if bounds else 0
+
+    @property
+    def cuts(self) -> list[int]:
+        """The number of the first entry, then the number behind each thing: where CasADi's ``vertsplit`` cuts."""
+        bounds = [*self.slices.values()]
+        return [bounds[0].start if bounds else 0, *(s.stop for s in bounds)]
+
+    @property
+    def labels(self) -> list[str]:
+        """Names of all entries; see `elements`."""
+        return [label for name, shape in self.shapes.items() for label in elements(name, shape)]
+
+    def index(self, name: str) -> np.ndarray:
+        """Return the numbers of the entries of one thing, in its shape."""
+        where = self.slices[name]
+        return np.arange(where.start, where.stop).reshape(self.shapes[name])
+
+    def entries(self, names: Iterable[str]) -> list[int]:
+        """Return the numbers of the entries of some things, one after the other."""
+        return [i for name in names for i in range(self.slices[name].start, self.slices[name].stop)]
+
+    def split(self, vector: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the parts of a vector by name, in their shapes: views, where NumPy can give them."""
+        return {name: vector[where].reshape(self.shapes[name]) for name, where in self.slices.items()}

@@ -1,0 +1,43 @@
+"""Layouts: where named arrays stand in a flat vector."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from loopwright.blocks.core.layout import Layout, elements
+
+SHAPES = st.dictionaries(
+    st.sampled_from(["a", "b.c", "d", "e", "f.g.h"]), st.lists(st.integers(0, 3), max_size=2).map(tuple), max_size=5
+)
+
+
+@given(shapes=SHAPES, offset=st.integers(0, 4))
+def test_what_is_laid_out_comes_one_after_the_other_as_numpy_ravels_it(shapes, offset):
+    layout = Layout.of(shapes, offset)
+    rng = np.random.default_rng(1)
+    arrays = {name: rng.normal(size=shape) for name, shape in shapes.items()}
+    vector = np.concatenate([np.zeros(offset), *(np.ravel(v) for v in arrays.values())])
+    assert layout.total == vector.size - offset
+    for name, part in layout.split(vector).items():
+        assert part.shape == shapes[name]
+        assert np.array_equal(part, arrays[name])
+        assert np.array_equal(vector[layout.index(name)], arrays[name])
+    backwards = [*shapes][::-1]
+    assert vector[layout.entries(backwards)].tolist() == [v for n in backwards for v in np.ravel(arrays[n])]
+    assert layout.cuts == ([offset, *(offset + np.cumsum([v.size for v in arrays.values()]))] if shapes else [0])
+    assert len(layout.labels) == layout.total
+
+
+@pytest.mark.parametrize(
+    ("shape", "first", "expected"),
+    [
+        ((), 0, ["q"]),
+        ((2,), 0, ["q[0]", "q[1]"]),
+        ((2,), 1, ["q[1]", "q[2]"]),
+        ((2, 2), 0, ["q[0,0]", "q[0,1]", "q[1,0]", "q[1,1]"]),
+        ((0,), 0, []),
+    ],
+)
+def test_elements_have_names(shape, first, expected):
+    assert elements("q", shape, first) == expected
