@@ -11,7 +11,10 @@ import numpy as np
 
 from ...blocks.core.errors import OptionError
 from ..flat.flat_diagram import FlatDiagram
-from .stored import Stopped
+from .stored import Stopped, own_version
+
+VERSION = 2
+"""Version of a state's vectors and their layout."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +32,10 @@ class RunState:
         Tick number on the base ``base`` (seconds, exact).
     fmus : mapping
         State of each FMU, as bytes, by path.
+    version : int
+        Version of what is saved; another version of loopwright may not read it.
+    made_by : str
+        Version of loopwright that made it.
     """
 
     t: float
@@ -43,6 +50,8 @@ class RunState:
     continuous: Mapping[str, Any] | None = field(default=None, repr=False)
     fmus: Mapping[str, bytes] = field(default_factory=dict, repr=False)
     stopped: Stopped | None = None
+    version: int = VERSION
+    made_by: str = field(default_factory=own_version)
 
 
 def layout_of(flat: FlatDiagram) -> tuple[Any, ...]:
@@ -58,11 +67,18 @@ def check_fits(state: RunState, flat: FlatDiagram, name: str) -> None:
     Raises
     ------
     OptionError
-        Another base, other blocks, states or ports.
+        Another version, another base, other blocks, states or ports.
     """
     if not isinstance(state, RunState):
         raise OptionError(
             f"found {state!r}; expected a state, as run.final_state or Simulation.save() give it.",
+            block=name,
+            port="start",
+        )
+    if state.version != VERSION:
+        raise OptionError(
+            f"found a state of version {state.version}, made by loopwright {state.made_by}; this loopwright "
+            f"{own_version()} reads version {VERSION}. Go on from it there, or make it again.",
             block=name,
             port="start",
         )

@@ -97,7 +97,7 @@ def header(
         "version": VERSION,
         "diagram": diagram,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": {"loopwright": _own_version(), "numpy": np.__version__, "python": platform.python_version()},
+        "versions": {"loopwright": own_version(), "numpy": np.__version__, "python": platform.python_version()},
         "columns": ["t", *(entries[k] for k in kept), *(["residual"] if residual else [])],
         "signals": [
             {"name": n, "shape": list(layout.shapes[n]), "first": s.start, "unit": units.get(n)}
@@ -323,7 +323,8 @@ def _index_from_json(index: Any) -> Any:
     return slice(*index["slice"]) if isinstance(index, dict) else index
 
 
-def _own_version() -> str:
+def own_version() -> str:
+    """Return the version of loopwright that is installed."""
     try:
         return version("loopwright")
     except PackageNotFoundError:

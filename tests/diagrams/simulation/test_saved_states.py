@@ -6,6 +6,7 @@ Elsewhere the straight run steps over the tick, and both agree within the tolera
 """
 
 import pickle
+import re
 import subprocess
 import sys
 from dataclasses import replace as replaced
@@ -274,3 +275,26 @@ def test_the_step_that_the_solver_would_take_next_is_saved(solver):
     lag = Lag(name="lag", k=20.0)
     diagram = Diagram("d", lag(Sine(frequency=3.0)), counting(1.0)().named("n"))
     assert_same_bits(diagram, 2.0, 2.0, solver=solver, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["loopwright.diagrams._state", "loopwright.blocks._algebra", "loopwright.fmus.gantry", "loopwright.diagrams.fig3"],
+)
+def test_a_pickle_from_before_the_files_moved_says_the_version(module):
+    with pytest.raises(ModuleNotFoundError, match=f"found {re.escape(module)}, .* before 0\\.2\\.0.* make it again"):
+        pickle.loads(f"c{module}\nAnything\n.".encode())
+
+
+def test_a_module_that_never_was_is_not_explained():
+    with pytest.raises(ModuleNotFoundError, match=r"No module named 'loopwright\.diagrams\.nothing'"):
+        pickle.loads(b"cloopwright.diagrams.nothing\nAnything\n.")
+
+
+def test_a_state_of_another_version_says_both_versions():
+    diagram = Diagram("ramp", Integrator()(Constant(value=1.0)).named("y"))
+    state = replaced(diagram.simulate(0.5, step=0.25, progress=False).final_state, version=1, made_by="0.1.0")
+    with pytest.raises(
+        OptionError, match=r"state of version 1, made by loopwright 0\.1\.0; this loopwright 0\.2\.0 reads version 2"
+    ):
+        diagram.simulate(0.5, step=0.25, start=state, progress=False)
