@@ -93,6 +93,18 @@ def test_every_subpackage_is_listed_for_the_wheel():
     assert importlib.metadata.version("loopwright")
 
 
+def test_every_file_that_is_no_code_is_listed_for_the_wheel():
+    setup = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+    listed = {
+        file
+        for package, patterns in setup["package-data"].items()
+        for pattern in patterns
+        for file in (ROOT / package.removeprefix("loopwright.").replace(".", os.sep)).glob(pattern)
+    }
+    kept = call("git", "ls-files", *ROOMS).stdout.splitlines()
+    assert {ROOT / name for name in kept if not name.endswith(".py")} == listed
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
 def test_the_benchmarks_run(path):
@@ -114,7 +126,9 @@ def test_the_built_wheel_imports_runs_and_holds_the_c_runtime(tmp_path):
     script = (
         "import loopwright.blocks, loopwright.fmus, loopwright.diagrams as d, sys; "
         f"assert d.__file__.startswith({str(site)!r}), d.__file__; "
-        "run = d.experiments.path_following().diagram.simulate(0.1, progress=False); print(run['eta'][0, 0])"
+        "run = d.experiments.path_following().diagram.simulate(0.1, progress=False); print(run['eta'][0, 0]); "
+        "from loopwright.blocks import Constant, Integrator; "
+        "d.Diagram('small', Integrator()(Constant(value=1.0))).report('small.html')"
     )
     environment = {**os.environ, "PYTHONPATH": str(site), "LOOPWRIGHT_CACHE": str(tmp_path / "cache")}
     done = subprocess.run(
@@ -122,6 +136,7 @@ def test_the_built_wheel_imports_runs_and_holds_the_c_runtime(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert float(done.stdout) == pytest.approx(0.1, abs=1e-12)
+    assert "Design report: small" in (tmp_path / "small.html").read_text(encoding="utf-8")
     for room in ROOMS:
         assert (site / "loopwright" / room / "py.typed").is_file()
 

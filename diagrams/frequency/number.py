@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,8 @@ class Number:
         Absolute bound of the numerical error of the value, in its unit.
     confirmed_by : str
         The independent computation that agreed.
+    given : bool
+        Whether it is a given, such as a parameter, with nothing to confirm.
 
     Examples
     --------
@@ -30,6 +32,7 @@ class Number:
     unit: str
     tolerance: float
     confirmed_by: str
+    given: bool = False
 
     def __post_init__(self) -> None:
         for name in ("value", "tolerance"):
@@ -43,4 +46,4 @@ class Number:
 
     def as_dict(self) -> dict[str, float | str]:
         """Return the four entries by name, as they stand in a report's JSON."""
-        return asdict(self)
+        return {name: getattr(self, name) for name in ("value", "unit", "tolerance", "confirmed_by")}

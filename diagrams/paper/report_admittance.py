@@ -126,7 +126,7 @@ def _side(loops: Loops, side: str) -> Section:
         ("damping", float(a.effective_damping), "N.s/m"),
         ("stiffness", a.stiffness, "N/m"),
     ):
-        numbers[f"target.{name}"] = Number(value, unit, 1e-15 * abs(value), "given")
+        numbers[f"target.{name}"] = Number(value, unit, 1e-15 * abs(value), "given", given=True)
     tables = [_passivity(loops, side, numbers), *_limits(loops, side, numbers), *_masses(loops, side, numbers)]
     plots = (_rendered(loops, side), _map(loops, side))
     symbol = "along the path, ∥" if side == "par" else "across the path, ⊥"

@@ -5,15 +5,18 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from ..drawing.svg import draw
 from ..flat.wired_diagram import WiredDiagram
 from .model import Plot, Report
+from .templating import Texts
 
-DRAWING = "diagram"
-"""How the keys of a diagram's drawings begin; they stand ahead of the tables."""
+if TYPE_CHECKING:
+    from markupsafe import Markup
+
+TEXTS = Texts(__package__, "figures")
 
 ACROSS = 1200.0
 """Width in pixels up to which a diagram is drawn as one."""
@@ -22,8 +25,28 @@ WIDE = 900.0
 """Width in pixels above which a figure is turned by a right angle on paper."""
 
 
-def embedded(figure: Any, key: str) -> str:
-    """Return a figure as a page holds it; a wide one twice, for the screen and, turned, for paper.
+@dataclass(frozen=True)
+class Picture:
+    """A figure as a page holds it: SVG for the screen, and another one for paper where it is turned there.
+
+    Attributes
+    ----------
+    screen : Markup
+        The SVG.
+    paper : Markup, optional
+        The same with ids of its own, of a wide figure.
+    width, height : float
+        Size of a wide figure in pixels.
+    """
+
+    screen: Markup
+    paper: Markup | None = None
+    width: float = 0.0
+    height: float = 0.0
+
+
+def embedded(figure: Any, key: str) -> Picture:
+    """Return a figure as a page holds it; a wide one twice, for the screen and, to be turned, for paper.
 
     Parameters
     ----------
@@ -36,23 +59,20 @@ def embedded(figure: Any, key: str) -> str:
     svg = re.sub(r"<\?xml.*?\?>|<!DOCTYPE.*?>|<!--.*?-->|<metadata>.*?</metadata>", "", svg, flags=re.DOTALL).strip()
     found = re.search(r'<svg[^>]*?\bwidth="([\d.]+)(pt|px)?" height="([\d.]+)', svg)
     if found is None:
-        return f'<div class="scroll">{_own_ids(svg, key)}</div>\n'
+        return Picture(_own_ids(svg, key))
     factor = 4 / 3 if found[2] == "pt" else 1.0
     width, height = float(found[1]) * factor, float(found[3]) * factor
     if width <= WIDE or width < height:
-        return f'<div class="scroll">{_own_ids(svg, key)}</div>\n'
-    turned = (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{height:g}" height="{width:g}" '
-        f'viewBox="0 0 {height:g} {width:g}"><g transform="translate({height:g} 0) rotate(90)">'
-        f"{_own_ids(svg, key + '-paper')}</g></svg>"
-    )
-    return f'<div class="scroll wide">{_own_ids(svg, key)}</div>\n<div class="paper">{turned}</div>\n'
+        return Picture(_own_ids(svg, key))
+    return Picture(_own_ids(svg, key), _own_ids(svg, f"{key}-paper"), width, height)
 
 
-def _own_ids(svg: str, key: str) -> str:
+def _own_ids(svg: str, key: str) -> Markup:
+    from markupsafe import Markup
+
     svg = re.sub(r'\bid="', f'id="{key}-', svg)
     svg = re.sub(r'((?:xlink:)?href=")#', rf"\1#{key}-", svg)
-    return re.sub(r"url\(#", f"url(#{key}-", svg)
+    return Markup(re.sub(r"url\(#", f"url(#{key}-", svg))
 
 
 def _drawn(figure: Any) -> str:
@@ -77,13 +97,13 @@ def with_drawing(report: Report, diagram: WiredDiagram) -> Report:
 
 
 def _drawings(diagram: WiredDiagram) -> Iterator[Plot]:
-    legend = "Boxes are subsystems with their rates; FMUs have a double border; names of wires are in italics."
     whole = draw(diagram, closed=False)
     found = re.search(r'width="([\d.]+)"', whole)
     boxes = [path for path in diagram.frames if path]
     if not boxes or (found is not None and float(found[1]) <= ACROSS):
-        yield Plot(DRAWING, f"The diagram. {legend}", whole)
+        yield Plot("diagram", TEXTS.line("diagram", closed=False), whole, ahead=True)
         return
-    yield Plot(DRAWING, f"The diagram with its subsystems closed. {legend}", draw(diagram, closed=True))
+    yield Plot("diagram", TEXTS.line("diagram", closed=True), draw(diagram, closed=True), ahead=True)
     for box in boxes:
-        yield Plot(f"{DRAWING}.{box}", f"The inside of the subsystem `{box}`.", draw(diagram, box=box, closed=True))
+        inside = draw(diagram, box=box, closed=True)
+        yield Plot(f"diagram.{box}", TEXTS.line("inside", subsystem=box), inside, ahead=True)

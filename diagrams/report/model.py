@@ -21,11 +21,12 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """A figure: a key for its file, a caption, and the matplotlib figure, or SVG text."""
+    """A figure: a key for its file, a caption, the matplotlib figure or SVG text; ``ahead`` of the tables or not."""
 
     key: str
     caption: str
     figure: Any
+    ahead: bool = False
 
 
 @dataclass(frozen=True, eq=False)

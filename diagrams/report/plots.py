@@ -9,10 +9,12 @@ import numpy as np
 
 from ..results.plots import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, new_figure, style
 from .model import Plot
+from .templating import Texts
 
 if TYPE_CHECKING:
     from ..frequency.margins import Margins
 
+TEXTS = Texts(__package__, "figures")
 LOOKS: Mapping[str, tuple[str, Any]] = {
     "continuous": (GREY, "-"),
     "sampled_d0": (BLUE, "-"),
@@ -78,10 +80,7 @@ def bode(
         bottom.set_ylabel("phase of L [°]")
         bottom.set_xlabel("ω [rad/s]")
         top.legend(loc="best")
-    caption = (
-        f"Bode diagram of the loop at {wire}. Thick: the phase margin at each |L| = 1 (○), and the gain margin at each "
-        "crossing of −180° (□). Dotted: the Nyquist frequency π/T."
-    )
+    caption = TEXTS.line("bode", wire=wire)
     return Plot(key, caption, figure)
 
 
@@ -115,10 +114,7 @@ def nyquist(
         ax.set_xlabel("Re L")
         ax.set_ylabel("Im L")
         ax.legend(loc="lower right")
-    caption = (
-        f"Nyquist diagram of the loop at {wire}, negative frequencies thin. Marked are −1, the points with |L| = 1 (○, "
-        "whose angle from −1 is the phase margin), and dotted the largest circle around −1 that L keeps out of."
-    )
+    caption = TEXTS.line("nyquist", wire=wire)
     return Plot(key, caption, figure)
 
 
@@ -144,7 +140,7 @@ def sensitivities(
             ax.set_xlabel("ω [rad/s]")
             ax.set_ylim(bottom=1e-3)
         left.legend(loc="best")
-    return Plot(key, f"Sensitivity S and complementary sensitivity T at {wire}; ○ are M_s and M_t.", figure)
+    return Plot(key, TEXTS.line("sensitivities", wire=wire), figure)
 
 
 def admittances(key: str, side: str, w: np.ndarray, curves: Mapping[str, tuple[str, np.ndarray]]) -> Plot:
@@ -239,6 +235,4 @@ def injected(key: str, wire: str, curves: Mapping[str, tuple[np.ndarray, ...]]) 
         for ax in (left, right):
             ax.set_xlabel("ω [rad/s]")
         left.legend(loc="best")
-    return Plot(
-        key, f"Loop at {wire}: linear model (lines), and measured in the running co-simulation (points).", figure
-    )
+    return Plot(key, TEXTS.line("injected", wire=wire), figure)

@@ -11,7 +11,7 @@ import numpy as np
 from ...blocks.core.errors import OptionError
 from ..flat.wired_diagram import WiredDiagram
 from ..linearization.operating_point import capture, operating_point
-from ..results.operating_point import OperatingPoint
+from ..results.operating_point import OperatingPoint, PointOrigin
 from ..results.run import Snapshot
 from ..simulation.start_at_point import carried, placed
 
@@ -37,7 +37,7 @@ def point_of(diagram: WiredDiagram, where: Any, source: WiredDiagram | None = No
     options: dict[str, Any] = {}
     if diagram.has_fmu and not diagram.has_clock:
         options["step"] = STEP
-    if isinstance(where, Snapshot) or (isinstance(where, OperatingPoint) and where.how == "run"):
+    if isinstance(where, Snapshot) or (isinstance(where, OperatingPoint) and where.how is PointOrigin.RUN):
         where = where.t
     if not isinstance(where, OperatingPoint):
         return operating_point(diagram, where, options)

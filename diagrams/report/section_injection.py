@@ -14,6 +14,9 @@ from . import plots as figures
 from .case import FRICTION, Case, Variant, in_s, with_parameters
 from .model import Plot, Section, Table
 from .section_loops import wires_on_loops
+from .templating import Texts
+
+TEXTS = Texts(__package__, "injection")
 
 FREQUENCIES = np.geomspace(1.0, 150.0, 9)
 """In rad/s, for Fig. 3; elsewhere they are spread around the loop's crossover."""
@@ -27,38 +30,24 @@ def injected(case: Case) -> Section | None:
     """Return the section that compares each sampled loop with its measured response."""
     numbers: dict[str, Number] = {}
     rows: list[tuple[Any, ...]] = []
-    text = [
-        (
-            "A sine d is added at the wire in the running nonlinear co-simulation, ramped in; after its "
-            "transient whole "
-            "periods are taken. Measured, at the ticks, are v, what the wire's source puts out, and u = v "
-            "+ d, what its "
-            "consumers get: L = −v/u, which is the loop that the margins are of. The deviation is "
-            "relative to the linear "
-            "model's L; the uncertainty is the measurement's own, from window to window."
-        ),
-    ]
+    text: list[str] = []
     plots = []
     for key, wire in list(wires_on_loops(case).items())[:2]:
         measured = {}
         for v in case.usable("sampled_d0", "sampled_d1", "sampled_d0" + FRICTION):
             if not v.rests:
-                text.append(f"{v.title} at {wire}: not done, as the operating point is not at rest{_moving(v)}.")
+                text.append(TEXTS.line("moving", variant=v.title, wire=wire, **_moving(v)))
                 continue
             try:
                 L = v.loop(wire)  # a wire without a loop at one rate needs no measurement
                 found, model = _measured(case, v, wire)
                 deviation = found.deviation(model, "L")
             except LoopwrightError as error:
-                text.append(f"{v.title} at {wire}: not done. {error.message}")
+                text.append(TEXTS.line("failed", variant=v.title, wire=wire, message=error.message))
                 continue
             worst, own = float(np.max(deviation)), float(np.max(found.uncertainty))
             if worst - 10 * own > REFUTED:
-                text.append(
-                    f"{v.title} at {wire}: the measurement refutes the linear model, by {worst:.3g}. Something there "
-                    "is not smooth at this point, such as a contact that just begins, or the point moves; the margins "
-                    "of this variant say nothing of the running loop."
-                )
+                text.append(TEXTS.line("refuted", variant=v.title, wire=wire, deviation=worst))
             where = f"{key}.{v.key}"
             low, high = float(found.omega[0]), float(found.omega[-1])
             how = f"{len(found.omega)} sines from {low:.4g} to {high:.4g} rad/s, amplitude {found.amplitude:g}"
@@ -72,22 +61,24 @@ def injected(case: Case) -> Section | None:
         if measured:
             plots.append(_plot(key, wire, measured))
     if not rows:
-        return Section("injection", "Injection check", tuple(text[1:])) if text[1:] else None
+        return Section("injection", "Injection check", tuple(text)) if text else None
+    text = [*TEXTS.paragraphs("measurement"), *text]
     columns = ("wire", "variant", "frequencies", "largest deviation", "uncertainty", f"within {CONFIRMED:g}")
     table = Table("Injected against linearized", columns, tuple(rows))
     return Section("injection", "Injection check", tuple(text), (table,), tuple(plots), numbers)
 
 
-def _moving(v: Variant) -> str:
-    """Name the state that moves most at an operating point; a measurement would wander off along it."""
+def _moving(v: Variant) -> dict[str, Any]:
+    """Return the state that moves most at an operating point, and how far; a measurement would wander off along it."""
+    nothing = {"state": "", "change": 0.0, "period": False}
     try:
         moves = np.abs(v.model.affine)
     except LoopwrightError:
-        return ""
+        return nothing
     if not moves.size or len(moves) != len(v.model.states) or not np.max(moves) > 0.0:
-        return ""
+        return nothing
     most = int(np.argmax(moves))
-    return f": {v.model.states[most]} moves by {moves[most]:.3g} " + ("in a period" if v.model.dt else "per second")
+    return {"state": v.model.states[most], "change": moves[most], "period": bool(v.model.dt)}
 
 
 def _measured(case: Case, v: Variant, wire: str) -> tuple[Any, Any]:

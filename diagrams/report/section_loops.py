@@ -16,16 +16,10 @@ from ..frequency.realization import Realization
 from . import plots as figures
 from .case import FRICTION, SIDES, Case, in_s
 from .model import Section, Table
+from .templating import Texts
 from .uncertainty import left_out, widened
 
-DEFINITIONS = (
-    "L is the loop transfer function at a wire that is cut behind its source for all its consumers, all other loops "
-    "closed, with the sign that makes S = 1/(1 + L) and T = L/(1 + L). Gain margins are factors of L, low "
-    "and high; the "
-    "phase margin is the smallest rotation to either side, the delay margin the smallest delay in series that ends "
-    "stability; the modulus margin is 1/M_s, the smallest distance of L to −1; the disk margin is α of the symmetric "
-    "disk, 1/max|S − T| times 2; the bandwidth is where |T| falls by 3.0103 dB."
-)
+TEXTS = Texts(__package__, "loops")
 ROWS: Mapping[str, str] = {
     "gain_margin_low": "gain margin, low",
     "gain_margin_high": "gain margin, high",
@@ -76,7 +70,7 @@ def _key(name: str) -> str:
 
 def inner(case: Case) -> Section:
     """Return the section about the loops, one part for each wire."""
-    text, parts = [DEFINITIONS], []
+    text, parts = [*TEXTS.paragraphs("margins")], []
     for key, wire in wires_on_loops(case).items():
         part = _wire(case, key, wire)
         if part is None:
@@ -86,7 +80,7 @@ def inner(case: Case) -> Section:
     if case.is_fig3:
         parts += _motor_forces(case)
     if not parts and len(text) == 1:
-        text.append("No wire of this diagram lies on a loop that has dynamics.")
+        text.append(TEXTS.line("no_loop"))
     return Section("inner", "Inner loops", tuple(text), sections=tuple(parts))
 
 
@@ -108,19 +102,17 @@ def _wire(case: Case, key: str, wire: str) -> Section | None:
         found[v.key], loops[v.key] = m, L
         numbers |= {f"{v.key}.{name}": number for name, number in _numbers(m).items()}
         if m.hidden_unstable:
-            notes.append(
-                f"{v.title}: modes that this loop does not show are not stable, with poles at "
-                f"{_poles(m.hidden_unstable, L.dt)} 1/s. The margins say nothing of them."
-            )
+            shown = _poles(m.hidden_unstable, L.dt)
+            notes.append(TEXTS.line("hidden_unstable", variant=v.title, poles=shown))
         if not m.stable:
-            notes.append(f"{v.title}: the closed loop is not stable, so that it has no margins.")
+            notes.append(TEXTS.line("unstable", variant=v.title))
         elif not v.key.endswith(FRICTION):
             try:
                 with np.errstate(all="ignore"):
                     r = Realization.of(L)
                     rows = compared(r, m, _as_control(r))
             except (LoopwrightError, np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
-                notes.append(f"{v.title}: python-control's values can't be judged ({error}).")
+                notes.append(TEXTS.line("not_compared", variant=v.title, error=error))
                 continue
             for c in rows:
                 numbers[f"{v.key}.control.{c.name}"] = _theirs(m, c)

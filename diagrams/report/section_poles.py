@@ -96,7 +96,7 @@ def _asked(case: Case, side: str, wire: str, block: Any, numbers: dict[str, Numb
     asked = np.array([1.0, block.a2, block.a1, block.a0])
     wanted = np.sort_complex(np.roots(asked))
     centre = -float(block.a2) / 3
-    numbers[f"{side}.asked.mean"] = Number(centre, "1/s", 1e-15 * abs(centre), "given: −a₂/3")
+    numbers[f"{side}.asked.mean"] = Number(centre, "1/s", 1e-15 * abs(centre), "given: −a₂/3", given=True)
     rows: list[tuple[Any, ...]] = [("asked", _listed(_cleaned(asked, wanted)), "")]
     gains: list[tuple[Any, ...]] = []
     for v in case.usable():

@@ -10,9 +10,16 @@ import numpy as np
 
 from ...blocks.core.block import Block
 from ..frequency.number import Number
+from ..results.operating_point import PointOrigin
 from .case import AT_REST, Case
 from .model import Section, Table
+from .templating import Texts
+from .values import symbol
 
+TEXTS = Texts(__package__, "subject")
+
+CONFIRMED = {PointOrigin.RUN: "the run's own next tick and rates", PointOrigin.TRIM: "the trim's equations"}
+"""How the residual of an operating point is confirmed."""
 PACKAGES = ("loopwright", "numpy", "scipy", "casadi", "control", "fmpy", "matplotlib")
 
 
@@ -36,7 +43,7 @@ def subject(case: Case) -> Section:
         rate = diagram.structure.rate(path)
         name = path or diagram.name
         if rate is not None and frame.sample_time is not None:
-            numbers[f"{path or 'diagram'}.sample_time"] = Number(float(rate), "s", 0.0, "given, exact")
+            numbers[f"{path or 'diagram'}.sample_time"] = Number(float(rate), "s", 0.0, "given, exact", given=True)
         rated = "continuous" if rate is None else f"{float(rate):g} s"
         frames.append(
             (name, rated, frame.method if rate is not None else "", frame.delay, f"{float(frame.offset):g} s")
@@ -44,9 +51,9 @@ def subject(case: Case) -> Section:
     for path, block in sorted(diagram.blocks.items()):
         rows = list(_parameters(block))
         for name, shown, unit, value in rows:
-            parameters.append((path, type(block).__name__, name, shown, unit))
+            parameters.append((path, type(block).__name__, name, shown, symbol(unit)))
             if isinstance(value, float) and np.isfinite(value):
-                numbers[f"{path}.{name}"] = Number(value, unit or "1", 0.0, "given")
+                numbers[f"{path}.{name}"] = Number(value, unit or "1", 0.0, "given", given=True)
         if not rows:
             parameters.append((path, type(block).__name__, "", "", ""))
         if hasattr(block, "description"):
@@ -63,7 +70,7 @@ def subject(case: Case) -> Section:
         tables.append(Table("FMUs", columns, tuple(plants)))
     tables.append(Table("Blocks and parameters", ("block", "type", "parameter", "value", "unit"), tuple(parameters)))
     tables.append(Table("Versions", ("package", "version"), tuple(versions().items())))
-    text = [f"The diagram “{diagram.name}”: {len(diagram.blocks)} blocks, {len(diagram.names)} named wires."]
+    text = [TEXTS.line("diagram", name=diagram.name, blocks=len(diagram.blocks), wires=len(diagram.names))]
     if case.experiment is not None:
         text.append(
             f"Experiment {case.experiment.letter}: {case.experiment.title.partition(':')[0].replace('_', ' ')}."
@@ -119,8 +126,8 @@ def operating_points(case: Case) -> Section:
     rows, notes = [], []
     for v in case.usable():
         point, model = v.point, v.model
-        how = {"run": "the run's own next tick and rates", "trim": "the trim's equations"}.get(point.how, point.how)
-        numbers[f"{v.key}.t"] = Number(point.t, "s", 0.0, "given")
+        how = CONFIRMED.get(point.how, str(point.how))
+        numbers[f"{v.key}.t"] = Number(point.t, "s", 0.0, "given", given=True)
         numbers[f"{v.key}.residual"] = Number(point.residual, "1", 1e-15, how)
         worst = float(np.max(np.abs(model.affine), initial=0.0))
         numbers[f"{v.key}.affine"] = Number(worst, "1", 1e-12 * (1 + worst), "the linear model's affine term")
@@ -130,7 +137,7 @@ def operating_points(case: Case) -> Section:
             notes.append(_moving(v))
         hidden = [p for p, b in v.diagram.blocks.items() if hasattr(b, "description") and not b.description.states]
         if hidden:
-            notes.append(f"{v.title}: {', '.join(sorted(hidden))} shows no states; the residual does not count them.")
+            notes.append(TEXTS.line("hidden_states", variant=v.title, plants=sorted(hidden)))
         notes += [f"{v.title}: {note}" for note in model.notes]
     tables = [
         Table("Operating points", ("variant", "t", "how", "residual", "largest of", "derivative of FMUs"), tuple(rows))
@@ -143,27 +150,18 @@ def operating_points(case: Case) -> Section:
             if f"{wire.block}.{wire.port}" in first.point.values
         ]
         tables.append(Table(f"Named wires there ({first.title})", ("wire", "value"), tuple(values)))
-    text = (
-        (
-            "The linear models below are made at these points. The residual is the largest change of a "
-            "state over the next tick, "
-            "and of a continuous state, an FMU's as well, in one second, relative to 1 + its size; it is 0 at rest."
-        ),
-        *notes,
-    )
+    text = (*TEXTS.paragraphs("operating_points"), *notes)
     return Section("operating_points", "Operating points", text, tuple(tables), (), numbers)
 
 
 def _moving(v: Any) -> str:
     """Return what is said of an operating point that is no equilibrium."""
     point, model = v.point, v.model
-    start = f"{v.title}: not an equilibrium (residual {point.residual:.3g}, of {point.largest}); "
     moving = [i for i, change in enumerate(model.affine) if not abs(change) <= AT_REST]
     fed = model.A - np.eye(len(model.A)) if model.dt else model.A
-    if moving and np.max(np.abs(fed[:, moving])) <= 1e-9 * (model.dt or 1.0):
-        names = ", ".join(model.states[i] for i in moving)
-        return f"{start}nothing but {names} moves, on which nothing depends: all else is as at an equilibrium."
-    return f"{start}the linear model follows the motion through one period only."
+    alone = moving and np.max(np.abs(fed[:, moving])) <= 1e-9 * (model.dt or 1.0)
+    names = [model.states[i] for i in moving] if alone else []
+    return TEXTS.line("moving", variant=v.title, point=point, alone=names)
 
 
 def _value(v: Any, wire: Any) -> Any:

@@ -10,18 +10,20 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core.errors import LoopwrightError
+from ...fmus.running.derivation import DerivativeMethod
 from ..frequency.margins import margins
 from ..frequency.number import Number
+from ..linearization.findings import StepsOnly
 from ..linearization.linearize import linearize
 from .case import Case, Variant
 from .model import Section, Table
+from .templating import Texts
 
 LINEAR = 1e-3
 """A difference between an FMU's step and its equations beyond which it is not the solver's: it moves as it steps."""
 NOTHING = 1e-12
 """What is left of a loop that is zero, by rounding."""
-WAYS = ("differences", "identified")
-"""How the derivatives of an FMU are said to be found that are not exact."""
+TEXTS = Texts(__package__, "loops")
 
 
 def left_out(case: Case, wire: str, on_cycles: Collection[str]) -> list[str]:
@@ -48,11 +50,9 @@ def _zero(v: Variant, wire: str, on_cycles: Collection[str]) -> str:
     names = v.diagram.names
     block = names[wire].block if wire in names else wire.rpartition(".")[0]
     if block not in on_cycles:
-        return f"{wire} does not lie on a loop."
-    steps = [note for note in v.model.notes if "in steps only" in note]
-    return f"{wire} lies on a loop, but the loop's slope is zero at the operating point, so that it has no margins" + (
-        ": " + "; ".join(steps) + ". For margins of the loop on average, take the quantization out." if steps else "."
-    )
+        return TEXTS.line("off_loops", wire=wire)
+    steps = [str(finding) for finding in v.model.findings if isinstance(finding, StepsOnly)]
+    return TEXTS.line("slope_is_zero", wire=wire, steps=steps)
 
 
 def widened(case: Case, wire: str, part: Section) -> Section:
@@ -65,7 +65,7 @@ def widened(case: Case, wire: str, part: Section) -> Section:
     changed: dict[int, Number] = {}
     numbers, text = dict(part.numbers), list(part.text)
     for v in case.usable():
-        if not any(how.startswith(WAYS) for how in v.model.how.values()):
+        if all(derivation.is_exact for derivation in v.model.derivations.values()):
             continue
         own = {path: n for path, n in numbers.items() if path.startswith(f"{v.key}.") and ".control." not in path}
         w = [n.value for n in own.values() if n.unit == "rad/s" and 0 < n.value < math.inf]
@@ -86,7 +86,7 @@ def widened(case: Case, wire: str, part: Section) -> Section:
 
 def _floor(n: Number, error: float) -> float:
     """Return the error of a number that a relative error of L makes."""
-    if not math.isfinite(n.value) or n.confirmed_by.startswith("winding") or n.value == 0.0:
+    if not math.isfinite(n.value) or n.value == 0.0:
         return 0.0
     if n.unit == "deg":
         return math.degrees(error)
@@ -111,18 +111,15 @@ def _relative_error(v: Variant, wire: str, w: np.ndarray) -> tuple[float, str]:
     error = 0.0
     for _ in range(4):
         error = max(error, off(_Moved(*(M * (1 + relative * rng.choice([-1, 1], M.shape)) for M in _matrices(L)))))
-    if not any("differences of steps" in how for how in v.model.how.values()):
+    if not any(d.method is DerivativeMethod.STEP_DIFFERENCES for d in v.model.derivations.values()):
         return error, ""
     try:
         held = linearize(v.diagram, v.point, plants="equations").loop(wire)
     except LoopwrightError:
-        return error, "an FMU tells no equations, so that its own solver's error is not in the tolerances."
+        return error, TEXTS.line("no_equations")
     solver = off(held)
     if solver > LINEAR:
-        return error, (
-            f"the FMU's step and its equations at the point give responses that differ by {solver:.2g}: it moves "
-            "during the step, or its solver's own step is coarse. That is not in the tolerances."
-        )
+        return error, TEXTS.line("coarse_step", difference=solver)
     return error + solver, ""
 
 

@@ -110,7 +110,7 @@ def test_confirmations_stand_below_the_table_by_letters():
 
 def test_kinds_of_confirmation_stand_once_and_why_there_is_no_value():
     numbers = [Number(1.0, "1", 0.0, f"eigenvalues: stable at {x}, unstable at {2 * x}") for x in (0.5, 1.5)]
-    numbers += [Number(math.nan, "1", math.nan, "the loop is not sampled"), Number(2.0, "1", 0.0, "given")]
+    numbers += [Number(math.nan, "1", math.nan, "the loop is not sampled"), Number(2.0, "1", 0.0, "given", given=True)]
     html = to_html(Report("R", (Section("s", "S", tables=(Table("T", ("x",), tuple((n,) for n in numbers)),)),)))
     notes = re.search(r'<p class="note">(.*?)</p>', html)[1].split("<br>")
     assert [re.sub("<.*?>", "", note) for note in notes] == [

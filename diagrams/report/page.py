@@ -1,0 +1,181 @@
+"""The content of a report's page, as its templates show it: everything numbered, with anchors, nothing escaped yet."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+from ..frequency.number import Number
+from .definitions import LOOP, LOOP_TERMS, definition
+from .figures import Picture, embedded
+from .model import Plot, Report, Section
+from .tables import Numbered, TableView, anchor
+from .values import cell, symbol, tolerance_text, value_text
+
+ITEM = "- "
+"""Beginning of a text that is an item of a list."""
+
+
+@dataclass(frozen=True)
+class FigureView:
+    """A figure with its number."""
+
+    number: int
+    anchor: str
+    caption: str
+    picture: Picture
+
+
+@dataclass(frozen=True)
+class SectionView:
+    """A section with its number, such as "1.2"; ``level`` is that of its heading."""
+
+    number: str
+    anchor: str
+    level: int
+    title: str
+    text: tuple[tuple[bool, tuple[str, ...]], ...]
+    """Paragraphs, and lists (True) of items."""
+    drawings: tuple[FigureView, ...]
+    tables: tuple[TableView, ...]
+    figures: tuple[FigureView, ...]
+    sections: tuple[SectionView, ...]
+
+    @property
+    def kept(self) -> bool:
+        """Whether the heading is kept together with the first thing below it, which is no text."""
+        first = (*self.drawings, *self.tables, *self.figures)[:1]
+        return not self.text and any(not isinstance(of, TableView) or not of.is_long for of in first)
+
+
+@dataclass(frozen=True)
+class NumberView:
+    """A line of the appendix: a number by its dotted path."""
+
+    path: str
+    anchor: str
+    value: str
+    unit: str
+    tolerance: str
+    reason: int
+    """Number of its confirmation in the list below."""
+    term: TermView | None
+
+
+@dataclass(frozen=True)
+class TermView:
+    """A term with its definition."""
+
+    term: str
+    anchor: str
+    definition: str
+
+
+@dataclass(frozen=True)
+class Page:
+    """A report's page."""
+
+    title: str
+    about: tuple[tuple[str, str], ...]
+    """Names and values of the lines below the title."""
+    sections: tuple[SectionView, ...]
+    numbers: tuple[tuple[NumberView, ...], ...]
+    """All numbers, by the sections that they stand in."""
+    reasons: tuple[str, ...]
+    """How numbers were confirmed."""
+    terms: tuple[TermView, ...]
+    loop: str
+    """The definition of the loop, where terms take it for granted."""
+
+    @classmethod
+    def of(cls, report: Report) -> Page:
+        """Return the page of a report."""
+        numbers = report.numbers()
+        more: Mapping[str, str] = report.meta.get("definitions") or {}
+        reasons = list(dict.fromkeys(n.confirmed_by for n in numbers.values()))
+        known = {path: _term(path, more) for path in numbers}
+        lines = [
+            NumberView(
+                path,
+                anchor("n", path),
+                value_text(number, 10),
+                symbol(number.unit),
+                tolerance_text(number),
+                reasons.index(number.confirmed_by) + 1,
+                known[path],
+            )
+            for path, number in numbers.items()
+        ]
+        tops = dict.fromkeys(path.partition(".")[0] for path in numbers)
+        terms = tuple(dict.fromkeys(term for term in known.values() if term is not None))
+        return cls(
+            report.title,
+            tuple(_about(report.meta)),
+            _Numbering(numbers).sections(report.sections, "", ""),
+            tuple(tuple(line for line in lines if line.path.partition(".")[0] == top) for top in tops),
+            tuple(reasons),
+            terms,
+            LOOP if LOOP_TERMS & {term.term for term in terms} else "",
+        )
+
+
+class _Numbering:
+    """Sections, tables and figures of a page, numbered in the order in which they are shown."""
+
+    def __init__(self, numbers: Mapping[str, Number]):
+        self.tables = Numbered(numbers)
+        self.figures: dict[str, None] = {}
+
+    def sections(self, sections: Sequence[Section], prefix: str, number: str) -> tuple[SectionView, ...]:
+        """Return sections that stand side by side."""
+        return tuple(self._section(s, prefix + s.key, f"{number}{i}") for i, s in enumerate(sections, 1))
+
+    def _section(self, section: Section, key: str, number: str) -> SectionView:
+        ahead = tuple(self._figure(plot) for plot in section.plots if plot.ahead)
+        return SectionView(
+            number,
+            anchor("s", key),
+            min(number.count(".") + 2, 4),
+            section.title,
+            tuple((listed, tuple(texts)) for listed, texts in _grouped(section.text)),
+            ahead,
+            tuple(map(self.tables.view, section.tables)),
+            tuple(self._figure(plot) for plot in section.plots if not plot.ahead),
+            self.sections(section.sections, f"{key}.", f"{number}."),
+        )
+
+    def _figure(self, plot: Plot) -> FigureView:
+        key = plot.key
+        while key in self.figures:
+            key += "_"
+        self.figures[key] = None
+        name = anchor("f", key)
+        return FigureView(len(self.figures), name, plot.caption, embedded(plot.figure, name))
+
+
+def _term(path: str, more: Mapping[str, str]) -> TermView | None:
+    found = definition(path, more)
+    return None if found is None else TermView(found[0], anchor("d", found[0]), found[1])
+
+
+def _grouped(texts: Sequence[str]) -> Any:
+    """Yield paragraphs and the lists among them, told apart by True, without the marks of their items."""
+    for listed, group in groupby(texts, lambda text: text.startswith(ITEM)):
+        yield listed, [text.removeprefix(ITEM) for text in group]
+
+
+def _about(meta: Mapping[str, Any]) -> Any:
+    """Yield the names and values of what was analysed, when and with which versions."""
+    for key, value in meta.items():
+        if key == "definitions" or value in (None, "", {}, ()):
+            continue
+        if isinstance(value, Mapping):
+            pairs = {str(k): cell(v) for k, v in value.items()}
+            plainly = all(len(text.split()) == 1 for text in pairs.values())
+            said = [v if k == v else f"{k}{' ' if plainly else ': '}{v}" for k, v in pairs.items()]
+            value = (", " if plainly else "; ").join(said)
+        elif isinstance(value, list | tuple):
+            value = ", ".join(map(cell, value))
+        yield str(key).replace("_", " "), cell(value)

@@ -1,0 +1,174 @@
+"""Tables as a page shows them: units in their headings, numbers with links, their confirmations by letters below."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from ..frequency.number import Number
+from .model import Table
+from .values import cell, is_numeric, quantity, symbol, tolerance_text, value_text
+
+LONG = 30
+"""Rows above which a table may go over to the next page."""
+WIDE = 6
+"""Columns above which a table is set small."""
+NO_VALUE = "no value"
+
+
+@dataclass(frozen=True)
+class Heading:
+    """The head of a column, with the unit that all its numbers share."""
+
+    text: str
+    unit: str
+    right: bool
+
+
+@dataclass(frozen=True)
+class CellView:
+    """A cell; ``kind`` is "right" for numbers, "again" where it repeats what stands above it.
+
+    Of a number ``about`` tells the path, the tolerance and the confirmation; ``anchor`` is where it stands in the
+    appendix, empty where it doesn't.
+    """
+
+    text: str
+    kind: str
+    is_head: bool
+    is_number: bool = False
+    anchor: str = ""
+    about: str = ""
+    letter: str = ""
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """A line below a table: how numbers were confirmed, and their letter where there are several."""
+
+    letter: str
+    text: str
+
+
+@dataclass(frozen=True)
+class TableView:
+    """A table with its number."""
+
+    number: int
+    title: str
+    headings: tuple[Heading, ...]
+    rows: tuple[tuple[CellView, ...], ...]
+    note: str
+    confirmations: tuple[Confirmation, ...]
+
+    @property
+    def is_long(self) -> bool:
+        """Whether it may go over to the next page."""
+        return len(self.rows) > LONG
+
+    @property
+    def is_wide(self) -> bool:
+        """Whether it is set small."""
+        return len(self.headings) > WIDE
+
+
+class Numbered:
+    """Tables of a page in the making, numbered from 1.
+
+    Parameters
+    ----------
+    numbers : mapping
+        The report's numbers by path, which those in tables lead to.
+    """
+
+    def __init__(self, numbers: Mapping[str, Number]):
+        self.count = 0
+        self.paths: dict[int, str] = {}
+        self.equal: dict[Number, str] = {}
+        for path, number in numbers.items():
+            self.paths.setdefault(id(number), path)
+            self.equal.setdefault(number, path)
+
+    def view(self, table: Table) -> TableView:
+        """Return the next table."""
+        self.count += 1
+        columns = range(len(table.columns))
+        units = [_common_unit(table, i) for i in columns]
+        right = [is_numeric([row[i] for row in table.rows if i < len(row)]) for i in columns]
+        heads = zip(table.columns, units, right, strict=True)
+        headings = [Heading(str(text), _heading_unit(text, unit), flush) for text, unit, flush in heads]
+        reasons = _grouped(v for row in table.rows for v in row if isinstance(v, Number))
+        letters = {kind: _letter(i) for i, kind in enumerate(reasons)} if len(reasons) > 1 else {}
+        rows = []
+        for above, row in zip([(), *table.rows], table.rows, strict=False):
+            cells = []
+            for i, value in enumerate(row):
+                again = not right[i] and i < len(columns) - 1 and above[: i + 1] == row[: i + 1]
+                kind = "again" if again else "right" if right[i] else ""
+                cells.append(self._cell(value, kind, letters, first=i == 0, with_unit=units[i] is None))
+            rows.append(tuple(cells))
+        said = tuple(Confirmation(letters.get(kind, ""), _said(*why)) for kind, why in reasons.items() if why[1])
+        return TableView(self.count, table.title, tuple(headings), tuple(rows), table.note, said)
+
+    def _cell(self, value: Any, kind: str, letters: Mapping[str, str], *, first: bool, with_unit: bool) -> CellView:
+        if not isinstance(value, Number):
+            return CellView(cell(value), kind, first)
+        path = self.paths.get(id(value)) or self.equal.get(value)
+        text = quantity(value) if with_unit else value_text(value)
+        about = f"{path + ': ' if path else ''}{tolerance_text(value)}; confirmed by {value.confirmed_by}"
+        letter = letters.get(_kind(_reason(value)), "")
+        return CellView(text, kind, False, True, anchor("n", path) if path else "", about, letter)
+
+
+def anchor(kind: str, key: str) -> str:
+    """Return an id: a letter for what it is, then the key, in characters that need no quoting in a link."""
+    return f"{kind}-" + re.sub(r"[^A-Za-z0-9._-]", lambda m: f"_{ord(m[0]):x}_", key)
+
+
+def _kind(reason: str) -> str:
+    """Return how a number was confirmed without the numbers in it."""
+    return re.sub(r"[-−]?\d[\d.]*(?:e[-+]?\d+)?(?:, [-−]?\d[\d.]*(?:e[-+]?\d+)?)*", "…", reason)
+
+
+def _grouped(numbers: Iterable[Number]) -> dict[str, tuple[Number, str]]:
+    """Return each kind of confirmation once: as it is where that is the same for all, else without its numbers."""
+    found: dict[str, tuple[Number, str]] = {}
+    for number in numbers:
+        reason = _reason(number)
+        kind = _kind(reason)
+        found[kind] = (number, kind if found.get(kind, (number, reason))[1] != reason else reason)
+    return found
+
+
+def _reason(number: Number) -> str:
+    """Return how a number was confirmed, or why there is none."""
+    return f"{NO_VALUE}: {number.confirmed_by}" if math.isnan(number.value) else number.confirmed_by
+
+
+def _said(number: Number, why: str) -> str:
+    """Return a sentence on how a number was confirmed."""
+    text = why[0].upper() + why[1:] if number.given or math.isnan(number.value) else f"Confirmed by {why}"
+    return text if text.endswith(("…", ".")) else f"{text}."
+
+
+def _common_unit(table: Table, column: int) -> str | None:
+    """Return the unit of all numbers in a column; None where they differ."""
+    units = {row[column].unit for row in table.rows if column < len(row) and isinstance(row[column], Number)}
+    if not units:
+        return "1"
+    return units.pop() if len(units) == 1 else None
+
+
+def _heading_unit(heading: str, unit: str | None) -> str:
+    """Return the unit that stands behind a heading; none where the heading names it already."""
+    if unit is None or unit == "1":
+        return ""
+    words = re.split(r"[\s(),\[\]]+", str(heading))
+    return "" if {unit, symbol(unit), f"/{unit}"} & set(words) else symbol(unit)
+
+
+def _letter(i: int) -> str:
+    return chr(97 + i) if i < 26 else _letter(i // 26 - 1) + chr(97 + i % 26)

@@ -1,0 +1,87 @@
+"""Templates: pages that escape what they show, and the report's longer texts, kept beside the code that fills them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jinja2 import Environment, Template
+
+TEXTS = ".txt.j2"
+"""Ends of the names of templates with plain text, which is escaped where a page shows it."""
+
+
+@cache
+def environment(package: str) -> Environment:
+    """Return the templates of a package, in its folder ``templates``.
+
+    Names that a template asks for and nobody gave are errors. All templates escape but those of plain text.
+
+    Parameters
+    ----------
+    package : str
+        Import name of the package, such as ``__package__``.
+    """
+    import jinja2
+
+    made = jinja2.Environment(
+        loader=jinja2.PackageLoader(package),
+        undefined=jinja2.StrictUndefined,
+        autoescape=lambda name: name is None or not name.endswith(TEXTS),
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    made.filters["digits"] = lambda value, most: f"{value:.{most}g}"
+    return made
+
+
+@dataclass(frozen=True)
+class Texts:
+    """The texts of a section: macros of a template, filled with facts.
+
+    Parameters
+    ----------
+    package : str
+        Import name of the package that has the template.
+    name : str
+        The template's name, without its ending.
+
+    Examples
+    --------
+    >>> Texts("loopwright.diagrams.report", "figures").line("sensitivities", wire="u")
+    'Sensitivity S and complementary sensitivity T at u; ○ are M_s and M_t.'
+    """
+
+    package: str
+    name: str
+
+    def paragraphs(self, macro: str, **facts: Any) -> tuple[str, ...]:
+        """Return the paragraphs of a macro, which blank lines part; a line's end is a space.
+
+        Parameters
+        ----------
+        macro : str
+            Name of the macro.
+        **facts
+            Its arguments.
+
+        Raises
+        ------
+        jinja2.UndefinedError
+            A macro that isn't there, or a fact that it needs and nobody gave.
+        """
+        text = str(getattr(self._template().module, macro)(**facts))
+        parts = (re.sub(r"[ \n]+", " ", part).strip() for part in re.split(r"\n[ \n]*\n", text))
+        return tuple(part for part in parts if part)
+
+    def line(self, macro: str, **facts: Any) -> str:
+        """Return the one paragraph of a macro; see `paragraphs`."""
+        (text,) = self.paragraphs(macro, **facts)
+        return text
+
+    def _template(self) -> Template:
+        return environment(self.package).get_template(self.name + TEXTS)
