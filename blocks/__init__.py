@@ -4,7 +4,6 @@ A block's equations are written once, as NumPy-style functions of (t, x, u), and
 compiled from there. Everything here is public; nothing here imports the rooms above.
 """
 
-from .core import explain_moved_modules
 from .core.arithmetic import Gain, Product, Sum
 from .core.block import Block
 from .core.errors import (
@@ -66,8 +65,6 @@ from .path_following.transverse import (
 )
 from .paths import Circle, CubicSpline, Ellipse, Frame, Line, Path
 from .tracing.discretization import hold
-
-explain_moved_modules()
 
 __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "AdmittanceFilter",

@@ -1,6 +1,7 @@
 """The base of all blocks: ports, signals, values, units and errors."""
 
-from . import arithmetic, source  # operators on signals make their blocks
-from .moved import explain_moved_modules
+from . import arithmetic, moved, source  # operators on signals make their blocks
 
-__all__ = ["arithmetic", "explain_moved_modules", "source"]
+__all__ = ["arithmetic", "moved", "source"]
+
+moved.explain_moved_modules()
