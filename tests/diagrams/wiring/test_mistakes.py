@@ -530,7 +530,7 @@ def test_an_equation_that_cannot_be_traced_says_the_line():
             return math.sin(u.u)
 
     with pytest.raises(
-        TraceError, match=r"bad: its output can't be traced in line \d+ of .*test_wiring\.py.*not math\.sqrt"
+        TraceError, match=r"bad: its output can't be traced in line \d+ of .*test_mistakes\.py.*not math\.sqrt"
     ):
         Diagram("d", Bad()(Constant(value=1.0)))
 
