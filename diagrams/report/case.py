@@ -15,6 +15,7 @@ from ...fmus.models.gantry import Gantry
 from ..admittance.compliance_loop import control_rate
 from ..admittance.shown_plant import is_discrete, show_plant
 from ..flat.wired_diagram import WiredDiagram
+from ..linearization.findings import UnusualStart
 from ..linearization.linearize import Linearization, linearize
 from ..results.operating_point import OperatingPoint
 from .points import point_of
@@ -277,7 +278,7 @@ class Case:
         variant = Variant(key, title, diagram, self.point, delay, problem, self.diagram, **wires)
         if not problem:
             try:
-                later = self.point is None and any("unlike every later tick" in note for note in variant.model.notes)
+                later = self.point is None and any(isinstance(f, UnusualStart) for f in variant.model.findings)
                 if later:
                     at = LATER * variant.model.dt
                     variant = Variant(key, title, diagram, at, delay, problem, self.diagram, **wires)

@@ -1,0 +1,138 @@
+"""The house's own rules, read from the sources: nothing depends on words of English texts."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+SOURCES = sorted(path for room in ("blocks", "fmus", "diagrams") for path in (ROOT / room).rglob("*.py"))
+
+SEARCHES = {
+    "count", "endswith", "find", "index", "partition", "removeprefix", "removesuffix", "rfind", "rindex", "rpartition",
+    "rsplit", "split", "startswith",
+}  # fmt: skip
+PATTERNS = {"compile", "findall", "finditer", "fullmatch", "match", "search", "split"}
+TEXTS = {"args", "confirmed_by", "how", "message", "note", "notes", "title"}
+"""Attributes that hold texts for people."""
+WORDS = re.compile(r"[A-Za-z]{2,}[^\n]* |\A[A-Z]?[a-z]{4,}[a-z ,.;:]*\Z| [^\n]*[A-Za-z]{2,}")
+"""A text with a space beside a word, or a word alone."""
+
+ALLOWED = {
+    "blocks/core/block.py": {"trapezoidal step"},  # the name of a guard, not a text about it
+    "blocks/library/python_control.py": {"Discrete"},  # the beginning of a class's name
+    "diagrams/report/figures.py": {r'<svg[^>]*?\bwidth="([\d.]+)(pt|px)?" height="([\d.]+)'},  # Matplotlib's SVG
+    "fmus/checks/summary.py": {
+        r"^\s*(\S+) => not found",
+        r"undefined symbol:\s*([^\s,]+)",
+        "linux",
+    },  # ldd's output; sys.platform
+    "fmus/checks/validation.py": {"has no start value", "is not defined"},  # FMPy's problems are texts alone
+    "fmus/export/c_code.py": {"int "},  # in the C code that CasADi writes
+    "fmus/export/compiler.py": {"windows"},  # the end of a platform's name
+    "fmus/export/python_slave.py": {"linux"},  # sys.platform
+}
+"""Literals that may be searched for, by file: the texts are not for people, or foreign code gives nothing else."""
+
+
+def literals(node):
+    """Yield the texts within an expression that are searched for: constants, tuples of them, parts of f-strings."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        yield node.value
+    elif isinstance(node, ast.JoinedStr | ast.Tuple | ast.List | ast.Set):
+        for part in getattr(node, "values", getattr(node, "elts", ())):
+            yield from literals(part)
+    elif isinstance(node, ast.Name) and node.id in CONSTANTS:
+        yield from literals(CONSTANTS[node.id])
+
+
+CONSTANTS = {}
+for source in SOURCES:
+    for statement in ast.parse(source.read_text(encoding="utf-8")).body:
+        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
+            CONSTANTS[statement.targets[0].id] = statement.value
+
+
+def is_text(node):
+    """Whether an expression is a text for people: ``str(error)``, ``error.message``, ``number.confirmed_by``."""
+    for part in ast.walk(node):
+        if isinstance(part, ast.Attribute) and part.attr in TEXTS:
+            return True
+        if isinstance(part, ast.Call) and isinstance(part.func, ast.Name) and part.func.id in ("str", "repr"):
+            return bool(part.args) and isinstance(part.args[0], ast.Name) and "err" in part.args[0].id
+    return False
+
+
+def prose_read(tree):
+    """Yield (line, literal) wherever a text is searched for words, or compared with some."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Compare):
+            sides = [node.left, *node.comparators]
+            within = isinstance(node.ops[0], ast.In | ast.NotIn)
+            if within and is_text(node.comparators[0]):
+                yield from ((node.lineno, text) for text in literals(node.left))
+            spaced = (
+                text for side in sides for text in literals(side) if " " in text.strip() or (" " in text and within)
+            )
+            yield from ((node.lineno, text) for text in spaced if re.search("[A-Za-z]{2,}", text))
+            if not within and any(is_text(side) for side in sides):
+                yield from ((node.lineno, text) for side in sides for text in literals(side))
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            of_re = isinstance(node.func.value, ast.Name) and node.func.value.id == "re"
+            if (of_re and node.func.attr in PATTERNS) or (not of_re and node.func.attr in SEARCHES):
+                texts = [text for argument in node.args[:1] for text in literals(argument)]
+                yield from ((node.lineno, text) for text in texts if re.search(" [a-z]|[a-z] ", text) if of_re)
+                yield from ((node.lineno, text) for text in texts if WORDS.search(text) if not of_re)
+
+
+def found_in(name):
+    return list(prose_read(ast.parse((ROOT / name).read_text(encoding="utf-8"))))
+
+
+@pytest.mark.parametrize("name", [path.relative_to(ROOT).as_posix() for path in SOURCES])
+def test_nothing_depends_on_words_of_a_text(name):
+    found = [(line, text) for line, text in found_in(name) if text not in ALLOWED.get(name, ())]
+    assert not found, f"{name}: facts belong into fields, enums and classes of errors, not into texts: {found}"
+
+
+def test_every_exception_is_still_needed():
+    for name, texts in ALLOWED.items():
+        assert texts <= {text for _, text in found_in(name)}, name
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        'if "in steps only" in note: pass',
+        'if how.startswith("differences"): pass',
+        "if how.startswith(WAYS_OF_A_TEST): pass",
+        'if "stands for several" in str(error): pass',
+        'if f" {name} " in f" {error.message} ": pass',
+        'if str(error).endswith("conjugate"): pass',
+        'if hint.startswith("Known"): pass',
+        'if problem.message == "interrupted": pass',
+        'if re.search("no start value", text): pass',
+        'if "winding" in number.confirmed_by: pass',
+        'if point.how == "run": pass',
+        'pin.endswith(" control")',
+    ],
+)
+def test_the_rule_sees_what_it_is_about(line, monkeypatch):
+    monkeypatch.setitem(CONSTANTS, "WAYS_OF_A_TEST", ast.parse('("differences", "identified")', mode="eval").body)
+    assert list(prose_read(ast.parse(line)))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        'if "plant" in options: pass',
+        'if name.startswith("_") or path.startswith("sources/"): pass',
+        'if kind == "input": pass',
+        'name.partition(".")',
+        '" · ".join(texts)',
+        'raise Error("found a word, expected " + "none") if x in ("a", "b") else None',
+    ],
+)
+def test_the_rule_leaves_names_alone(line):
+    assert not list(prose_read(ast.parse(line)))
