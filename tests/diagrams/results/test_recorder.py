@@ -14,9 +14,9 @@ from loopwright.blocks import OptionError, SimulationError, UnknownNameError
 from loopwright.diagrams import Layout, Occurrence, Run, Stopped, Wire
 from loopwright.diagrams.results import memory as _memory
 from loopwright.diagrams.results import recorder as _recorder
+from loopwright.diagrams.results.memory import check_memory
 from loopwright.diagrams.results.recorder import Recorder, select
 from loopwright.diagrams.results.stored import header
-from loopwright.diagrams.simulation.duration import check_memory
 
 LAYOUT = Layout.of({"a.y": (), "box.b.v": (2,), "box.c.z": ()})  # and two states
 WIRES = {"e": Wire("box.b", "v", 1), "box.w": Wire("a", "y")}
