@@ -165,7 +165,7 @@ def _plant(letter: str, options: Mapping[str, Any], given: Collection[str], posi
 
 def _build(
     letter: str,
-    title: str,
+    name: str,
     duration: float,
     options: dict[str, Any],
     start: tuple[float, float],
@@ -187,8 +187,8 @@ def _build(
         admittance_method=options["admittance_method"],
     )
     model = gantry.nominal.replace(friction_width=options["friction_width"])
-    diagram = fig3(plant, path, par, perp, environment=environment, model=model, rig=rig, name=title.split(":")[0])
-    return Experiment(letter, title, diagram, duration, options, path)
+    diagram = fig3(plant, path, par, perp, environment=environment, model=model, rig=rig, name=name)
+    return Experiment(letter, f"{name}: experiment {letter}", diagram, duration, options, path)
 
 
 def path_following(**options: Any) -> Experiment:
@@ -221,9 +221,7 @@ def path_following(**options: Any) -> Experiment:
     perp = SmoothStep(
         levels=(0.0, -0.03, 0.03, 0.0), start_times=(4.0, 8.5, 9.5), durations=(0.5, 0.5, 0.5), unit="m", name="xi_d"
     )
-    return _build(
-        "A", "path_following: experiment A", 11.0, o, (0.10, 0.01), Channel(par), Channel(perp), given=options
-    )
+    return _build("A", "path_following", 11.0, o, (0.10, 0.01), Channel(par), Channel(perp), given=options)
 
 
 def compliance(*, smooth_reference: bool = False, **options: Any) -> Experiment:
@@ -263,7 +261,7 @@ def compliance(*, smooth_reference: bool = False, **options: Any) -> Experiment:
         _admittance(o, 1, **IMPEDANCE_PERP),
         Step(times=(4.0, 11.0), values=(5.0, -5.0), unit="N", name="desired_force_perp"),
     )
-    return _build("B", "compliance: experiment B", 15.0, o, (0.0, 0.0), par, perp, given=options)
+    return _build("B", "compliance", 15.0, o, (0.0, 0.0), par, perp, given=options)
 
 
 def hand_guiding(**options: Any) -> Experiment:
@@ -301,7 +299,7 @@ def hand_guiding(**options: Any) -> Experiment:
     def hand(position: Any) -> Any:
         return HandForce(path, name="hand")(position, f_par=f_par, f_perp=f_perp)
 
-    return _build("C", "hand_guiding: experiment C", 12.0, o, (0.2, 0.0), par, perp, hand, given=options)
+    return _build("C", "hand_guiding", 12.0, o, (0.2, 0.0), par, perp, hand, given=options)
 
 
 def force_tracking(*, cubic: bool = False, **options: Any) -> Experiment:
@@ -335,7 +333,7 @@ def force_tracking(*, cubic: bool = False, **options: Any) -> Experiment:
     def spring(position: Any) -> Any:
         return PathSpring(path, **law, name="spring")(position)
 
-    return _build("D", "force_tracking: experiment D", 9.0, o, (0.2, 0.0), par, perp, spring, given=options)
+    return _build("D", "force_tracking", 9.0, o, (0.2, 0.0), par, perp, spring, given=options)
 
 
 def _damping(impedance: Mapping[str, float]) -> float:

@@ -84,7 +84,7 @@ def _title(experiment: Experiment, run: Run) -> str:
     """Return the experiment's name, when it stopped if that was early, and the options that are not the usual ones."""
     from .experiments import DEFAULTS
 
-    text = f"Experiment {experiment.letter}: {experiment.title.partition(':')[0].replace('_', ' ')}"
+    text = f"Experiment {experiment.letter}: {experiment.diagram.name.replace('_', ' ')}"
     if not len(run.t):
         text += ", no sample"
     elif run.t[-1] < experiment.duration * (1.0 - 1e-9):

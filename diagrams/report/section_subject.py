@@ -72,9 +72,7 @@ def subject(case: Case) -> Section:
     tables.append(Table("Versions", ("package", "version"), tuple(versions().items())))
     text = [TEXTS.line("diagram", name=diagram.name, blocks=len(diagram.blocks), wires=len(diagram.names))]
     if case.experiment is not None:
-        text.append(
-            f"Experiment {case.experiment.letter}: {case.experiment.title.partition(':')[0].replace('_', ' ')}."
-        )
+        text.append(f"Experiment {case.experiment.letter}: {case.experiment.diagram.name.replace('_', ' ')}.")
     if case.has_friction:
         text.append(
             "Where keys end with _friction, the diagram is analysed as it is, with the plant's friction and its "
