@@ -24,7 +24,7 @@ from ...fmus.export.python_fmu import build_python
 from ...fmus.models import gantry
 from ...fmus.platform import native_platform
 from .text import fit, say
-from .user_models import user_model
+from .user_models import load_user_model
 
 _WIDTH = 120  # of a table that goes into a file
 _MOST = 6  # numbers of a start value that are shown
@@ -54,8 +54,10 @@ def add_commands(commands: Any) -> None:
     build.add_argument(
         "--integrator", choices=("rk4", "dopri5", "rodas"), help="fixed step, adaptive, or implicit (default: rk4)"
     )
-    build.add_argument("--tolerance", type=_positive, help="relative tolerance of dopri5 and rodas")
-    build.add_argument("--internal-step", type=_positive, metavar="S", help="longest step of the integrator, in s")
+    build.add_argument("--tolerance", type=_parse_positive, help="relative tolerance of dopri5 and rodas")
+    build.add_argument(
+        "--internal-step", type=_parse_positive, metavar="S", help="longest step of the integrator, in s"
+    )
     build.add_argument("--no-arrays", action="store_true", help="a scalar variable for each element of a vector")
     build.add_argument(
         "--python", action="store_true", help="put the Python code inside, for equations that can't be traced"
@@ -82,7 +84,7 @@ def add_commands(commands: Any) -> None:
     check.add_argument("--no-run", action="store_true", help="don't run it: an FMU is a program of its maker's")
 
 
-def _positive(text: str) -> float:
+def _parse_positive(text: str) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -92,7 +94,7 @@ def _positive(text: str) -> float:
     return value
 
 
-def _existing(name: str) -> Path:
+def _check_file(name: str) -> Path:
     path = Path(name).expanduser()
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "there is no such file"
@@ -126,7 +128,7 @@ def run_build(arguments: argparse.Namespace) -> int:
     if out.is_file() and not out_is_file:
         raise OptionError(f"found the file {str(out)!r}; expected a folder, or a file that ends in .fmu.", port="--out")
     try:
-        with _model(arguments) as make:
+        with _find_model(arguments) as make:
             built = make(options, out if out_is_file else None, out)
         summary = summarize(built)
     except OptionError:
@@ -139,7 +141,7 @@ def run_build(arguments: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         say("loopwright: interrupted; nothing is written", sys.stderr)
         return 130
-    say(f"{built}  ({_size(summary['size'])})")
+    say(f"{built}  ({_size_text(summary['size'])})")
     say(f"FMI {summary['fmi_version']}, {' and '.join(INTERFACES[kind] for kind in summary['interfaces'])}")
     say(f"platforms: {', '.join(summary['platforms'])}")
     for note in summary["notes"]:
@@ -169,11 +171,11 @@ def _build_options(arguments: argparse.Namespace) -> dict[str, Any]:
             raise OptionError("found 3; an FMU with Python inside is one of FMI 2.0. Give --fmi 2.", port="--fmi")
         for name in ("platform", "integrator", "tolerance", "arrays"):
             if name in options:
-                raise OptionError("it can't be chosen with --python. Leave it out.", port=_option(name))
+                raise OptionError("it can't be chosen with --python. Leave it out.", port=_option_text(name))
     return options
 
 
-def _option(name: str) -> str:
+def _option_text(name: str) -> str:
     return "--no-arrays" if name == "arrays" else f"--{name.replace('_', '-')}"
 
 
@@ -182,22 +184,26 @@ Make = Callable[[dict[str, Any], Path | None, Path], Path]
 
 
 @contextlib.contextmanager
-def _model(arguments: argparse.Namespace) -> Iterator[Make]:
+def _find_model(arguments: argparse.Namespace) -> Iterator[Make]:
     """Give what builds the model that is asked for."""
     text = arguments.model
     if text in plants():
         module = importlib.import_module(f"{gantry.__package__}.{text}")
-        yield _maker(module.nominal, arguments.python, module.build, text)
+        yield _make_builder(module.nominal, arguments.python, module.build, text)
     elif text.endswith(".py") or ".py:" in text:
-        with user_model(text) as model:
-            yield _maker(model.block, arguments.python, build_model, type(model.block).__name__.lower(), model.beside)
+        with load_user_model(text) as model:
+            yield _make_builder(
+                model.block, arguments.python, build_model, type(model.block).__name__.lower(), model.beside
+            )
     else:
         hint = near(text, plants())  # it names all of them where none is close
         known = f" The plants: {', '.join(plants())}." if close_names(text, plants()) else ""
         raise OptionError(f"there is no model {text!r}. {hint}{known} A model of yours is FILE.py:Name.", port="MODEL")
 
 
-def _maker(block: Block, python: bool, build: Callable[..., Path], name: str, beside: Iterable[Path] = ()) -> Make:
+def _make_builder(
+    block: Block, python: bool, build: Callable[..., Path], name: str, beside: Iterable[Path] = ()
+) -> Make:
     def make(options: dict[str, Any], file: Path | None, folder: Path) -> Path:
         chosen = {"name": name, **options}
         target = file or folder / f"{chosen['name']}.fmu"
@@ -209,7 +215,7 @@ def _maker(block: Block, python: bool, build: Callable[..., Path], name: str, be
     return make
 
 
-def _size(n: int) -> str:
+def _size_text(n: int) -> str:
     return f"{n / 1e6:.2f} MB" if n >= 1e6 else f"{n / 1e3:.1f} kB"
 
 
@@ -218,7 +224,7 @@ def _size(n: int) -> str:
 
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright inspect``."""
-    path = _existing(arguments.file)
+    path = _check_file(arguments.file)
     try:
         summary = summarize(path)
     except FmuFileError as error:
@@ -226,7 +232,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(summary, indent=2))  # ASCII: it prints on any terminal
         return 0
-    for label, text in _about(summary):
+    for label, text in _summary_lines(summary):
         say(f"{label:<15}{text}")
     for note in summary["notes"]:
         say(f"{'note':<15}{note}")
@@ -234,7 +240,7 @@ def run_inspect(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _about(s: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
+def _summary_lines(s: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
     version = f", version {s['version']}" if s["version"] else ""
     yield "model", f"{s['model_name']}{version}"
     if s["description"]:
@@ -244,7 +250,7 @@ def _about(s: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
     for key in ("author", "license", "copyright"):
         if s[key]:
             yield key, s[key]
-    yield "file", f"{s['file']}  ({_size(s['size'])})"
+    yield "file", f"{s['file']}  ({_size_text(s['size'])})"
     yield "SHA-256", s["sha256"]
     yield "FMI", s["fmi_version"]
     for kind, attributes in s["interfaces"].items():
@@ -293,14 +299,14 @@ def _print_variables(variables: Iterable[Mapping[str, Any]], *, everything: bool
             causality = f"{v['causality']}, state" if v["state"] else v["causality"]
             shape = "×".join("?" if n is None else str(n) for n in v["shape"])
             cells = (v["name"], v["type"], shape, causality, v["variability"] or "", v["unit"] or "",
-                     _start(v["start"]), v["description"])  # fmt: skip
+                     _start_text(v["start"]), v["description"])  # fmt: skip
             table.add_row(*(Text(fit(cell, sys.stdout)) for cell in cells))
         Console(file=sys.stdout, width=None if sys.stdout.isatty() else _WIDTH, highlight=False).print(table)
     if hidden:
         say(f"not shown: {', '.join(f'{n} {name}' for name, n in hidden.items())}; --all shows them.")
 
 
-def _start(value: Any) -> str:
+def _start_text(value: Any) -> str:
     if value is None:
         return ""
     values = value if isinstance(value, list) else [value]
@@ -313,7 +319,7 @@ def _start(value: Any) -> str:
 
 def run_validate(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright validate``."""
-    path = _existing(arguments.file)
+    path = _check_file(arguments.file)
     try:
         report = validate(path, run=not arguments.no_run)
     except KeyboardInterrupt:

@@ -60,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv : sequence of str, optional
         The arguments; those of the process without it.
     """
-    parser = _parser()
+    parser = _make_parser()
     try:
         arguments = parser.parse_args(argv)
     except SystemExit as stop:
@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
 
 
-def _parser() -> argparse.ArgumentParser:
+def _make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="loopwright", description="Block diagrams and co-simulation for control engineers."
     )
@@ -128,7 +128,7 @@ def _version() -> str:
 # --- what is asked for ----------------------------------------------------------------------------------------------
 
 
-def _known(letter: str) -> dict[str, Any]:
+def _known_options(letter: str) -> dict[str, Any]:
     """Return the options of an experiment with their defaults."""
     own = {p.name: p.default for p in signature(EXPERIMENTS[letter]).parameters.values() if p.kind is p.KEYWORD_ONLY}
     limits = ("velocity_limit", "acceleration_limit") if letter == "A" else ()  # it has no admittance to limit
@@ -136,14 +136,16 @@ def _known(letter: str) -> dict[str, Any]:
 
 
 def _option_lines() -> Iterable[str]:
-    for name, value in {name: value for letter in EXPERIMENTS for name, value in _known(letter).items()}.items():
+    for name, value in {
+        name: value for letter in EXPERIMENTS for name, value in _known_options(letter).items()
+    }.items():
         if name not in ("plant", "path"):
-            owners = [letter for letter in EXPERIMENTS if name in _known(letter)]
+            owners = [letter for letter in EXPERIMENTS if name in _known_options(letter)]
             only = "" if len(owners) == len(EXPERIMENTS) else f"  ({', '.join(owners)} only)"
             yield f"{name}={value}{only}"
 
 
-def _letters(given: Sequence[str]) -> list[str]:
+def _parse_letters(given: Sequence[str]) -> list[str]:
     """Return the experiments that are meant: ``A B``, ``A,B`` and ``AB`` alike."""
     pieces = [piece.strip() for text in given for piece in text.split(",")]
     for piece in pieces:
@@ -152,7 +154,7 @@ def _letters(given: Sequence[str]) -> list[str]:
     return list(dict.fromkeys("".join(pieces).upper())) or list(EXPERIMENTS)
 
 
-def _options(arguments: argparse.Namespace) -> dict[str, Any]:
+def _parse_options(arguments: argparse.Namespace) -> dict[str, Any]:
     options: dict[str, Any] = {}
     for text in arguments.options:
         name, equals, value = text.partition("=")
@@ -167,7 +169,7 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
             )
         if name in options:
             raise OptionError("it is given twice; give it once.", port=f"--option {name}")
-        options[name] = _value(value.strip())
+        options[name] = _parse_value(value.strip())
     if arguments.plant is not None:
         if "plant" in options:
             raise OptionError("the plant is given twice; give it once.", port="--plant")
@@ -175,7 +177,7 @@ def _options(arguments: argparse.Namespace) -> dict[str, Any]:
     return options
 
 
-def _value(text: str) -> Any:
+def _parse_value(text: str) -> Any:
     """Read a word of `_WORDS`, or a Python or JSON literal; anything else is text."""
     if text.lower() in _WORDS:
         return _WORDS[text.lower()]
@@ -188,29 +190,29 @@ def _value(text: str) -> Any:
 def _share(letters: Sequence[str], options: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Give every experiment the options that it has."""
     for name in options:
-        owners = [letter for letter in EXPERIMENTS if name in _known(letter)]
+        owners = [letter for letter in EXPERIMENTS if name in _known_options(letter)]
         without = [letter for letter in letters if letter not in owners]
         if not owners:
-            known = {name for letter in EXPERIMENTS for name in _known(letter)} - {"path"}
+            known = {name for letter in EXPERIMENTS for name in _known_options(letter)} - {"path"}
             raise OptionError(f"no experiment has such an option. {near(name, known)}", port=f"--option {name}")
         if len(without) == len(letters):
             raise OptionError(
-                f"{_and(without)} can't take it; an option of {_and(owners)} only.",
+                f"{_join(without)} can't take it; an option of {_join(owners)} only.",
                 port=f"--option {name}",
             )
         if without:
             have = "has" if len(owners) == 1 else "have"
-            _say(f"{', '.join(without)}: without {name}, which only {_and(owners)} {have}.", sys.stderr)
-    return {letter: {k: v for k, v in options.items() if k in _known(letter)} for letter in letters}
+            _say(f"{', '.join(without)}: without {name}, which only {_join(owners)} {have}.", sys.stderr)
+    return {letter: {k: v for k, v in options.items() if k in _known_options(letter)} for letter in letters}
 
 
-def _and(letters: Sequence[str]) -> str:
+def _join(letters: Sequence[str]) -> str:
     """Write A; A and B; A, B and C."""
     *first, last = letters
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def _folder(name: str) -> Path:
+def _make_folder(name: str) -> Path:
     """Make the folder, and find out whether files can be written there."""
     folder = Path(name).expanduser()
     try:
@@ -232,8 +234,8 @@ def _folder(name: str) -> Path:
 
 def _run(arguments: argparse.Namespace) -> int:
     """Build all experiments first, so that wrong usage is found before anything runs; then run them."""
-    letters = _letters(arguments.letters)
-    chosen = _share(letters, _options(arguments))
+    letters = _parse_letters(arguments.letters)
+    chosen = _share(letters, _parse_options(arguments))
     try:
         if any(options.get("plant") is None for options in chosen.values()):
             gantry.build(notify=lambda line: _say(line, sys.stderr))
@@ -241,7 +243,7 @@ def _run(arguments: argparse.Namespace) -> int:
     except LoopwrightError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
         return 1 if isinstance(error, FmuError) and not isinstance(error, FmuFileError) else 2
-    folder = _folder(arguments.out)
+    folder = _make_folder(arguments.out)
     table: dict[str, dict[str, float | None]] = {}
     written: list[list[str]] = []
     failed: dict[str, str] = {}
@@ -255,7 +257,10 @@ def _run(arguments: argparse.Namespace) -> int:
             failed[letter] = problem
             _say(f"loopwright: experiment {letter} failed: {problem}", sys.stderr)
         if run is None or not len(run.t):
-            _say(f"{letter}: nothing was recorded, so nothing is written{_kept(letter, folder)}.", sys.stderr)
+            _say(
+                f"{letter}: nothing was recorded, so nothing is written{_earlier_files_text(letter, folder)}.",
+                sys.stderr,
+            )
         else:
             try:
                 table[letter], names = _write(experiment, run, problem, folder)
@@ -314,7 +319,7 @@ def _files(letter: str, folder: Path) -> list[Path]:
     return [folder / f"{letter}{ending}" for ending in (".csv", ".json", *figures)]
 
 
-def _kept(letter: str, folder: Path) -> str:
+def _earlier_files_text(letter: str, folder: Path) -> str:
     """Say that an earlier run's files stay, where there are some."""
     return f"; the files of an earlier run stay in {folder}" if any(f.exists() for f in _files(letter, folder)) else ""
 
@@ -337,14 +342,14 @@ def _print_table(table: Mapping[str, Mapping[str, float | None]], failed: Mappin
         shown.add_column(f"{letter} failed" if letter in failed else letter, justify="right", no_wrap=True)
     for name, (unit, _) in DEFINITIONS.items():
         label, factor = ("", 1.0) if name == "real_time_factor" else _SHOWN.get(unit, (unit, 1.0))
-        values = [_number(numbers[name], factor) for numbers in table.values()]
+        values = [_number_text(numbers[name], factor) for numbers in table.values()]
         if set(values) != {"-"}:
             shown.add_row(name, _fit(label, sys.stdout), *values)
     console = Console(file=sys.stdout, width=None if sys.stdout.isatty() else 80, highlight=False)
     console.print(shown)
 
 
-def _number(value: float | None, factor: float) -> str:
+def _number_text(value: float | None, factor: float) -> str:
     if value is None:
         return "-"
     return f"{value * factor:.4g}" if math.isfinite(value) else "never"

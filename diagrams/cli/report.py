@@ -14,7 +14,7 @@ from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..paper.experiments import EXPERIMENTS, Experiment
 from .text import say
-from .user_models import user_file
+from .user_models import load_user_file
 
 DEFAULT = "B"
 """The experiment whose Fig. 3 is taken: both admittances are in it."""
@@ -56,7 +56,7 @@ def report_command(arguments: argparse.Namespace) -> int:
     what = arguments.what or DEFAULT
     with contextlib.ExitStack() as open_file:
         try:
-            diagram, experiment = open_file.enter_context(_subject(what, arguments))
+            diagram, experiment = open_file.enter_context(_open_subject(what, arguments))
         except OptionError:
             raise
         except LoopwrightError as error:
@@ -67,7 +67,7 @@ def report_command(arguments: argparse.Namespace) -> int:
         began = time.perf_counter()
         try:
             with _progress(diagram.name) as tell:
-                report = _analysed(diagram, experiment, tell)
+                report = _analyse(diagram, experiment, tell)
         except LoopwrightError as error:
             say(f"loopwright: error: {error}", sys.stderr)
             return 1
@@ -84,7 +84,7 @@ def report_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _analysed(diagram: Diagram, experiment: Experiment | None, tell: Callable[[str], None]) -> Any:
+def _analyse(diagram: Diagram, experiment: Experiment | None, tell: Callable[[str], None]) -> Any:
     from ..report.analyse import analyse
     from ..report.figures import with_drawing
 
@@ -110,22 +110,22 @@ def _progress(name: str) -> Iterator[Callable[[str], None]]:
 
 
 @contextlib.contextmanager
-def _subject(what: str, arguments: argparse.Namespace) -> Iterator[tuple[Diagram, Experiment | None]]:
+def _open_subject(what: str, arguments: argparse.Namespace) -> Iterator[tuple[Diagram, Experiment | None]]:
     """Yield the diagram, and its experiment where it is one."""
     if ".py" in what:
         for name, given in (("--option", arguments.options), ("--plant", arguments.plant)):
             if given:
                 raise OptionError("it is for experiments; set it in the file.", port=name)
-        with user_file(what, port="WHAT") as (module, path, name):
-            found = _diagram(vars(module), str(path), path.name, name)
+        with load_user_file(what, port="WHAT") as (module, path, name):
+            found = _find_diagram(vars(module), str(path), path.name, name)
             yield (found.diagram, found) if isinstance(found, Experiment) else (found, None)
         return
-    experiment = _experiment(what, arguments)
+    experiment = _make_experiment(what, arguments)
     yield experiment.diagram, experiment
 
 
-def _experiment(what: str, arguments: argparse.Namespace) -> Experiment:
-    from .main import _options, _share
+def _make_experiment(what: str, arguments: argparse.Namespace) -> Experiment:
+    from .main import _parse_options, _share
 
     letter = what.upper()
     if letter not in EXPERIMENTS:
@@ -133,13 +133,13 @@ def _experiment(what: str, arguments: argparse.Namespace) -> Experiment:
             f"found {what!r}; expected one of {', '.join(EXPERIMENTS)}, or FILE.py:NAME, such as loop.py:diagram.",
             port="WHAT",
         )
-    options = _share([letter], _options(arguments))[letter]
+    options = _share([letter], _parse_options(arguments))[letter]
     if options.get("plant") is None:
         gantry.build(notify=lambda line: say(line, sys.stderr))
     return EXPERIMENTS[letter](**options)
 
 
-def _diagram(names: dict[str, Any], who: str, file: str, name: str) -> Diagram | Experiment:
+def _find_diagram(names: dict[str, Any], who: str, file: str, name: str) -> Diagram | Experiment:
     """Return what a name of a user's file stands for."""
     known = [key for key, value in names.items() if isinstance(value, Diagram | Experiment)]
     if not name:

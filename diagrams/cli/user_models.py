@@ -33,7 +33,7 @@ class UserModel:
 
 
 @contextlib.contextmanager
-def user_model(text: str) -> Iterator[UserModel]:
+def load_user_model(text: str) -> Iterator[UserModel]:
     """Load a model from ``FILE.py:Name``; its module, and those beside it that it imports, are forgotten afterwards.
 
     Raises
@@ -43,16 +43,16 @@ def user_model(text: str) -> Iterator[UserModel]:
     DefinitionError
         The file can't be imported, or the class can't be made.
     """
-    path, name = _parts(text)
-    with _loaded(path) as module:
-        block = _block(module, path, name)
-        tops = {key.partition(".")[0] for key, value in sys.modules.items() if _stands_in(value, key, path.parent)}
+    path, name = _split_name(text)
+    with _load(path) as module:
+        block = _find_block(module, path, name)
+        tops = {key.partition(".")[0] for key, value in sys.modules.items() if _is_in(value, key, path.parent)}
         places = [place for top in sorted(tops) for place in (path.parent / f"{top}.py", path.parent / top)]
         yield UserModel(block, tuple(place for place in places if place.exists() and place != path))
 
 
 @contextlib.contextmanager
-def user_file(text: str, *, port: str) -> Iterator[tuple[ModuleType, Path, str]]:
+def load_user_file(text: str, *, port: str) -> Iterator[tuple[ModuleType, Path, str]]:
     """Load a file from ``FILE.py:NAME``, or ``FILE.py``; yield its module, its path, and the name or "".
 
     Parameters
@@ -67,12 +67,12 @@ def user_file(text: str, *, port: str) -> Iterator[tuple[ModuleType, Path, str]]
     DefinitionError
         The file can't be imported.
     """
-    path, name = _parts(text, port, "loop.py:diagram")
-    with _loaded(path) as module:
+    path, name = _split_name(text, port, "loop.py:diagram")
+    with _load(path) as module:
         yield module, path, name
 
 
-def _parts(text: str, port: str = "MODEL", example: str = "model.py:Motor") -> tuple[Path, str]:
+def _split_name(text: str, port: str = "MODEL", example: str = "model.py:Motor") -> tuple[Path, str]:
     head, colon, name = text.rpartition(":")
     if not colon or not head.endswith(".py"):  # a drive's colon is none of ours
         head, name = text, ""
@@ -85,7 +85,7 @@ def _parts(text: str, port: str = "MODEL", example: str = "model.py:Motor") -> t
 
 
 @contextlib.contextmanager
-def _loaded(path: Path) -> Iterator[ModuleType]:
+def _load(path: Path) -> Iterator[ModuleType]:
     """Import a file under a name of our own; files beside it can be imported as from a script."""
     folder = str(path.parent)
     before = set(sys.modules)
@@ -107,7 +107,7 @@ def _loaded(path: Path) -> Iterator[ModuleType]:
             if isinstance(error, SystemExit):
                 step = 'Put what it does as a script behind if __name__ == "__main__".'
             raise DefinitionError(
-                f"importing it fails{_line(error, path)}: {type(error).__name__}: {_text(error)}. {step}",
+                f"importing it fails{_line_text(error, path)}: {type(error).__name__}: {_message(error)}. {step}",
                 block=str(path),
             ) from error
         yield module
@@ -116,11 +116,11 @@ def _loaded(path: Path) -> Iterator[ModuleType]:
         if folder in sys.path:
             sys.path.remove(folder)
         for name in set(sys.modules) - before:
-            if name == _MODULE or _stands_in(sys.modules[name], name, path.parent):
+            if name == _MODULE or _is_in(sys.modules[name], name, path.parent):
                 del sys.modules[name]
 
 
-def _stands_in(module: ModuleType, name: str, folder: Path) -> bool:
+def _is_in(module: ModuleType, name: str, folder: Path) -> bool:
     """Return whether a module was found in a folder itself, and not in an environment below it."""
     top = folder / name.partition(".")[0]
     own = getattr(module, "__dict__", {})  # not through the module's own __getattr__, which may warn
@@ -129,7 +129,7 @@ def _stands_in(module: ModuleType, name: str, folder: Path) -> bool:
     return any(p == top.with_suffix(".py") or p == top or top in p.parents for p in found)
 
 
-def _block(module: ModuleType, path: Path, name: str) -> Block:
+def _find_block(module: ModuleType, path: Path, name: str) -> Block:
     who = str(path)
     blocks = {
         key: value
@@ -166,12 +166,12 @@ def _block(module: ModuleType, path: Path, name: str) -> Block:
         raise OptionError(f"{name}() can't be made: {error}", block=who) from error
     except Exception as error:
         raise DefinitionError(
-            f"{name}() can't be made{_line(error, path)}: {type(error).__name__}: {_text(error)}. Correct it.",
+            f"{name}() can't be made{_line_text(error, path)}: {type(error).__name__}: {_message(error)}. Correct it.",
             block=who,
         ) from error
 
 
-def _line(error: BaseException, path: Path) -> str:
+def _line_text(error: BaseException, path: Path) -> str:
     """Say which line of a file an error came through last."""
     if isinstance(error, SyntaxError) and error.filename is not None:
         return f" in line {error.lineno} of {error.filename}"
@@ -183,5 +183,5 @@ def _line(error: BaseException, path: Path) -> str:
     return line
 
 
-def _text(error: BaseException) -> str:
+def _message(error: BaseException) -> str:
     return error.msg if isinstance(error, SyntaxError) else str(error)

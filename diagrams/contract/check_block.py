@@ -12,10 +12,10 @@ from ...blocks.core.block import Block
 from ...blocks.core.errors import DefinitionError, LoopwrightError, OptionError, SampleTimeError, ShapeError, near
 from ...blocks.core.ports import Shape
 from ...blocks.tracing.trace import trace
-from .events import check_events, check_smooth, instants
-from .exercise import Bench, Exercise, frame_text, points
+from .events import check_events, check_smooth, find_instants
+from .exercise import Bench, Exercise, kind_text, points
 from .runs import check_run
-from .traces import check_derivatives, check_feedthrough, check_guards, check_shapes, check_trace, swallowed
+from .traces import check_derivatives, check_feedthrough, check_guards, check_shapes, check_trace, find_swallowed
 from .values import check_ports, check_purity, check_values
 
 
@@ -131,19 +131,19 @@ def check_block(
     checks = {"values": check_values(block)}
     exercise = Exercise.of(block, inputs or {}, shapes or {}, sample_time, ticks, seed)
     checks["ports"] = check_ports(block)
-    announced = instants(block, exercise.duration)
+    announced = find_instants(block, exercise.duration)
     checks["next_instant"] = f"{len(announced)} within {exercise.duration:g} s"
     found = _Findings(exercise, announced, checks)
-    wanted = _wanted(frames)
-    refused = [error for sampled in wanted if (error := found.frame(sampled)) is not None]
+    wanted = _choose_kinds(frames)
+    refused = [error for sampled in wanted if (error := found.check_in(sampled)) is not None]
     if refused and (frames or len(refused) == len(wanted)):
         raise refused[0]
     return found.report()
 
 
-def _wanted(frames: Iterable[str]) -> list[bool]:
+def _choose_kinds(frames: Iterable[str]) -> list[bool]:
     """Return which kinds of frames are wanted: sampled True, continuous False."""
-    names = [frame_text(sampled) for sampled in (True, False)]
+    names = [kind_text(sampled) for sampled in (True, False)]
     for name in (given := list(frames)):
         if name not in names:
             raise OptionError(
@@ -151,7 +151,7 @@ def _wanted(frames: Iterable[str]) -> list[bool]:
                 block="check_block",
                 port="frames",
             )
-    return [sampled for sampled in (True, False) if not given or frame_text(sampled) in given]
+    return [sampled for sampled in (True, False) if not given or kind_text(sampled) in given]
 
 
 class _Findings:
@@ -165,12 +165,12 @@ class _Findings:
         self.swallowed: dict[str, frozenset[tuple[str, str]]] = {}
         self.quiet: set[str] = set()
 
-    def frame(self, sampled: bool) -> LoopwrightError | None:
+    def check_in(self, sampled: bool) -> LoopwrightError | None:
         """Check the block in a frame of one kind; return the error with which it refuses to stand there."""
-        exercise, kind, checks = self.exercise, frame_text(sampled), self.checks
+        exercise, kind, checks = self.exercise, kind_text(sampled), self.checks
         block = exercise.block
         if block.transport or block.stepped:
-            self.run(sampled)
+            self.check_run_in(sampled)
             return None
         rng = np.random.default_rng([exercise.seed, 20140])
         equations = check_purity(exercise, sampled, list(points(exercise, rng, 6)))
@@ -189,7 +189,7 @@ class _Findings:
         checks[f"{kind}: derivatives"] = f"as differences to {check_derivatives(bench):.1e}"
         measured, unseen = check_feedthrough(bench)
         self.feedthrough[kind], self.unseen[kind] = frozenset(measured), frozenset(unseen)
-        self.swallowed[kind] = frozenset(swallowed(bench, measured))
+        self.swallowed[kind] = frozenset(find_swallowed(bench, measured))
         checks[f"{kind}: feedthrough"] = f"{len(measured)} pairs, {len(unseen)} more in the trace"
         if guards := check_guards(bench):
             checks[f"{kind}: guards"] = str(guards)
@@ -198,12 +198,12 @@ class _Findings:
             fired, self.quiet = check_events(bench)
             if block.events:
                 checks[f"{kind}: events"] = f"{fired} fired in small steps"
-        self.run(sampled)
+        self.check_run_in(sampled)
         return None
 
-    def run(self, sampled: bool) -> None:
+    def check_run_in(self, sampled: bool) -> None:
         """Check a run in a frame of one kind."""
-        kind = frame_text(sampled)
+        kind = kind_text(sampled)
         text, fired = check_run(self.exercise, sampled)
         self.quiet -= fired
         self.checks[f"{kind}: run"], self.frames[kind] = text, "checked"

@@ -12,14 +12,14 @@ import numpy as np
 from ...blocks.core.block import Block
 from ...blocks.tracing.symbols import bundle
 from .exercise import Bench, Point
-from .values import broken
+from .values import rule_error
 
 _INSTANTS = 200  # asked for at most
 _SAME_INSTANT = 100  # jumps that may follow each other at one instant
 _FINENESS = 13  # refinements of an interval by 8, each
 
 
-def instants(block: Block, end: float) -> list[float]:
+def find_instants(block: Block, end: float) -> list[float]:
     """Return the instants up to an end that a block announces, after checking that they rise."""
     found: list[float] = []
     t = 0.0
@@ -27,7 +27,7 @@ def instants(block: Block, end: float) -> list[float]:
         following = block.next_instant(t)
         good = isinstance(following, int | float) and following > t and block.next_instant(t) == following
         if not good:
-            raise broken(
+            raise rule_error(
                 "next_instant",
                 f"next_instant({t!r}) gave {following!r}; expected a later time, the same at every call, or math.inf. "
                 "Return the first one strictly after t.",
@@ -35,7 +35,7 @@ def instants(block: Block, end: float) -> list[float]:
             )
         between = t + 0.5 * (min(following, end) - t)
         if following <= end and block.next_instant(between) != following:
-            raise broken(
+            raise rule_error(
                 "next_instant",
                 f"next_instant({t!r}) gave {following!r}, but next_instant({between!r}) "
                 f"{block.next_instant(between)!r}; expected the same one from all times before it. Return the first "
@@ -73,12 +73,12 @@ def check_smooth(bench: Bench, announced: list[float]) -> int:
             return np.array(in_time.call([time(s)[None], *rest, bench.p])[0])
 
         def domains(s: float, time: Any = time) -> tuple[bool, ...]:
-            return _domains(bench, [time(s), *rest])
+            return _evaluate_domains(bench, [time(s), *rest])
 
-        where = _jump(along, domains)
+        where = _find_jump(along, domains)
         searched += 1
         if where is not None:
-            raise broken(
+            raise rule_error(
                 "next_instant",
                 f"its outputs, or their rates, jump at t = {time(where):.9g} s, and next_instant does not announce it; "
                 "expected smooth outputs between instants. Return this time from next_instant, or make it an Event.",
@@ -106,14 +106,14 @@ def _search_signals(bench: Bench) -> int:
             ]
 
         def along(s: np.ndarray) -> np.ndarray:
-            found = [v for v in bench.in_trace(at(s))[:shown] if v.size]
+            found = [v for v in bench.evaluate_trace(at(s))[:shown] if v.size]
             return np.vstack([np.broadcast_to(v, (len(v), len(s))) for v in found]) if found else np.zeros((0, len(s)))
 
-        where = _jump(along, lambda s: _domains(bench, at(np.array([s]))))
+        where = _find_jump(along, lambda s: _evaluate_domains(bench, at(np.array([s]))))
         if where is not None:
             near = [[float(f"{v:.6g}") for v in np.ravel(part)] for part in at(np.array([where]))[1:]]
             shown_at = dict(zip(("x", *one.u), near, strict=True))
-            raise broken(
+            raise rule_error(
                 "events",
                 f"in a continuous frame its outputs or derivatives jump at {shown_at} and "
                 "no indicator crosses zero there; expected every discontinuity to be an event. Declare an Event "
@@ -123,11 +123,11 @@ def _search_signals(bench: Bench) -> int:
     return len(pairs)
 
 
-def _domains(bench: Bench, columns: list[Any]) -> tuple[bool, ...]:
-    return () if bench.traced.indicators is None else tuple(bench.extra("indicators", columns) > 0.0)
+def _evaluate_domains(bench: Bench, columns: list[Any]) -> tuple[bool, ...]:
+    return () if bench.traced.indicators is None else tuple(bench.evaluate("indicators", columns) > 0.0)
 
 
-def _jump(along: Callable[[np.ndarray], np.ndarray], domains: Callable[[float], Any]) -> float | None:
+def _find_jump(along: Callable[[np.ndarray], np.ndarray], domains: Callable[[float], Any]) -> float | None:
     """Return where in [0, 1] a row of a function jumps without a change of domains, or None.
 
     The part with the largest change is refined: there a smooth function changes less and less, one that jumps as much.
@@ -172,10 +172,10 @@ def check_events(bench: Bench) -> tuple[int, set[str]]:
     for i, t in enumerate(exercise.times):
         inputs = [np.ravel(v) for v in exercise.inputs_at(i).values()]
         for count in range(_SAME_INSTANT + 1):
-            z = bench.extra("indicators", [t, x, *inputs])
+            z = bench.evaluate("indicators", [t, x, *inputs])
             if not np.all(np.isfinite(z)):
                 bad = names[int(np.argmin(np.isfinite(z)))]
-                raise broken(
+                raise rule_error(
                     "events",
                     f"its indicator is {z.tolist()} at t = {t:.6g} s, x = {x.tolist()}; expected finite numbers. "
                     "Guard the operation that fails with np.where.",
@@ -191,16 +191,16 @@ def check_events(bench: Bench) -> tuple[int, set[str]]:
                 break
             if count == _SAME_INSTANT:
                 again = ", ".join(n for n, f in zip(names, fired, strict=True) if f)
-                raise broken(
+                raise rule_error(
                     "events",
                     f"at t = {t:.6g} s its events go on firing ({again}), {count} times at one instant; expected a "
                     "jump after which nothing fires. Let it lead to a state in which the indicator stays where it is.",
                     block,
                 )
             shown += fired
-            x = bench.extra("jump", [t, x, *inputs], fired.astype(float))
+            x = bench.evaluate("jump", [t, x, *inputs], fired.astype(float))
         if bench.traced.advance == "derivative":
-            x = x + h * np.ravel(bench.in_trace([t, x, *inputs])[len(bench.traced.outputs)])
+            x = x + h * np.ravel(bench.evaluate_trace([t, x, *inputs])[len(bench.traced.outputs)])
     return int(shown.sum()), {n for n, count in zip(names, shown, strict=True) if not count}
 
 

@@ -159,7 +159,7 @@ class Exercise:
         """Time that the exercise takes in s."""
         return float(exact_time(self.sample_time) * self.ticks)
 
-    def wired(self) -> dict[str, Signal]:
+    def make_signals(self) -> dict[str, Signal]:
         """Return what drives each input."""
         made = dict(self.signals)
         for number, (name, (low, high)) in enumerate(self.ranges.items()):
@@ -172,18 +172,20 @@ class Exercise:
 
     def diagram(self, sampled: bool) -> Diagram:
         """Return the block, driven, in a frame of one kind."""
-        return _framed("contract", [self.block(**self.wired())], self.sample_time if sampled else None)
+        return _make_diagram("contract", [self.block(**self.make_signals())], self.sample_time if sampled else None)
 
     @cached_property
     def samples(self) -> dict[str, np.ndarray]:
         """Values of the inputs over time, one row for each instant of `times`."""
         if not self.block.inputs:
             return {}
-        names = {f"u_{i}": (name, signal) for i, (name, signal) in enumerate(self.wired().items())}
+        names = {f"u_{i}": (name, signal) for i, (name, signal) in enumerate(self.make_signals().items())}
         roots = [signal.named(short) for short, (_, signal) in names.items()]
-        run = _framed("exercise", roots, None).simulate(self.duration, step=self.duration / _SAMPLES, progress=False)
+        run = _make_diagram("exercise", roots, None).simulate(
+            self.duration, step=self.duration / _SAMPLES, progress=False
+        )
         _, last = np.unique(run.t, return_index=True)  # where there are two samples of one time
-        return {name: _rows(run, short, self.times, last) for short, (name, _) in names.items()}
+        return {name: _read_rows(run, short, self.times, last) for short, (name, _) in names.items()}
 
     @property
     def times(self) -> np.ndarray:
@@ -200,13 +202,13 @@ def _is_range(given: Any) -> bool:
     return isinstance(given, tuple) and len(given) == 2 and not any(isinstance(v, Signal | Block) for v in given)
 
 
-def _rows(run: Any, name: str, times: np.ndarray, kept: np.ndarray) -> np.ndarray:
+def _read_rows(run: Any, name: str, times: np.ndarray, kept: np.ndarray) -> np.ndarray:
     where = np.searchsorted(run.t[kept], times - 1e-9 * times[-1])
     result: np.ndarray = run[name][kept][np.minimum(where, len(kept) - 1)]
     return result
 
 
-def _framed(name: str, roots: list[Any], sample_time: float | None) -> Diagram:
+def _make_diagram(name: str, roots: list[Any], sample_time: float | None) -> Diagram:
     table = Collector(roots).structure()
     if sample_time is not None:
         table.frames[""] = replace_fields(table.frames[""], sample_time=exact_time(sample_time))
@@ -239,9 +241,9 @@ class Bench:
     @property
     def frame(self) -> str:
         """The frame in words."""
-        return frame_text(self.sampled)
+        return kind_text(self.sampled)
 
-    def in_numbers(self, point: Point, names: list[str]) -> dict[str, np.ndarray]:
+    def evaluate_with_numpy(self, point: Point, names: list[str]) -> dict[str, np.ndarray]:
         """Return what equations give with NumPy, or nothing where they can't be computed."""
         try:
             found = evaluate(self.block, point.arguments(), self.T, self.numbers, names)
@@ -249,11 +251,11 @@ class Bench:
             return {}
         return {name: np.asarray(value, dtype=float) for name, value in found.items()}
 
-    def in_trace(self, columns: list[Any]) -> list[np.ndarray]:
+    def evaluate_trace(self, columns: list[Any]) -> list[np.ndarray]:
         """Return what the traced function gives, one column for each column of its arguments."""
         return [np.array(v) for v in self.traced.function.call([*columns, self.p])]
 
-    def extra(self, what: str, columns: list[Any], *more: Any) -> np.ndarray:
+    def evaluate(self, what: str, columns: list[Any], *more: Any) -> np.ndarray:
         """Return what the traced ``indicators`` or ``jump`` give."""
         return np.ravel(np.array(getattr(self.traced, what).call([*columns, self.p, *more])[0]))
 
@@ -277,17 +279,17 @@ def points(exercise: Exercise, rng: np.random.Generator, count: int) -> Iterator
             flat = initial_state(block, {n: v.shape for n, v in starts.items()}, bundled)
             x = Layout.of({n: v.shape for n, v in starts.items()}).split(flat)
         if number and not block.memory:
-            x = {n: v + _off(rng, block.states[n], v.shape) for n, v in x.items()}
+            x = {n: v + _draw_offset(rng, block.states[n], v.shape) for n, v in x.items()}
         fired = {name: float(rng.integers(2)) for name in block.events}
         yield Point(float(exercise.times[i]), x, u, fired)
 
 
-def _off(rng: np.random.Generator, port: Any, shape: Shape) -> np.ndarray:
+def _draw_offset(rng: np.random.Generator, port: Any, shape: Shape) -> np.ndarray:
     """Return how far a state is moved from where it starts: by whole numbers where it is discrete."""
     scale = port.nominal or 1.0
     return np.asarray(rng.integers(-1, 2, shape) * 1.0 if port.discrete else scale * rng.standard_normal(shape))
 
 
-def frame_text(sampled: bool) -> str:
+def kind_text(sampled: bool) -> str:
     """Return a kind of frame in words."""
     return "sampled" if sampled else "continuous"

@@ -10,13 +10,13 @@ import numpy as np
 from ...blocks.core.block import Block
 from ...blocks.core.errors import SimulationError
 from ..simulation.simulation import Simulation
-from .exercise import Exercise, frame_text
-from .values import broken
+from .exercise import Exercise, kind_text
+from .values import rule_error
 
 
 def check_run(exercise: Exercise, sampled: bool) -> tuple[str, set[str]]:
     """Run the block, save and restore in the middle; return what was done, and the events that fired."""
-    block, kind = exercise.block, frame_text(sampled)
+    block, kind = exercise.block, kind_text(sampled)
     diagram = exercise.diagram(sampled)
     half = exercise.sample_time * (exercise.ticks // 2)
     half = float(f"{half:.12g}")
@@ -69,7 +69,7 @@ def _compare(block: Block, kind: str, expected: Any, found: tuple[Any, float]) -
         where = (
             f"from t = {rows[0][first, 0]:.9g} s on, {rows[1][first, 1:].tolist()} for {rows[0][first, 1:].tolist()}"
         )
-    raise broken(
+    raise rule_error(
         "runs",
         f"in a {kind} frame a run that was saved at t = {t:g} s and restored is another one {where}; expected the "
         "straight run, bit for bit. What a block remembers must be in its states.",

@@ -9,7 +9,7 @@ from ...blocks.core.errors import GuardError, ShapeError, TraceError
 from ...blocks.tracing.numpy_check import GUARDS, NEXT
 from ...blocks.tracing.symbols import bundle
 from .exercise import Bench, Point
-from .values import broken
+from .values import rule_error
 
 _STEP = 1e-6  # of differences, relative to 1 + |v|
 
@@ -20,9 +20,9 @@ def check_shapes(bench: Bench) -> None:
     """Compare the shapes of NumPy's results with those declared and traced."""
     own = [n for n in bench.traced.outputs if n not in bench.traced.states]
     for point in bench.points[:6]:
-        for name, value in bench.in_numbers(point, own).items():
+        for name, value in bench.evaluate_with_numpy(point, own).items():
             if value.shape != bench.traced.outputs[name]:
-                raise broken(
+                raise rule_error(
                     "shapes",
                     f"with numbers its output has shape {value.shape} in a {bench.frame} frame, traced "
                     f"{bench.traced.outputs[name]}; expected one shape. Build it with np.stack.",
@@ -41,21 +41,21 @@ def check_trace(bench: Bench) -> float:
     update = NEXT if bench.traced.advance == "update" else ""
     for point in bench.points:
         columns = point.columns()
-        traced = dict(zip(bench.names, bench.in_trace(columns), strict=True))
+        traced = dict(zip(bench.names, bench.evaluate_trace(columns), strict=True))
         names = [*bench.traced.outputs, GUARDS, update, *own]
         if bench.traced.indicators is not None:
             names += ["indicators", "jump"]
-            traced["indicators"] = bench.extra("indicators", columns)
-            traced["jump"] = bench.extra("jump", columns, np.array(list(point.fired.values())))
+            traced["indicators"] = bench.evaluate("indicators", columns)
+            traced["jump"] = bench.evaluate("jump", columns, np.array(list(point.fired.values())))
         traced["derivative"] = traced[NEXT]
-        for name, value in bench.in_numbers(point, names).items():
+        for name, value in bench.evaluate_with_numpy(point, names).items():
             flat, found = np.ravel(value), np.ravel(traced[name])[: value.size]
             with np.errstate(all="ignore"):
                 off = np.abs(found - flat) / (1.0 + np.abs(flat))
             off = np.where(np.isfinite(flat), np.where(np.isnan(off), np.inf, off), 0.0)
             worst = max(worst, float(np.max(off, initial=0.0)))
             if worst > 1e-9:
-                raise broken(
+                raise rule_error(
                     "trace",
                     f"in a {bench.frame} frame its traced {name} is {found[:3]} where NumPy gives {flat[:3]} "
                     f"({point}); expected the same. Avoid what traces wrongly: math.…, float(…), masks, "
@@ -105,7 +105,7 @@ def check_derivatives(bench: Bench) -> float:
         off = np.where(np.isnan(off), np.inf, off)
         i, j = np.unravel_index(int(np.argmax(off)), off.shape)
         if off[i, j] > 1e-4:
-            raise broken(
+            raise rule_error(
                 "derivatives",
                 f"in a {bench.frame} frame the traced derivative of {rows[i]} by {columns[j]} is {J[i, j]:.6g} where "
                 f"differences give {measured[i, j]:.6g} ({point}); expected the same. Write the equation so that it is "
@@ -132,14 +132,14 @@ def check_feedthrough(bench: Bench) -> tuple[set[Pair], set[Pair]]:
     traced = {(u, y) for y in outputs for u in depends[y] if u in bench.traced.inputs}
     measured: set[Pair] = set()
     for number, point in enumerate(bench.points if own else []):
-        before = bench.in_numbers(point, own)
+        before = bench.evaluate_with_numpy(point, own)
         for name in bench.traced.inputs:
             for other in (bench.points[number - 1], bench.points[number - 7]):
-                after = bench.in_numbers(point.with_input(name, other.u[name]), own)
+                after = bench.evaluate_with_numpy(point.with_input(name, other.u[name]), own)
                 shows = (y for y in before.keys() & after.keys() if before[y].tobytes() != after[y].tobytes())
                 measured |= {(name, y) for y in shows}
     for u, y in sorted(measured - traced):
-        raise broken(
+        raise rule_error(
             "feedthrough",
             f"in a {bench.frame} frame the output {y!r} changes with the input {u!r}, and the trace doesn't show it; "
             "expected every dependency in it, since blocks are ordered by it. Use NumPy functions of u alone, no "
@@ -150,13 +150,13 @@ def check_feedthrough(bench: Bench) -> tuple[set[Pair], set[Pair]]:
     return measured, traced - measured
 
 
-def swallowed(bench: Bench, pairs: set[Pair]) -> set[Pair]:
+def find_swallowed(bench: Bench, pairs: set[Pair]) -> set[Pair]:
     """Return the pairs (input, output) at which a NaN never comes through, though numbers do."""
     found = set(pairs)
     for point in bench.points:
         for name in {u for u, _ in found}:
             columns = point.with_input(name, np.full(np.shape(point.u[name]), np.nan)).columns()
-            made = dict(zip(bench.names, bench.in_trace(columns), strict=True))
+            made = dict(zip(bench.names, bench.evaluate_trace(columns), strict=True))
             found -= {(u, y) for u, y in found if u == name and np.any(np.isnan(made[y]))}
     return found
 
@@ -166,12 +166,12 @@ def check_guards(bench: Bench) -> int:
     block, names = bench.block, [n for n in bench.traced.guards if n.isidentifier()]
     for point in bench.points[:3] if names else []:
         _, x, u, _ = point.arguments()
-        made = bench.in_trace(point.columns())
+        made = bench.evaluate_trace(point.columns())
         y = {n: v.reshape(s) for (n, s), v in zip(bench.traced.outputs.items(), made, strict=False)}
         for name in names:
             error = block.guard_error(name, -1.0, bundle("u", u), bundle("y", y), bundle("x", x))
             if not isinstance(error, GuardError):
-                raise broken(
+                raise rule_error(
                     "guards",
                     f"guard_error gave {error!r} for the guard {name!r}; expected a GuardError. Return one.",
                     block,

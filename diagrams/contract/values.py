@@ -16,7 +16,9 @@ from ...blocks.tracing.symbols import bundle, size, with_values
 from .exercise import Exercise, Point, numbers_of
 
 
-def broken(rule: str, text: str, block: Block, port: str | None = None, kind: Any = DefinitionError) -> LoopwrightError:
+def rule_error(
+    rule: str, text: str, block: Block, port: str | None = None, kind: Any = DefinitionError
+) -> LoopwrightError:
     """Return the error for a rule that is not kept."""
     error: LoopwrightError = kind(f"{rule}: {text}", block=block.label, port=port)
     return error
@@ -26,7 +28,7 @@ def check_values(block: Block) -> str:
     """Check equality, pickling and ``replace``, and return what was done."""
     same = block.replace()
     if same != block or hash(same) != hash(block):
-        raise broken(
+        raise rule_error(
             "values",
             f"replace() without changes gave {same!r}, which is not equal to {block!r}; expected an equal block. Leave "
             "the constructor and == as they are, and check parameters in check().",
@@ -38,7 +40,7 @@ def check_values(block: Block) -> str:
     except Exception as error:  # an object's pickling may raise anything
         culprit = next((n for n, v in block.parameters.items() if not _can_be_pickled(v)), None)
         if culprit is None:
-            raise broken(
+            raise rule_error(
                 "values",
                 f"it can't be pickled ({type(error).__name__}: {error}); expected a value that can. Define its class "
                 "at the top of a module, and keep nothing on it but parameters.",
@@ -46,7 +48,7 @@ def check_values(block: Block) -> str:
             ) from error
         copy, pickled = block, f"not pickled, since its {culprit} can't be"
     if copy != block or vars(copy).keys() != vars(block).keys():
-        raise broken(
+        raise rule_error(
             "values",
             f"pickled and read back it is {copy!r} with the attributes {sorted(vars(copy))}; expected {block!r} with "
             f"{sorted(vars(block))}. Keep nothing on it but parameters.",
@@ -67,7 +69,7 @@ def _can_be_pickled(value: Any) -> bool:
 def _check_replace(block: Block, name: str) -> bool:
     """Change one parameter and change it back; return whether it could be."""
     old = block.parameters[name]
-    for value in _others(old):
+    for value in _other_values(old):
         if np.array_equal(value, old):
             continue
         try:
@@ -75,7 +77,7 @@ def _check_replace(block: Block, name: str) -> bool:
         except LoopwrightError:  # out of bounds, or it doesn't fit the other parameters
             continue
         if not np.array_equal(variant.parameters[name], value) or variant == block:
-            raise broken(
+            raise rule_error(
                 "values",
                 f"replace({name}={value!r}) gave {variant!r}, and it {'equals' if variant == block else 'is not'} what "
                 f"was asked for; expected another block with this value. Don't change parameters in the constructor.",
@@ -83,7 +85,7 @@ def _check_replace(block: Block, name: str) -> bool:
                 name,
             )
         if variant.replace(**{name: old}) != block:
-            raise broken(
+            raise rule_error(
                 "values",
                 f"replace({name}={value!r}) and back gave {variant.replace(**{name: old})!r}; expected {block!r}. Let "
                 "no parameter depend on another one.",
@@ -94,7 +96,7 @@ def _check_replace(block: Block, name: str) -> bool:
     return False
 
 
-def _others(value: Any) -> list[Any]:
+def _other_values(value: Any) -> list[Any]:
     """Return other values of a parameter, of which one may be allowed."""
     if isinstance(value, bool):
         return [not value]
@@ -111,13 +113,13 @@ def check_ports(block: Block) -> str:
     count = 0
     for kind, ports in kinds.items():
         if [*ports] != [*getattr(block, kind)]:
-            raise broken(
+            raise rule_error(
                 "ports", f"its {kind} are {[*ports]}, then {[*getattr(block, kind)]}; expected the same.", block
             )
         for name, port in ports.items():
             count += 1
             if port.name != name:
-                raise broken(
+                raise rule_error(
                     "ports",
                     f"it stands under {name!r} and calls itself {port.name!r}; expected one name. Give name={name!r}.",
                     block,
@@ -125,7 +127,7 @@ def check_ports(block: Block) -> str:
                 )
             like = getattr(port, "like", None)
             if like is not None and like not in block.inputs:
-                raise broken(
+                raise rule_error(
                     "ports",
                     f"found like={like!r}; expected an input: {', '.join(block.inputs) or 'there are none'}. Name one.",
                     block,
@@ -135,7 +137,7 @@ def check_ports(block: Block) -> str:
             for unit in units:
                 parse_unit(unit)
             if isinstance(port.unit, tuple) and port.shape is not None and len(units) != size(port.shape):
-                raise broken(
+                raise rule_error(
                     "units",
                     f"found {len(units)} units for shape {port.shape}; expected one for each entry, or one for all. "
                     "Give as many.",
@@ -159,7 +161,7 @@ def check_purity(exercise: Exercise, sampled: bool, places: list[Point]) -> int:
     for number, point in enumerate(places):
         for what, value in _evaluate_all(shadow, point, T if sampled else None).items():
             if first[number].get(what, value) != value:
-                raise broken(
+                raise rule_error(
                     "purity",
                     f"its {what} gives other values when it is called again with the same arguments ({point}); "
                     "expected the same ones. Let it depend on nothing but (t, x, u) and parameters; what a block "
@@ -169,7 +171,7 @@ def check_purity(exercise: Exercise, sampled: bool, places: list[Point]) -> int:
         after = _attributes(shadow)
         changed = sorted(n for n in before.keys() | after.keys() if before.get(n) != after.get(n))
         if changed:
-            raise broken(
+            raise rule_error(
                 "purity",
                 f"its attribute {changed[0]!r} was changed by its equations; expected none to change. A block is a "
                 "value: keep it in a State.",
@@ -198,14 +200,14 @@ def _evaluate_all(block: Any, point: Point, T: float | None) -> dict[str, bytes]
         except Exception:  # what fails is left to the trace
             continue
         _expect_unchanged(block, what, point, x, u)
-        result[what] = _bytes(found)
+        result[what] = _to_bytes(found)
     return result
 
 
 def _expect_unchanged(block: Block, what: str, point: Point, x: dict[str, Any], u: dict[str, Any]) -> None:
     for name, given, now in [*((n, point.x[n], v) for n, v in x.items()), *((n, point.u[n], v) for n, v in u.items())]:
         if not np.array_equal(np.asarray(given), np.asarray(now), equal_nan=True):
-            raise broken(
+            raise rule_error(
                 "purity",
                 f"its {what} changes its argument {name!r} from {np.asarray(given).tolist()} to "
                 f"{np.asarray(now).tolist()}; expected it unchanged. Return new values: y = u + 1, not u += 1.",
@@ -214,11 +216,11 @@ def _expect_unchanged(block: Block, what: str, point: Point, x: dict[str, Any], 
             )
 
 
-def _bytes(value: Any) -> bytes:
+def _to_bytes(value: Any) -> bytes:
     if isinstance(value, dict):
-        return b"".join(str(k).encode() + _bytes(v) for k, v in value.items())
+        return b"".join(str(k).encode() + _to_bytes(v) for k, v in value.items())
     if isinstance(value, tuple | list):
-        return b"|".join(map(_bytes, value))
+        return b"|".join(map(_to_bytes, value))
     return np.asarray(value).tobytes()
 
 

@@ -82,17 +82,17 @@ def arrange(nodes: Sequence[Node], nets: Sequence[Net]) -> tuple[float, float]:
     """
     by_key = {node.key: node for node in nodes}
     pairs = [(net.source[0], sink[0]) for net in nets for sink in net.sinks]
-    _layers(nodes, pairs)
+    _assign_layers(nodes, pairs)
     depth = max((node.layer for node in nodes), default=0) + 1
     layers: list[list[Node]] = [[n for n in nodes if n.layer == i] for i in range(depth)]
     for node in nodes:
         node.loose = not node.ins
-    lanes = _lanes(nets, by_key, layers)
-    links = _links(nets, by_key, lanes)
+    lanes = _add_lanes(nets, by_key, layers)
+    links = _find_links(nets, by_key, lanes)
     layers = order_layers(layers, links)
     place_layers(layers, links, gap=lambda a, b: LANE if a.lane or b.lane or (a.side and b.side) else GAP)
     floor = max((n.y + n.height for layer in layers for n in layer), default=0.0)
-    channels = _channels(nets, by_key, lanes, depth)
+    channels = _find_parts(nets, by_key, lanes, depth)
     x = 0.0
     for index in range(-1, depth):
         if index >= 0:
@@ -102,13 +102,13 @@ def arrange(nodes: Sequence[Node], nets: Sequence[Net]) -> tuple[float, float]:
                 if node.lane:
                     node.x, node.width = x, width
             x += width
-        x = _tracks(channels[index], x, floor, outside=index in (-1, depth - 1))
-    bottom = _ways_back(nets, channels, floor)
+        x = _assign_tracks(channels[index], x, floor, outside=index in (-1, depth - 1))
+    bottom = _route_back(nets, channels, floor)
     _draw(channels)
     return x, bottom
 
 
-def _layers(nodes: Sequence[Node], pairs: Sequence[tuple[str, str]]) -> None:
+def _assign_layers(nodes: Sequence[Node], pairs: Sequence[tuple[str, str]]) -> None:
     """Give every node its layer: behind all that it takes signals from, but for what closes a loop."""
     forward = cut_loops([n.key for n in nodes], pairs, {n.key for n in nodes if n.plant})
     before: dict[str, list[str]] = {n.key: [] for n in nodes}
@@ -138,7 +138,7 @@ def _layers(nodes: Sequence[Node], pairs: Sequence[tuple[str, str]]) -> None:
         node.layer = last if node.side > 0 else layer[node.key]
 
 
-def _lanes(nets: Sequence[Net], by_key: dict[str, Node], layers: list[list[Node]]) -> dict[tuple[str, int], Node]:
+def _add_lanes(nets: Sequence[Net], by_key: dict[str, Node], layers: list[list[Node]]) -> dict[tuple[str, int], Node]:
     """Add a node without content wherever a net passes a layer."""
     lanes: dict[tuple[str, int], Node] = {}
     for net in nets:
@@ -152,12 +152,12 @@ def _lanes(nets: Sequence[Net], by_key: dict[str, Node], layers: list[list[Node]
     return lanes
 
 
-def _ends(net: Net, by_key: dict[str, Node], layer: int) -> Iterable[tuple[Node, Pin]]:
+def _sinks_in(net: Net, by_key: dict[str, Node], layer: int) -> Iterable[tuple[Node, Pin]]:
     """Yield the sinks of a net in a layer."""
     return ((by_key[s], pin) for s, pin in net.sinks if by_key[s].layer == layer)
 
 
-def _links(
+def _find_links(
     nets: Sequence[Net], by_key: dict[str, Node], lanes: dict[tuple[str, int], Node]
 ) -> list[tuple[Node, float, Node, float]]:
     """Return what is to be straight between neighbouring layers: node, height of its pin, node, height."""
@@ -166,7 +166,7 @@ def _links(
         node, pin = by_key[net.source[0]], net.source[1]
         dy, i = node.outs[pin], node.layer + 1
         while True:
-            links += [(node, dy, sink, sink.ins[p]) for sink, p in _ends(net, by_key, i)]
+            links += [(node, dy, sink, sink.ins[p]) for sink, p in _sinks_in(net, by_key, i)]
             if (net.key, i) not in lanes:
                 break
             links.append((node, dy, lanes[net.key, i], 0.0))
@@ -174,7 +174,7 @@ def _links(
     return links
 
 
-def _channels(
+def _find_parts(
     nets: Sequence[Net], by_key: dict[str, Node], lanes: dict[tuple[str, int], Node], depth: int
 ) -> dict[int, list[_Part]]:
     """Return the parts of all nets by channel; channel i lies behind layer i."""
@@ -186,24 +186,24 @@ def _channels(
         behind = sorted({by_key[s].layer for s, _ in net.sinks if by_key[s].layer <= first})
         for i in range(first, max(last, first + 1)):
             start = (source, source.outs[net.source[1]]) if i == first else (lanes[net.key, i], 0.0)
-            ends = [(node, node.ins[pin]) for node, pin in _ends(net, by_key, i + 1)]
+            ends = [(node, node.ins[pin]) for node, pin in _sinks_in(net, by_key, i + 1)]
             if (net.key, i + 1) in lanes:
                 ends.append((lanes[net.key, i + 1], 0.0))
             channels[i].append(_Part(net, start, ends, back=bool(behind) and i == first))
         for layer in behind:
-            ends = [(node, node.ins[pin]) for node, pin in _ends(net, by_key, layer)]
+            ends = [(node, node.ins[pin]) for node, pin in _sinks_in(net, by_key, layer)]
             channels[layer - 1].append(_Part(net, None, ends, back=True))
     return channels
 
 
-def _tracks(parts: list[_Part], x: float, floor: float, *, outside: bool) -> float:
+def _assign_tracks(parts: list[_Part], x: float, floor: float, *, outside: bool) -> float:
     """Give the upright pieces of a channel their places; return where the channel ends."""
     placed: list[_Part] = []
-    waiting = sorted((p for p in parts if _upright(p, floor)), key=lambda p: _preference(p, floor))
+    waiting = sorted((p for p in parts if _is_upright(p, floor)), key=lambda p: _preference(p, floor))
     while waiting:
-        free = [p for p in waiting if not any(_first(b, p) for b in waiting)]
+        free = [p for p in waiting if not any(_turns_first(b, p) for b in waiting)]
         if not free:  # they wait for one another in a circle: one of them changes its height on the way
-            rest = _dogleg(waiting[0], parts)
+            rest = _split_part(waiting[0], parts)
             parts.append(rest)
             waiting.append(rest)
             continue
@@ -211,7 +211,7 @@ def _tracks(parts: list[_Part], x: float, floor: float, *, outside: bool) -> flo
         waiting.remove(part)
         low, high = part.span(floor)
         busy = {p.track for p in placed if p.span(floor)[0] < high + LANE / 2 and low < p.span(floor)[1] + LANE / 2}
-        part.track = max((b.track + 1 for b in placed if _first(b, part)), default=0)
+        part.track = max((b.track + 1 for b in placed if _turns_first(b, part)), default=0)
         while part.track in busy:
             part.track += 1
         placed.append(part)
@@ -226,12 +226,12 @@ def _tracks(parts: list[_Part], x: float, floor: float, *, outside: bool) -> flo
     return x + max(LEAST, max(names, LANE) + max(tracks - 1, 0) * TRACK + LANE + 4)
 
 
-def _upright(part: _Part, floor: float) -> bool:
+def _is_upright(part: _Part, floor: float) -> bool:
     low, high = part.span(floor)
     return high > low
 
 
-def _first(a: _Part, b: _Part) -> bool:
+def _turns_first(a: _Part, b: _Part) -> bool:
     """Return whether a part must turn ahead of another: where it enters the channel the other one leaves it."""
     if any(node.layer < 0 and a.start == (node, dy) for node, dy in b.ends):
         return False
@@ -240,7 +240,7 @@ def _first(a: _Part, b: _Part) -> bool:
     return a.net is not b.net and a.left is not None and any(abs(a.left - right) < 3.0 for right in b.rights)
 
 
-def _dogleg(part: _Part, parts: list[_Part]) -> _Part:
+def _split_part(part: _Part, parts: list[_Part]) -> _Part:
     """Split a part at a height at which no other one enters or leaves; return what comes behind."""
     taken = [y for p in parts for y in (*p.rights, *([] if p.left is None else [p.left]))]
     begin = part.rights[0] if part.left is None else part.left
@@ -261,7 +261,7 @@ def _preference(part: _Part, floor: float) -> tuple[float, ...]:
     return (1.0, -part.left) if falls else (0.0, part.left)
 
 
-def _ways_back(nets: Sequence[Net], channels: dict[int, list[_Part]], floor: float) -> float:
+def _route_back(nets: Sequence[Net], channels: dict[int, list[_Part]], floor: float) -> float:
     """Route what runs back below everything, short ways above long ones; return the lower edge."""
     ways = []
     for net in nets:

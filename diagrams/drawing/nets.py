@@ -79,7 +79,7 @@ class Nets:
         block = path if path in self.table.blocks else pin.maker
         return ", ".join(self.names.get((block, pin.port), []))
 
-    def written_at(self, place: Place, pin: Pin, sinks: list[PlacedPin]) -> str:
+    def label_at(self, place: Place, pin: Pin, sinks: list[PlacedPin]) -> str:
         """Return the name that is written at a wire; one that only leaves the box is named outside."""
         if place.border is Border.INPUTS or (sinks and all(end.border is Border.OUTPUTS for end, _ in sinks)):
             return ""
@@ -99,7 +99,7 @@ class Nets:
             self._join(here, end, (Place(here, Border.OUTPUTS), crossing))
             _add(self.outs, here, crossing)
             end, here = (Place(here), crossing), here.rpartition(".")[0]
-        for box in _between(here, frame):
+        for box in _subsystems_between(here, frame):
             self._join(here, end, (Place(box), crossing))
             _add(self.ins, box, crossing)
             end, here = (Place(box, Border.INPUTS), crossing), box
@@ -114,7 +114,7 @@ class Nets:
             sinks.append(sink)
 
 
-def _between(outer: str, inner: str) -> list[str]:
+def _subsystems_between(outer: str, inner: str) -> list[str]:
     """Return the boxes from a frame down to one inside it."""
     parts = inner.split(".") if inner else []
     start = len(outer.split(".")) if outer else 0

@@ -76,7 +76,7 @@ def cut_loops(keys: Sequence[str], pairs: Iterable[tuple[str, str]], plants: set
     left = [pair for pair in dict.fromkeys(pairs) if pair[0] != pair[1]]
     place = {key: i for i, key in enumerate(keys)}
     while True:
-        knots = [knot for knot in _knots(keys, left) if len(knot) > 1]
+        knots = [knot for knot in _find_knots(keys, left) if len(knot) > 1]
         if not knots:
             return left
         gone: set[tuple[str, str]] = set()
@@ -91,7 +91,7 @@ def cut_loops(keys: Sequence[str], pairs: Iterable[tuple[str, str]], plants: set
         left = [pair for pair in left if pair not in gone]
 
 
-def _knots(keys: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[set[str]]:
+def _find_knots(keys: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[set[str]]:
     """Return the strongly connected parts of a graph (Tarjan's algorithm, without recursion)."""
     after: dict[str, list[str]] = {key: [] for key in keys}
     for a, b in pairs:
@@ -131,7 +131,7 @@ def _knots(keys: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[set[st
 def order_layers(layers: list[list[Node]], links: Sequence[Link]) -> list[list[Node]]:
     """Sort every layer so that few wires cross: sweeps to the barycentres of the neighbours, the best one is kept."""
     left, right = _neighbours(links)
-    best, least = layers, _crossings(layers, links)
+    best, least = layers, _count_crossings(layers, links)
     now = [list(layer) for layer in layers]
     for sweep in range(24):
         if not least:
@@ -146,13 +146,13 @@ def order_layers(layers: list[list[Node]], links: Sequence[Link]) -> list[list[N
                 centre[id(node)] = sum(around) / len(around) if around else float(i)
             layer.sort(key=lambda node: centre[id(node)])
             spot.update({id(node): float(i) for i, node in enumerate(layer)})
-        crossings = _crossings(now, links)
+        crossings = _count_crossings(now, links)
         if crossings < least:
             best, least = [list(layer) for layer in now], crossings
-    return _swapped(best, links, least)
+    return _swap_neighbours(best, links, least)
 
 
-def _swapped(layers: list[list[Node]], links: Sequence[Link], least: int) -> list[list[Node]]:
+def _swap_neighbours(layers: list[list[Node]], links: Sequence[Link], least: int) -> list[list[Node]]:
     """Exchange neighbours in a layer as long as that removes crossings."""
     layers = [list(layer) for layer in layers]
     if sum(map(len, layers)) > 150:
@@ -161,10 +161,10 @@ def _swapped(layers: list[list[Node]], links: Sequence[Link], least: int) -> lis
         start = least
         for layer in layers:
             near = [k for k in links if k[0] in layer or k[2] in layer]
-            here = _crossings(layers, near)
+            here = _count_crossings(layers, near)
             for i in range(len(layer) - 1):
                 layer[i], layer[i + 1] = layer[i + 1], layer[i]
-                crossings = _crossings(layers, near)
+                crossings = _count_crossings(layers, near)
                 if crossings < here:
                     least, here = least - (here - crossings), crossings
                 else:
@@ -188,7 +188,7 @@ def _neighbours(links: Sequence[Link]) -> tuple[dict[int, list[tuple[Node, float
     return left, right
 
 
-def _crossings(layers: list[list[Node]], links: Sequence[Link]) -> int:
+def _count_crossings(layers: list[list[Node]], links: Sequence[Link]) -> int:
     spot = _spots(layers)
     channels: dict[int, list[tuple[tuple[float, float], tuple[float, float]]]] = {}
     for a, da, b, db in links:

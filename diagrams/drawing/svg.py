@@ -63,13 +63,13 @@ def draw(diagram: CheckedDiagram, *, box: str = "", closed: bool | Iterable[str]
     """
     table = diagram.structure
     boxes = [path for path in table.frames if path]
-    shut = _closed(table, box, closed, who=diagram.name)
+    shut = _find_closed(table, box, closed, diagram=diagram.name)
     if box not in table.frames:
         raise OptionError(f"there is no subsystem {box!r}. {near(box, boxes)}", block=diagram.name, port="box")
     return _Picture(table, shut - {box}).page(box, box or diagram.name)
 
 
-def _closed(table: Structure, box: str, closed: bool | Iterable[str] | None, *, who: str) -> set[str]:
+def _find_closed(table: Structure, box: str, closed: bool | Iterable[str] | None, *, diagram: str) -> set[str]:
     boxes = {path for path in table.frames if path}
     if closed is None:
         inside = [p for p, frame in table.frame_of.items() if not box or frame == box or frame.startswith(box + ".")]
@@ -78,7 +78,7 @@ def _closed(table: Structure, box: str, closed: bool | Iterable[str] | None, *, 
         return boxes if closed else set()
     shut = {closed} if isinstance(closed, str) else set(closed)
     for path in sorted(shut - boxes):
-        raise OptionError(f"there is no subsystem {path!r}. {near(path, boxes)}", block=who, port="closed")
+        raise OptionError(f"there is no subsystem {path!r}. {near(path, boxes)}", block=diagram, port="closed")
     return shut
 
 
@@ -96,7 +96,7 @@ class _Picture:
 
     def page(self, frame: str, title: str) -> str:
         """Return the whole SVG."""
-        body, w, h, pins = self._inside(frame)
+        body, w, h, pins = self._lay_out(frame)
         left, right, top, border = MARGIN, MARGIN, MARGIN, ""
         if frame:  # its border, and the names of the pins on it
             texts = {name: (side, text) for side, names in enumerate(self._pin_texts(frame)) for name, text in names}
@@ -118,7 +118,7 @@ class _Picture:
             f'<g transform="translate({left:g} {top:g})">\n{border}{body}</g>\n</svg>\n'
         )
 
-    def _inside(self, frame: str) -> tuple[str, float, float, list[Node]]:
+    def _lay_out(self, frame: str) -> tuple[str, float, float, list[Node]]:
         """Lay a frame out; return its drawing, its size, and the pins on its border."""
         table = self.table
         items = [p for p, f in table.frame_of.items() if f == frame]
@@ -127,15 +127,15 @@ class _Picture:
         nodes = []
         for path in [*items, *boxes]:
             if path in table.blocks:
-                nodes.append(self._block(path))
+                nodes.append(self._block_node(path))
             elif path in self.closed:
-                nodes.append(self._shut(path))
+                nodes.append(self._closed_node(path))
             else:
-                body, w, h, pins = self._inside(path)
+                body, w, h, pins = self._lay_out(path)
                 node = Node(path, max(w + 2 * MARGIN, width(self._header(path), 10, True) + 20), h + HEADER + MARGIN)
                 node.ins = {name: p.y + HEADER for p in pins for name in p.outs}
                 node.outs = {name: p.y + HEADER for p in pins for name in p.ins}
-                self._control_pins(node)
+                self._place_control_pins(node)
                 drawn[path] = (body, pins)
                 nodes.append(node)
             nodes[-1].plant = self._has_plant(path)
@@ -148,7 +148,7 @@ class _Picture:
             borders += [Node(leaving.key(n), 0, 0, {n: 0.0}, {}, 1) for n in self.nets.outs.get(frame, [])]
         nets, names = [], []
         for (place, pin), sinks in self.nets.of[frame].items():
-            name = self.nets.written_at(place, pin, sinks)
+            name = self.nets.label_at(place, pin, sinks)
             part = any(self.nets.is_part(*sink) for sink in sinks)
             label = (width(name, 9) + 10 if name else 0.0) + (14.0 if part else 0.0)
             ends = [(end.key(p), p) for end, p in sinks]
@@ -160,7 +160,7 @@ class _Picture:
         out += [self._label(net, name, nodes) for net, name in zip(nets, names, strict=True)]
         return "".join(out), w, h, borders
 
-    def _control_pins(self, node: Node) -> None:
+    def _place_control_pins(self, node: Node) -> None:
         for pin in self.nets.ins.get(node.key, []):
             if pin.control:
                 node.ins[pin] = HEADER / 2
@@ -190,7 +190,7 @@ class _Picture:
         plain_in, plain_out = len(declared_in) == 1, len(declared_out) == 1
         return [(n, "" if plain_in else n.port) for n in ins], [(n, "" if plain_out else n.port) for n in outs]
 
-    def _block(self, path: str) -> Node:
+    def _block_node(self, path: str) -> Node:
         ins, outs = self._pin_texts(path)
         title, kind = self._titles(path)
         if isinstance(self.table.blocks[path], Sum):
@@ -210,7 +210,7 @@ class _Picture:
             node.outs = dict.fromkeys(node.outs, round(node.height / 2))
         return node
 
-    def _shut(self, path: str) -> Node:
+    def _closed_node(self, path: str) -> Node:
         ins, outs = self._pin_texts(path)
         rows = max(len(ins), len(outs), 1)
         sides = max((width(t, 8.5) for _, t in ins), default=0) + max((width(t, 8.5) for _, t in outs), default=0)

@@ -147,7 +147,7 @@ def _events(table: Structure, checked: Checked) -> Iterator[FlatEvent]:
 
 def _period(table: Structure, path: str) -> float:
     frame = table.frame_of[path]
-    if table.triggered(frame) is not None:
+    if table.triggered_around(frame) is not None:
         return math.nan
     rate = table.rate(frame)
     return math.nan if rate is None else float(rate)

@@ -60,7 +60,7 @@ def _clocks(flat: FlatDiagram, port: tuple[str, str], *, reading: bool) -> set[C
             continue
         seen.add(path)
         frame = table.frame_of[path]
-        if table.sampled(frame) and frame in flat.clocks:
+        if table.is_sampled(frame) and frame in flat.clocks:
             found.add(flat.clocks[frame])
             continue
         where = flat.states.slices.get(path)

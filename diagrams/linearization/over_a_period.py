@@ -276,7 +276,7 @@ def _pieces(flat: FlatDiagram, t: float, end: float) -> Iterator[tuple[float, fl
     sources = [
         flat.table.blocks[path]
         for path in flat.checked.traced
-        if not flat.table.sampled(flat.table.frame_of[path])
+        if not flat.table.is_sampled(flat.table.frame_of[path])
         and type(flat.table.blocks[path]).next_instant is not Block.next_instant
     ]
     while t < end:
@@ -314,7 +314,7 @@ def own_states(flat: FlatDiagram) -> set[int]:
     """
     found = set(flat.continuous.tolist())
     for path, where in flat.states.slices.items():
-        if flat.table.sampled(flat.table.frame_of[path]):
+        if flat.table.is_sampled(flat.table.frame_of[path]):
             found |= set(range(where.start, where.stop))
     return found
 

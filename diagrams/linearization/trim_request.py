@@ -226,7 +226,7 @@ def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[li
 def _place(free: Free, diagram: WiredDiagram, flat: FlatDiagram) -> None:
     trace, free.block = flat.checked.traced[free.path], diagram.structure.blocks[free.path]
     rate = flat.table.rate(flat.table.frame_of[free.path])
-    period = np.nan if rate is None or flat.table.triggered(flat.table.frame_of[free.path]) else float(rate)
+    period = np.nan if rate is None or flat.table.triggered_around(flat.table.frame_of[free.path]) else float(rate)
     if ".".join(free.keys) not in dict(traced_parameters(free.block)):
         raise ParameterError(
             "it is structure: the equations were traced with this value, so it can't be found by a trim. Try values "

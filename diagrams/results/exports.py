@@ -34,7 +34,7 @@ def to_csv(run: Run, path: Any, names: Sequence[str]) -> None:
 
 def to_pandas(run: Run, names: Sequence[str]) -> Any:
     """See `Run.to_pandas`."""
-    pandas = library("pandas")
+    pandas = import_library("pandas")
     table = dict(columns(run, names))
     frame = pandas.DataFrame(table, index=pandas.Index(np.array(run.t), name="t"))
     frame.attrs["units"] = {"t": "s", **units_of_columns(run, names)}
@@ -43,9 +43,9 @@ def to_pandas(run: Run, names: Sequence[str]) -> Any:
 
 def to_xarray(run: Run, names: Sequence[str]) -> Any:
     """See `Run.to_xarray`."""
-    xarray = library("xarray")
+    xarray = import_library("xarray")
     variables, coordinates = {}, {"t": ("t", np.array(run.t), {"units": "s"})}
-    for name in chosen(run, names):
+    for name in select_signals(run, names):
         values = run[name]
         axes = values.shape[1:]
         dims = [f"{name}_dim"] if len(axes) == 1 else [f"{name}_dim{i + 1}" for i in range(len(axes))]
@@ -58,7 +58,7 @@ def to_xarray(run: Run, names: Sequence[str]) -> Any:
 
 def to_parquet(run: Run, path: Any, names: Sequence[str]) -> None:
     """See `Run.to_parquet`."""
-    arrow, parquet = library("pyarrow"), library("pyarrow.parquet")
+    arrow, parquet = import_library("pyarrow"), import_library("pyarrow.parquet")
     units = {"t": "s", **units_of_columns(run, names)}
     fields = [arrow.field(n, arrow.float64(), metadata={"unit": u} if u else None) for n, u in units.items()]
     schema = arrow.schema(fields, metadata={"diagram": run.diagram_name})
@@ -74,9 +74,9 @@ def to_mat(run: Run, path: Any, names: Sequence[str]) -> None:
     """See `Run.to_mat`."""
     from scipy.io import savemat
 
-    signals = chosen(run, names)
+    signals = select_signals(run, names)
     variables = matlab_names(signals)
-    values = {v: flat(run[n]) for n, v in variables.items()}
+    values = {v: flatten_samples(run[n]) for n, v in variables.items()}
     for name, variable in variables.items():
         if values[variable].nbytes > _LARGEST:
             raise OptionError(
@@ -111,7 +111,7 @@ def matlab_names(names: Sequence[str]) -> dict[str, str]:
     return made
 
 
-def chosen(run: Run, names: Sequence[str]) -> list[str]:
+def select_signals(run: Run, names: Sequence[str]) -> list[str]:
     """Return the signals to export: those given, else all named wires, else all ports; each once."""
     every = run.names
     wires = [n for n in every if n in run.wires]
@@ -120,18 +120,18 @@ def chosen(run: Run, names: Sequence[str]) -> list[str]:
 
 def columns(run: Run, names: Sequence[str], some: slice = slice(None)) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the name and the values of each column; entries of a vector are counted from 1."""
-    for name in chosen(run, names):
+    for name in select_signals(run, names):
         values = run.part(name, some)
-        for label, column in zip(labels(name, values.shape[1:]), flat(values).T, strict=True):
+        for label, column in zip(column_labels(name, values.shape[1:]), flatten_samples(values).T, strict=True):
             yield label, np.ascontiguousarray(column)
 
 
-def flat(values: np.ndarray) -> np.ndarray:
+def flatten_samples(values: np.ndarray) -> np.ndarray:
     """Return the entries of each sample side by side, a matrix's row by row."""
     return values.reshape(len(values), int(np.prod(values.shape[1:])))
 
 
-def labels(name: str, shape: tuple[int, ...]) -> list[str]:
+def column_labels(name: str, shape: tuple[int, ...]) -> list[str]:
     """Return the names of a signal's columns."""
     return [name] if shape == () else [f"{name}[{i + 1}]" for i in range(int(np.prod(shape)))]
 
@@ -139,9 +139,9 @@ def labels(name: str, shape: tuple[int, ...]) -> list[str]:
 def units_of_columns(run: Run, names: Sequence[str]) -> dict[str, str]:
     """Return the unit of each column, "" where it is not declared."""
     units: dict[str, str] = {}
-    for name in chosen(run, names):
+    for name in select_signals(run, names):
         shape = run.part(name, slice(0)).shape[1:]
-        units |= zip(labels(name, shape), unit_list(run, name, int(np.prod(shape))), strict=True)
+        units |= zip(column_labels(name, shape), unit_list(run, name, int(np.prod(shape))), strict=True)
     return units
 
 
@@ -153,7 +153,7 @@ def unit_list(run: Run, name: str, size: int) -> list[str]:
     return [u or "" for u in unit] if len(unit) == size else [", ".join(u or "" for u in unit)] * size
 
 
-def library(name: str) -> Any:
+def import_library(name: str) -> Any:
     """Return a library of the extra ``export``.
 
     Raises

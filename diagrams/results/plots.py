@@ -191,10 +191,10 @@ def _units(run: Run, name: str) -> list[str]:
     """Return the unit of every entry, as it is to be read."""
     unit = run.unit(name)
     units = [u or "" for u in unit] if isinstance(unit, tuple) else [unit or ""] * _size(run, name)
-    return [_readable(u) for u in units]
+    return [_unit_text(u) for u in units]
 
 
-def _readable(unit: str) -> str:
+def _unit_text(unit: str) -> str:
     """Write an FMI unit with superscripts: m/s2 as m/s²."""
     return "" if unit == "1" else unit.translate(str.maketrans("23", "²³")).replace(".", " ")
 

@@ -15,7 +15,7 @@ from ...blocks.core.layout import Layout
 from ..wiring.structure import Wire
 from .memory import memory
 from .signal_names import entries, resolve
-from .stored import END, Occurrence, create, line, prepare, read, split, write_json
+from .stored import END, Occurrence, create, event_line, prepare, read, split, write_json
 
 _FIRST, _LARGEST = 1024, 2**26  # rows of the first chunk in memory, bytes of the largest
 _ROWS, _BYTES = 1024, 2**18  # of a chunk on its way to disk, whichever is less
@@ -95,14 +95,14 @@ class Recorder:
         self._k = self._limit = self._skip = 0
         self._due, self._broken = 0.0, False
         self._tail: np.ndarray | None = None  # the newest row that was flushed
-        self._keep = self._in_memory if to is None else self._on_disk
-        self.row = self._keep if self.every == 1 else self._nth
+        self._keep = self._keep_in_memory if to is None else self._keep_on_disk
+        self.row = self._keep if self.every == 1 else self._keep_nth
         self.residual: np.ndarray | None = None
         """After `finish`: the residual of each sample kept."""
 
     # --- samples: called at every tick -------------------------------------------------------------------------------
 
-    def _in_memory(self, t: float, vector: np.ndarray) -> None:
+    def _keep_in_memory(self, t: float, vector: np.ndarray) -> None:
         k = self._k
         if k == self._limit:
             self._grow(t)
@@ -111,7 +111,7 @@ class Recorder:
         self._values[k] = vector if self._pick is None else vector[self._pick]
         self._k = k + 1
 
-    def _on_disk(self, t: float, vector: np.ndarray) -> None:
+    def _keep_on_disk(self, t: float, vector: np.ndarray) -> None:
         k = self._k
         if k == self._limit or monotonic() >= self._due:
             self._start()
@@ -121,7 +121,7 @@ class Recorder:
         self._values[k] = vector if self._pick is None else vector[self._pick]
         self._k = k + 1
 
-    def _nth(self, t: float, vector: np.ndarray) -> None:
+    def _keep_nth(self, t: float, vector: np.ndarray) -> None:
         if self._skip:
             self._skip -= 1
         else:
@@ -140,11 +140,11 @@ class Recorder:
         if self.to is None:
             self.events.append(occurrence)
         else:
-            self._start()[1].write(line(occurrence))
+            self._start()[1].write(event_line(occurrence))
 
     # --- chunks ------------------------------------------------------------------------------------------------------
 
-    def _new(self, rows: int) -> None:
+    def _begin_chunk(self, rows: int) -> None:
         self._chunk = np.empty((rows, self._width), "<f8")
         self._times, self._values = self._chunk[:, 0], self._chunk[:, 1:]
         self._k, self._limit = 0, rows
@@ -163,7 +163,7 @@ class Recorder:
                 "with record=[…] or every=…, or stream to disk with to=path.",
                 t=t,
             )
-        self._new(rows)
+        self._begin_chunk(rows)
 
     def _start(self) -> Any:
         """Create the folder, if that has not been done."""
@@ -172,8 +172,8 @@ class Recorder:
             try:
                 self._files = create(self.to, self._header or {})
             except OSError as error:
-                raise self._failed(error) from error
-            self._new(max(1, min(_ROWS, _BYTES // (8 * self._width))))
+                raise self._write_error(error) from error
+            self._begin_chunk(max(1, min(_ROWS, _BYTES // (8 * self._width))))
             self._due = monotonic() + _LATEST
         return self._files
 
@@ -197,11 +197,11 @@ class Recorder:
         except OSError as error:
             rows.truncate(self._written * 8 * self._width)  # whole rows only: later ones must not be shifted
             self._k = 0
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
         self._written += self._k
         self._k, self._due = 0, monotonic() + _LATEST
 
-    def _failed(self, error: OSError) -> SimulationError:
+    def _write_error(self, error: OSError) -> SimulationError:
         self._broken = True
         return SimulationError(
             f"the run can't be written to {os.fspath(self.to or '')!r}: {error.strerror or error}. What was written "
@@ -221,12 +221,12 @@ class Recorder:
         if self._k:
             self._done.append(self._chunk[: self._k])
         self._chunk, self._k, self._limit = np.empty((0, 0)), 0, 0
-        rows = self._done.pop() if len(self._done) == 1 else self._together()
+        rows = self._done.pop() if len(self._done) == 1 else self._join_chunks()
         self.events = tuple(self.events)
         t, data, self.residual = split(rows, self.has_residual)
         return np.ascontiguousarray(t), data
 
-    def _together(self) -> np.ndarray:
+    def _join_chunks(self) -> np.ndarray:
         rows, n = np.empty((sum(map(len, self._done)), self._width)), 0
         self._done.reverse()
         while self._done:  # each is freed as soon as it is copied: the pages of `rows` come only with what is written
@@ -246,7 +246,7 @@ class Recorder:
             write_json(self.to / END, end)
         except OSError as error:
             if not self._broken:  # else that was said already
-                raise self._failed(error) from error
+                raise self._write_error(error) from error
         finally:
             for file in files:
                 file.close()

@@ -175,7 +175,7 @@ class Run:
     @property
     def names(self) -> list[str]:
         """Every name under which a signal was recorded: the wires' names, then the ports' paths."""
-        return [n for n in (*sorted(self.wires), *self.layout.slices) if self._where(n) is not None]
+        return [n for n in (*sorted(self.wires), *self.layout.slices) if self._find_columns(n) is not None]
 
     @cached_property
     def _position(self) -> np.ndarray | None:
@@ -186,7 +186,7 @@ class Run:
         position[self.columns] = np.arange(len(self.columns))
         return position
 
-    def _where(self, full: str) -> np.ndarray | None:
+    def _find_columns(self, full: str) -> np.ndarray | None:
         """Return the columns of a signal in ``data``, in its shape; None if not all were recorded."""
         where = entries(full, self.layout, self.wires)
         if self._position is None:
@@ -220,7 +220,7 @@ class Run:
             If there is none of that name, or several, or if it was not recorded.
         """
         full = resolve(name, self.wires, self.layout.slices)
-        where = self._where(full)
+        where = self._find_columns(full)
         if where is None:
             raise UnknownNameError(
                 f"the signal {full!r} was not recorded in this run, as the selection left it out. Run again with "
@@ -238,7 +238,7 @@ class Run:
 
     def __contains__(self, name: str) -> bool:
         try:
-            return self._where(resolve(name, self.wires, self.layout.slices)) is not None
+            return self._find_columns(resolve(name, self.wires, self.layout.slices)) is not None
         except UnknownNameError:
             return False
 
@@ -269,7 +269,7 @@ class Run:
                 f"again with the states recorded; for a signal alone, take run[name][{k}]."
             )
         row = np.array(self.data[k])
-        found = ((name, self._where(name)) for name in (*self.layout.slices, *self.wires))
+        found = ((name, self._find_columns(name)) for name in (*self.layout.slices, *self.wires))
         values = {name: row[where] for name, where in found if where is not None}
         first = self.layout.total if self.columns is None else int(np.searchsorted(self.columns, self.layout.total))
         return Snapshot(float(self.t[k]), k, values, row[first:].copy(), dict(self.wires), self)

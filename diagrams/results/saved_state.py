@@ -105,7 +105,7 @@ def check_fits(state: RunState, flat: FlatDiagram, name: str) -> None:
                 )
 
 
-def not_open(opened: bool | None, name: str) -> OptionError:
+def not_open_error(opened: bool | None, name: str) -> OptionError:
     """Return the error of a run that is used before it has begun (``opened`` is None), or after it has ended."""
     found = "has not begun" if opened is None else "has ended, and its FMUs are freed"
     return OptionError(

@@ -155,16 +155,16 @@ def write_json(path: Path, value: Any) -> None:
     """Write a file as a whole: whoever reads it finds all of it, or no file."""
     part = path.with_name(path.name + ".part")
     with open(part, "w", encoding="utf-8") as file:
-        json.dump(value, file, ensure_ascii=False, indent=1, default=_plain)
+        json.dump(value, file, ensure_ascii=False, indent=1, default=_to_json)
         file.write("\n")
         file.flush()
         os.fsync(file.fileno())
     part.replace(path)
 
 
-def line(event: Occurrence) -> str:
+def event_line(event: Occurrence) -> str:
     """Return the line of an event."""
-    return json.dumps(asdict(event), ensure_ascii=False, default=_plain) + "\n"
+    return json.dumps(asdict(event), ensure_ascii=False, default=_to_json) + "\n"
 
 
 def write(folder: Path, run: Any, overwrite: bool) -> None:
@@ -190,7 +190,7 @@ def write(folder: Path, run: Any, overwrite: bool) -> None:
             left = np.ascontiguousarray(np.hstack(parts), "<f8").data.cast("B")
             while left:
                 left = left[rows.write(left) :]
-        lines.writelines(map(line, events))
+        lines.writelines(map(event_line, events))
         lines.flush()
         for file in (rows, lines):
             os.fsync(file.fileno())
@@ -257,7 +257,7 @@ class Stored:
     @property
     def units(self) -> dict[str, Any]:
         """The units of ports."""
-        return {s["name"]: _tuples(s["unit"]) for s in self.head["signals"] if s["unit"] is not None}
+        return {s["name"]: _to_tuples(s["unit"]) for s in self.head["signals"] if s["unit"] is not None}
 
 
 def read(folder: Path) -> Stored:
@@ -285,7 +285,7 @@ def read(folder: Path) -> Stored:
         )
     ended = folder / END
     end = json.loads(ended.read_text(encoding="utf-8")) if ended.is_file() else None
-    t, data, residual = split(_rows(folder / ROWS, len(head["columns"])), head["vector"]["residual"])
+    t, data, residual = split(_read_rows(folder / ROWS, len(head["columns"])), head["vector"]["residual"])
     return Stored(head, end, t, data, residual, StoredEvents(folder / EVENTS))
 
 
@@ -294,14 +294,14 @@ def split(rows: np.ndarray, residual: bool) -> tuple[np.ndarray, np.ndarray, np.
     return rows[:, 0], rows[:, 1 : -1 if residual else None], rows[:, -1] if residual else None
 
 
-def _rows(path: Path, width: int) -> np.ndarray:
+def _read_rows(path: Path, width: int) -> np.ndarray:
     n = path.stat().st_size // (8 * width) if path.is_file() else 0
     if n == 0:
         return np.zeros((0, width))  # an empty file can't be mapped
     return np.asarray(np.memmap(path, "<f8", mode="r", shape=(n, width)))
 
 
-def _plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     if isinstance(value, Mapping):
         return dict(value)
     if isinstance(value, np.ndarray | np.generic):
@@ -311,8 +311,8 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} can't be stored")
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
+def _to_tuples(value: Any) -> Any:
+    return tuple(_to_tuples(v) for v in value) if isinstance(value, list) else value
 
 
 def _index_to_json(index: Any) -> Any:

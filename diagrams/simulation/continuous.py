@@ -99,7 +99,7 @@ class Continuous:
         self.sources = [
             (path, flat.table.blocks[path])
             for path in sorted(flat.checked.traced)
-            if not flat.table.sampled(flat.table.frame_of[path])
+            if not flat.table.is_sampled(flat.table.frame_of[path])
             and type(flat.table.blocks[path]).next_instant is not Block.next_instant
         ]
 

@@ -54,7 +54,7 @@ from ..results.operating_point import OperatingPoint
 from ..results.recorder import Recorder
 from ..results.recording import Recording
 from ..results.run import Run
-from ..results.saved_state import RunState, check_fits, layout_of, not_open
+from ..results.saved_state import RunState, check_fits, layout_of, not_open_error
 from ..results.stored import Occurrence, Stopped
 from ..solvers.base import solver_name
 from ..wiring.structure import join
@@ -164,7 +164,7 @@ class Simulation:
 
     def __enter__(self) -> Simulation:
         if self._open is not None:
-            raise not_open(self._open, self.diagram.name)
+            raise not_open_error(self._open, self.diagram.name)
         try:
             self._open = True
             self._load()
@@ -242,7 +242,7 @@ class Simulation:
             A duration that is not positive, or no multiple of the step; a run that has not begun, or has ended.
         """
         if not self._open:
-            raise not_open(self._open, self.diagram.name)
+            raise not_open_error(self._open, self.diagram.name)
         last = self._tick + ticks_in(duration, self.flat.base, self.diagram.name)
         started = time.perf_counter()
 
@@ -431,7 +431,7 @@ class Simulation:
             If the run has not begun, or has ended and its FMUs are freed.
         """
         if not self._begun or (self._plants and not self._open):
-            raise not_open(self._open, self.diagram.name)
+            raise not_open_error(self._open, self.diagram.name)
         machine = self._machine
         return RunState(
             t=self.t if self._stopped is None else self._stopped.t,
@@ -458,7 +458,7 @@ class Simulation:
             ended.
         """
         if not self._open:
-            raise not_open(self._open, self.diagram.name)
+            raise not_open_error(self._open, self.diagram.name)
         check_fits(state, self.flat, self.diagram.name)
         machine = self._machine
         for path, plant in self._plants:

@@ -37,14 +37,14 @@ def recall(solver: Any, kept: dict[str, Any]) -> None:
 def time_scale_of(flat: FlatDiagram) -> float:
     """Return the shortest time within which a source in a continuous frame changes."""
     table = flat.table
-    paths = (p for p in flat.checked.traced if not table.sampled(table.frame_of[p]))
+    paths = (p for p in flat.checked.traced if not table.is_sampled(table.frame_of[p]))
     return min((float(table.blocks[p].time_scale()) for p in paths), default=math.inf)
 
 
 def remembers(flat: FlatDiagram) -> bool:
     """Whether a block in a continuous frame has a memory, such as a projection's last foot point."""
     table = flat.table
-    return any(table.blocks[p].memory and not table.sampled(table.frame_of[p]) for p in flat.checked.traced)
+    return any(table.blocks[p].memory and not table.is_sampled(table.frame_of[p]) for p in flat.checked.traced)
 
 
 def absolute_tolerances(flat: FlatDiagram, atol: float) -> Any:

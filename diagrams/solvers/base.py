@@ -125,7 +125,7 @@ class Solver(ABC):
         self.statistics.jacobian_evaluations += 1
         return np.array(self.problem.jacobian(min(t, self.stop), x), dtype=float)
 
-    def finite(self, t: float, values: np.ndarray, what: str) -> None:
+    def check_finite(self, t: float, values: np.ndarray, what: str) -> None:
         """Raise if an entry is not finite; ``what`` is "state" or "rate"."""
         if not np.isfinite(values).all():
             i = int(np.flatnonzero(~np.isfinite(values))[0])
@@ -145,7 +145,7 @@ class Solver(ABC):
         """
         f = self.rate(t, x)
         try:
-            self.finite(t, f, "rate")
+            self.check_finite(t, f, "rate")
         except NonFiniteError as error:
             return error
         h = max(abs(h), 16 * math.ulp(t))
@@ -192,7 +192,7 @@ class VariableStep(Solver):
             return step
         t, x = self._sliver
         f = self.rate(t, x)
-        self.finite(t, f, "rate")
+        self.check_finite(t, f, "rate")
         self.statistics.steps += 1
         return Step(t, self.stop, _heun(self.rate, t, x, f, self.stop), lambda: lambda time: x + (time - t) * f)
 
@@ -240,9 +240,9 @@ class FixedStep(Solver):
         if self.problem.size:
             with np.errstate(all="ignore"):
                 f = self.rate(t, x)
-                self.finite(t, f, "rate")
+                self.check_finite(t, f, "rate")
                 x_new = self._formula(self.rate, t, x, f, t_new)
-            self.finite(t_new, x_new, "state")
+            self.check_finite(t_new, x_new, "state")
         else:
             f = x_new = x
         self._t, self._x = t_new, x_new

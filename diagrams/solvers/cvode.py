@@ -91,7 +91,7 @@ class _Library:
 
 
 @functools.cache
-def _library() -> _Library:
+def _load_library() -> _Library:
     try:
         from fmpy.sundials import libraries
 
@@ -160,7 +160,7 @@ class Cvode(VariableStep):
 
     def __init__(self, name: str, problem: Problem, rtol: float, atol: Any, max_step: float):
         super().__init__(name, problem, rtol, atol, max_step)
-        self._library = library = _library()
+        self._library = library = _load_library()
         self._calls = calls = _Calls(problem, self.statistics, library)
         context = c_void_p()
         library.SUNContext_Create(0, byref(context))
@@ -191,7 +191,7 @@ class Cvode(VariableStep):
         self._t, self._x_old, self._fails, self._t_new = 0.0, np.empty(0), 0, c_double()
 
     def _start(self, t: float, x: np.ndarray) -> None:
-        self._fails += self._failed_tests()
+        self._fails += self._count_failed_tests()
         self._calls.stop, self._t, self._x_old = self.stop, t, x
         self._calls.vector(self._x)[:] = x
         self._check(self._library.CVodeReInit(self._memory, t, self._x))
@@ -201,17 +201,17 @@ class Cvode(VariableStep):
         t = self._t
         self._check(self._library.CVode(self._memory, self.stop, self._x, byref(self._t_new), _ONE_STEP))
         self._t, self._x_old = self._t_new.value, self._calls.vector(self._x).copy()
-        self.finite(self._t, self._x_old, "state")
+        self.check_finite(self._t, self._x_old, "state")
         self.statistics.steps += 1
-        self.statistics.rejected = self._fails + self._failed_tests()
-        return Step(t, self._t, self._x_old.copy(), self._dense)
+        self.statistics.rejected = self._fails + self._count_failed_tests()
+        return Step(t, self._t, self._x_old.copy(), self._prepare_dense)
 
-    def _failed_tests(self) -> int:
+    def _count_failed_tests(self) -> int:
         count = c_long()
         self._library.CVodeGetNumErrTestFails(self._memory, byref(count))
         return count.value
 
-    def _dense(self) -> Dense:
+    def _prepare_dense(self) -> Dense:
         def at(t: float) -> np.ndarray:
             self._check(self._library.CVodeGetDky(self._memory, t, 0, self._dky))
             return self._calls.vector(self._dky).copy()

@@ -69,8 +69,8 @@ class SciPySolver(VariableStep):
         elif self._last_jacobian is not None:
             return self._last_jacobian.copy()
         else:
-            self.finite(t, super().rate(t, x), "rate")
-            self.finite(t, jacobian.sum(axis=1), "row in the Jacobian")
+            self.check_finite(t, super().rate(t, x), "rate")
+            self.check_finite(t, jacobian.sum(axis=1), "row in the Jacobian")
         return jacobian
 
     def _start(self, t: float, x: np.ndarray) -> None:
@@ -96,7 +96,7 @@ class SciPySolver(VariableStep):
         before = self.statistics.rate_evaluations
         planned = 0.0 if self.name == "LSODA" else inner.h_abs
         if self._strange and inner.t_old is None:  # perhaps it is the very start
-            self.finite(inner.t, super().rate(inner.t, inner.y), "rate")
+            self.check_finite(inner.t, super().rate(inner.t, inner.y), "rate")
         self._attempt_step()
         inner = self._inner
         if self._attempt and self.statistics.rejected is not None:
@@ -104,7 +104,7 @@ class SciPySolver(VariableStep):
         if self.name not in _MULTISTEP:  # a step that was cut at the stop says little about the next
             self.planned = max(planned, inner.h_abs) if inner.t == self.stop else inner.h_abs
         self.statistics.steps += 1
-        return Step(float(inner.t_old), float(inner.t), inner.y.copy(), self._dense)
+        return Step(float(inner.t_old), float(inner.t), inner.y.copy(), self._prepare_dense)
 
     def _attempt_step(self) -> None:
         """Take a step; go back and take a shorter one if it ended where the rates are not finite."""
@@ -122,7 +122,7 @@ class SciPySolver(VariableStep):
                     inner.step()
             if inner.status == "failed":
                 break
-            if self._sound(inner):
+            if self._is_sound(inner):
                 self._retried = max(0, self._retried - 1) if inner is first else self._retried + 3
                 return
             h = 0.25 * (inner.t - t)
@@ -131,11 +131,11 @@ class SciPySolver(VariableStep):
             self._create(t, x, h)
         if self._strange:
             f = super().rate(t, x)
-            self.finite(t, f, "rate")
+            self.check_finite(t, f, "rate")
         self.stuck = (t, x)
         raise self.failure(t, x, 10 * math.ulp(t))
 
-    def _sound(self, inner: Any) -> bool:
+    def _is_sound(self, inner: Any) -> bool:
         """Tell whether an accepted step is: a method may have met a NaN and shortened its step, which is well."""
         if self.name == "LSODA":  # which accepts a NaN
             return not self._strange
@@ -144,7 +144,7 @@ class SciPySolver(VariableStep):
         finite = np.isfinite(inner.y).all() and np.isfinite(getattr(inner, "f", 0.0)).all()
         return bool(finite and not math.isnan(inner.h_abs))
 
-    def _dense(self) -> Dense:
+    def _prepare_dense(self) -> Dense:
         return self._inner.dense_output()  # type: ignore[no-any-return]
 
 
@@ -187,9 +187,9 @@ class AutoSolver(VariableStep):
             step = self._active.step()
         h = step.t - step.t_old
         if self._active is self._explicit:
-            if (self._hits or not self.statistics.steps % _LOOK_EVERY) and self._stiff(step):
+            if (self._hits or not self.statistics.steps % _LOOK_EVERY) and self._is_stiff(step):
                 self._switch(self._implicit, step.t, step.x, h, why=f"stiff at steps of {h:.2g} s")
-        elif self._eased(step):
+        elif self._has_eased(step):
             self._switch(self._explicit, step.t, step.x, h, why="no longer stiff")
         return step
 
@@ -206,7 +206,7 @@ class AutoSolver(VariableStep):
         if t < self.stop:
             to.restart(t, x, self.stop)
 
-    def _stiff(self, step: Step) -> bool:
+    def _is_stiff(self, step: Step) -> bool:
         inner, border = self._explicit._inner, _STABLE[self._explicit.name]
         h, stages, last = step.t - step.t_old, inner.K, inner.n_stages - 1
         if inner.y_old is None or inner.y is None:
@@ -225,16 +225,16 @@ class AutoSolver(VariableStep):
         if self._hits < _HITS:
             return False
         self._hits = 0
-        return -h * self._abscissa(step.t, step.x) > 0.5 * border
+        return -h * self._leftmost_eigenvalue(step.t, step.x) > 0.5 * border
 
-    def _abscissa(self, t: float, x: np.ndarray) -> float:
+    def _leftmost_eigenvalue(self, t: float, x: np.ndarray) -> float:
         """Return the real part of the fastest decaying mode."""
         jacobian = self.jacobian(t, x)
         if self.problem.size > 300:  # the eigenvalues would cost more than many steps; trust the estimate
             return -math.inf
         return float(np.linalg.eigvals(jacobian).real.min()) if np.isfinite(jacobian).all() else 0.0
 
-    def _eased(self, step: Step) -> bool:
+    def _has_eased(self, step: Step) -> bool:
         scale = self.atol + self.rtol * np.abs(step.x)
         with np.errstate(all="ignore"):
             norm = (np.abs(self._implicit._inner.J) @ scale / scale).max()  # in the units of the error control

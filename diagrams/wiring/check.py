@@ -51,28 +51,23 @@ def check(table: Structure) -> Checked:
     """
     _check_ports(table)
     traced, shapes = _infer_shapes(table)
-    _check_boxes(table, traced, shapes)
+    _check_subsystems(table, traced, shapes)
     _check_stops(table, shapes)
     return Checked(traced, shapes, _check_units(table, shapes))
 
 
-def sources(table: Structure, path: str) -> dict[str, Wire | None]:
-    """Return the wire of every input of a block, None where its default is used."""
-    return {port: table.wires.get((path, port)) for port in table.blocks[path].inputs}
-
-
-def part_shape(shape: Shape, wire: Wire, who: str, port: str) -> Shape:
+def part_shape(shape: Shape, wire: Wire, consumer: str, port: str) -> Shape:
     """Return the shape of the part of an output that a wire takes."""
     if wire.index is None:
         return shape
     if not shape:
         raise ShapeError(
-            f"{wire} takes a part of a scalar; wire the whole of {wire.block}.{wire.port}.", block=who, port=port
+            f"{wire} takes a part of a scalar; wire the whole of {wire.block}.{wire.port}.", block=consumer, port=port
         )
     try:
         return np.empty(shape)[wire.index].shape
     except IndexError:
-        raise ShapeError(f"{wire} is out of range: the port has shape {shape}.", block=who, port=port) from None
+        raise ShapeError(f"{wire} is out of range: the port has shape {shape}.", block=consumer, port=port) from None
 
 
 def _check_ports(table: Structure) -> None:
@@ -120,11 +115,11 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[Port, Shape
     ready = [path for path, ports in unknown.items() if not ports]
     heapq.heapify(ready)
     waiting = set(table.blocks) - set(ready)
-    stuck: list[tuple[bool, bool, str]] | None = None  # from the first assumption on: who is best to make the next one
+    stuck: list[tuple[bool, bool, str]] | None = None  # blocks to make the next assumption for, the best one first
     while ready or waiting:
         if not ready:
             if stuck is None:
-                stuck = [(not _known(table, shapes, p), not table.blocks[p].states, p) for p in waiting]
+                stuck = [(not _known_shapes(table, shapes, p), not table.blocks[p].states, p) for p in waiting]
                 heapq.heapify(stuck)
             while (path := heapq.heappop(stuck)[2]) not in waiting:
                 pass
@@ -182,7 +177,7 @@ def _check_shapes(
         part_shape(shapes[wire.block, wire.port], wire, wire.block, f"{wire.port} (named {name!r})")
 
 
-def _check_boxes(table: Structure, traced: dict[str, Traced], shapes: dict[Port, Shape]) -> None:
+def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[Port, Shape]) -> None:
     """Check what controls boxes, and what stands in them."""
     for box, wire in sorted(table.controls.items()):
         kind = table.frames[box].control
@@ -215,7 +210,7 @@ def _check_boxes(table: Structure, traced: dict[str, Traced], shapes: dict[Port,
                 "time whatever the box does. Put it outside, and wire its outputs in.",
                 block=path,
             )
-        triggered = table.triggered(table.frame_of[path])
+        triggered = table.triggered_around(table.frame_of[path])
         if triggered is None:
             continue
         trace = traced[path]
@@ -263,7 +258,7 @@ def _reads_sample_time(block: Block, trace: Traced) -> bool:
 
 def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, shared: dict[Any, Traced]) -> Traced:
     frame = table.frame_of[path]
-    sampled, method, rate = table.sampled(frame), table.method(frame), table.rate(frame)
+    sampled, method, rate = table.is_sampled(frame), table.method(frame), table.rate(frame)
     try:
         if rate is not None and isinstance(block, SampleTimeOfFrame):
             block.check_rate(float(rate))
@@ -273,7 +268,7 @@ def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, 
         raise
 
 
-def _known(table: Structure, shapes: dict[Port, Shape], path: str) -> list[Shape]:
+def _known_shapes(table: Structure, shapes: dict[Port, Shape], path: str) -> list[Shape]:
     """Return the shapes that are known of what is wired to a block."""
     wires = ((port, table.wires.get((path, port))) for port in table.blocks[path].inputs)
     return [
@@ -289,7 +284,7 @@ def _assume(table: Structure, shapes: dict[Port, Shape], path: str) -> dict[Port
     A block's unknown inputs are assumed to have the shape of a known one beside them, else of its first state.
     """
     block = table.blocks[path]
-    shape = next(iter([*_known(table, shapes, path), *start_shapes(block)]), ())
+    shape = next(iter([*_known_shapes(table, shapes, path), *start_shapes(block)]), ())
     return {
         (path, port): shape
         for port, spec in block.inputs.items()
@@ -347,10 +342,12 @@ def _check_units(table: Structure, shapes: dict[Port, Shape]) -> dict[Port, Unit
                 if seen is None:
                     seen = (wire, unit)
                 expected, what = seen[1], f"{seen[0]} beside it is"
-            problem = _mismatch(unit, expected)
+            problem = _unit_mismatch(unit, expected)
             if problem:
                 raise UnitError(
-                    f"{wire} is in {_text(unit)}; {what} in {_text(expected)}: {problem}", block=path, port=name
+                    f"{wire} is in {_unit_text(unit)}; {what} in {_unit_text(expected)}: {problem}",
+                    block=path,
+                    port=name,
                 )
     return units
 
@@ -362,11 +359,11 @@ def _part_unit(units: dict[Port, Unit], wire: Wire) -> Unit:
     return unit
 
 
-def _text(unit: Unit) -> str:
+def _unit_text(unit: Unit) -> str:
     return ", ".join(unit) if isinstance(unit, tuple) else str(unit)
 
 
-def _mismatch(found: Unit, expected: Unit) -> str:
+def _unit_mismatch(found: Unit, expected: Unit) -> str:
     if found is None or expected is None:
         return ""
     n = max(len(u) if isinstance(u, tuple) else 1 for u in (found, expected))

@@ -12,11 +12,11 @@ from ...blocks.core.errors import OptionError, WiringError
 from ...blocks.core.signals import check_name
 from ...blocks.tracing.discretization import check_method
 from .check import Checked, check
-from .delay_blocks import lowered
+from .delay_blocks import add_delay_blocks
 from .evaluation_order import evaluation_order
 from .structure import Collector, Frame, Structure, Wire, stepped_blocks
 from .subsystem import exact_time
-from .variants import replaced, unique
+from .variants import apply_changes, find_path
 
 LOOPS = ("error", "solve")
 
@@ -64,7 +64,7 @@ class CheckedDiagram:
     """Traces of the blocks, and shapes and units of the ports, of what is scheduled."""
 
     def _set(self, name: str, table: Structure, loops: str) -> None:
-        runs = lowered(table)
+        runs = add_delay_blocks(table)
         checked = check(runs)
         for start in (False, True):
             evaluation_order(runs, checked.traced, start=start, solve=loops == "solve")
@@ -112,7 +112,7 @@ class CheckedDiagram:
 
     def __getitem__(self, path: str) -> Block:
         """Return the block at a path, or at the unique end of one."""
-        return self.structure.blocks[unique(path, self.structure.blocks, "block", self.name)]
+        return self.structure.blocks[find_path(path, self.structure.blocks, "block", self.name)]
 
     def replace(self, changes: Mapping[str, Any] | None = None, /, **more: Any) -> Self:
         """Return a variant: other blocks, parameters or sample times.
@@ -132,7 +132,7 @@ class CheckedDiagram:
         UnknownNameError, ParameterError, WiringError
             A name that isn't there, a value out of bounds, a block that doesn't fit the wires.
         """
-        table = replaced(self.structure, {**(changes or {}), **more}, self.name)
+        table = apply_changes(self.structure, {**(changes or {}), **more}, self.name)
         return self.with_structure(table)
 
     def continuous(self) -> Self:

@@ -12,7 +12,7 @@ from ...blocks.library.delays import Delay
 from .structure import Structure, Wire, join
 
 
-def lowered(table: Structure) -> Structure:
+def add_delay_blocks(table: Structure) -> Structure:
     """Return the table with a delay block for every output that leaves a box with a computational delay.
 
     It stands inside the box, acts at its ticks, and is called ``delay_`` after the output, numbered where two outputs
@@ -33,18 +33,18 @@ def lowered(table: Structure) -> Structure:
     table = Structure(**{k: dict(v) for k, v in vars(table).items()})
     table.blocks.update(sampled)
     for frame in late:
-        _delay(table, frame)
+        _delay_outputs(table, frame)
     return table
 
 
-def _inside(frame: str, path: str) -> bool:
+def _is_inside(frame: str, path: str) -> bool:
     return path == frame or path.startswith(f"{frame}.")
 
 
-def _delay(table: Structure, frame: str) -> None:
+def _delay_outputs(table: Structure, frame: str) -> None:
     made: dict[tuple[str, str], str] = {}
 
-    def late(wire: Wire) -> Wire:
+    def delay(wire: Wire) -> Wire:
         key = (wire.block, wire.port)
         if key not in made:
             base = path = join(frame, f"delay_{wire.port if wire.port.isidentifier() else 'output'}")
@@ -58,14 +58,14 @@ def _delay(table: Structure, frame: str) -> None:
         return Wire(made[key], "y", wire.index)
 
     def leaves(wire: Wire, consumer_frame: str) -> bool:
-        return _inside(frame, table.frame_of[wire.block]) and not _inside(frame, consumer_frame)
+        return _is_inside(frame, table.frame_of[wire.block]) and not _is_inside(frame, consumer_frame)
 
     for key, wire in sorted(table.wires.items()):
         if leaves(wire, table.frame_of[key[0]]):
-            table.wires[key] = late(wire)
+            table.wires[key] = delay(wire)
     for box, wire in sorted(table.controls.items()):
         if leaves(wire, box.rpartition(".")[0]):
-            table.controls[box] = late(wire)
+            table.controls[box] = delay(wire)
     for name, wire in sorted(table.names.items()):
         if leaves(wire, name.rpartition(".")[0]):
-            table.names[name] = late(wire)
+            table.names[name] = delay(wire)

@@ -71,18 +71,18 @@ def evaluation_order(
         With the loop printed port by port.
     """
     waits = dependencies(table, traced, start=start)
-    steps, stuck = _sorted(traced, waits)
+    steps, stuck = _sort(traced, waits)
     if not stuck:
         return Order(steps)
     if not solve:
         within = {port: {s for s in waits[port] if s in stuck} for port in stuck}
-        raise _loop_error(table, traced, _a_loop(within, _first(stuck)), start)
+        raise _loop_error(table, traced, _find_loop(within, _first_output(stuck)), start)
     torn: set[Port] = set()
     loops: list[str] = []
     for loop, port in _tear(traced, waits, stuck):
         torn.add(port)
-        loops.append("\n".join(_printed(table, traced, loop)))
-    steps, _ = _sorted(traced, {port: sources - torn for port, sources in waits.items()})
+        loops.append("\n".join(_write_loop(table, traced, loop)))
+    steps, _ = _sort(traced, {port: sources - torn for port, sources in waits.items()})
     return Order(steps, tuple(sorted(torn)), tuple(loops))
 
 
@@ -100,7 +100,7 @@ def _tear(
         if not waits[candidates[-1]]:
             candidates.pop()
             continue
-        loop = _a_loop(waits, candidates[-1])
+        loop = _find_loop(waits, candidates[-1])
         sizes = {port: math.prod(traced[port[0]].outputs[port[1]]) for port in loop}
         torn = min(loop, key=lambda port: (sizes[port], port))
         yield loop, torn
@@ -113,7 +113,7 @@ def _tear(
                     known.append(port)
 
 
-def _sorted(traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]]) -> tuple[list[Step], set[Port]]:
+def _sort(traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]]) -> tuple[list[Step], set[Port]]:
     """Return what can be evaluated, in order, and what is left over."""
     missing = {port: len(sources) for port, sources in waits.items()}
     consumers: dict[Port, list[Port]] = defaultdict(list)
@@ -145,12 +145,12 @@ def _sorted(traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]]) -> tu
     return order, {(path, name) for path, every in left.items() for name in every}
 
 
-def _first(ports: Iterable[Port]) -> Port:
+def _first_output(ports: Iterable[Port]) -> Port:
     """Return the first one that is an output."""
     return min(p for p in ports if p[1] not in (NEXT, GUARDS))
 
 
-def _a_loop(waits: Mapping[Port, set[Port]], port: Port) -> list[Port]:
+def _find_loop(waits: Mapping[Port, set[Port]], port: Port) -> list[Port]:
     """Return the ports of one loop, found from a port that is stuck, each waiting for the next."""
     seen: dict[Port, int] = {}
     while port not in seen:
@@ -161,7 +161,7 @@ def _a_loop(waits: Mapping[Port, set[Port]], port: Port) -> list[Port]:
     return loop[first:] + loop[:first]
 
 
-def _printed(table: Structure, traced: Mapping[str, Traced], loop: list[Port]) -> list[str]:
+def _write_loop(table: Structure, traced: Mapping[str, Traced], loop: list[Port]) -> list[str]:
     """Print a loop port by port."""
     lines = []
     for i, (path, name) in enumerate(reversed(loop)):
@@ -190,7 +190,7 @@ def _loop_error(table: Structure, traced: Mapping[str, Traced], loop: list[Port]
     if start:
         what, delay = "initial values depend on each other", "UnitDelay(initial_value=…)"
     return AlgebraicLoopError(
-        f"{what}:\n" + "\n".join(_printed(table, traced, loop)) + f"\nBreak the loop where a delay is real: put a "
+        f"{what}:\n" + "\n".join(_write_loop(table, traced, loop)) + f"\nBreak the loop where a delay is real: put a "
         f"{delay} on one of these wires{'' if start else advice}.",
         block=min(loop)[0],
     )

@@ -94,31 +94,31 @@ class Structure:
         found = self.clock(frame)
         return None if found is None else found.sample_time
 
-    def around(self, frame: str) -> list[Frame]:
+    def subsystems_around(self, frame: str) -> list[Frame]:
         """Return the frames around a block in ``frame``, from the outermost one that is not the diagram to it."""
         parts = frame.split(".") if frame else []
         return [self.frames[".".join(parts[: i + 1])] for i in range(len(parts))]
 
     def gates(self, frame: str) -> tuple[str, ...]:
         """Return the enabled and triggered boxes around a block in ``frame``, from outside in."""
-        return tuple(f.path for f in self.around(frame) if f.control)
+        return tuple(f.path for f in self.subsystems_around(frame) if f.control)
 
-    def triggered(self, frame: str) -> str | None:
+    def triggered_around(self, frame: str) -> str | None:
         """Return the innermost triggered box around a block in ``frame``."""
-        return next((f.path for f in reversed(self.around(frame)) if f.control == "triggered"), None)
+        return next((f.path for f in reversed(self.subsystems_around(frame)) if f.control == "triggered"), None)
 
     def is_event(self, box: str) -> bool:
         """Whether a box is enabled or triggered in continuous time, by an event, and not at ticks."""
-        return box in self.controls and self.rate(box) is None and not self.sampled(box.rpartition(".")[0])
+        return box in self.controls and self.rate(box) is None and not self.is_sampled(box.rpartition(".")[0])
 
     def is_traced(self, path: str) -> bool:
         """Whether a run evaluates a block's equations: it is not stepped, and no transport delay in continuous time."""
         block = self.blocks[path]
-        return not block.stepped and (not block.transport or self.sampled(self.frame_of[path]))
+        return not block.stepped and (not block.transport or self.is_sampled(self.frame_of[path]))
 
-    def sampled(self, frame: str) -> bool:
+    def is_sampled(self, frame: str) -> bool:
         """Whether blocks in a frame act at instants only: ticks, or those of a trigger."""
-        return self.rate(frame) is not None or self.triggered(frame) is not None
+        return self.rate(frame) is not None or self.triggered_around(frame) is not None
 
 
 def stepped_blocks(table: Structure, inside: str = "") -> dict[str, Block]:
@@ -180,9 +180,9 @@ class Collector:
             elif isinstance(item.call, Call):
                 self._follow(item.call, consumer)
             else:
-                self._block(source, consumer)
+                self._add_block(source, consumer)
         elif isinstance(item, Call):
-            self._block(item.block, consumer)
+            self._add_block(item.block, consumer)
             known = self.calls.setdefault(id(item.block), item.origin)
             if known is not item.origin:
                 raise DoubleDriveError(
@@ -205,9 +205,9 @@ class Collector:
                 self.stack.extend((c, None) for c in reversed(item.calls))
                 self.stack.extend((s, item) for s in reversed(list(item.wires.values())))
         else:
-            self._block(item, consumer)
+            self._add_block(item, consumer)
 
-    def _block(self, block: Block, consumer: Any) -> None:
+    def _add_block(self, block: Block, consumer: Any) -> None:
         self.blocks.setdefault(id(block), block)
         self.consumers.setdefault(id(block), []).append(consumer)
 
@@ -233,25 +233,25 @@ class Collector:
 
         fixed: set[str] = set()
 
-        def box_path(box: SubsystemCall) -> str:
+        def subsystem_path(box: SubsystemCall) -> str:
             if id(box) not in path_of_box:
                 outer = inner.get(id(box))
-                frame = "" if outer is None else box_path(outer)
+                frame = "" if outer is None else subsystem_path(outer)
                 path_of_box[id(box)] = place(frame, box.label, box.label)
             return path_of_box[id(box)]
 
-        def frame_of_item(item: Any) -> str | None:
+        def subsystem_of_item(item: Any) -> str | None:
             if item is None:
                 return None
             if item is _ROOT:
                 return ""
             if isinstance(item, _Inside):
-                return box_path(item.box)
+                return subsystem_path(item.box)
             outer = inner.get(id(item))
-            return "" if outer is None else box_path(outer)
+            return "" if outer is None else subsystem_path(outer)
 
-        for box in sorted(self.boxes.values(), key=lambda b: (box_path(b).count("."), box_path(b))):
-            path, made = box_path(box), box.subsystem
+        for box in sorted(self.boxes.values(), key=lambda b: (subsystem_path(b).count("."), subsystem_path(b))):
+            path, made = subsystem_path(box), box.subsystem
             table.frames[path] = Frame(
                 path,
                 made.sample_time,
@@ -268,7 +268,7 @@ class Collector:
         for key, block in self.blocks.items():
             call = self.calls.get(key)
             if call is not None:
-                frames[key] = frame_of_item(call) or ""
+                frames[key] = subsystem_of_item(call) or ""
             else:
                 if any(port.default is None for port in block.inputs.values()):
                     needed = [n for n, port in block.inputs.items() if port.default is None]
@@ -279,8 +279,8 @@ class Collector:
                         block=block.label,
                         port=needed[0],
                     )
-                users = [frame_of_item(c) for c in self.consumers[key]]
-                frames[key] = _common([u for u in users if u is not None])
+                users = [subsystem_of_item(c) for c in self.consumers[key]]
+                frames[key] = _common_subsystem([u for u in users if u is not None])
             if block.name:
                 fixed.add(join(frames[key], block.name))
         paths: dict[int, str] = {}
@@ -296,16 +296,16 @@ class Collector:
                 crossed: list[tuple[SubsystemCall, str]] = []
                 wire = table.wires[paths[key], port] = _resolve(signal, paths, crossed)
                 maker = f"{table.frame_of[wire.block]}."
-                outputs = [(box_path(box), output) for box, output in crossed]
+                outputs = [(subsystem_path(box), output) for box, output in crossed]
                 handed = tuple((box, output) for box, output in outputs if not maker.startswith(f"{box}."))
                 if handed:
                     table.handed[paths[key], port] = handed
         for box in self.boxes.values():
             if box.subsystem.control:
-                table.controls[box_path(box)] = _resolve(box.wires[box.subsystem.control_input], paths)
+                table.controls[subsystem_path(box)] = _resolve(box.wires[box.subsystem.control_input], paths)
         for name, signal, consumer in self.named:
             wire = _resolve(signal, paths)
-            frame = frame_of_item(consumer)
+            frame = subsystem_of_item(consumer)
             frame = table.frame_of[wire.block] if frame is None else frame
             if table.names.setdefault(join(frame, name), wire) != wire:
                 raise DuplicateNameError(
@@ -316,7 +316,7 @@ class Collector:
         return table
 
 
-def _common(frames: list[str]) -> str:
+def _common_subsystem(frames: list[str]) -> str:
     """Return the innermost frame that holds all the given ones."""
     if not frames:
         return ""

@@ -68,7 +68,7 @@ def exact_offset(value: Any, sample_time: Fraction | None, *, block: str) -> Fra
     return offset
 
 
-def samples_of_delay(value: Any, sample_time: Fraction | None, *, block: str) -> int:
+def check_delay(value: Any, sample_time: Fraction | None, *, block: str) -> int:
     """Return a computational delay in samples.
 
     Raises
@@ -114,7 +114,7 @@ class Subsystem:
         self.name = check_name(name or own)
         self.sample_time = None if sample_time is None else exact_time(sample_time, block=self.name)
         self.offset = exact_offset(offset, self.sample_time, block=self.name)
-        self.delay = samples_of_delay(delay, self.sample_time, block=self.name)
+        self.delay = check_delay(delay, self.sample_time, block=self.name)
         self.enabled, self.triggered = enabled, triggered
         if enabled is not None and triggered is not None:
             raise WiringError("it is both enabled and triggered; put one box into the other.", block=self.name)
@@ -196,13 +196,13 @@ class SubsystemCall(Wireable):
         finally:
             recorder.reset(token)
         self.calls = calls
-        self.results = self._name(result)
+        self.results = self._name_results(result)
         self.outputs = list(self.results)
         outer = recorder.get()
         if outer is not None:
             outer.append(self)
 
-    def _name(self, result: Any) -> dict[str, Signal]:
+    def _name_results(self, result: Any) -> dict[str, Signal]:
         if result is None:
             return {}
         if isinstance(result, dict):

@@ -11,12 +11,12 @@ from ...blocks.core.errors import UnknownNameError, WiringError, near
 from ...blocks.core.values import Value
 from ...blocks.tracing.discretization import check_method
 from .structure import Frame, Structure
-from .subsystem import exact_offset, exact_time, samples_of_delay
+from .subsystem import check_delay, exact_offset, exact_time
 
 _OF_A_BOX = ("sample_time", "method", "offset", "delay")
 
 
-def replaced(table: Structure, changes: Mapping[str, Any], diagram: str) -> Structure:
+def apply_changes(table: Structure, changes: Mapping[str, Any], diagram: str) -> Structure:
     """Return the structure of a variant; see `Diagram.replace`."""
     table = Structure(**{k: dict(v) for k, v in vars(table).items()})
     for path, value in changes.items():
@@ -24,7 +24,7 @@ def replaced(table: Structure, changes: Mapping[str, Any], diagram: str) -> Stru
     return table
 
 
-def _owner(table: Structure, path: str) -> str:
+def _find_owner(table: Structure, path: str) -> str:
     """Return the block that a path is, or is the unique end of; "" if there is none."""
     if path in table.blocks:
         return path
@@ -34,11 +34,11 @@ def _owner(table: Structure, path: str) -> str:
 
 def _change(table: Structure, path: str, value: Any, diagram: str) -> None:
     head, _, last = path.rpartition(".")
-    owner = table.blocks.get(_owner(table, head)) if head else None
+    owner = table.blocks.get(_find_owner(table, head)) if head else None
     if isinstance(value, Block) and not (owner is not None and last in type(owner).parameter_specs):
-        full = unique(path, table.blocks, "block", diagram)
+        full = find_path(path, table.blocks, "block", diagram)
         table.blocks[full] = value.replace(name=full.rpartition(".")[2])
-    elif last in _OF_A_BOX and (frame := _frame(table, head, last, diagram)) is not None:
+    elif last in _OF_A_BOX and (frame := _find_subsystem(table, head, last, diagram)) is not None:
         table.frames[frame] = _change_subsystem(table.frames[frame], last, value)
     elif path in table.blocks:
         raise WiringError(
@@ -51,16 +51,16 @@ def _change(table: Structure, path: str, value: Any, diagram: str) -> None:
         table.blocks[full] = change_parameter(table.blocks[full], keys, value)
 
 
-def _frame(table: Structure, path: str, what: str, diagram: str) -> str | None:
+def _find_subsystem(table: Structure, path: str, key: str, diagram: str) -> str | None:
     """Return the subsystem that a path means; None where it means none, but perhaps a block."""
     boxes = {frame: None for frame in table.frames if frame}
     if path:
         found = [f for f in boxes if f == path or f.endswith("." + path)]
-        return unique(path, boxes, "subsystem", diagram) if found else None
-    if any(what in type(block).parameter_specs for block in table.blocks.values()):
+        return find_path(path, boxes, "subsystem", diagram) if found else None
+    if any(key in type(block).parameter_specs for block in table.blocks.values()):
         return None  # a block's parameter of that name
-    offered = ", ".join(f"{frame}.{what}" for frame in boxes) or "none: this diagram has no subsystem"
-    raise UnknownNameError(f"a diagram has no {what!r} of its own; its subsystems have: {offered}.")
+    offered = ", ".join(f"{frame}.{key}" for frame in boxes) or "none: this diagram has no subsystem"
+    raise UnknownNameError(f"a diagram has no {key!r} of its own; its subsystems have: {offered}.")
 
 
 def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str]]:
@@ -68,7 +68,7 @@ def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str
     parts = path.split(".")
     for cut in range(len(parts) - 1, 0, -1):
         try:
-            return unique(".".join(parts[:cut]), table.blocks, "block", diagram), parts[cut:]
+            return find_path(".".join(parts[:cut]), table.blocks, "block", diagram), parts[cut:]
         except UnknownNameError:
             continue
     owners = [p for p, block in sorted(table.blocks.items()) if path in type(block).parameter_specs]
@@ -82,25 +82,25 @@ def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str
     raise UnknownNameError(f"nothing is called {path!r} in diagram {diagram!r}. {near(path, known)}")
 
 
-def _change_subsystem(frame: Frame, what: str, value: Any) -> Frame:
+def _change_subsystem(frame: Frame, key: str, value: Any) -> Frame:
     """Return a box with another sample time, method, offset or delay."""
     new, path = value, frame.path
-    if what == "sample_time" and value is not None:
+    if key == "sample_time" and value is not None:
         new = exact_time(value, block=path)
-    elif what == "method" and value is not None:
+    elif key == "method" and value is not None:
         check_method(value)
-    elif what == "offset":
+    elif key == "offset":
         new = exact_offset(value, frame.sample_time, block=path)
-    elif what == "delay":
-        new = samples_of_delay(value, frame.sample_time, block=path)
-    changed: dict[str, Any] = {what: new}
-    if what == "sample_time":
+    elif key == "delay":
+        new = check_delay(value, frame.sample_time, block=path)
+    changed: dict[str, Any] = {key: new}
+    if key == "sample_time":
         exact_offset(frame.offset, new, block=path)
-        samples_of_delay(frame.delay, new, block=path)
+        check_delay(frame.delay, new, block=path)
     return replace_fields(frame, **changed)
 
 
-def unique(path: str, known: Mapping[str, Any], kind: str, diagram: str) -> str:
+def find_path(path: str, known: Mapping[str, Any], kind: str, diagram: str) -> str:
     """Return the full path that ``path`` is, or is the unique end of."""
     if not isinstance(path, str):
         raise UnknownNameError(f"found {path!r}; expected the path of a {kind}, such as {next(iter(known), '')!r}.")

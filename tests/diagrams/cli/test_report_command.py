@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from loopwright.blocks import ConfirmationError
-from loopwright.diagrams.cli.main import _parser, main
+from loopwright.diagrams.cli.main import _make_parser, main
 from loopwright.diagrams.frequency.number import Number
 from loopwright.diagrams.report import analyse as _report_analysis
 from loopwright.diagrams.report.model import Report, Section
@@ -161,4 +161,4 @@ def test_the_commands_of_the_page_on_reports_are_understood():
     commands = [shlex.split(line, comments=True)[1:] for line in lines]
     assert len(commands) == 3
     for command in commands:
-        assert _parser().parse_args(command).command == "report"
+        assert _make_parser().parse_args(command).command == "report"

@@ -155,7 +155,7 @@ def test_what_never_settles_is_null(tmp_path, capsys):
     ],
 )
 def test_option_values(text, value):
-    assert _cli._value(text) == value
+    assert _cli._parse_value(text) == value
 
 
 # --- a run that fails -----------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import pytest
 
 from loopwright.blocks import Gain, Integrator, OptionError, Sine, Sum
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.drawing.layout import Net, _draw, _Part, _tracks, arrange
+from loopwright.diagrams.drawing.layout import Net, _assign_tracks, _draw, _Part, arrange
 from loopwright.diagrams.drawing.order import Node, cut_loops
 from loopwright.diagrams.drawing.svg import draw
 from loopwright.fmus import Fmu, dc_motor
@@ -120,7 +120,7 @@ def test_what_exchanges_heights_in_a_channel_takes_a_step_aside():
     right = [Node("c", 10.0, 10.0, {"i": 40.0}, {}, x=200.0), Node("d", 10.0, 10.0, {"i": 0.0}, {}, x=200.0)]
     nets = [Net("n", ("a", "o"), [("c", "i")]), Net("m", ("b", "o"), [("d", "i")])]
     parts = [_Part(n, (a, a.outs["o"]), [(b, b.ins["i"])]) for n, a, b in zip(nets, left, right, strict=True)]
-    _tracks(parts, 10.0, 100.0, outside=False)
+    _assign_tracks(parts, 10.0, 100.0, outside=False)
     assert len(parts) == 3  # one of them has a knee
     _draw({0: parts})
     assert [p for p in problems([*left, *right], nets) if p[0] == "wire over wire"] == []

@@ -44,7 +44,7 @@ def test_numpys_truth_values_are_some():
     ("word", "meant"), [("yes", True), ("On", True), ("TRUE", True), ("no", False), ("off", False)]
 )
 def test_words_for_truth_on_the_command_line(word, meant):
-    assert _cli._value(word) is meant
+    assert _cli._parse_value(word) is meant
 
 
 def test_a_word_that_is_no_truth_value(tmp_path, capsys):
@@ -208,7 +208,7 @@ def test_references_have_units(letter, runs):
     ],
 )
 def test_letters(given, letters):
-    assert _cli._letters(given) == list(letters)
+    assert _cli._parse_letters(given) == list(letters)
 
 
 @pytest.mark.parametrize(

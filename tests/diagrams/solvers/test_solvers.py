@@ -467,7 +467,7 @@ def test_options_out_of_range_are_refused(options, message):
 
 def test_without_sundials_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(_solvers_sundials._FUNCTIONS, "sundials_of_another_version", {"f": (None,)})
-    monkeypatch.setattr(_solvers_sundials, "_library", _solvers_sundials._library.__wrapped__)
+    monkeypatch.setattr(_solvers_sundials, "_load_library", _solvers_sundials._load_library.__wrapped__)
     with pytest.raises(OptionError, match=r"SUNDIALS can't be loaded: .*pip install -U fmpy, or take solver='BDF'"):
         make_solver("cvode", PENDULUM)
 
