@@ -7,25 +7,23 @@ Exit status: 0 done, 1 a run or a build failed (what a run recorded is written) 
 from __future__ import annotations
 
 import argparse
-import ast
 import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
-from inspect import signature
 from pathlib import Path
 from tempfile import TemporaryFile
-from types import MappingProxyType
 from typing import Any
 
-from ...blocks.core.errors import FmuError, FmuFileError, LoopwrightError, OptionError, near
+from ...blocks.core.errors import FmuError, FmuFileError, LoopwrightError, OptionError
 from ...fmus.models import gantry
-from ..paper.experiments import DEFAULTS, EXPERIMENTS, Experiment
+from ..paper.experiments import EXPERIMENTS, Experiment
 from ..paper.key_numbers import DEFINITIONS, key_numbers
 from ..results.run import Run
 from .fmu import COMMANDS, add_commands
+from .options import option_lines, parse_letters, parse_options, share
 from .report import add_report, report_command
 from .text import fit as _fit
 from .text import say as _say
@@ -45,10 +43,6 @@ SIGNALS = (
     "xi_p",
 )
 """Signals of the CSV file, in order."""
-
-_WORDS: Mapping[str, bool | None] = MappingProxyType(
-    {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False, "none": None, "null": None}
-)
 _SHOWN = {"m": ("mm", 1e3), "1": ("%", 100.0), "m/s2": ("m/s²", 1.0)}
 
 
@@ -94,7 +88,7 @@ def _make_parser() -> argparse.ArgumentParser:
         ".png and .svg) of each, in place of an earlier run's. A run that fails writes what it recorded, and why it\n"
         'failed ("error" in A.json); one that recorded nothing writes nothing, and an earlier run\'s files stay.',
         epilog="options (--option), with their defaults:\n  "
-        + "\n  ".join(_option_lines())
+        + "\n  ".join(option_lines())
         + "\n  An option that only some experiments have is given to those.\n\nkey numbers:\n"
         + "\n".join(f"  {name:{width}}  [{unit}] {text}" for name, (unit, text) in DEFINITIONS.items())
         + '\n  In A.json a number that there is none of is null; "never" lists the settling times without end.\n\n'
@@ -128,90 +122,6 @@ def _version() -> str:
 # --- what is asked for ----------------------------------------------------------------------------------------------
 
 
-def _known_options(letter: str) -> dict[str, Any]:
-    """Return the options of an experiment with their defaults."""
-    own = {p.name: p.default for p in signature(EXPERIMENTS[letter]).parameters.values() if p.kind is p.KEYWORD_ONLY}
-    limits = ("velocity_limit", "acceleration_limit") if letter == "A" else ()  # it has no admittance to limit
-    return {name: value for name, value in {**DEFAULTS, **own}.items() if name not in limits}
-
-
-def _option_lines() -> Iterable[str]:
-    for name, value in {
-        name: value for letter in EXPERIMENTS for name, value in _known_options(letter).items()
-    }.items():
-        if name not in ("plant", "path"):
-            owners = [letter for letter in EXPERIMENTS if name in _known_options(letter)]
-            only = "" if len(owners) == len(EXPERIMENTS) else f"  ({', '.join(owners)} only)"
-            yield f"{name}={value}{only}"
-
-
-def _parse_letters(given: Sequence[str]) -> list[str]:
-    """Return the experiments that are meant: ``A B``, ``A,B`` and ``AB`` alike."""
-    pieces = [piece.strip() for text in given for piece in text.split(",")]
-    for piece in pieces:
-        if (not piece and len(pieces) == 1) or any(letter not in EXPERIMENTS for letter in piece.upper()):
-            raise OptionError(f"there is no experiment {piece!r}. Known: {', '.join(EXPERIMENTS)}.")
-    return list(dict.fromkeys("".join(pieces).upper())) or list(EXPERIMENTS)
-
-
-def _parse_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    options: dict[str, Any] = {}
-    for text in arguments.options:
-        name, equals, value = text.partition("=")
-        name = name.strip().replace("-", "_")
-        if not equals or not name:
-            raise OptionError(f"found --option {text!r}; expected NAME=VALUE, such as --option delay=1.")
-        if name == "path":
-            raise OptionError(
-                "a path can't be given on the command line; take Python: "
-                "loopwright.diagrams.experiments.path_following(path=…).simulate().",
-                port="--option path",
-            )
-        if name in options:
-            raise OptionError("it is given twice; give it once.", port=f"--option {name}")
-        options[name] = _parse_value(value.strip())
-    if arguments.plant is not None:
-        if "plant" in options:
-            raise OptionError("the plant is given twice; give it once.", port="--plant")
-        options["plant"] = arguments.plant
-    return options
-
-
-def _parse_value(text: str) -> Any:
-    """Read a word of `_WORDS`, or a Python or JSON literal; anything else is text."""
-    if text.lower() in _WORDS:
-        return _WORDS[text.lower()]
-    try:
-        return ast.literal_eval(text)
-    except (ValueError, SyntaxError, MemoryError, RecursionError):
-        return text
-
-
-def _share(letters: Sequence[str], options: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Give every experiment the options that it has."""
-    for name in options:
-        owners = [letter for letter in EXPERIMENTS if name in _known_options(letter)]
-        without = [letter for letter in letters if letter not in owners]
-        if not owners:
-            known = {name for letter in EXPERIMENTS for name in _known_options(letter)} - {"path"}
-            raise OptionError(f"no experiment has such an option. {near(name, known)}", port=f"--option {name}")
-        if len(without) == len(letters):
-            raise OptionError(
-                f"{_join(without)} can't take it; an option of {_join(owners)} only.",
-                port=f"--option {name}",
-            )
-        if without:
-            have = "has" if len(owners) == 1 else "have"
-            _say(f"{', '.join(without)}: without {name}, which only {_join(owners)} {have}.", sys.stderr)
-    return {letter: {k: v for k, v in options.items() if k in _known_options(letter)} for letter in letters}
-
-
-def _join(letters: Sequence[str]) -> str:
-    """Write A; A and B; A, B and C."""
-    *first, last = letters
-    return f"{', '.join(first)} and {last}" if first else last
-
-
 def _make_folder(name: str) -> Path:
     """Make the folder, and find out whether files can be written there."""
     folder = Path(name).expanduser()
@@ -234,8 +144,8 @@ def _make_folder(name: str) -> Path:
 
 def _run(arguments: argparse.Namespace) -> int:
     """Build all experiments first, so that wrong usage is found before anything runs; then run them."""
-    letters = _parse_letters(arguments.letters)
-    chosen = _share(letters, _parse_options(arguments))
+    letters = parse_letters(arguments.letters)
+    chosen = share(letters, parse_options(arguments))
     try:
         if any(options.get("plant") is None for options in chosen.values()):
             gantry.build(notify=lambda line: _say(line, sys.stderr))

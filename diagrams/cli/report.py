@@ -13,6 +13,7 @@ from ...blocks.core.errors import DefinitionError, FmuError, FmuFileError, Loopw
 from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..paper.experiments import EXPERIMENTS, Experiment
+from .options import parse_options, share
 from .text import say
 from .user_models import load_user_file
 
@@ -125,15 +126,13 @@ def _open_subject(what: str, arguments: argparse.Namespace) -> Iterator[tuple[Di
 
 
 def _make_experiment(what: str, arguments: argparse.Namespace) -> Experiment:
-    from .main import _parse_options, _share
-
     letter = what.upper()
     if letter not in EXPERIMENTS:
         raise OptionError(
             f"found {what!r}; expected one of {', '.join(EXPERIMENTS)}, or FILE.py:NAME, such as loop.py:diagram.",
             port="WHAT",
         )
-    options = _share([letter], _parse_options(arguments))[letter]
+    options = share([letter], parse_options(arguments))[letter]
     if options.get("plant") is None:
         gantry.build(notify=lambda line: say(line, sys.stderr))
     return EXPERIMENTS[letter](**options)

@@ -12,7 +12,7 @@ import numpy as np
 from ...blocks.core.errors import OptionError
 
 if TYPE_CHECKING:
-    from .run import Run
+    from .recorded_signals import RecordedSignals
 
 _GROUP = 2**24  # bytes of a row group
 _LONGEST = 63  # characters of a name in MATLAB
@@ -24,7 +24,7 @@ _TAKEN = {
 }
 
 
-def to_csv(run: Run, path: Any, names: Sequence[str]) -> None:
+def to_csv(run: RecordedSignals, path: Any, names: Sequence[str]) -> None:
     """See `Run.to_csv`."""
     table = dict(columns(run, names))
     header = ",".join(["t", *table])
@@ -32,7 +32,7 @@ def to_csv(run: Run, path: Any, names: Sequence[str]) -> None:
     np.savetxt(path, rows, "%.17g", ",", header=header, comments="", encoding="utf-8")
 
 
-def to_pandas(run: Run, names: Sequence[str]) -> Any:
+def to_pandas(run: RecordedSignals, names: Sequence[str]) -> Any:
     """See `Run.to_pandas`."""
     pandas = import_library("pandas")
     table = dict(columns(run, names))
@@ -41,7 +41,7 @@ def to_pandas(run: Run, names: Sequence[str]) -> Any:
     return frame
 
 
-def to_xarray(run: Run, names: Sequence[str]) -> Any:
+def to_xarray(run: RecordedSignals, names: Sequence[str]) -> Any:
     """See `Run.to_xarray`."""
     xarray = import_library("xarray")
     variables, coordinates = {}, {"t": ("t", np.array(run.t), {"units": "s"})}
@@ -56,7 +56,7 @@ def to_xarray(run: Run, names: Sequence[str]) -> Any:
     return xarray.Dataset(variables, coordinates, attrs={"title": run.diagram_name})
 
 
-def to_parquet(run: Run, path: Any, names: Sequence[str]) -> None:
+def to_parquet(run: RecordedSignals, path: Any, names: Sequence[str]) -> None:
     """See `Run.to_parquet`."""
     arrow, parquet = import_library("pyarrow"), import_library("pyarrow.parquet")
     units = {"t": "s", **units_of_columns(run, names)}
@@ -70,7 +70,7 @@ def to_parquet(run: Run, path: Any, names: Sequence[str]) -> None:
             writer.write_table(arrow.Table.from_arrays([arrow.array(a) for a in arrays], schema=schema))
 
 
-def to_mat(run: Run, path: Any, names: Sequence[str]) -> None:
+def to_mat(run: RecordedSignals, path: Any, names: Sequence[str]) -> None:
     """See `Run.to_mat`."""
     from scipy.io import savemat
 
@@ -111,14 +111,14 @@ def matlab_names(names: Sequence[str]) -> dict[str, str]:
     return made
 
 
-def select_signals(run: Run, names: Sequence[str]) -> list[str]:
+def select_signals(run: RecordedSignals, names: Sequence[str]) -> list[str]:
     """Return the signals to export: those given, else all named wires, else all ports; each once."""
     every = run.names
     wires = [n for n in every if n in run.wires]
     return list(dict.fromkeys(names or wires or every))
 
 
-def columns(run: Run, names: Sequence[str], some: slice = slice(None)) -> Iterator[tuple[str, np.ndarray]]:
+def columns(run: RecordedSignals, names: Sequence[str], some: slice = slice(None)) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the name and the values of each column; entries of a vector are counted from 1."""
     for name in select_signals(run, names):
         values = run.part(name, some)
@@ -136,7 +136,7 @@ def column_labels(name: str, shape: tuple[int, ...]) -> list[str]:
     return [name] if shape == () else [f"{name}[{i + 1}]" for i in range(int(np.prod(shape)))]
 
 
-def units_of_columns(run: Run, names: Sequence[str]) -> dict[str, str]:
+def units_of_columns(run: RecordedSignals, names: Sequence[str]) -> dict[str, str]:
     """Return the unit of each column, "" where it is not declared."""
     units: dict[str, str] = {}
     for name in select_signals(run, names):
@@ -145,7 +145,7 @@ def units_of_columns(run: Run, names: Sequence[str]) -> dict[str, str]:
     return units
 
 
-def unit_list(run: Run, name: str, size: int) -> list[str]:
+def unit_list(run: RecordedSignals, name: str, size: int) -> list[str]:
     """Return the unit of each entry of a signal, "" where it is not declared."""
     unit: Any = run.unit(name)
     if not isinstance(unit, tuple):

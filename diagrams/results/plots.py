@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from .run import Run
+    from .recorded_signals import RecordedSignals
 
 # Okabe and Ito's palette, which colour-blind readers tell apart
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
@@ -131,7 +131,7 @@ def save(figure: Figure, stem: Path) -> tuple[Path, Path]:
     return files
 
 
-def plot_signals(run: Run, names: Sequence[str], axes: Any = None) -> Figure:
+def plot_signals(run: RecordedSignals, names: Sequence[str], axes: Any = None) -> Figure:
     """Draw signals over time, one below the other; a vector's entries share an axis.
 
     Parameters
@@ -182,12 +182,12 @@ def plot_signals(run: Run, names: Sequence[str], axes: Any = None) -> Figure:
     return result
 
 
-def _size(run: Run, name: str) -> int:
+def _size(run: RecordedSignals, name: str) -> int:
     """Return the number of entries of a signal."""
     return int(np.prod(run[name].shape[1:]))
 
 
-def _units(run: Run, name: str) -> list[str]:
+def _units(run: RecordedSignals, name: str) -> list[str]:
     """Return the unit of every entry, as it is to be read."""
     unit = run.unit(name)
     units = [u or "" for u in unit] if isinstance(unit, tuple) else [unit or ""] * _size(run, name)
@@ -199,12 +199,12 @@ def _unit_text(unit: str) -> str:
     return "" if unit == "1" else unit.translate(str.maketrans("23", "²³")).replace(".", " ")
 
 
-def marker_of(run: Run) -> str:
+def marker_of(run: RecordedSignals) -> str:
     """Return the marker of a line: a single sample is a dot."""
     return "." if len(run.t) == 1 else ""
 
 
-def limit_time(ax: Axes, run: Run) -> None:
+def limit_time(ax: Axes, run: RecordedSignals) -> None:
     """Let the time axis span the run."""
     from matplotlib.ticker import MaxNLocator
 

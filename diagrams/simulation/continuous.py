@@ -13,7 +13,8 @@ from ...blocks.core.errors import NonFiniteError, OptionError, SimulationError
 from ...blocks.core.instants import is_before, left_of
 from ..flat.functions import active_loops
 from ..results.stored import Occurrence
-from ..solvers.base import Problem, make_solver
+from ..solvers.base import Problem
+from ..solvers.choose import make_solver
 from .diagnosis import failure, forget_trials, opaque_failure, state_values
 from .events import Domains
 from .solver_setup import absolute_tolerances, recall, remembers, solver_memory, time_scale_of

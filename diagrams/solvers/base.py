@@ -32,7 +32,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -250,7 +249,7 @@ class FixedStep(Solver):
         return Step(t, t_new, x_new.copy(), lambda: lambda time: self._formula(self.rate, t, x, f, time))
 
 
-def _euler(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray, t_new: float) -> np.ndarray:
+def euler(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray, t_new: float) -> np.ndarray:
     """Forward Euler, order 1, one stage: x + h f(t, x). Stable for |1 + hλ| < 1: h < 2/|λ| for a real pole.
 
     The step below is Hairer, Nørsett, Wanner, Solving Ordinary Differential Equations I, II.1, for all three methods.
@@ -276,14 +275,14 @@ def _rk4(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray
     return x_new
 
 
-_FIXED = {"euler": _euler, "heun": _heun, "rk4": _rk4}
+FIXED = {"euler": euler, "heun": _heun, "rk4": _rk4}
 _SCIPY = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
-_SUNDIALS = ("CVODE_BDF", "CVODE_Adams")
+SUNDIALS = ("CVODE_BDF", "CVODE_Adams")
 
-SOLVERS: tuple[str, ...] = ("auto", *_FIXED, *_SCIPY, *_SUNDIALS)
+SOLVERS: tuple[str, ...] = ("auto", *FIXED, *_SCIPY, *SUNDIALS)
 
 
-class _NoStates(FixedStep):
+class NoStates(FixedStep):
     """Without states there is nothing to integrate: one step to ``stop``, or several of ``max_step``."""
 
     fixed = False
@@ -298,62 +297,3 @@ def solver_name(name: str) -> str:
             hint = hint.replace(repr(lower), repr(known))
         raise OptionError(f"There is no solver {name!r}; expected one of {', '.join(SOLVERS)}. {hint}")
     return spelled[name.lower()]
-
-
-def make_solver(
-    name: str,
-    problem: Problem,
-    *,
-    rtol: float = 1e-6,
-    atol: float | np.ndarray = 1e-9,
-    step: float | None = None,
-    max_step: float | None = None,
-) -> Solver:
-    """Return the solver of this name (capitals don't matter).
-
-    Parameters
-    ----------
-    name : str
-        One of `SOLVERS`.
-    problem : Problem
-        What is integrated.
-    rtol, atol : float, float or ndarray
-        Each step's error in entry i is held below about atol[i] + rtol·|x[i]|.
-    step : float, optional
-        Step of a fixed-step method, s; the others take none.
-    max_step : float, optional
-        Upper bound of the step of a variable-step method, s.
-
-    Raises
-    ------
-    OptionError
-        If the name is unknown or an option is out of its range.
-    """
-    name = solver_name(name)
-    size = problem.size
-    for option, value in (("step", step), ("max_step", max_step)):
-        if value is not None and not (isinstance(value, int | float | np.number) and value > 0):
-            raise OptionError(f"{option} is {value!r}; expected a positive number of seconds.")
-    if name in _FIXED:
-        if step is None:
-            raise OptionError(f"solver={name!r} has a fixed step and step is None; give step=1e-3 or so, in s.")
-        return FixedStep(name, problem, step, _FIXED[name])
-    bound = math.inf if max_step is None else float(max_step)
-    if isinstance(rtol, bool) or not isinstance(rtol, int | float | np.number) or not 3e-14 <= rtol < 1:
-        raise OptionError(f"rtol is {rtol!r}; expected 3e-14 <= rtol < 1. 1e-6 serves most diagrams.")
-    try:
-        absolute = np.asarray(atol, dtype=float)
-    except (TypeError, ValueError):
-        absolute = np.full((), -1.0)
-    if absolute.shape not in ((), (size,)) or not (absolute >= 0).all():
-        raise OptionError(f"atol is {atol!r}; expected a number or an array of shape ({size},), not negative.")
-    if not size:
-        return _NoStates(name, problem, bound, _euler)
-    tolerance: Any = absolute if absolute.ndim else float(absolute)
-    if name in _SUNDIALS:
-        from .cvode import Cvode
-
-        return Cvode(name, problem, rtol, tolerance, bound)
-    from .scipy_methods import AutoSolver, SciPySolver
-
-    return (AutoSolver if name == "auto" else SciPySolver)(name, problem, rtol, tolerance, bound)

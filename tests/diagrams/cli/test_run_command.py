@@ -13,6 +13,7 @@ import pytest
 from loopwright.blocks import OptionError, PathDomainError
 from loopwright.diagrams import experiments
 from loopwright.diagrams.cli import main as _cli
+from loopwright.diagrams.cli import options as _cli_options
 from loopwright.diagrams.cli.main import main
 from loopwright.diagrams.paper.figures import plot_experiment, plot_path
 from loopwright.diagrams.paper.key_numbers import DEFINITIONS, key_numbers
@@ -155,7 +156,7 @@ def test_what_never_settles_is_null(tmp_path, capsys):
     ],
 )
 def test_option_values(text, value):
-    assert _cli._parse_value(text) == value
+    assert _cli_options.parse_value(text) == value
 
 
 # --- a run that fails -----------------------------------------------------------------------------------------------

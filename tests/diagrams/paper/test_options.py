@@ -12,7 +12,7 @@ import pytest
 
 from loopwright.blocks import OptionError
 from loopwright.diagrams import experiments
-from loopwright.diagrams.cli import main as _cli
+from loopwright.diagrams.cli import options as _cli_options
 from loopwright.diagrams.cli.main import main
 from loopwright.diagrams.paper.experiments import EXPERIMENTS, compliance, force_tracking, path_following
 from loopwright.diagrams.paper.options import LIMITS
@@ -44,7 +44,7 @@ def test_numpys_truth_values_are_some():
     ("word", "meant"), [("yes", True), ("On", True), ("TRUE", True), ("no", False), ("off", False)]
 )
 def test_words_for_truth_on_the_command_line(word, meant):
-    assert _cli._parse_value(word) is meant
+    assert _cli_options.parse_value(word) is meant
 
 
 def test_a_word_that_is_no_truth_value(tmp_path, capsys):
@@ -208,7 +208,7 @@ def test_references_have_units(letter, runs):
     ],
 )
 def test_letters(given, letters):
-    assert _cli._parse_letters(given) == list(letters)
+    assert _cli_options.parse_letters(given) == list(letters)
 
 
 @pytest.mark.parametrize(
@@ -220,7 +220,7 @@ def test_letters_that_are_none(given, named, capsys):
 
 
 def test_options_of_several_experiments(capsys):
-    shares = _cli._share("AB", {"velocity_limit": 1.0})
+    shares = _cli_options.share("AB", {"velocity_limit": 1.0})
     assert shares == {"A": {}, "B": {"velocity_limit": 1.0}}
     assert capsys.readouterr().err == "A: without velocity_limit, which only B, C and D have.\n"
 

@@ -10,7 +10,8 @@ from scipy.linalg import expm
 
 from loopwright.blocks.core.errors import NonFiniteError, OptionError, SimulationError
 from loopwright.diagrams.solvers import cvode as _solvers_sundials
-from loopwright.diagrams.solvers.base import SOLVERS, Problem, make_solver
+from loopwright.diagrams.solvers.base import SOLVERS, Problem
+from loopwright.diagrams.solvers.choose import make_solver
 
 FIXED = {"euler": 1, "heun": 2, "rk4": 4}
 VARIABLE = [name for name in SOLVERS if name not in FIXED]
