@@ -1,17 +1,14 @@
 """What a run recorded, reached by name: in the whole, at an instant, and as a picture."""
 
-import ast
 import json
 import pickle
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from loopwright.blocks import Constant, Gain, OptionError, Reference, Sine, UnitDelay, UnknownNameError
 from loopwright.diagrams import Diagram, Occurrence, Run, Stopped, subsystem
-from loopwright.diagrams.results import plots as _plots
 from loopwright.diagrams.results import stored as _stored
 from loopwright.diagrams.results.recorder import select
 
@@ -66,13 +63,6 @@ def test_a_part_of_a_vector_has_its_unit_and_its_row():
 
 def test_names_complete_in_a_notebook(run):
     assert {"a.w", "b.w", "constant.y"} <= set(run._ipython_key_completions_())
-
-
-def test_plots_of_a_run_need_nothing_of_the_experiments():
-    tree = ast.parse(Path(_plots.__file__).read_text(encoding="utf-8"))
-    modules = [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    assert "run" in modules
-    assert not any(word in module for word in ("experiments", "figures", "fig3", "paper") for module in modules)
 
 
 # --- selections ---------------------------------------------------------------------------------------------------------
