@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from .values import ParameterSpec, Value
+from .parameters import HasParameters, ParameterSpec
 
 _NAME = ("name : str, optional", "Name in the diagram; without one the class name in snake case, numbered on repeats.")
 
@@ -20,7 +19,7 @@ _NAME = ("name : str, optional", "Name in the diagram; without one the class nam
 class ParameterSignature:
     """Signature shown for a value: a class shows its constructor's, a block its call's."""
 
-    def __get__(self, instance: Any, owner: type[Value]) -> inspect.Signature:
+    def __get__(self, instance: Any, owner: type[HasParameters]) -> inspect.Signature:
         if instance is None:
             return _constructor(owner)
         inputs = getattr(instance, "inputs", None)
@@ -35,7 +34,7 @@ class ParameterSignature:
         return inspect.Signature(parameters, __validate_parameters__=False)
 
 
-def _constructor(cls: type[Value]) -> inspect.Signature:
+def _constructor(cls: type[HasParameters]) -> inspect.Signature:
     parameters = []
     for name, spec in sorted(cls.parameter_specs.items(), key=lambda item: item[1].kw_only):
         kind = inspect.Parameter.KEYWORD_ONLY if spec.kw_only else inspect.Parameter.POSITIONAL_OR_KEYWORD
@@ -55,7 +54,7 @@ def with_section(text: str, title: str, entries: Iterable[tuple[str, str]]) -> s
     return text if not lines or header in text else f"{text}\n\n{header}" + "\n".join(lines)
 
 
-def parameter_section(cls: type[Value]) -> list[tuple[str, str]]:
+def parameter_section(cls: type[HasParameters]) -> list[tuple[str, str]]:
     """Return an entry for each parameter of a class: type, unit, range and default, then the description."""
     entries = [
         (f"{name} : {', '.join(_describe_parameter(spec))}", spec.description)

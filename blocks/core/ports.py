@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 
 from .errors import DefinitionError
+from .signals import Signal, Wireable
 from .units import parse_unit
-
-if TYPE_CHECKING:
-    from .block import Block
-    from .signals import Signal
 
 Shape = tuple[int, ...]
 PortUnit = str | tuple[str, ...] | None
@@ -139,12 +136,10 @@ class Output(Port):
     @overload
     def __get__(self, instance: None, owner: type) -> Output: ...
     @overload
-    def __get__(self, instance: Block, owner: type | None = None) -> Signal: ...
+    def __get__(self, instance: Wireable, owner: type | None = None) -> Signal: ...
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
         if instance is None:
             return self
-        from .signals import Signal
-
         return Signal(instance, self.name)
 
 
@@ -179,7 +174,7 @@ class State(Port):
         super().__init__(None, unit, description, name, **limits)
         self.start, self.like, self.output, self.discrete = start, like, output, discrete
 
-    def start_value(self, block: Block, shapes: Mapping[str, Shape]) -> np.ndarray:
+    def start_value(self, block: object, shapes: Mapping[str, Shape]) -> np.ndarray:
         """Return the start value for ``block``, with inputs of the given shapes, as a float64 array."""
         start = self.start
         if isinstance(start, str):
@@ -193,8 +188,6 @@ class State(Port):
         if instance is None:
             return self
         if self.output:
-            from .signals import Signal
-
             return Signal(instance, self.name)
         raise AttributeError(f"{self.name!r} is a state of {instance!r}: it lives in the run, not on the block.")
 

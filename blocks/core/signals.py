@@ -7,10 +7,10 @@ one. Both can be wired on, indexed, unpacked, named, and used in ``+``, ``-`` an
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -25,12 +25,19 @@ from .errors import (
 )
 from .numpy_guard import NoNumber
 
-if TYPE_CHECKING:
-    from .block import Block
+B = TypeVar("B")
 
-B = TypeVar("B", bound="Block")
 
-_OPERATOR_BLOCKS: dict[str, type[Block]] = {}
+class OperatorBlock(Protocol):
+    """A block that an operator makes: it is called with signals, or stands for its own output."""
+
+    def __call__(self, *inputs: Any) -> Call:
+        """Wire the inputs."""
+
+    def _signal(self) -> Signal: ...
+
+
+_OPERATOR_BLOCKS: dict[str, Callable[..., OperatorBlock]] = {}
 
 
 def made_by_operators(name: str) -> Callable[[type[B]], type[B]]:
@@ -40,10 +47,27 @@ def made_by_operators(name: str) -> Callable[[type[B]], type[B]]:
     """
 
     def declare(cls: type[B]) -> type[B]:
-        _OPERATOR_BLOCKS[name] = cls
+        made: Any = cls
+        _OPERATOR_BLOCKS[name] = made
         return cls
 
     return declare
+
+
+class Node(Protocol):
+    """A block, as far as wiring needs it."""
+
+    @property
+    def label(self) -> str:
+        """Name for messages."""
+
+    @property
+    def inputs(self) -> Mapping[str, Any]:
+        """Input ports by name."""
+
+    @property
+    def outputs(self) -> Mapping[str, Any]:
+        """Output ports by name."""
 
 
 recorder: ContextVar[list[Any] | None] = ContextVar("loopwright_calls", default=None)
@@ -208,7 +232,7 @@ class Call(Wired):
     """A block with its inputs: one node of a diagram."""
 
     def __init__(
-        self, block: Block, wires: dict[str, Signal], names: tuple[str | None, ...] = (), origin: Call | None = None
+        self, block: Node, wires: dict[str, Signal], names: tuple[str | None, ...] = (), origin: Call | None = None
     ):
         self.block, self.wires, self.names = block, wires, names
         self.origin = self if origin is None else origin
@@ -267,7 +291,7 @@ class UnknownAttributeError(UnknownNameError, AttributeError):
     """An unknown output or parameter was read as an attribute."""
 
 
-def primary_outputs(block: Block) -> list[str]:
+def primary_outputs(block: Node) -> list[str]:
     """Return the outputs that a call of ``block`` unpacks into."""
     return [name for name, port in block.outputs.items() if not getattr(port, "secondary", False)]
 
@@ -305,7 +329,7 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
     )
 
 
-def bind(block: Block, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Signal]:
+def bind(block: Node, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Signal]:
     """Match the arguments of a call with the block's inputs.
 
     Raises
@@ -344,7 +368,7 @@ def _operand(value: Any, default: str) -> str:
     return signal.source.label if len(outputs) == 1 else signal.port
 
 
-def with_hint(block: Block, hint: str) -> Block:
+def with_hint(block: B, hint: str) -> B:
     """Set the name of a block that an operator makes, numbered where it repeats, and return the block."""
     object.__setattr__(block, "_hint", hint)
     return block

@@ -10,97 +10,18 @@ import inspect
 import numbers
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from dataclasses import replace as replace_fields
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, dataclass_transform
+from typing import Any, ClassVar, Self, dataclass_transform
 
 import numpy as np
 
 from .docstrings import ParameterSignature, parameter_section, with_section
 from .errors import DefinitionError, ParameterError, near
 from .frozen import freeze
-from .units import parse_unit
-
-if TYPE_CHECKING:
-    Array: TypeAlias = Any
-else:
-
-    class Array:
-        """A number or a NumPy array of floats; inside an equation that is being traced, its symbolic stand-in.
-
-        Used in annotations only: ``mass: Array = parameter(…)``. Type checkers take it for ``Any``.
-        """
-
-
-_MISSING: Any = object()
-
-
-@dataclass(frozen=True)
-class ParameterSpec:
-    """Declaration of one parameter, made by `parameter`."""
-
-    default: Any = _MISSING
-    unit: str | None = None
-    description: str = ""
-    above: float | None = None
-    minimum: float | None = None
-    maximum: float | None = None
-    shape: tuple[int, ...] | None = None
-    structural: bool = False
-    kw_only: bool = True
-    tunable: bool = True
-    annotation: str = "Any"
-
-    @property
-    def required(self) -> bool:
-        """Whether the constructor needs a value for it."""
-        return self.default is _MISSING
-
-
-def parameter(
-    *,
-    default: Any = _MISSING,
-    unit: str | None = None,
-    description: str = "",
-    above: float | None = None,
-    minimum: float | None = None,
-    maximum: float | None = None,
-    shape: tuple[int, ...] | None = None,
-    structural: bool = False,
-    kw_only: bool = True,
-    tunable: bool = True,
-) -> Any:
-    """Declare a parameter of a value: ``mass: float = parameter(unit="kg", above=0.0)``.
-
-    Parameters
-    ----------
-    default : object, optional
-        The default; without one the parameter is required.
-    unit : str, optional
-        Unit, as FMI spells it (``"N.s/m"``).
-    description : str, optional
-        One line for people.
-    above, minimum, maximum : float, optional
-        Bounds of every entry: strictly above, at least, at most.
-    shape : tuple of int, optional
-        Shape that a numeric value is broadcast to.
-    structural : bool, optional
-        True when the equations branch on the value in Python; it is then a constant of the trace and not a symbol.
-        Values other than floats are always structural.
-    kw_only : bool, optional
-        False for the one object that defines the value and may come first, by position.
-    tunable : bool, optional
-        False when an FMU made from it must not change the value during a run (FMI's variability "fixed").
-
-    Raises
-    ------
-    UnitError
-        For a unit that can't be read.
-    """
-    if unit is not None:
-        parse_unit(unit)
-    return ParameterSpec(default, unit, description, above, minimum, maximum, shape, structural, kw_only, tunable)
+from .parameters import MISSING, ParameterSpec
+from .parameters import Array as Array
+from .parameters import parameter as parameter
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, eq_default=False, field_specifiers=(parameter,))
@@ -119,7 +40,7 @@ class Value:
             text = annotation if isinstance(annotation, str) else _annotation_text(annotation)
             if "ClassVar" in text or name.startswith("_") or name in cls._keywords:
                 continue
-            declared = cls.__dict__.get(name, _MISSING)
+            declared = cls.__dict__.get(name, MISSING)
             spec = declared if isinstance(declared, ParameterSpec) else ParameterSpec(default=declared)
             if name in cls.__dict__:
                 delattr(cls, name)  # the value is an attribute of the instance alone

@@ -6,15 +6,12 @@ import math
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.polynomial import chebyshev, polynomial
 
 from ..core.errors import ParameterError
-
-if TYPE_CHECKING:
-    from .path import Path
 
 UNLIMITED = 1e6
 """What a path's reach is where there is no limit, m: a number, so that equations can be traced and compared."""
@@ -23,6 +20,42 @@ UNLIMITED = 1e6
 def limited(reach: float) -> float:
     """Return the reach as it is told: infinite where there is no limit."""
     return math.inf if reach >= UNLIMITED * (1.0 - 1e-9) else reach
+
+
+class Curve(Protocol):
+    """A path, as far as its tables need it; `Path` says what each part is."""
+
+    @property
+    def period(self) -> float | None:
+        """Period in θ; None for an open path."""
+
+    @property
+    def knots(self) -> np.ndarray:
+        """Parameters between which σ is smooth."""
+
+    @property
+    def length(self) -> float:
+        """Length in m."""
+
+    @property
+    def sampling(self) -> tuple[np.ndarray, np.ndarray]:
+        """Dense parameters, and their arc lengths in m."""
+
+    @property
+    def sampled(self) -> np.ndarray:
+        """Points at the dense parameters, (2, N), in m."""
+
+    def sigma(self, theta: Any, order: int = 0) -> Any:
+        """Return σ(θ), or its derivative of an order."""
+
+    def derivatives(self, theta: Any, highest: int = 3) -> tuple[Any, ...]:
+        """Return σ(θ) and its derivatives."""
+
+    def arc_length(self, theta: Any) -> Any:
+        """Return the arc length at θ in m."""
+
+    def frame(self, theta: Any) -> Any:
+        """Return the moving frame at θ."""
 
 
 _DEGREE = 12  # of the polynomials that are fitted to the speed
@@ -92,7 +125,7 @@ def _subdivided(knots: np.ndarray) -> np.ndarray:
     return np.append(np.concatenate(parts), knots[-1])
 
 
-def grid(path: Path) -> np.ndarray:
+def grid(path: Curve) -> np.ndarray:
     """Return path parameters so dense that no cell turns by more than 0.05 rad or is longer than length/400."""
     theta = _subdivided(path.knots)
     for _ in range(14):
@@ -107,7 +140,7 @@ def grid(path: Path) -> np.ndarray:
     return theta
 
 
-def invert(path: Path, s: np.ndarray) -> np.ndarray:
+def invert(path: Curve, s: np.ndarray) -> np.ndarray:
     """Return the parameters at which the arc length is s, within [0, length] (Newton between brackets)."""
     theta, lengths = path.sampling
     i = np.clip(np.searchsorted(lengths, s, side="right") - 1, 0, len(theta) - 2)
@@ -124,7 +157,7 @@ def invert(path: Path, s: np.ndarray) -> np.ndarray:
     return result
 
 
-def positions(path: Path, y: object) -> np.ndarray:
+def positions(path: Curve, y: object) -> np.ndarray:
     """Return positions as an array, and refuse what is none.
 
     Raises
@@ -145,7 +178,7 @@ def positions(path: Path, y: object) -> np.ndarray:
     return array
 
 
-def nearest(path: Path, y: np.ndarray) -> float:
+def nearest(path: Curve, y: np.ndarray) -> float:
     """Return the parameter of the point of the path nearest to y, among all of it.
 
     Around every dip of the sampled distance that may be the least, three cells to both sides are resampled 16 times as
@@ -185,7 +218,7 @@ def _dips(values: np.ndarray) -> np.ndarray:
     return dips
 
 
-def polish(path: Path, y: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def polish(path: Curve, y: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the roots of (σ − y)ᵀσ′, rising, between the brackets: Newton, halving where it would leave them."""
     theta: np.ndarray = (low + high) / 2.0
     for _ in range(60):
@@ -209,7 +242,7 @@ def polish(path: Path, y: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.n
 class _Contact:
     """Curvature of the circle that touches the path at θ and passes through its point at φ: 2 nᵀΔ/|Δ|²."""
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Curve):
         self.path = path
         self.near = 1e-4 * path.length / np.pi
         theta, _ = path.sampling
@@ -279,7 +312,7 @@ class _Contact:
         return best
 
 
-def reach_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def reach_table(path: Curve) -> tuple[np.ndarray, np.ndarray]:
     """Return breaks and coefficients (pieces, 2, 2) of the inverse reach, left and right, linear between the nodes.
 
     The inverse reach is a maximum of smooth functions: where it has kinks, straight lines lie above it, on the safe

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any
+from typing import Any, cast
 
 from ...blocks.core.block import Block
 from ...blocks.core.errors import DoubleDriveError, DuplicateNameError, UnwiredInputError, WiringError
@@ -182,7 +182,7 @@ class Collector:
             else:
                 self._add_block(source, consumer)
         elif isinstance(item, Call):
-            self._add_block(item.block, consumer)
+            self._add_block(cast(Block, item.block), consumer)  # signals know blocks by their face only
             known = self.calls.setdefault(id(item.block), item.origin)
             if known is not item.origin:
                 raise DoubleDriveError(

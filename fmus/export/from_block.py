@@ -12,8 +12,8 @@ import numpy as np
 from ...blocks.core.block import Block
 from ...blocks.core.errors import DefinitionError, LoopwrightError
 from ...blocks.core.layout import Layout
+from ...blocks.core.parameters import ParameterSpec
 from ...blocks.core.ports import Port, Shape
-from ...blocks.core.values import ParameterSpec
 from ...blocks.tracing.numpy_check import GUARDS, NEXT
 from ...blocks.tracing.trace import Traced, trace, traced_parameters
 from .build import build_fmu

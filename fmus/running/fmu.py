@@ -59,14 +59,21 @@ class Fmu(Block):
                 raise UnknownNameError(
                     f"it has no port {old!r} to rename. {near(old, ports)}", block=who, port="rename"
                 )
-        start = {k: self._start_value(description, k, v) for k, v in self.start.items()}
+        start = {k: self.start_value(description, k, v) for k, v in self.start.items()}
         object.__setattr__(self, "start", FrozenMapping(start))
         object.__setattr__(self, "_content", description.digest)
         new = [self.rename.get(name, name) for name in ports]
         if len(set(new)) < len(new):
             raise ParameterError("two ports get the same name; rename them apart.", block=who, port="rename")
 
-    def _start_value(self, description: FmuDescription, name: str, value: Any) -> Any:
+    def start_value(self, description: FmuDescription, name: str, value: Any) -> Any:
+        """Return a start value in the variable's shape, after checking it.
+
+        Raises
+        ------
+        UnknownNameError, ParameterError
+            No such variable, one that can't be set, another shape, a value out of its range.
+        """
         who, port = self.label, f"start.{name}"
         if name in description.other:
             raise ParameterError(

@@ -6,19 +6,17 @@ import ctypes
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from ...blocks.core.errors import FmuError, ParameterError, UnknownNameError, near
 from ...blocks.core.layout import Layout, elements
 from ..archive.description import FmuDescription
+from ..calls.fmu_block import FmuBlock
 from ..calls.loaded_library import LoadedFmu
 from .derivation import Derivation, DerivativeMethod
 from .differences import Column, columns
-
-if TYPE_CHECKING:
-    from .fmu import Fmu
 
 EQUATIONS, STEP = 1e-5, 1e-4
 """Differences, relative to nominal values: of equations, and of steps, where an adaptive solver leaves its traces."""
@@ -61,10 +59,17 @@ class FmuLinearization:
         return str(self.derivation)
 
 
+class LinearizableFmu(FmuBlock, Protocol):
+    """The block of an FMU, as its linear model needs it."""
+
+    def start_value(self, description: FmuDescription, name: str, value: Any) -> Any:
+        """Return a start value, checked and in the variable's shape."""
+
+
 class _Point:
     """An operating point, as values of the FMU's variables."""
 
-    def __init__(self, block: Fmu, t: float, state: Any, inputs: Any):
+    def __init__(self, block: LinearizableFmu, t: float, state: Any, inputs: Any):
         self.block, self.about, self.t = block, block.description, float(t)
         about = self.about
         self.states = list(about.states)
@@ -76,7 +81,7 @@ class _Point:
             state, {name: name for name in self.states}, "state", block.description.discrete_states
         )
         given_inputs = self._named(inputs, ports, "inputs", ())
-        self.given = {n: block._start_value(about, n, v) for n, v in {**given_state, **given_inputs}.items()}
+        self.given = {n: block.start_value(about, n, v) for n, v in {**given_state, **given_inputs}.items()}
 
     def _named(self, given: Any, names: Mapping[str, str], what: str, more: tuple[str, ...]) -> dict[str, Any]:
         if given is None:
@@ -129,7 +134,7 @@ class _Point:
 
 
 def linear_model(
-    block: Fmu, t: float, state: Any, inputs: Any, interface: str | None, exact: bool | None
+    block: LinearizableFmu, t: float, state: Any, inputs: Any, interface: str | None, exact: bool | None
 ) -> FmuLinearization:
     """Linearize an FMU's equations; see `Fmu.linear_model`."""
     if interface not in (None, "model_exchange", "co_simulation"):
@@ -273,7 +278,9 @@ def _differenced(point: _Point, instance: LoadedFmu) -> FmuLinearization:
 # ---- of a step ----
 
 
-def step_difference(block: Fmu, h: float, t: float, state: Any, inputs: Any, relative_step: float) -> FmuLinearization:
+def step_difference(
+    block: LinearizableFmu, h: float, t: float, state: Any, inputs: Any, relative_step: float
+) -> FmuLinearization:
     """Linearize a communication step; see `Fmu.step_difference`."""
     for name, value in (("h", h), ("relative_step", relative_step)):
         if not 0 < value < np.inf:
