@@ -1,7 +1,7 @@
-"""Blocks: what a block is, and the library.
+"""Blocks: the base of all blocks, and the library.
 
-A block's equations are written once, as NumPy-style functions of (t, x, u), and run, traced, differentiated and
-compiled from there. Everything here is public; nothing here imports the rooms above.
+A block's equations are written once, as NumPy-style functions of (t, x, u); from these they are run, traced,
+differentiated and compiled. Everything exported here is public; nothing here imports the rooms above.
 """
 
 from .core.arithmetic import Gain, Product, Sum

@@ -1,6 +1,6 @@
 """The base of all blocks: ports, signals, values, units and errors."""
 
-from . import arithmetic, moved, source  # operators on signals make their blocks
+from . import arithmetic, moved, source  # arithmetic and source register the blocks that operators make
 
 __all__ = ["arithmetic", "moved", "source"]
 

@@ -10,7 +10,7 @@ import numpy as np
 from .block import Block
 from .errors import ParameterError, ShapeError
 from .ports import Input, Output, Shape
-from .signals import made_by_operators
+from .signals import register_operator_block
 from .values import Array, parameter
 
 
@@ -25,7 +25,7 @@ def check_shapes(**values: Array) -> None:
     Raises
     ------
     ShapeError
-        Two shapes that differ.
+        For two shapes that differ.
     """
     first = next(((name, shape_of(v)) for name, v in values.items() if shape_of(v)), ("", ()))
     for name, value in values.items():
@@ -37,19 +37,19 @@ def check_shapes(**values: Array) -> None:
             )
 
 
-@made_by_operators("sum")
+@register_operator_block("sum")
 class Sum(Block):
     """Sum with signs: y = ± u₁ ± u₂ ….
 
-    Inputs ``u1``, ``u2``, …, one for each sign, are of one shape and unit (a scalar goes with any); the output ``y``
-    has them too.
+    Inputs ``u1``, ``u2``, …, one for each sign, have one shape and unit (a scalar goes with any shape). The output
+    ``y`` has the same.
 
     Raises
     ------
     ParameterError
-        Anything but plus and minus among the signs.
+        For signs other than plus and minus.
     ShapeError
-        Inputs of different shapes, when the diagram is built.
+        For inputs of different shapes, when the diagram is built.
     """
 
     same_units = True
@@ -77,7 +77,7 @@ class Sum(Block):
         return total
 
 
-@made_by_operators("gain")
+@register_operator_block("gain")
 class Gain(Block):
     """Gain: y = k u, element by element, or the matrix product y = K u for a matrix K.
 
@@ -86,13 +86,13 @@ class Gain(Block):
     Raises
     ------
     ParameterError
-        A gain of more than two dimensions.
+        For a gain of more than two dimensions.
     ShapeError
-        An input with another number of entries than the vector or the matrix takes, when the diagram is built.
+        For an input with another number of entries than the vector or the matrix takes, when the diagram is built.
     """
 
     gain: Array = parameter(description="number, array of the signal's shape, or matrix")
-    u = Input(shape=None, description="what is multiplied, of any shape")
+    u = Input(shape=None, description="signal to multiply, of any shape")
     y = Output(shape=None, description="the product")
 
     def check(self) -> None:
@@ -118,14 +118,14 @@ class Gain(Block):
         return self.gain @ u.u if getattr(self.gain, "ndim", 0) == 2 else self.gain * u.u
 
 
-@made_by_operators("product")
+@register_operator_block("product")
 class Product(Block):
     """Product, element by element: y = u₁ u₂.
 
     Raises
     ------
     ShapeError
-        Inputs of different shapes (a scalar goes with any), when the diagram is built.
+        For inputs of different shapes (a scalar goes with any), when the diagram is built.
     """
 
     u1 = Input(shape=None, description="first factor, of any shape")

@@ -25,7 +25,7 @@ from .signals import (
 from .values import Value
 
 SOLVED = "trapezoidal step"
-"""Name of the guard that a block sampled by the trapezoidal method has for Newton's steps."""
+"""Name of the guard of a block's trapezoidal step, which fails if Newton's steps don't solve it."""
 
 _ABSENT = frozenset({"output", "derivative", "update", "indicators", "jump", "guards", "initial", "constants"})
 _ABSENT |= {"inputs", "outputs", "states", "events"}
@@ -114,9 +114,9 @@ class Block(Value, Wireable):
     name: str | None = None
     _hint: ClassVar[str | None] = None
     traced_of: ClassVar[str] = "(t, x, u)"
-    """Arguments of its equations, for messages."""
+    """Arguments of the equations, for messages."""
     untraced_twin: ClassVar[str] = ""
-    """Name of the block that takes what this one can't trace, for messages."""
+    """Name of the block that takes functions this one can't trace, for messages."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         check_port_names(cls)
@@ -214,8 +214,8 @@ class Block(Value, Wireable):
         text = super().__repr__()
         return text if self.name is None else f"{text[:-1]}{', ' if text[-2] != '(' else ''}name={self.name!r})"
 
-    def written(self, equation: str) -> Callable[..., Any]:
-        """Return the function in which a user has written an equation, for messages."""
+    def equation_function(self, equation: str) -> Callable[..., Any]:
+        """Return the function that a user wrote for an equation, for messages."""
         return getattr(type(self), equation)  # type: ignore[no-any-return]
 
     def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:

@@ -97,7 +97,7 @@ class TraceError(DefinitionError):
     Attributes
     ----------
     is_mistake : bool
-        Whether the equation would fail in Python, too, such as by a name that isn't there.
+        Whether the equation would fail in plain Python too, such as by a name that doesn't exist.
     """
 
     is_mistake: bool = False
@@ -125,7 +125,7 @@ class UnknownNameError(WiringError, KeyError):
     Attributes
     ----------
     candidates : tuple of str
-        The full names that a short name stands for; empty where it stands for none.
+        The full names that a short name stands for; empty if it stands for none.
     """
 
     candidates: tuple[str, ...] = ()

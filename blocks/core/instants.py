@@ -1,4 +1,4 @@
-"""Instants at which something happens again and again, and what is left of an instant."""
+"""Periodic instants, and comparisons of instants that allow for their rounding."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ _TOLERANCE = 4.0 * float(np.finfo(float).eps)  # of t: t, the period and their r
 
 
 def left_of(t: float) -> float:
-    """Return a time just before t at which an edge at t has not come yet, in spite of the tolerance of `period_of`.
+    """Return a time just before t, at which an edge at t has not come yet for `period_of` with its tolerance.
 
-    A solver takes the left limits of what is not smooth at t from there. The number before t would be too near.
+    A solver takes left limits at t there. The floating-point number before t would be too near.
     """
     return t - 4.0 * _TOLERANCE * abs(t)
 
 
 def is_before(a: float, b: float) -> bool:
-    """Whether a comes before b by more than the rounding of both: what is as near as that is one instant."""
+    """Whether a comes before b by more than the rounding of both; nearer than that they are one instant."""
     return a < b - 2.0 * _TOLERANCE * abs(b) if b < math.inf else a < b
 
 
-def earliest(instants: Array) -> Array:
-    """Return the first times that count as the given instants: 2e-15 t before, as times may be off by their rounding.
+def move_earlier(instants: Array) -> Array:
+    """Return the first times that count as the given instants: 2e-15 t earlier, which allows for their rounding.
 
-    Three times 0.1 is more than the tick at 0.3, and so are times of ``np.linspace``; both mean the tick.
+    Three times 0.1 is more than the tick at 0.3, and so may a time of ``np.linspace`` be; both mean the tick.
     """
     return instants - 2.0 * _TOLERANCE * np.abs(instants)
 
 
 def period_of(t: Array, period: Array, delay: Array) -> tuple[Array, Array, Array]:
-    """Return the number of the period at t, the time since it began in periods, and the rounding of it."""
+    """Return the number of the period at t, the time since it began in periods, and the rounding of that time."""
     passed = (t - delay) / period
     tolerance = _TOLERANCE * (np.abs(t) + np.abs(delay)) / period
     number = np.floor(passed + tolerance)

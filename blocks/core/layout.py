@@ -1,4 +1,4 @@
-"""Where named arrays stand in a flat vector: the one place in which offsets are counted."""
+"""Layout of named arrays in a flat vector: the one place in which offsets are counted."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def elements(name: str, shape: Shape, first: int = 0) -> list[str]:
     Parameters
     ----------
     first : int, default: 0
-        The number of the first element: FMI counts from 1.
+        Number of the first element; FMI counts from 1.
     """
     return [f"{name}[{','.join(str(i + first) for i in index)}]" if index else name for index in np.ndindex(*shape)]
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things stand in a flat vector: slice and shape by dotted path, in C order, one after the other.
+    """Layout of a flat vector: slice and shape of each array by name, in C order, one after the other.
 
     Examples
     --------
@@ -37,14 +37,14 @@ class Layout:
 
     @staticmethod
     def of(shapes: Mapping[str, Shape], offset: int = 0) -> Layout:
-        """Lay out the given shapes one after the other.
+        """Return the layout of arrays of the given shapes, one after the other.
 
         Parameters
         ----------
         shapes : mapping
-            Shape of everything, by name.
+            Shape of each array, by name.
         offset : int, default: 0
-            Where the first one begins.
+            Number of the first entry.
         """
         slices = {}
         for name, shape in shapes.items():
@@ -61,7 +61,7 @@ class Layout:
 
     @property
     def cuts(self) -> list[int]:
-        """The number of the first entry, then the number behind each thing: where CasADi's ``vertsplit`` cuts."""
+        """Numbers of the first entry and of the entry behind each array, as CasADi's ``vertsplit`` takes them."""
         bounds = [*self.slices.values()]
         return [bounds[0].start if bounds else 0, *(s.stop for s in bounds)]
 
@@ -71,14 +71,14 @@ class Layout:
         return [label for name, shape in self.shapes.items() for label in elements(name, shape)]
 
     def index(self, name: str) -> np.ndarray:
-        """Return the numbers of the entries of one thing, in its shape."""
+        """Return the numbers of the entries of one array, in its shape."""
         where = self.slices[name]
         return np.arange(where.start, where.stop).reshape(self.shapes[name])
 
     def entries(self, names: Iterable[str]) -> list[int]:
-        """Return the numbers of the entries of some things, one after the other."""
+        """Return the numbers of the entries of some arrays, one after the other."""
         return [i for name in names for i in range(self.slices[name].start, self.slices[name].stop)]
 
     def split(self, vector: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the parts of a vector by name, in their shapes: views, where NumPy can give them."""
+        """Return the arrays in a vector by name: views, if NumPy can give them."""
         return {name: vector[where].reshape(self.shapes[name]) for name, where in self.slices.items()}

@@ -1,4 +1,4 @@
-"""Modules of earlier versions: a pickle that names one gets an error that says which version it is from."""
+"""Modules of earlier versions: unpickling one raises an error that names the version."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 
 MOVED_IN = "0.2.0"
-"""The version in which every file moved into a sub-package."""
+"""Version in which every file moved into a sub-package."""
 _PLANTS = "bouncing_ball|dc_motor|gantry|gantry_contact|gantry_elastic|gantry_stiction|mass_spring_damper|scara"
 _BEFORE = re.compile(rf"loopwright\.(blocks|fmus|diagrams)\.(_[a-z]\w*|fig3|experiments|{_PLANTS})")
 
 
 class _FinderOfMovedModules(MetaPathFinder):
-    """The last finder that is asked: it finds nothing, and says why a module of ours is no longer there."""
+    """Last finder of modules: it finds none, and raises an error for modules that have moved."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -32,6 +32,6 @@ class _FinderOfMovedModules(MetaPathFinder):
 
 
 def explain_moved_modules() -> None:
-    """Let the import of a module that has moved say so; nothing else is changed by it."""
+    """Make the import of a module that has moved raise an error that says so."""
     if not any(type(finder).__name__ == _FinderOfMovedModules.__name__ for finder in sys.meta_path):
         sys.meta_path.append(_FinderOfMovedModules())

@@ -29,7 +29,7 @@ B = TypeVar("B")
 
 
 class OperatorBlock(Protocol):
-    """A block that an operator makes: it is called with signals, or stands for its own output."""
+    """A block that an operator makes; it is called with signals, or used as its own output."""
 
     def __call__(self, *inputs: Any) -> Call:
         """Wire the inputs."""
@@ -40,22 +40,22 @@ class OperatorBlock(Protocol):
 _OPERATOR_BLOCKS: dict[str, Callable[..., OperatorBlock]] = {}
 
 
-def made_by_operators(name: str) -> Callable[[type[B]], type[B]]:
-    """Declare the class of the blocks that an operator on signals makes: ``sum``, ``gain``, ``product``, ``constant``.
+def register_operator_block(name: str) -> Callable[[type[B]], type[B]]:
+    """Register the class of the blocks that an operator on signals makes: ``sum``, ``gain``, ``product``, ``constant``.
 
-    Blocks need signals, and signals make blocks: the classes are declared from above, so that imports run one way.
+    Blocks need signals, and operators on signals make blocks: registering keeps the imports one way.
     """
 
-    def declare(cls: type[B]) -> type[B]:
+    def register(cls: type[B]) -> type[B]:
         made: Any = cls
         _OPERATOR_BLOCKS[name] = made
         return cls
 
-    return declare
+    return register
 
 
 class Node(Protocol):
-    """A block, as far as wiring needs it."""
+    """The members of a block that wiring needs."""
 
     @property
     def label(self) -> str:
@@ -93,7 +93,7 @@ class Wireable(NoNumber):
         return _sum(other, self, "+-")
 
     def __neg__(self) -> Signal:
-        total = _OPERATOR_BLOCKS["sum"](signs="-")  # it keeps the unit, which a gain would not
+        total = _OPERATOR_BLOCKS["sum"](signs="-")  # keeps the unit, which a gain would not
         return with_hint(total, f"minus_{_operand(self, 'constant')}")(self)._signal()
 
     def __mul__(self, other: Any) -> Signal:

@@ -1,4 +1,4 @@
-"""The base of all sources, and a constant, which numbers on a wire become."""
+"""Base of all sources, and the constant that a number on a wire becomes."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 
 from .block import Block
 from .errors import ParameterError, UnitError
-from .instants import earliest
+from .instants import move_earlier
 from .ports import Output, PortUnit
-from .signals import made_by_operators
+from .signals import register_operator_block
 from .units import parse_unit, rate_of
 from .values import Array, parameter
 
@@ -19,10 +19,10 @@ from .values import Array, parameter
 class Source(Block):
     """Base of the sources: one output, ``y``, in the unit that the parameter ``unit`` declares.
 
-    Where y holds a value with its first two time derivatives, ``unit`` is that of the value.
+    If y is a value with its first two time derivatives, ``unit`` is that of the value.
     """
 
-    unit: str | None = parameter(default=None, description="unit of the output, where it is to be checked")
+    unit: str | None = parameter(default=None, description="unit of the output; None: not checked")
     y = Output(shape=None)
 
     def check(self) -> None:
@@ -47,18 +47,18 @@ class Source(Block):
         return {"y": Output(declared.shape, each, declared.description, name="y")}
 
     def instants(self) -> Array:
-        """Return the times at which the output or its derivatives are not smooth, in any order: none."""
+        """Return the times, in any order, at which the output or its derivatives are not smooth: none by default."""
         return np.zeros(0)
 
     def next_instant(self, t: float) -> float:
-        """Return the first of `instants` after t, without one that t counts as."""
+        """Return the first of `instants` after t; one that differs from t by rounding is not after it."""
         times = np.ravel(self.instants())
-        return float(np.min(times[earliest(times) > t], initial=math.inf))
+        return float(np.min(times[move_earlier(times) > t], initial=math.inf))
 
 
-@made_by_operators("constant")
+@register_operator_block("constant")
 class Constant(Source):
-    """A constant number or array."""
+    """Constant number or array."""
 
     value: Array = parameter(description="number or array")
 

@@ -20,7 +20,7 @@ class Minimum(Numbered):
     Raises
     ------
     ShapeError
-        Inputs of different shapes (a scalar goes with any), when the diagram is built.
+        For inputs of different shapes (a scalar goes with any), when the diagram is built.
     """
 
     same_units = True
@@ -28,7 +28,7 @@ class Minimum(Numbered):
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the smallest."""
-        return self.folded(u, lambda a, b: np.where(a < b, a, np.where(b <= a, b, a + b)))
+        return self.fold(u, lambda a, b: np.where(a < b, a, np.where(b <= a, b, a + b)))
 
 
 class Maximum(Numbered):
@@ -37,7 +37,7 @@ class Maximum(Numbered):
     Raises
     ------
     ShapeError
-        Inputs of different shapes (a scalar goes with any), when the diagram is built.
+        For inputs of different shapes (a scalar goes with any), when the diagram is built.
     """
 
     same_units = True
@@ -45,41 +45,41 @@ class Maximum(Numbered):
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the largest."""
-        return self.folded(u, lambda a, b: np.where(a > b, a, np.where(b >= a, b, a + b)))
+        return self.fold(u, lambda a, b: np.where(a > b, a, np.where(b >= a, b, a + b)))
 
 
 class Limited(Block):
-    """Base of the blocks with limits: ±limit, or lower and upper ones, or one of them."""
+    """Base of the blocks with limits: ±limit, or a lower limit, an upper limit or both."""
 
     limit: Array | None = parameter(
         default=None, above=0.0, description="largest magnitude, a number or one for each element"
     )
     lower: Array | None = parameter(default=None, description="lower limit, in place of limit; None for none")
     upper: Array | None = parameter(default=None, description="upper limit, in place of limit; None for none")
-    u = Input(shape=None, description="what is limited, of any shape")
+    u = Input(shape=None, description="signal to limit, of any shape")
 
     def check(self) -> None:
         """Refuse no limits, two kinds of limits, and limits that cross."""
 
-        def bad(text: str, port: str) -> ParameterError:
+        def error(text: str, port: str) -> ParameterError:
             return ParameterError(text, block=self.label, port=port)
 
         sides = {k: v for k, v in (("lower", self.lower), ("upper", self.upper)) if v is not None}
         if (self.limit is None) == (not sides):
             found = "no limit" if not sides else f"limit and {' and '.join(sides)}"
-            raise bad(
+            raise error(
                 f"found {found}; expected limit=… for ±limit, or lower=… or upper=… or both. Give these.", "limit"
             )
         if len(sides) == 2:
             check_shapes(**sides)
             if np.any(np.asarray(self.lower) >= np.asarray(self.upper)):
-                raise bad(
+                raise error(
                     f"found lower={shorten(self.lower)} and upper={shorten(self.upper)}; expected lower below upper. "
                     "Exchange them, or move one.",
                     "lower",
                 )
 
-    def limited(self, u: Array) -> Array:
+    def clip(self, u: Array) -> Array:
         """Return u within the limits; NaN passes through."""
         given = {k: v for k in ("limit", "lower", "upper") if (v := getattr(self, k)) is not None}
         check_shapes(**given, u=u)
@@ -91,41 +91,41 @@ class Limited(Block):
 class Saturation(Limited):
     """Saturation: y = u limited to ±limit, or to [lower, upper], element by element; NaN passes through.
 
-    The secondary output ``excess`` is what was cut off, u − y: zero exactly while no limit acts. It drives the
-    anti-windup of `ErrorDynamics`. Its kinks need no events.
+    The secondary output ``excess`` is the part cut off, u − y: zero exactly while no limit acts. It drives the
+    anti-windup of `ErrorDynamics`. The kinks need no events.
 
     Raises
     ------
     ParameterError
-        No limit, ``limit`` beside ``lower`` or ``upper``, or limits that cross.
+        For no limit, for ``limit`` beside ``lower`` or ``upper``, and for limits that cross.
     ShapeError
-        Limits and a signal of different shapes, when the diagram is built.
+        For limits and a signal of different shapes, when the diagram is built.
     """
 
     y = Output(like="u", description="the limited signal")
-    excess = Output(like="u", secondary=True, description="what was cut off, u − y")
+    excess = Output(like="u", secondary=True, description="the part cut off, u − y")
 
     def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return the limited signal and what was cut off."""
-        y = self.limited(u.u)
+        """Return the limited signal and the part cut off."""
+        y = self.clip(u.u)
         return y, u.u - y
 
 
 class DeadZone(Limited):
     """Dead zone: y = u − (u limited to ±limit, or to [lower, upper]), element by element; NaN passes through.
 
-    y is zero exactly within the limits, and rises from zero outside of them with slope 1. Its kinks need no events.
+    y is zero exactly within the limits, and rises from zero outside of them with slope 1. The kinks need no events.
 
     Raises
     ------
     ParameterError
-        No limit, ``limit`` beside ``lower`` or ``upper``, or limits that cross.
+        For no limit, for ``limit`` beside ``lower`` or ``upper``, and for limits that cross.
     ShapeError
-        Limits and a signal of different shapes, when the diagram is built.
+        For limits and a signal of different shapes, when the diagram is built.
     """
 
-    y = Output(like="u", description="what is beyond the limits")
+    y = Output(like="u", description="the part beyond the limits")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return what is beyond the limits."""
-        return u.u - self.limited(u.u)
+        """Return the part beyond the limits."""
+        return u.u - self.clip(u.u)

@@ -1,4 +1,4 @@
-"""What blocks that branch have in common: truth, numbered inputs, and events that take one signal."""
+"""Common parts of blocks that branch: truth, numbered inputs, checks of shapes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from ..core.values import Array, parameter
 
 
 def check_fits(value: Array, port: str, main: Array, main_port: str) -> None:
-    """Refuse a signal that is neither a scalar nor of the shape of the main one, which a state has as well.
+    """Refuse a signal that is neither a scalar nor of the main signal's shape, which a state has as well.
 
     Raises
     ------
     ShapeError
-        Any other shape.
+        For any other shape.
     """
     if shape_of(value) not in ((), shape_of(main)):
         raise ShapeError(
@@ -35,18 +35,18 @@ def truth(u: Array) -> Array:
     return np.where(u > 0.5, 1.0, np.where(u <= 0.5, 0.0, u))
 
 
-def single(value: Array, port: str) -> Array:
-    """Return the signal that an event looks at, and refuse a vector: an event is one crossing of one number.
+def expect_scalar(value: Array, port: str) -> Array:
+    """Return the signal of an event, and refuse a vector: an event is one crossing of one number.
 
     Raises
     ------
     ShapeError
-        A signal of several entries.
+        For a signal of several entries.
     """
     if shape_of(value):
         raise ShapeError(
-            f"found shape {shape_of(value)}; in a continuous frame it switches by events and takes a scalar. Index the "
-            "signal, as in u[0], and give each entry a block of its own, or put the block into a "
+            f"found shape {shape_of(value)}; expected a scalar in a continuous subsystem, where it switches by events. "
+            "Index the signal, as in u[0], and give each entry a block of its own, or put the block into a "
             "@subsystem(sample_time=…), where it acts on every entry.",
             port=port,
         )
@@ -54,17 +54,17 @@ def single(value: Array, port: str) -> Array:
 
 
 class Numbered(Block):
-    """Base of the blocks with inputs ``u1``, ``u2``, …: ``count`` of them, of one shape (a scalar goes with any)."""
+    """Base of the blocks with ``count`` inputs ``u1``, ``u2``, …, of one shape (a scalar goes with any)."""
 
-    count: int = parameter(default=2, minimum=1, description="how many inputs there are")
+    count: int = parameter(default=2, minimum=1, description="number of inputs")
 
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
         """The numbered inputs."""
         return {f"u{i}": Input(shape=None, name=f"u{i}") for i in range(1, self.count + 1)}
 
-    def folded(self, u: Any, combine: Any) -> Array:
-        """Return ``combine`` applied from the first input to the last."""
+    def fold(self, u: Any, combine: Any) -> Array:
+        """Combine the inputs from the first to the last."""
         check_shapes(**u._asdict())
         total = u[0]
         for value in u[1:]:

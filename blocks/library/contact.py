@@ -1,4 +1,4 @@
-"""What a body meets: a spring with a damper, a wall, the push of a hand. Forces act on the body."""
+"""Contact: a spring with a damper, a wall, the push of a hand. Forces act on the body."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from .sources import smooth_step
 class SpringDamper(Block):
     """Spring and damper between a body and an anchor: F = −k (p − p_a − r) − d (v − v_a).
 
-    It works along each axis on its own, in any number of dimensions; k and d may be matrices, F = −K (…) − D (…).
-    The anchor rests at zero unless it is wired: a hand that holds the body, another body.
+    Each axis is on its own, in any number of dimensions; k and d may be matrices, F = −K (…) − D (…). The anchor may be
+    wired, such as to a hand that holds the body or to another body; else it rests at zero.
 
     Raises
     ------
     ShapeError
-        Inputs or parameters of different shapes, when the diagram is built.
+        For inputs or parameters of different shapes, when the diagram is built.
     """
 
     stiffness: Array = parameter(unit="N/m", description="stiffness k: a number, one for each axis, or a matrix")
-    damping: Array = parameter(default=0.0, unit="N.s/m", description="damping d: as the stiffness")
+    damping: Array = parameter(default=0.0, unit="N.s/m", description="damping d: like the stiffness")
     rest: Array = parameter(default=0.0, unit="m", description="offset r from the anchor at which the spring rests")
     position = Input(shape=None, unit="m", description="position p of the body")
     velocity = Input(shape=None, unit="m/s", default=0.0, description="its velocity v")
@@ -51,9 +51,9 @@ class SpringDamper(Block):
             check_fits(value, name, u.position, "position")
         stretch = u.position - u.anchor - self.rest
         rate = u.velocity - u.anchor_velocity + 0.0 * u.position
-        return -self._times("stiffness", stretch) - self._times("damping", rate)
+        return -self._multiply("stiffness", stretch) - self._multiply("damping", rate)
 
-    def _times(self, name: str, value: Array) -> Array:
+    def _multiply(self, name: str, value: Array) -> Array:
         factor = getattr(self, name)
         n = shape_of(value)
         if shape_of(factor) not in ((), n, (*n, *n)):
@@ -72,15 +72,16 @@ class Wall(Block):
 
         F = n max(k δ + d δ̇, 0) in the wall, δ > 0;    F = 0 outside.
 
-    n points out of the wall. A damped wall's force jumps where the body comes in, and is gone before it leaves. In a
-    continuous frame that jump is an event; without damping the force has a kink only, and the event is for ``contact``.
+    n points out of the wall. A damped wall's force jumps when the body enters, and ends before the body leaves. In a
+    continuous subsystem that jump is an event. Without damping the force has a kink only, and the event is for
+    ``contact``.
 
     Raises
     ------
     ParameterError
-        A normal of length zero.
+        For a normal of length zero.
     ShapeError
-        Point, normal and inputs of different shapes, when the diagram is built.
+        For point, normal and inputs of different shapes, when the diagram is built.
     """
 
     stiffness: float = parameter(unit="N/m", above=0.0, description="stiffness k")
@@ -90,7 +91,7 @@ class Wall(Block):
     position = Input(shape=None, unit="m", description="position p of the body")
     velocity = Input(shape=None, unit="m/s", default=0.0, description="its velocity v")
     force = Output(shape=None, unit="N", description="force F on the body")
-    depth = Output(unit="m", secondary=True, description="depth δ in the wall; negative: the gap")
+    depth = Output(unit="m", secondary=True, description="depth δ in the wall; a gap is negative")
     contact = Output(secondary=True, description="1 while the wall pushes, else 0")
     touching = State(discrete=True, description="1 while the wall pushes")
     touch = Event("both", "the body reaches the wall", nominal=1e-3)
@@ -108,15 +109,15 @@ class Wall(Block):
 
     @property
     def states(self) -> Mapping[str, State]:  # type: ignore[override]
-        """Whether it pushes, where that is switched."""
+        """``touching``, if the wall is damped; else none."""
         return {"touching": type(self).touching} if self.damping else {}
 
     @property
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """Contact that is made and lost, where the force jumps; undamped, it follows the depth alone."""
+        """``touch``, and if the wall is damped ``press``."""
         return {"touch": Wall.touch} | ({"press": Wall.press} if self.damping else {})
 
-    def _seen(self, u: Any) -> tuple[Array, Array, Array]:
+    def _measure(self, u: Any) -> tuple[Array, Array, Array]:
         """Return n, the depth δ, and k δ + d δ̇."""
         expected = shape_of(self.point)
         for name, value in u._asdict().items():
@@ -131,57 +132,57 @@ class Wall(Block):
         return n, depth, self.stiffness * depth - self.damping * np.sum(n * u.velocity)
 
     def _pushes(self, u: Any) -> Array:
-        """Return 1 where it pushes; NaN passes through."""
-        _, depth, push = self._seen(u)
+        """Return 1 if the wall pushes, else 0; NaN passes through."""
+        _, depth, push = self._measure(u)
         inside = np.where(depth > 0.0, 1.0, np.where(depth <= 0.0, 0.0, depth))
         return inside * np.where(push > 0.0, 1.0, np.where(push <= 0.0, 0.0, push))
 
     @property
     def starts_from_inputs(self) -> bool:
-        """Whether there is a state, which `initial` finds."""
+        """Whether there is a state, which `initial` computes."""
         return bool(self.damping)
 
     def initial(self, u: Any) -> Array:
-        """Return whether it pushes at the start."""
+        """Return 1 if the wall pushes at the start, else 0."""
         return np.asarray(self._pushes(u))
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> tuple[Array, Array, Array]:
-        """Return force, depth, and whether it pushes."""
-        n, depth, push = self._seen(u)
+        """Return force, depth and contact."""
+        n, depth, push = self._measure(u)
         contact = x.touching if T is None and x else self._pushes(u)
         return n * np.where(contact > 0.5, push, np.where(contact <= 0.5, 0.0, contact)), depth, contact
 
     def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Keep whether it pushes."""
+        """Keep the contact."""
         return self._pushes(u)
 
     def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, Array] | Array:
         """Return δ and k δ + d δ̇."""
-        _, depth, push = self._seen(u)
+        _, depth, push = self._measure(u)
         return (depth, push) if x else depth
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> Array | tuple[()]:
-        """Return whether it pushes now, where that is a state."""
+        """Return the contact after an event, if it is a state."""
         return self._pushes(u) if x else ()
 
 
 class HandProfile(Block):
-    """A human hand that pushes: it approaches, holds, and lets go. F = e F₀ s(t), with the unit vector e.
+    """Push of a human hand: the force rises, is held, and falls. F = e F₀ s(t), with the unit vector e.
 
-    s rises from 0 to 1 over ``rise_time``, stays for ``hold_time`` and falls to 0 over ``release_time``: 7th-order
-    smooth steps, so that the force and its first three derivatives are continuous.
+    s rises from 0 to 1 over ``rise_time``, stays for ``hold_time`` and falls to 0 over ``release_time``. These are
+    7th-order smooth steps, so the force and its first three derivatives are continuous.
     """
 
-    start_time: float = parameter(default=0.0, unit="s", description="when the hand begins to push")
-    rise_time: float = parameter(default=0.3, unit="s", above=0.0, description="how long the force rises")
-    hold_time: float = parameter(unit="s", minimum=0.0, description="how long it is held")
-    release_time: float = parameter(default=0.3, unit="s", above=0.0, description="how long it falls")
-    peak_force: float = parameter(unit="N", description="force F₀ that is held")
+    start_time: float = parameter(default=0.0, unit="s", description="time at which the hand begins to push")
+    rise_time: float = parameter(default=0.3, unit="s", above=0.0, description="duration of the rise")
+    hold_time: float = parameter(unit="s", minimum=0.0, description="duration of the full force")
+    release_time: float = parameter(default=0.3, unit="s", above=0.0, description="duration of the fall")
+    peak_force: float = parameter(unit="N", description="full force F₀")
     direction: Array = parameter(default=1.0, unit="1", description="direction e; its length does not matter")
-    force = Output(shape=None, unit="N", description="force on what is pushed, of the direction's shape")
+    force = Output(shape=None, unit="N", description="force on the body, of the direction's shape")
 
     def check(self) -> None:
-        """Refuse a direction of length zero."""
+        """Refuse a direction of length zero, or a matrix."""
         if np.ndim(self.direction) > 1 or not np.any(self.direction):
             raise ParameterError(
                 f"found {shorten(self.direction)}; expected a direction that is not zero, such as (1, 0), or 1 or −1 "
@@ -191,7 +192,7 @@ class HandProfile(Block):
             )
 
     def _corners(self) -> tuple[Array, Array, Array, Array]:
-        """Return when it begins to rise, is up, begins to fall, is over."""
+        """Return the times at which the rise begins and ends, and at which the fall begins and ends."""
         up = self.start_time + self.rise_time
         return self.start_time, up, up + self.hold_time, up + self.hold_time + self.release_time
 

@@ -1,4 +1,4 @@
-"""Delays: of whole samples, of a time, and the rational approximation."""
+"""Delays: by whole samples, by a time, and Padé's rational approximation."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from ..core.values import Array, parameter
 
 
 class History(State):
-    """A state that holds the last ``rows`` inputs, the oldest first, one row for each; ``rows`` is an attribute."""
+    """State of the last inputs, the oldest first, one in a row; ``rows`` names the attribute of their number."""
 
     def __init__(self, rows: str, start: str, description: str):
         super().__init__(None, description, start=start, like="u")
         self.rows = rows
 
     def start_value(self, block: Any, shapes: Mapping[str, Shape]) -> np.ndarray:
-        """Return the start value, the same in each row."""
+        """Return the start value, equal in all rows."""
         shape = shapes.get(self.like or "")
-        if shape is None:  # where the input's shape is not known yet, one row shows it
+        if shape is None:  # the input's shape is not known yet: one row, which may show it
             return super().start_value(block, shapes)
         if len(shape) > 1:
             raise ShapeError(
@@ -39,37 +39,38 @@ class History(State):
         return np.array(np.broadcast_to(row, (getattr(block, self.rows), *row.shape)))
 
 
-def pushed(line: Array, value: Array) -> Array:
-    """Return the history after one more input: the oldest leaves."""
+def push(line: Array, value: Array) -> Array:
+    """Return the history with one more input and without the oldest."""
     return np.concatenate([line[1:], np.stack([value])])
 
 
 class Delay(Block):
     """Delay by whole samples: y[k] = u[k − n].
 
-    The first n outputs are ``initial_value``; without one they are the first input.
+    The first n outputs are ``initial_value``; without it, the first input.
 
     Raises
     ------
     SampleTimeError
-        In a continuous frame, when the diagram is built.
+        In a continuous subsystem, when the diagram is built.
     ShapeError
-        An ``initial_value`` of another shape than the input's, or a matrix as input, when the diagram is built.
+        For an ``initial_value`` of another shape than the input's, and for a matrix as input, when the diagram is
+        built.
     """
 
     steps: int = parameter(minimum=1, description="number of samples, n")
     initial_value: Array | None = parameter(default=None, description="first outputs; None takes the first input")
-    u = Input(shape=None, description="what is delayed, a scalar or a vector")
+    u = Input(shape=None, description="signal to delay, a scalar or a vector")
     y = Output(like="u", description="the input n ticks ago")
     line = History("steps", "initial_value", description="the last n inputs, the oldest first, one row for each")
 
     @property
     def starts_from_inputs(self) -> bool:
-        """Whether `initial` reads the inputs."""
+        """Whether `initial` computes the state."""
         return self.initial_value is None
 
     def initial(self, u: Any) -> Array:
-        """Return the state at the start."""
+        """Return the state at the start, all rows the first input."""
         return np.stack([u.u] * self.steps)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
@@ -77,38 +78,38 @@ class Delay(Block):
         return x.line[0]
 
     def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Keep the input."""
-        return pushed(x.line, u.u)
+        """Return the history with this input."""
+        return push(x.line, u.u)
 
 
 class TransportDelay(Block):
-    """Transport delay: y(t) = u(t − τ), of any shape; ``initial_value`` while t < τ.
+    """Transport delay: y(t) = u(t − τ), of any shape, and ``initial_value`` while t < τ.
 
-    In a continuous frame the input is kept as the solver found it. In a sampled frame the delay must be a whole number
-    of samples; `sampled` gives the block that then takes its place.
+    In a continuous subsystem the solver keeps past inputs. In a sampled subsystem the delay must be a whole number of
+    samples; `discretize` returns the block that then replaces this one.
 
     Raises
     ------
     SampleTimeError
-        In a sampled frame of whose sample time the delay is no multiple, when the diagram is built.
+        In a sampled subsystem, if the delay is no multiple of its sample time, when the diagram is built.
     ShapeError
-        An ``initial_value`` of another shape than the input's, when the diagram is built; a number fits any.
+        For an ``initial_value`` of another shape than the input's, when the diagram is built; a number fits any.
     """
 
     transport: ClassVar[bool] = True
-    """True: the run gives ``u`` of the time ``delay`` ago."""
+    """True: a solver gives the input of the time ``delay`` ago."""
     delay: float = parameter(unit="s", above=0.0, description="delay τ")
     initial_value: Array | None = parameter(default=0.0, description="output while t < τ; None takes the first input")
-    u = Input(shape=None, description="what is delayed, of any shape")
+    u = Input(shape=None, description="signal to delay, of any shape")
     y = Output(like="u", description="the input τ ago")
 
-    def sampled(self, sample_time: float | Fraction) -> Delay:
-        """Return the delay by whole samples that does the same in a sampled frame.
+    def discretize(self, sample_time: float | Fraction) -> Delay:
+        """Return the delay by whole samples that replaces this block in a sampled subsystem.
 
         Raises
         ------
         SampleTimeError
-            If the delay is no multiple of the sample time; a float is read as its shortest decimal.
+            If the delay is no multiple of the sample time. A float is read as its shortest decimal.
         """
         T = sample_time if isinstance(sample_time, Fraction) else Fraction(repr(float(sample_time)))
         ratio = Fraction(repr(self.delay)) / T
@@ -117,28 +118,29 @@ class TransportDelay(Block):
             low, high = max(int(ratio), 1), int(ratio) + 1
             near = f"{float(low * T):.9g} s" if low == high else f"{float(low * T):.9g} s or {float(high * T):.9g} s"
             raise SampleTimeError(
-                f"found a delay of {self.delay:.9g} s in a frame with a sample time of {float(T):.9g} s; expected a "
-                f"multiple of it. The nearest: {near}. Change one of the two, or put the block outside of the frame.",
+                f"found a delay of {self.delay:.9g} s in a subsystem with a sample time of {float(T):.9g} s; expected "
+                f"a multiple of it. The nearest: {near}. Change one of the two, or put the block outside of the "
+                "subsystem.",
                 block=self.label,
                 port="delay",
             )
         return Delay(steps=n, initial_value=self.initial_value, name=self.name)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Refuse a frame that doesn't give past inputs."""
+        """Refuse a subsystem without past inputs."""
         raise SampleTimeError(
-            f"the frame that it stands in gives no past inputs. Use Delay(steps=…) in a sampled frame, "
-            f"PadeDelay(delay={self._written()}, order=…) in a continuous one.",
+            "found no past inputs in its subsystem; expected a solver that keeps them. Use Delay(steps=…) in a sampled "
+            f"subsystem, PadeDelay(delay={self._delay_text()}, order=…) in a continuous one.",
             block=self.label,
         )
 
-    def _written(self) -> str:
+    def _delay_text(self) -> str:
         return f"{self.delay:g}" if isinstance(self.delay, float) else "…"
 
 
 @lru_cache(maxsize=64)
 def _ladder(order: int) -> tuple[float, ...]:
-    """Return the entries of the ladder of the Padé delay in s τ / 2: β² and the squares of the couplings.
+    """Return the entries of the Padé delay's ladder in s τ / 2: β² and the squares of the couplings.
 
     The denominator is the reverse Bessel polynomial θ(z) of z = s τ / 2, the whole θ(−z) / θ(z). The quotient of the
     lower and the higher of its even and odd part is the continued fraction β² / (z + c₁ / (z + c₂ / (z + …))), whose
@@ -160,17 +162,17 @@ def _ladder(order: int) -> tuple[float, ...]:
 class PadeDelay(Block):
     """Padé approximation of a delay: Y(s) = θ(−s τ / 2) / θ(s τ / 2) U(s) ≈ e^(−s τ) U(s), with θ of degree n.
 
-    An all-pass: its gain is 1 at every frequency, its phase that of the delay up to about ω τ = n. A jump of the
-    input shows in the output at once, with the sign (−1)ⁿ. θ is the reverse Bessel polynomial; it is realized as a
-    lossless ladder with a resistor at one end, τ/2 ẋ = (J − b bᵀ / 2) x + b u, y = (−1)ⁿ (u − bᵀ x), which is balanced:
-    in the time 2 t / τ both of its Gramians are the unit matrix. It starts in the steady state of ``initial_value``.
+    The block is an all-pass: its gain is 1 at every frequency, its phase that of the delay up to about ω τ = n. A jump
+    of the input appears in the output at once, with the sign (−1)ⁿ. θ is the reverse Bessel polynomial. The realization
+    is a lossless ladder with a resistor at one end, τ/2 ẋ = (J − b bᵀ / 2) x + b u, y = (−1)ⁿ (u − bᵀ x). It is
+    balanced: in the time 2 t / τ both Gramians are the unit matrix. It starts in the steady state of ``initial_value``.
     """
 
     delay: float = parameter(unit="s", above=0.0, description="delay τ")
-    order: int = parameter(default=3, minimum=1, maximum=30, description="degree n; the states are as many")
+    order: int = parameter(default=3, minimum=1, maximum=30, description="degree n, which is also the number of states")
     initial_value: float = parameter(default=0.0, description="input and output before the start")
-    u = Input(description="what is delayed")
-    y = Output(description="about the input τ ago")
+    u = Input(description="signal to delay")
+    y = Output(description="approximately the input τ ago")
     x = State(start=lambda block: block.steady_state() * block.initial_value, description="states of the ladder")
 
     def ladder(self) -> tuple[np.ndarray, np.ndarray]:

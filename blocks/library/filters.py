@@ -1,4 +1,4 @@
-"""Linear blocks that live in sampled subsystems: integrator and filters."""
+"""Linear blocks of sampled subsystems: integrator and filters."""
 
 from __future__ import annotations
 
@@ -12,28 +12,28 @@ from ..core.errors import ParameterError
 from ..core.ports import Input, Output, State
 from ..core.values import Array, parameter
 from .branching import truth
-from .delays import History, pushed
-from .integrators import check_limits, limited
+from .delays import History, push
+from .integrators import check_limits, clip
 from .linear import section
 
 _WEIGHTS = {"forward": (0.0, 1.0), "backward": (1.0, 0.0), "trapezoidal": (0.5, 0.5)}
 
 
 class DiscreteIntegrator(Block):
-    """Discrete integrator: a sum that stands for an integral, by one of three rules, element by element.
+    """Discrete integrator: a sum in place of an integral, by one of three rules, element by element.
 
-    ``forward`` y[k] = y[k − 1] + T u[k − 1], ``backward`` y[k] = y[k − 1] + T u[k], ``trapezoidal``
-    y[k] = y[k − 1] + T (u[k − 1] + u[k]) / 2; before the first tick the input counts as zero. With limits every sum is
-    limited, so that nothing winds up. At a rising edge of ``reset`` the sum goes on from ``initial_value``, or with
-    ``reset_to_input`` from the input ``value``, in this tick; a signal that is true at the start is no edge. The
-    secondary output ``before`` is the sum over the past ticks, before a reset, without feedthrough.
+    ``forward`` y[k] = y[k − 1] + T u[k − 1], ``backward`` y[k] = y[k − 1] + T u[k], ``trapezoidal`` y[k] = y[k − 1] + T
+    (u[k − 1] + u[k]) / 2. Before the first tick the input counts as zero. With limits every sum is limited, so that
+    nothing winds up. At a rising edge of ``reset`` the sum restarts in the same tick, from ``initial_value`` or, with
+    ``reset_to_input``, from the input ``value``. A signal that is true at the start is no edge. The secondary output
+    ``before`` is the sum over the past ticks, before a reset, without feedthrough.
 
     Raises
     ------
     ParameterError
-        Another rule, limits in the wrong order, or an ``initial_value`` outside of them.
+        For another rule, limits in the wrong order, and an ``initial_value`` outside of them.
     SampleTimeError
-        In a continuous frame, when the diagram is built.
+        In a continuous subsystem, when the diagram is built.
     """
 
     method: str = parameter(default="forward", description="'forward', 'backward' or 'trapezoidal'")
@@ -41,10 +41,10 @@ class DiscreteIntegrator(Block):
     initial_value: Array = parameter(default=0.0, description="the sum at the start, a number or of the input's shape")
     lower: float | None = parameter(default=None, description="lower limit of y; None: there is none")
     upper: float | None = parameter(default=None, description="upper limit of y; None: there is none")
-    reset_to_input: bool = parameter(default=False, description="True adds the input value, which y is reset to")
-    u = Input(shape=None, description="what is integrated, of any shape")
+    reset_to_input: bool = parameter(default=False, description="True adds the input value, to which y is reset")
+    u = Input(shape=None, description="signal to integrate, of any shape")
     reset = Input(default=0.0, description="logic: a rising edge resets")
-    value = Input(shape=None, description="what the sum is reset to; with reset_to_input only")
+    value = Input(shape=None, description="value after a reset; with reset_to_input only")
     y = Output(shape=None, description="the integral")
     before = Output(shape=None, secondary=True, description="the sum over the past ticks, before a reset in this one")
     total = State(start="initial_value", like="u", description="the sum over the past ticks")
@@ -62,51 +62,51 @@ class DiscreteIntegrator(Block):
 
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
-        """The inputs; value where the sum is reset to an input."""
+        """``u``, ``reset``, and with ``reset_to_input`` ``value``."""
         cls = type(self)
         own = {"u": cls.u, "reset": cls.reset}
         return {**own, "value": cls.value} if self.reset_to_input else own
 
     def sums(self, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
-        """Return y and the sum that the next tick starts from."""
+        """Return y, and the sum from which the next tick starts."""
         target = u.value if self.reset_to_input else self.initial_value
         edge = truth(u.reset) * (1.0 - truth(x.last))
         total = np.where(edge > 0.5, 0.0 * x.total + target, np.where(edge <= 0.5, x.total, edge))
         now, then = _WEIGHTS[self.method]
         area = self.gain * T * u.u
-        y = limited(total + now * area if now else total, self.lower, self.upper)
-        return y, limited(y + then * area if then else y, self.lower, self.upper)
+        y = clip(total + now * area if now else total, self.lower, self.upper)
+        return y, clip(y + then * area if then else y, self.lower, self.upper)
 
     def output(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
         """Return the integral, and the sum over the past ticks."""
         return self.sums(x, u, T)[0], x.total
 
     def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
-        """Return the sum over this tick as well."""
+        """Return the sum that includes this tick, and ``reset``."""
         return self.sums(x, u, T)[1], u.reset
 
 
 class FIR(Block):
     """FIR filter: y[k] = c₀ u[k] + c₁ u[k − 1] + … + c_n u[k − n], of a scalar or, element by element, of a vector.
 
-    The inputs before the first are ``initial_value``; without one they are the first input.
+    The inputs before the first are ``initial_value``; without it, the first input.
 
     Raises
     ------
     ParameterError
-        Fewer than two coefficients.
+        For fewer than two coefficients.
     SampleTimeError
-        In a continuous frame, when the diagram is built.
+        In a continuous subsystem, when the diagram is built.
     """
 
     coefficients: Array = parameter(description="c₀, c₁, …, at least two")
     initial_value: Array | None = parameter(default=None, description="inputs before the first; None: the first input")
-    u = Input(shape=None, description="what is filtered, a scalar or a vector")
+    u = Input(shape=None, description="signal to filter, a scalar or a vector")
     y = Output(shape=None, description="the filtered input")
     line = History("taps", "initial_value", description="the last inputs, the oldest first, one row for each")
 
     def check(self) -> None:
-        """Refuse what needs no memory."""
+        """Refuse fewer than two coefficients."""
         if np.ndim(self.coefficients) != 1 or len(self.coefficients) < 2:
             raise ParameterError(
                 f"found {self.coefficients!r}; expected two coefficients or more. Use Gain for one.",
@@ -116,16 +116,16 @@ class FIR(Block):
 
     @property
     def taps(self) -> int:
-        """How many past inputs it needs."""
+        """Number of past inputs that are kept."""
         return len(self.coefficients) - 1
 
     @property
     def starts_from_inputs(self) -> bool:
-        """Whether `initial` reads the inputs."""
+        """Whether `initial` computes the state."""
         return self.initial_value is None
 
     def initial(self, u: Any) -> Array:
-        """Return the state at the start."""
+        """Return the state at the start, all rows the first input."""
         return np.stack([u.u] * self.taps)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
@@ -133,40 +133,40 @@ class FIR(Block):
         return self.coefficients[0] * u.u + self.coefficients[1:][::-1] @ x.line
 
     def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Keep the input."""
-        return pushed(x.line, u.u)
+        """Return the history with this input."""
+        return push(x.line, u.u)
 
 
 class MovingAverage(Block):
     """Moving average: y[k] = (u[k] + u[k − 1] + … + u[k − n + 1]) / n, of a scalar or a vector.
 
-    It is summed anew in each tick, so no rounding error builds up. The inputs before the first are ``initial_value``;
-    without one they are the first input.
+    The sum is computed anew in each tick, so no rounding error builds up. The inputs before the first are
+    ``initial_value``; without it, the first input.
 
     Raises
     ------
     SampleTimeError
-        In a continuous frame, when the diagram is built.
+        In a continuous subsystem, when the diagram is built.
     """
 
     samples: int = parameter(minimum=2, description="number of samples in the average, n")
     initial_value: Array | None = parameter(default=None, description="inputs before the first; None: the first input")
-    u = Input(shape=None, description="what is averaged, a scalar or a vector")
+    u = Input(shape=None, description="signal to average, a scalar or a vector")
     y = Output(like="u", description="the average of the last n inputs")
     line = History("taps", "initial_value", description="the last inputs, the oldest first, one row for each")
 
     @property
     def taps(self) -> int:
-        """How many past inputs it needs."""
+        """Number of past inputs that are kept."""
         return self.samples - 1
 
     @property
     def starts_from_inputs(self) -> bool:
-        """Whether `initial` reads the inputs."""
+        """Whether `initial` computes the state."""
         return self.initial_value is None
 
     def initial(self, u: Any) -> Array:
-        """Return the state at the start."""
+        """Return the state at the start, all rows the first input."""
         return np.stack([u.u] * self.taps)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
@@ -174,23 +174,24 @@ class MovingAverage(Block):
         return (u.u + np.sum(x.line, axis=0)) / self.samples
 
     def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Keep the input."""
-        return pushed(x.line, u.u)
+        """Return the history with this input."""
+        return push(x.line, u.u)
 
 
 class IIR(Block):
     """IIR filter: Y(z) = (b₀ + b₁ z⁻¹ + …) / (a₀ + a₁ z⁻¹ + …) U(z), in SciPy's convention; it starts at rest.
 
-    With matrices each row of ``b`` and ``a`` is a section, and the sections follow one another: `from_sos` takes what
-    ``scipy.signal.butter(…, output="sos")`` and its like give. Realized in the transposed direct form II. Filters of
-    order 4 and more should come in sections: the coefficients of one long polynomial don't define them well.
+    With matrices, each row of ``b`` and ``a`` is a section, and the sections follow one another. `from_sos` takes the
+    sections that SciPy's filter designs return, such as ``scipy.signal.butter(…, output="sos")``. The realization is
+    the transposed direct form II. Give filters of order 4 and more in sections: the coefficients of one long polynomial
+    don't define them well.
 
     Raises
     ------
     ParameterError
-        Coefficients that don't fit each other, or an a₀ of zero.
+        For coefficients that don't fit each other, and an a₀ of zero.
     SampleTimeError
-        In a continuous frame, when the diagram is built.
+        In a continuous subsystem, when the diagram is built.
 
     Examples
     --------
@@ -200,12 +201,12 @@ class IIR(Block):
 
     b: Array = parameter(description="numerator in powers of 1/z, or one row for each section")
     a: Array = parameter(description="denominator in powers of 1/z, or one row for each section")
-    u = Input(description="what is filtered")
+    u = Input(description="signal to filter")
     y = Output(description="the filtered input")
     x = State(start=lambda block: np.zeros(sum(block.orders)), description="states of the sections, one after another")
 
     def check(self) -> None:
-        """Refuse coefficients that are no filter."""
+        """Refuse coefficients that don't make a filter."""
         shapes = np.shape(self.b), np.shape(self.a)
         alike = len(shapes[0]) == len(shapes[1]) and shapes[0][:-1] == shapes[1][:-1]
         if not alike or len(shapes[0]) not in (1, 2) or 0 in shapes[0] + shapes[1]:
@@ -217,28 +218,29 @@ class IIR(Block):
             )
         if np.any(np.asarray(self.a)[..., 0] == 0):
             raise ParameterError(
-                "found a first coefficient of zero; expected another number, by which all are divided. Leave leading "
-                "zeros out of b and a.",
+                "found a first coefficient of zero; expected another number, since all are divided by it. Leave "
+                "leading zeros out of b and a.",
                 block=self.label,
                 port="a",
             )
         if max(shapes[0][-1], shapes[1][-1]) < 2:
-            raise ParameterError("found one coefficient each; use Gain.", block=self.label, port="b")
+            text = "found one coefficient each; expected two or more. Use Gain."
+            raise ParameterError(text, block=self.label, port="b")
 
     @property
     def orders(self) -> list[int]:
-        """The order of each section."""
+        """Order of each section."""
         rows = self.b.shape[0] if len(self.b.shape) == 2 else 1
         return [max(self.b.shape[-1], self.a.shape[-1]) - 1] * rows
 
     @classmethod
     def from_sos(cls, sections: Any, *, name: str | None = None) -> Self:
-        """Return the filter of second-order sections as SciPy gives them: rows of b₀, b₁, b₂, a₀, a₁, a₂.
+        """Return the filter of second-order sections, in SciPy's rows of b₀, b₁, b₂, a₀, a₁, a₂.
 
         Raises
         ------
         ParameterError
-            An array of another shape.
+            For an array of another shape.
         """
         rows = np.asarray(sections, dtype=float)
         if rows.ndim != 2 or rows.shape[1] != 6 or not len(rows):
@@ -255,7 +257,7 @@ class IIR(Block):
         signal, parts, position = u.u, [], 0
         several = len(self.b.shape) == 2
         for i, n in enumerate(self.orders):
-            b, a = (_padded(c[i] if several else c, n + 1) for c in (self.b, self.a))
+            b, a = (_pad(c[i] if several else c, n + 1) for c in (self.b, self.a))
             signal, part = section(b, a, x.x[position : position + n], signal)
             parts.append(part)
             position += n
@@ -270,5 +272,5 @@ class IIR(Block):
         return self.cascade(x, u)[1]
 
 
-def _padded(coefficients: Array, n: int) -> Array:
+def _pad(coefficients: Array, n: int) -> Array:
     return np.concatenate([coefficients, np.zeros(n - coefficients.shape[0])])

@@ -1,4 +1,4 @@
-"""Functions as blocks: those that can be traced, and any Python callable."""
+"""Functions as blocks: functions that can be traced, and any Python callable."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ from ..core.values import Array, parameter
 
 
 class Function(Block):
-    """A NumPy-style function of its inputs, traced as the equations of every block: y = f(u₁, …).
+    """NumPy-style function of the inputs, traced like the equations of every block: y = f(u₁, …).
 
-    ``Function(np.sin)(u)``, ``Function(lambda a, b: a * b)(a, b)``. The inputs are named after the function's arguments
-    (those that have a default are left alone), those of a NumPy function ``u``, or ``u1``, ``u2``, …. What can't be
-    traced is refused when the diagram is built; `PythonFunction` takes any. Two such blocks are equal where their
-    functions are one object. It can be pickled where the function can: where that has a name in a module. In a trace
-    ``np.minimum``, ``np.maximum`` and ``np.clip`` replace a NaN by their other argument: write ``np.where`` instead.
+    ``Function(np.sin)(u)``, ``Function(lambda a, b: a * b)(a, b)``. The inputs have the names of the function's
+    arguments, except arguments with a default, which keep it. The inputs of a NumPy function are ``u``, or ``u1``,
+    ``u2``, …. A function that can't be traced is refused when the diagram is built; `PythonFunction` takes any. Two
+    such blocks are equal if their functions are one object. The block can be pickled if the function can, which needs a
+    name in a module. In a trace ``np.minimum``, ``np.maximum`` and ``np.clip`` replace a NaN by their other argument:
+    write ``np.where`` instead.
 
     Raises
     ------
     ParameterError
-        No function, or one whose arguments can't be told.
+        For an object that is no function, or whose arguments can't be found.
     TraceError
-        A function that can't be traced, or returns another number of values than ``results`` names, when the diagram
-        is built.
+        For a function that can't be traced, or returns another number of values than ``results`` names, when the
+        diagram is built.
     """
 
     function: object = parameter(kw_only=False, description="the function, of one array for each input")
@@ -44,7 +45,7 @@ class Function(Block):
     )
 
     def check(self) -> None:
-        """Refuse what is no function, and names that can't be ports."""
+        """Refuse an object that is no function, and names that can't be ports."""
         if not callable(self.function):
             raise self._refuse("function", repr(self.function), "a function, such as np.sin or lambda a, b: a * b")
         for name in self.inputs.keys() & self.outputs.keys():
@@ -53,13 +54,13 @@ class Function(Block):
     traced_of = "its arguments"
     untraced_twin = "PythonFunction"
 
-    def written(self, equation: str) -> Callable[..., Any]:
-        """Return the function."""
+    def equation_function(self, equation: str) -> Callable[..., Any]:
+        """Return the function, which is the only equation."""
         return self.function  # type: ignore[return-value]
 
     @property
     def label(self) -> str:
-        """Name for messages and for numbering: the given one, else the function's."""
+        """Name for messages and for numbering: the name given, else the function's."""
         own = getattr(self.function, "__name__", "")
         return self.name or self._hint or (own if own.isidentifier() else "function")
 
@@ -80,7 +81,7 @@ class Function(Block):
         return super().__getattr__(name)
 
     def output(self, t: Array, x: Any, u: Any) -> Any:
-        """Return what the function returns."""
+        """Return the function's result."""
         return self.function(*u)  # type: ignore[operator]
 
     def _refuse(self, port: str, found: str, expected: str) -> ParameterError:
@@ -98,13 +99,13 @@ class Function(Block):
         needed = [p for p in every if p.default is p.empty and p.kind is not p.VAR_KEYWORD]
         if not needed or any(p.kind in (p.VAR_POSITIONAL, p.KEYWORD_ONLY) for p in needed):
             raise self._refuse(
-                "arguments", f"the function {self.label}, of which the number of arguments can't be told",
+                "arguments", f"the function {self.label}, whose number of arguments can't be found",
                 "names for the inputs, such as arguments=('a', 'b')",
             )  # fmt: skip
         return [p.name for p in needed]
 
     def _shapes(self, parameter: str, given: Any) -> dict[str, Shape | None]:
-        """Return the names of ports with the shapes given, None where there is none."""
+        """Return the names of ports with the shapes given; None for a shape that is not given."""
         named = given if isinstance(given, Mapping) else dict.fromkeys([given] if isinstance(given, str) else given)
         shapes: dict[str, Shape | None] = {}
         for name, shape in named.items():
@@ -122,23 +123,24 @@ class Function(Block):
 
 
 class PythonFunction(Function):
-    """Any Python callable of its inputs: y = f(u₁, …), evaluated as it is, with NumPy's numbers and arrays.
+    """Any Python callable of the inputs: y = f(u₁, …), called with NumPy's numbers and arrays.
 
-    It may branch, loop, look things up and call foreign code, but should depend on nothing but its arguments: a solver
-    calls it more often than there are samples. Every output counts as fed through from every input. Its derivatives,
-    where a linearization or an implicit step asks for them, are central differences. It is not compiled, and not
-    exported to an FMU. An exception stops the run, as the cause of a `SimulationError` that names the block.
+    It may branch, loop, look things up and call foreign code. It should depend on nothing but its arguments, since a
+    solver calls it more often than there are samples. Every output counts as fed through from every input. A
+    linearization or an implicit step takes its derivatives by central differences. It is neither compiled nor exported
+    to an FMU. An exception stops the run, as the cause of a `SimulationError` that names the block.
 
-    ``PythonFunction(f)(a, b)`` calls ``f(a, b)``. Where no shape is given for a result, f is called once, with positive
-    numbers, when the diagram is built; ``PythonFunction(f, results={"y": (3,)})`` is not. Time, where it is needed,
-    comes from a `Clock`. The block can be pickled where the function can.
+    ``PythonFunction(f)(a, b)`` calls ``f(a, b)``. If a result has no declared shape, f is called once, with positive
+    numbers, when the diagram is built; ``PythonFunction(f, results={"y": (3,)})`` declares it. Wire a `Clock` for the
+    time. The block can be pickled if the function can.
 
     Raises
     ------
     ParameterError
-        No function, or one whose arguments can't be told.
+        For an object that is no function, or whose arguments can't be found.
     TraceError
-        A trial call that fails, or returns another number of values than ``results`` names, when the diagram is built.
+        For a trial call that fails, or returns another number of values than ``results`` names, when the diagram is
+        built.
     """
 
     opaque = True

@@ -1,8 +1,8 @@
-"""Sources that are used as test signals: ramps, chirps, pulse trains, tables, noise, the clock.
+"""Test signals: ramps, chirps, pulse trains, tables, noise, the clock.
 
-Times in s; a change at ``t0`` acts from the first instant t ≥ t0 on. What repeats is computed from the number of the
-period, never by adding up periods: period k begins at k times the period as it is written in decimals, at any t. An
-instant that is a few rounding errors before such an edge (1e-15 t) counts as the edge itself, so that with a period of
+Times are in s; a change at ``t0`` acts from the first instant t ≥ t0 on. A periodic signal is computed from the number
+of the period, never by adding up periods: period k begins at k times the period as it is written in decimals, at any t.
+An instant that is a few rounding errors before such an edge (1e-15 t) counts as the edge itself. So with a period of
 0.1 s the tick at 0.3 s, which is less than three times the number nearest to 0.1, belongs to the fourth period.
 """
 
@@ -16,18 +16,18 @@ from typing import Any, Self
 import numpy as np
 
 from ..core.errors import ParameterError
-from ..core.instants import earliest, next_edge, period_of
+from ..core.instants import move_earlier, next_edge, period_of
 from ..core.ports import Output
 from ..core.source import Source
 from ..core.values import Array, parameter
 from .piecewise import piecewise
 
-_HALF = 2.0**24  # counters are mixed in two halves: products of two such numbers are exact
+_HALF = 2.0**24  # counters are mixed in two halves, since products of two such numbers are exact
 _ROUNDS = 10
 
 
 class Clock(Source):
-    """The time: y = t."""
+    """Clock: y = t."""
 
     unit: str | None = parameter(default="s", description="unit of the output")
     y = Output(description="time")
@@ -38,15 +38,15 @@ class Clock(Source):
 
 
 class Ramp(Source):
-    """A ramp: y = y₀ up to the start time t₀, y₀ + slope (t − t₀) from then on."""
+    """Ramp: y = y₀ until the start time t₀, then y₀ + slope (t − t₀)."""
 
     slope: float = parameter(description="rate of change, per s")
-    start_time: float = parameter(default=0.0, unit="s", description="when it begins to rise, t₀")
-    initial_value: float = parameter(default=0.0, description="value before, y₀")
+    start_time: float = parameter(default=0.0, unit="s", description="time at which the ramp begins, t₀")
+    initial_value: float = parameter(default=0.0, description="value before the ramp, y₀")
     y = Output()
 
     def instants(self) -> Array:
-        """Return its start."""
+        """Return the start time."""
         return np.array([self.start_time])
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
@@ -55,24 +55,24 @@ class Ramp(Source):
 
 
 class Chirp(Source):
-    """A sine whose frequency runs from f₀ to f₁: y = A sin(φ₀ + φ(τ)) + bias, τ = t − t₀ within [0, D].
+    """Chirp, a sine whose frequency runs from f₀ to f₁: y = A sin(φ₀ + φ(τ)) + bias, τ = t − t₀ within [0, D].
 
-    ``linear``: φ = 2π (f₀ τ + (f₁ − f₀) τ² / (2 D)), the frequency φ̇/2π = f₀ + (f₁ − f₀) τ/D. ``logarithmic``:
-    φ = 2π f₀ D / λ (exp(λ τ/D) − 1), λ = ln(f₁/f₀), the frequency f₀ exp(λ τ/D): equal times for equal ratios.
-    Before t₀ the phase is φ₀; after t₀ + D it goes on at the frequency f₁.
+    ``linear``: φ = 2π (f₀ τ + (f₁ − f₀) τ² / (2 D)), the frequency φ̇/2π = f₀ + (f₁ − f₀) τ/D. ``logarithmic``: φ = 2π
+    f₀ D / λ (exp(λ τ/D) − 1), λ = ln(f₁/f₀), the frequency f₀ exp(λ τ/D): equal times for equal ratios. Before t₀ the
+    phase is φ₀; after t₀ + D the sine continues at the frequency f₁.
 
     Raises
     ------
     ParameterError
-        Another sweep, or a logarithmic one from or to zero, or between equal frequencies.
+        For another sweep, and for a logarithmic one from or to zero or between equal frequencies.
     """
 
     amplitude: float = parameter(default=1.0, description="amplitude A")
     start_frequency: float = parameter(unit="Hz", minimum=0.0, description="frequency at the start, f₀")
     end_frequency: float = parameter(unit="Hz", minimum=0.0, description="frequency at the end, f₁")
-    duration: float = parameter(unit="s", above=0.0, description="how long the sweep takes, D")
+    duration: float = parameter(unit="s", above=0.0, description="duration of the sweep, D")
     sweep: str = parameter(default="linear", description="'linear' or 'logarithmic'")
-    start_time: float = parameter(default=0.0, unit="s", description="when it starts, t₀")
+    start_time: float = parameter(default=0.0, unit="s", description="time at which the sweep starts, t₀")
     phase: float = parameter(default=0.0, unit="rad", description="phase at the start, φ₀")
     bias: float = parameter(default=0.0, description="mean value")
     y = Output()
@@ -94,7 +94,7 @@ class Chirp(Source):
             )
 
     def instants(self) -> Array:
-        """Return where the sweep starts and ends."""
+        """Return the times at which the sweep starts and ends."""
         return np.array([self.start_time, self.start_time + self.duration])
 
     def time_scale(self) -> float:
@@ -119,27 +119,27 @@ class Chirp(Source):
 class PulseTrain(Source):
     """Rectangular pulses: y = base + A from each edge t₀ + k P on, for the part ``duty`` of the period P; else base.
 
-    k = 0, 1, …; before t₀ it is at its base. Edges never drift: both lie where their decimals say, to 1e-15 t.
+    k = 0, 1, …; before t₀ the output is the base. Edges never drift: both are at their decimal times, to 1e-15 t.
 
     Raises
     ------
     ParameterError
-        A duty of 1 or more.
+        For a duty of 1 or more.
     """
 
     amplitude: float = parameter(default=1.0, description="height of the pulses, A")
     period: float = parameter(unit="s", above=0.0, description="time from pulse to pulse, P")
-    duty: float = parameter(default=0.5, above=0.0, description="part of the period that a pulse lasts, below 1")
-    delay: float = parameter(default=0.0, unit="s", minimum=0.0, description="when the first pulse begins, t₀")
+    duty: float = parameter(default=0.5, above=0.0, description="duration of a pulse as a part of the period, below 1")
+    delay: float = parameter(default=0.0, unit="s", minimum=0.0, description="time at which the first pulse begins, t₀")
     base: float = parameter(default=0.0, description="value between the pulses")
     y = Output()
 
     def check(self) -> None:
-        """Refuse pulses without an end."""
+        """Refuse pulses that don't end within the period."""
         super().check()
         if self.duty >= 1.0:
             raise ParameterError(
-                f"found {self.duty:g}; expected a part of the period below 1. Take a Step for what does not end.",
+                f"found {self.duty:g}; expected a part of the period below 1. Use Step for a pulse without an end.",
                 block=self.label,
                 port="duty",
             )
@@ -157,13 +157,13 @@ class PulseTrain(Source):
 
 
 class _Table(Source):
-    """Base of the sources that look values up."""
+    """Base of the sources that read a table over time."""
 
     times: Array = parameter(unit="s", structural=True, description="times of the values, rising")
     values: Array = parameter(structural=True, description="a value for each time: numbers, or a vector in each row")
 
     def check(self) -> None:
-        """Refuse times that do not rise, and values that do not belong to them."""
+        """Refuse times that don't rise, and values that don't fit them."""
         super().check()
         times, values = np.shape(self.times), np.shape(self.values)
         if len(times) != 1 or not times[0] or np.any(np.diff(self.times) <= 0):
@@ -180,38 +180,38 @@ class _Table(Source):
                 port="values",
             )
 
-    def begins(self) -> np.ndarray:
-        """Return where the piece after each time begins."""
+    def piece_starts(self) -> np.ndarray:
+        """Return the beginnings of the pieces after each time."""
         times: np.ndarray = self.times
         return times
 
     @property
     def slopes(self) -> np.ndarray:
-        """Slopes between the times, one row each, for linear interpolation."""
+        """Slopes between the times, one row for each, for linear interpolation."""
         columns = np.reshape(self.values, (len(self.times), -1))
         result: np.ndarray = np.diff(columns, axis=0) / np.diff(self.times)[:, None]
         return result
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the value at t: one piece before the first time, one after the last, and those between."""
+        """Return the value at t, from one piece before the first time, those between, and one after the last."""
         columns = np.reshape(self.values, (len(self.times), -1))
         still = np.zeros((1, columns.shape[1]))
         coefficients = np.stack(
             [np.concatenate([columns[:1], columns]), np.concatenate([still, self.slopes, still])], axis=2
         )
-        span, times = 1.0 + np.abs(self.times[[0, -1]]), self.begins()
+        span, times = 1.0 + np.abs(self.times[[0, -1]]), self.piece_starts()
         breaks = np.concatenate([[times[0] - span[0]], times, [times[-1] + span[1]]])
         y = piecewise(breaks, coefficients, t)
         return y if np.ndim(self.values) == 2 else y[0]
 
 
 class PiecewiseLinear(_Table):
-    """Straight lines through given points: y(times[i]) = values[i]; the first and the last value are held beyond them.
+    """Straight lines through points, y(times[i]) = values[i]; beyond the ends the first and the last value are held.
 
     Raises
     ------
     ParameterError
-        Times that do not rise, or not one value for each.
+        For times that don't rise, or not one value for each.
     """
 
     def instants(self) -> Array:
@@ -223,21 +223,22 @@ class PiecewiseLinear(_Table):
 
 
 class Recorded(_Table):
-    """Recorded data: y is interpolated between the samples; the first and the last value are held beyond them.
+    """Recorded data: y is interpolated between the samples; beyond them the first and the last value are held.
 
     ``linear`` interpolates, ``previous`` holds each value until the next time, as a sampled signal does; the times may
-    be off by their rounding, as those of ``np.linspace`` are. A solver lands on every sample, in a continuous frame.
+    be off by their rounding, as those of ``np.linspace`` are. A solver lands on every sample, in a continuous
+    subsystem.
 
     Raises
     ------
     ParameterError
-        Times that do not rise, not one value for each, or another interpolation.
+        For times that don't rise, not one value for each, or another interpolation.
     """
 
     interpolation: str = parameter(default="linear", description="'linear' or 'previous'")
 
     def check(self) -> None:
-        """Refuse an interpolation that there is none of."""
+        """Refuse an unknown interpolation."""
         super().check()
         if self.interpolation not in ("linear", "previous"):
             raise ParameterError(
@@ -246,14 +247,14 @@ class Recorded(_Table):
                 port="interpolation",
             )
 
-    def begins(self) -> np.ndarray:
-        """Return the times, less their rounding where a value jumps."""
+    def piece_starts(self) -> np.ndarray:
+        """Return the times, moved earlier by their rounding if values jump there."""
         times: np.ndarray = self.times
-        return earliest(times) if self.interpolation == "previous" else times
+        return move_earlier(times) if self.interpolation == "previous" else times
 
     @property
     def slopes(self) -> np.ndarray:
-        """Slopes between the times, zero where values are held."""
+        """Slopes between the times; zero if values are held."""
         return super().slopes * float(self.interpolation == "linear")
 
     def instants(self) -> Array:
@@ -262,7 +263,7 @@ class Recorded(_Table):
 
 
 class BandLimitedNoise(Source):
-    """Normal noise with a white spectrum up to its band: a new independent value every ``sample_time`` T, held between.
+    """Normal noise, white up to its band: a new independent value every ``sample_time`` T, held in between.
 
     y(t) = mean + √variance n(k), k = ⌊t/T⌋, n(k) standard normal. Its two-sided spectral density is
     variance · T sinc²(f T): flat, in its unit squared per Hz, to 4 % up to f = 0.1/T. ``from_density`` takes that
@@ -271,19 +272,19 @@ class BandLimitedNoise(Source):
     often and in whatever order it is evaluated. It repeats after 2⁴⁸ values; |n| is at most 5.9.
     """
 
-    sample_time: float = parameter(unit="s", above=0.0, description="how long each value is held, T")
+    sample_time: float = parameter(unit="s", above=0.0, description="time between two values, T")
     variance: float = parameter(default=1.0, minimum=0.0, description="variance, in the unit squared")
     mean: float = parameter(default=0.0, description="mean value")
-    seed: int = parameter(default=0, minimum=0, description="which noise: another seed gives an independent one")
+    seed: int = parameter(default=0, minimum=0, description="another seed gives another, independent noise")
     y = Output()
 
     @classmethod
     def from_density(cls, *, density: float, sample_time: float, **parameters: Any) -> Self:
-        """Return noise of a two-sided spectral density, at low frequency, in its unit squared per Hz."""
+        """Return noise of a given two-sided spectral density at low frequency, in its unit squared per Hz."""
         return cls(variance=density / sample_time, sample_time=sample_time, **parameters)
 
     def next_instant(self, t: float) -> float:
-        """Return when the next value comes."""
+        """Return the time of the next value."""
         return next_edge(t, self.sample_time, 0.0)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:

@@ -1,4 +1,4 @@
-"""Integrators: plain, limited, resettable; and the derivative that can be built, the filtered one."""
+"""Integrators, plain, limited or resettable, and the filtered derivative."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from .branching import truth
 class Integrator(Block):
     """Integrator: ẏ = u, element by element.
 
-    Every method of a sampled frame gives y[k + 1] = y[k] + T u[k], which is exact for an input that is held.
+    In a sampled subsystem every method gives y[k + 1] = y[k] + T u[k], which is exact for an input that is held.
 
     Raises
     ------
     ShapeError
-        An ``initial_value`` of another shape than the input's, when the diagram is built; a number fits any.
+        For an ``initial_value`` of another shape than the input's, when the diagram is built; a number fits any.
     """
 
     initial_value: Array = parameter(default=0.0, description="y at the start, a number or of the input's shape")
-    u = Input(shape=None, description="what is integrated, of any shape")
+    u = Input(shape=None, description="signal to integrate, of any shape")
     y = State(start="initial_value", like="u", output=True, description="the integral")
 
     def derivative(self, t: Array, x: Any, u: Any) -> Array:
@@ -40,7 +40,7 @@ def check_limits(block: Any, start: str | None = None) -> None:
     Raises
     ------
     ParameterError
-        ``lower`` that is not below ``upper``; a start value beyond a limit.
+        For a ``lower`` that is not below ``upper``, and a start value beyond a limit.
     """
     low, high = (np.inf * s if v is None else v for s, v in ((-1.0, block.lower), (1.0, block.upper)))
     if not low < high:
@@ -58,14 +58,14 @@ def check_limits(block: Any, start: str | None = None) -> None:
         )
 
 
-def limited(value: Array, lower: Array | None, upper: Array | None) -> Array:
-    """Return a value within limits; NaN passes (a traced np.clip swallows it)."""
+def clip(value: Array, lower: Array | None, upper: Array | None) -> Array:
+    """Return a value within limits; NaN passes through (a traced np.clip loses it)."""
     value = value if upper is None else np.where(value > upper, upper, value)
     return value if lower is None else np.where(value < lower, lower, value)
 
 
-def _beyond(y: Array, lower: Array | None, upper: Array | None) -> tuple[Array, Array]:
-    """Return how far y is beyond the nearer limit (negative inside), and which one that is: 1 upper, −1 lower."""
+def _excess(y: Array, lower: Array | None, upper: Array | None) -> tuple[Array, Array]:
+    """Return the distance of y beyond the nearer limit (negative inside), and its side: 1 upper, −1 lower."""
     if lower is None:
         return y - upper, 1.0 + 0.0 * y
     if upper is None:
@@ -75,31 +75,31 @@ def _beyond(y: Array, lower: Array | None, upper: Array | None) -> tuple[Array, 
 
 
 class _Limits:
-    """What integrators with limits share: ``held`` is 1 while y is held at ``upper``, −1 at ``lower``, else 0."""
+    """Common part of integrators with limits: ``held`` is 1 while y is held at ``upper``, −1 at ``lower``, else 0."""
 
     lower: Any
     upper: Any
 
-    def at_limits(self, y: Array) -> Array:
-        """Return ``held`` as a sampled frame has it: whether y is at a limit."""
+    def find_side(self, y: Array) -> Array:
+        """Return ``held`` in a sampled subsystem: 1 or −1 where y is at a limit."""
         held = 0.0 * y
         held = held if self.upper is None else np.where(y >= self.upper, 1.0, held)
         return held if self.lower is None else np.where(y <= self.lower, -1.0, held)
 
     def limit_indicators(self, y: Array, held: Array, u: Array) -> tuple[Array, Array]:
-        """Return the indicators of ``reached`` and ``released``; each is −1 where it can't happen."""
+        """Return the indicators of ``reached`` and ``released``; an event that can't happen now has −1."""
         if getattr(u, "shape", ()):
             raise ShapeError(
-                f"found shape {u.shape}; expected a scalar in a continuous frame, where each limit is an event. Index "
-                "the signal and give each entry an integrator of its own.",
+                f"found shape {u.shape}; expected a scalar in a continuous subsystem, where each limit is an event. "
+                "Index the signal and give each entry an integrator of its own.",
                 port="u",
             )
         free = np.abs(held) < 0.5
-        return np.where(free, _beyond(y, self.lower, self.upper)[0], -1.0), np.where(free, -1.0, -held * u)
+        return np.where(free, _excess(y, self.lower, self.upper)[0], -1.0), np.where(free, -1.0, -held * u)
 
     def limit_jump(self, y: Array, held: Array, fired: Any) -> tuple[Array, Array]:
-        """Return y and ``held`` after ``reached`` (y is put exactly onto the limit) or ``released``."""
-        side = _beyond(y, self.lower, self.upper)[1]
+        """Return y and ``held`` after ``reached``, which puts y exactly onto the limit, or ``released``."""
+        side = _excess(y, self.lower, self.upper)[1]
         low, high = (y if v is None else v for v in (self.lower, self.upper))
         reached, released = fired.reached > 0.5, fired.released > 0.5
         onto = np.where(side > 0.0, high, low)
@@ -109,22 +109,22 @@ class _Limits:
 class LimitedIntegrator(_Limits, Block):
     """Integrator with limits: ẏ = u, but held at a limit while u drives outward.
 
-    In a sampled frame y[k + 1] = y[k] + T u[k], limited: exact for an input that is held. In a continuous one a limit
-    is an event, and so is the input's change of sign that releases it; the input is a scalar there. The secondary
-    output ``held`` says where y is held.
+    In a sampled subsystem y[k + 1] = y[k] + T u[k], limited, which is exact for an input that is held. In a continuous
+    one a limit is an event, and so is the input's change of sign that releases y; the input is a scalar there. The
+    secondary output ``held`` names the limit at which y is held.
 
     Raises
     ------
     ParameterError
-        No limit, limits in the wrong order, or an ``initial_value`` outside of them.
+        For no limit, limits in the wrong order, and an ``initial_value`` outside of them.
     ShapeError
-        A vector in a continuous frame, when the diagram is built.
+        For a vector in a continuous subsystem, when the diagram is built.
     """
 
     lower: float | None = parameter(default=None, description="lower limit of y; None: there is none")
     upper: float | None = parameter(default=None, description="upper limit of y; None: there is none")
     initial_value: Array = parameter(default=0.0, description="y at the start, a number or of the input's shape")
-    u = Input(shape=None, description="what is integrated; a scalar in a continuous frame")
+    u = Input(shape=None, description="signal to integrate; a scalar in a continuous subsystem")
     y = State(start="initial_value", like="u", output=True, description="the integral")
     side = State(like="u", discrete=True, description="1 while held at the upper limit, −1 at the lower, else 0")
     held = Output(shape=None, secondary=True, description="1 while held at the upper limit, −1 at the lower, else 0")
@@ -134,11 +134,12 @@ class LimitedIntegrator(_Limits, Block):
     def check(self) -> None:
         """Refuse an integrator without limits, and limits that y can't keep."""
         if self.lower is None and self.upper is None:
-            raise ParameterError("no limit is given; give lower, upper or both, or use Integrator.", block=self.label)
+            text = "found no limit; expected one or two. Give lower, upper or both, or use Integrator."
+            raise ParameterError(text, block=self.label)
         check_limits(self, "initial_value")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return where y is held."""
+        """Return ``held``."""
         return x.side
 
     def derivative(self, t: Array, x: Any, u: Any) -> Array:
@@ -146,47 +147,47 @@ class LimitedIntegrator(_Limits, Block):
         return np.where(np.abs(x.side) > 0.5, 0.0, u.u)
 
     def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return how far y is beyond a limit, and how the input drives inward."""
+        """Return the distance of y beyond a limit, and the inward rate of the input."""
         return self.limit_indicators(x.y, x.side, u.u)
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[Array, Array]:
-        """Hold y, or let it go."""
+        """Hold y, or release it."""
         return self.limit_jump(x.y, x.side, fired)
 
     def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, Array]:
         """Return the limited integral at the next tick."""
-        new = limited(x.y + T * u.u, self.lower, self.upper)
-        return new, self.at_limits(new)
+        new = clip(x.y + T * u.u, self.lower, self.upper)
+        return new, self.find_side(new)
 
 
 class ResettableIntegrator(_Limits, Block):
     """Integrator with a reset: ẏ = u; y = value at a rising edge of ``reset``.
 
-    ``value`` is ``initial_value``, or with ``reset_to_input`` an input. Limits are optional, as in
-    `LimitedIntegrator`. In a continuous frame an edge is an event. In a sampled one the output is the reset value in
-    the tick of the edge already, so ``reset`` feeds through to ``y``; the secondary output ``before`` is the integral
-    before a reset in this tick, without feedthrough, for a loop that resets itself. A signal that is true at the start
-    is no edge.
+    ``value`` is ``initial_value``, or with ``reset_to_input`` an input. Limits are optional, as in `LimitedIntegrator`.
+    In a continuous subsystem an edge is an event. In a sampled one the output is the reset value in the tick of the
+    edge already, so ``reset`` feeds through to ``y``. The secondary output ``before`` is the integral before a reset in
+    this tick; it has no feedthrough and serves loops that reset themselves. A signal that is true at the start is no
+    edge.
 
     Raises
     ------
     ParameterError
-        Limits in the wrong order, or an ``initial_value`` outside of them.
+        For limits in the wrong order, and an ``initial_value`` outside of them.
     ShapeError
-        Limits and a vector in a continuous frame, when the diagram is built.
+        For a vector in combination with limits in a continuous subsystem, when the diagram is built.
     """
 
     initial_value: Array = parameter(default=0.0, description="y at the start, a number or of the input's shape")
-    reset_to_input: bool = parameter(default=False, description="True adds the input value, which y is reset to")
+    reset_to_input: bool = parameter(default=False, description="True adds the input value, to which y is reset")
     lower: float | None = parameter(default=None, description="lower limit of y; None: there is none")
     upper: float | None = parameter(default=None, description="upper limit of y; None: there is none")
-    u = Input(shape=None, description="what is integrated; a scalar where there are limits in a continuous frame")
+    u = Input(shape=None, description="signal to integrate; with limits a scalar in a continuous subsystem")
     reset = Input(description="logic: a rising edge resets")
-    value = Input(shape=None, description="what y is reset to; with reset_to_input only")
+    value = Input(shape=None, description="value after a reset; with reset_to_input only")
     y = Output(like="u", description="the integral")
     before = Output(like="u", secondary=True, description="the integral before a reset in this tick")
     integral = State(start="initial_value", like="u", description="the integral")
-    last = State(start=1.0, discrete=True, description="reset at the last tick, in a sampled frame")
+    last = State(start=1.0, discrete=True, description="reset at the last tick, in a sampled subsystem")
     side = State(like="u", discrete=True, description="1 while held at the upper limit, −1 at the lower; with limits")
     restart = Event("rising", "an edge of reset")
     reached = Event("rising", "y reaches a limit; with limits")
@@ -203,38 +204,38 @@ class ResettableIntegrator(_Limits, Block):
 
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
-        """The inputs; value where y is reset to an input."""
+        """``u``, ``reset``, and with ``reset_to_input`` ``value``."""
         cls = type(self)
         own = {"u": cls.u, "reset": cls.reset}
         return {**own, "value": cls.value} if self.reset_to_input else own
 
     @property
     def states(self) -> Mapping[str, State]:  # type: ignore[override]
-        """The states; side where there are limits."""
+        """``integral``, ``last``, and with limits ``side``."""
         cls = type(self)
         own = {"integral": cls.integral, "last": cls.last}
         return {**own, "side": cls.side} if self.has_limits else own
 
     @property
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """The events; those of the limits where there are any."""
+        """``restart``, and with limits ``reached`` and ``released``."""
         cls = type(self)
         own = {"restart": cls.restart}
         return {**own, "reached": cls.reached, "released": cls.released} if self.has_limits else own
 
     def reset_value(self, x: Any, u: Any) -> Array:
-        """Return what y is reset to, of the integral's shape."""
+        """Return y after a reset, of the integral's shape."""
         target = u.value if self.reset_to_input else self.initial_value
-        return limited(0.0 * x.integral + target, self.lower, self.upper)
+        return clip(0.0 * x.integral + target, self.lower, self.upper)
 
-    def now(self, x: Any, u: Any) -> Array:
+    def value_at_tick(self, x: Any, u: Any) -> Array:
         """Return y at a tick; NaN passes through."""
         edge = truth(u.reset) * (1.0 - truth(x.last))
         return np.where(edge > 0.5, self.reset_value(x, u), np.where(edge <= 0.5, x.integral, edge))
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> tuple[Array, Array]:
-        """Return the integral after and before a reset."""
-        return (x.integral if T is None else self.now(x, u)), x.integral
+        """Return the integral after and before a reset in this tick."""
+        return (x.integral if T is None else self.value_at_tick(x, u)), x.integral
 
     def derivative(self, t: Array, x: Any, u: Any) -> Array:
         """Return the input, or zero at a limit."""
@@ -247,7 +248,7 @@ class ResettableIntegrator(_Limits, Block):
         return (restart, *self.limit_indicators(x.integral, x.side, u.u)) if self.has_limits else restart
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[Array, ...]:
-        """Reset; else hold y, or let it go."""
+        """Return the states after a reset; else hold y, or release it."""
         restart, value = fired.restart > 0.5, self.reset_value(x, u)
         if not self.has_limits:
             return np.where(restart, value, x.integral), x.last
@@ -256,31 +257,31 @@ class ResettableIntegrator(_Limits, Block):
 
     def update(self, t: Array, x: Any, u: Any, T: Array) -> tuple[Array, ...]:
         """Return the integral at the next tick."""
-        new = limited(self.now(x, u) + T * u.u, self.lower, self.upper)
-        return (new, u.reset, self.at_limits(new)) if self.has_limits else (new, u.reset)
+        new = clip(self.value_at_tick(x, u) + T * u.u, self.lower, self.upper)
+        return (new, u.reset, self.find_side(new)) if self.has_limits else (new, u.reset)
 
 
 class FilteredDerivative(Block):
     """Filtered derivative: Y(s) = s / (T_f s + 1) U(s), element by element.
 
-    T_f ẋ = u − x, y = (u − x) / T_f. The filter starts at ``initial_value``; without one at the first input, so that
-    y is zero at the start.
+    T_f ẋ = u − x, y = (u − x) / T_f. The filter starts at ``initial_value``; without it, at the first input, so that y
+    is zero at the start.
 
     Raises
     ------
     ShapeError
-        An ``initial_value`` of another shape than the input's, when the diagram is built; a number fits any.
+        For an ``initial_value`` of another shape than the input's, when the diagram is built; a number fits any.
     """
 
     time_constant: float = parameter(unit="s", above=0.0, description="time constant of the filter, T_f")
     initial_value: Array | None = parameter(default=None, description="x at the start; None takes the first input")
-    u = Input(shape=None, description="what is differentiated, of any shape")
+    u = Input(shape=None, description="signal to differentiate, of any shape")
     y = Output(shape=None, description="the filtered derivative")
     filtered = State(start="initial_value", like="u", description="the filtered input, x")
 
     @property
     def starts_from_inputs(self) -> bool:
-        """Whether `initial` reads the inputs."""
+        """Whether `initial` computes the state."""
         return self.initial_value is None
 
     def initial(self, u: Any) -> Array:
@@ -292,7 +293,7 @@ class FilteredDerivative(Block):
         return (u.u - x.filtered) / self.time_constant
 
     def derivative(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the same."""
+        """Return ẋ, which is y."""
         return (u.u - x.filtered) / self.time_constant
 
     def to_control(self) -> Any:

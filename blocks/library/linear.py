@@ -12,7 +12,7 @@ from ..core.errors import ParameterError
 from ..core.ports import Input, Output, State
 from ..core.values import Array, parameter
 from .python_control import (
-    SampleTimeOfFrame,
+    FixedSampleTime,
     block_name,
     check_names,
     check_single,
@@ -26,16 +26,16 @@ Names = tuple[str, ...] | None
 
 
 def _ndim(value: Array) -> int:
-    return len(getattr(value, "shape", ()))  # np.ndim has no answer for what is being traced
+    return len(getattr(value, "shape", ()))  # np.ndim does not work on a traced value
 
 
-def _applied(matrix: Array, u: Array) -> Array:
-    """Return the product of a matrix and the input; one column belongs to a scalar."""
+def _apply(matrix: Array, u: Array) -> Array:
+    """Return the product of a matrix and the input; a scalar input takes a single column."""
     return matrix @ u if _ndim(u) else matrix * u
 
 
 class _StateSpace(Block):
-    """What state-space blocks of both kinds of time share."""
+    """Common part of state-space blocks in continuous and in discrete time."""
 
     A: Array = parameter(description="system matrix, n × n")
     B: Array = parameter(description="input matrix, n × m; n numbers make u a scalar")
@@ -75,12 +75,12 @@ class _StateSpace(Block):
 
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
-        """U, of the shape that B takes."""
+        """Input ``u``, of the shape that B takes."""
         return {"u": Input(np.shape(self.B)[1:], None, type(self).u.description, name="u")}
 
     @property
     def outputs(self) -> Mapping[str, Output]:  # type: ignore[override]
-        """Y, of the shape that C gives."""
+        """Output ``y``, of the shape that C gives."""
         return {"y": Output(np.shape(self.C)[:-1], None, type(self).y.description, name="y")}
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
@@ -88,19 +88,18 @@ class _StateSpace(Block):
         y = self.C @ x.x
         if not _ndim(self.D) and (_ndim(y) or _ndim(u.u)):
             return y
-        return y + _applied(self.D, u.u)
+        return y + _apply(self.D, u.u)
 
     def advance(self, x: Any, u: Any) -> Array:
         """Return A x + B u."""
-        return self.A @ x.x + _applied(self.B, u.u)
+        return self.A @ x.x + _apply(self.B, u.u)
 
     @classmethod
     def _from_control(cls, system: Any, *, discrete: bool, name: str | None, **more: Any) -> Self:
         dt = check_system(cls, system, "StateSpace", discrete=discrete)
         if system.nstates == 0:
-            raise ParameterError(
-                "the system has no states; use Gain(gain=system.D).", block=cls.__name__, port="system"
-            )
+            text = "found a system without states; expected one state or more. Use Gain(gain=system.D)."
+            raise ParameterError(text, block=cls.__name__, port="system")
         B, C, D = (np.asarray(m, dtype=float) for m in (system.B, system.C, system.D))
         B, D = (B[:, 0], D[:, 0]) if system.ninputs == 1 else (B, D)
         C, D = (C[0], D[0]) if system.noutputs == 1 else (C, D)
@@ -120,12 +119,12 @@ class _StateSpace(Block):
 class StateSpace(_StateSpace):
     """Linear system in state space: ẋ = A x + B u, y = C x + D u.
 
-    In a sampled frame it is discretized by the frame's method; ``exact`` is the zero-order hold.
+    A sampled subsystem discretizes it by its method; ``exact`` is the zero-order hold.
 
     Raises
     ------
     ParameterError
-        Matrices that don't fit each other, or names that are not as many as the signals.
+        For matrices that don't fit each other, and a number of names that is not that of the signals.
 
     Examples
     --------
@@ -141,12 +140,13 @@ class StateSpace(_StateSpace):
     def from_control(cls, system: Any, *, initial_state: Any = 0.0, name: str | None = None) -> Self:
         """Return the block of a `control.StateSpace` in continuous time; one input or output becomes a scalar.
 
-        It takes over the names of the signals, and the system's own where that is an identifier and none is given.
+        The block has the names of the system's signals. Without ``name`` its name is the system's, if that is an
+        identifier.
 
         Raises
         ------
         ParameterError
-            No state space, or one in discrete time, or one without states.
+            For anything but a state space in continuous time, and for one without states.
         """
         return cls._from_control(system, discrete=False, name=name, initial_state=initial_state)
 
@@ -155,19 +155,19 @@ class StateSpace(_StateSpace):
         return self._to_control(0)
 
 
-class DiscreteStateSpace(SampleTimeOfFrame, _StateSpace):
+class DiscreteStateSpace(FixedSampleTime, _StateSpace):
     """Linear system in discrete time: x[k + 1] = A x[k] + B u[k], y[k] = C x[k] + D u[k].
 
     Raises
     ------
     ParameterError
-        Matrices that don't fit each other, or names that are not as many as the signals.
+        For matrices that don't fit each other, and a number of names that is not that of the signals.
     SampleTimeError
-        In a continuous frame, or in one whose sample time is not ``dt``, when the diagram is built.
+        In a continuous subsystem, or with a sample time other than ``dt``, when the diagram is built.
     """
 
     dt: float | None = parameter(
-        default=None, unit="s", above=0.0, structural=True, description="sample time that it holds for; None: any"
+        default=None, unit="s", above=0.0, structural=True, description="sample time that it is made for; None: any"
     )
 
     def update(self, t: Array, x: Any, u: Any) -> Array:
@@ -178,12 +178,13 @@ class DiscreteStateSpace(SampleTimeOfFrame, _StateSpace):
     def from_control(cls, system: Any, *, initial_state: Any = 0.0, name: str | None = None) -> Self:
         """Return the block of a `control.StateSpace` in discrete time; one input or output becomes a scalar.
 
-        It takes over the names of the signals, and the system's own where that is an identifier and none is given.
+        The block has the names of the system's signals. Without ``name`` its name is the system's, if that is an
+        identifier.
 
         Raises
         ------
         ParameterError
-            No state space, or one in continuous time, or one without states.
+            For anything but a state space in discrete time, and for one without states.
         """
         return cls._from_control(system, discrete=True, name=name, initial_state=initial_state)
 
@@ -193,7 +194,7 @@ class DiscreteStateSpace(SampleTimeOfFrame, _StateSpace):
 
 
 class _TransferFunction(Block):
-    """What transfer functions of both kinds of time share."""
+    """Common part of transfer functions in continuous and in discrete time."""
 
     numerator: Array = parameter(tunable=False, description="coefficients of the numerator, highest power first")
     denominator: Array = parameter(tunable=False, description="coefficients of the denominator, highest power first")
@@ -205,16 +206,16 @@ class _TransferFunction(Block):
 
     @property
     def order(self) -> int:
-        """The degree of the denominator."""
+        """Degree of the denominator."""
         return int(np.atleast_1d(self.denominator).shape[0]) - 1
 
     @property
     def states(self) -> Mapping[str, State]:  # type: ignore[override]
-        """X, unless the transfer function is a number."""
+        """``x``; none if the transfer function is a number."""
         return {"x": type(self).x} if self.order else {}
 
     def check(self) -> None:
-        """Refuse coefficients that are no proper transfer function."""
+        """Refuse coefficients that don't make a proper transfer function."""
         for name in ("numerator", "denominator"):
             if np.ndim(getattr(self, name)) > 1 or np.size(getattr(self, name)) == 0:
                 raise ParameterError(
@@ -261,15 +262,15 @@ class _TransferFunction(Block):
 class TransferFunction(_TransferFunction):
     """Transfer function: Y(s) = (b₀ sᵐ + … + b_m) / (a₀ sⁿ + … + a_n) U(s), m ≤ n; it starts at rest.
 
-    Realized in controllable canonical form in the scaled frequency s / ω, ω = |a_l / a₀|^(1 / l) with the last
-    coefficient a_l that is not zero: the geometric mean of the magnitudes of the poles that are not zero. So
-    coefficients and states are of one size where the poles are. Where they are many decades apart, or many and close
-    together, the coefficients themselves don't define them well: `ZeroPoleGain` is better then.
+    The realization is the controllable canonical form in the scaled frequency s / ω, ω = |a_l / a₀|^(1 / l) with the
+    last coefficient a_l that is not zero. ω is the geometric mean of the magnitudes of the poles that are not zero, so
+    poles of one size give coefficients and states of one size. The coefficients don't define poles well that are many
+    decades apart, or many and close together: use `ZeroPoleGain` for these.
 
     Raises
     ------
     ParameterError
-        No proper transfer function.
+        For coefficients that don't make a proper transfer function.
 
     Examples
     --------
@@ -278,14 +279,14 @@ class TransferFunction(_TransferFunction):
     """
 
     def check(self) -> None:
-        """Refuse what is not proper; find the coefficient that sets the scale."""
+        """Refuse an improper transfer function, and find the coefficient that sets the scale."""
         super().check()
         object.__setattr__(self, "_last", int(np.flatnonzero(np.atleast_1d(self.denominator))[-1]))
 
-    def scaled(self) -> tuple[Array, Array, Array]:
-        """Return ω, and the coefficients of numerator and denominator in s / ω, by a₀."""
+    def scale_coefficients(self) -> tuple[Array, Array, Array]:
+        """Return ω, and the coefficients of numerator and denominator in s / ω, divided by a₀."""
         b, a = self.coefficients()
-        last: int = self.__dict__["_last"]  # known by which coefficients are zero, so the same in every equal trace
+        last: int = self.__dict__["_last"]  # follows from which coefficients are zero, so equal traces share it
         w = np.abs(a[last] / a[0]) ** (1.0 / last) if last else 1.0 + 0.0 * a[0]
         factors = [1.0 / a[0]]
         for _ in range(self.order):
@@ -295,24 +296,25 @@ class TransferFunction(_TransferFunction):
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the output."""
-        _, b, a = self.scaled()
+        _, b, a = self.scale_coefficients()
         return b[0] * u.u + ((b[1:] - b[0] * a[1:])[::-1] @ x.x if self.order else 0.0)
 
     def derivative(self, t: Array, x: Any, u: Any) -> Array:
-        """Return ẋ: a chain of integrators, the last driven by what is left of the input."""
-        w, _, a = self.scaled()
+        """Return ẋ of the chain of integrators; the last is driven by the input less the feedback."""
+        w, _, a = self.scale_coefficients()
         return w * np.concatenate([x.x[1:], np.stack([u.u - a[1:][::-1] @ x.x])])
 
     @classmethod
     def from_control(cls, system: Any, *, name: str | None = None) -> Self:
         """Return the block of a `control.TransferFunction` in continuous time, of one input and one output.
 
-        It takes over the names of the signals, and the system's own where that is an identifier and none is given.
+        The block has the names of the system's signals. Without ``name`` its name is the system's, if that is an
+        identifier.
 
         Raises
         ------
         ParameterError
-            No transfer function, or one in discrete time, or one of several inputs or outputs.
+            For anything but a transfer function in continuous time, of one input and one output.
         """
         return cls._from_control(system, discrete=False, name=name)
 
@@ -321,21 +323,21 @@ class TransferFunction(_TransferFunction):
         return self._to_control(0)
 
 
-class DiscreteTransferFunction(SampleTimeOfFrame, _TransferFunction):
+class DiscreteTransferFunction(FixedSampleTime, _TransferFunction):
     """Transfer function: Y(z) = (b₀ zᵐ + … + b_m) / (a₀ zⁿ + … + a_n) U(z), m ≤ n; it starts at rest.
 
-    Realized in the transposed direct form II. For filters in powers of 1/z there is `IIR`, for sharp ones in sections.
+    The realization is the transposed direct form II. `IIR` takes filters in powers of 1/z, and in sections.
 
     Raises
     ------
     ParameterError
-        No proper transfer function.
+        For coefficients that don't make a proper transfer function.
     SampleTimeError
-        In a continuous frame, or in one whose sample time is not ``dt``, when the diagram is built.
+        In a continuous subsystem, or with a sample time other than ``dt``, when the diagram is built.
     """
 
     dt: float | None = parameter(
-        default=None, unit="s", above=0.0, structural=True, description="sample time that it holds for; None: any"
+        default=None, unit="s", above=0.0, structural=True, description="sample time that it is made for; None: any"
     )
 
     def output(self, t: Array, x: Any, u: Any, T: Array) -> Array:
@@ -352,12 +354,13 @@ class DiscreteTransferFunction(SampleTimeOfFrame, _TransferFunction):
     def from_control(cls, system: Any, *, name: str | None = None) -> Self:
         """Return the block of a `control.TransferFunction` in discrete time, of one input and one output.
 
-        It takes over the names of the signals, and the system's own where that is an identifier and none is given.
+        The block has the names of the system's signals. Without ``name`` its name is the system's, if that is an
+        identifier.
 
         Raises
         ------
         ParameterError
-            No transfer function, or one in continuous time, or one of several inputs or outputs.
+            For anything but a transfer function in discrete time, of one input and one output.
         """
         return cls._from_control(system, discrete=True, name=name)
 

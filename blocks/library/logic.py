@@ -1,8 +1,8 @@
-"""Logic: signals that are 0 or 1, true where they are above 0.5.
+"""Logic: signals that are 0 or 1, and count as true above 0.5.
 
-`Compare` turns any signal into one. `And`, `Or`, `Not` and `Switch` have no memory: their outputs follow their inputs
-at once, in every kind of frame, so that what changes at one instant changes together. In a continuous frame the solver
-lands where one of their inputs crosses 0.5.
+`Compare` makes a logic signal of any signal. `And`, `Or`, `Not` and `Switch` have no memory: their outputs follow their
+inputs at once in every subsystem, so that signals that change at one instant change together. In a continuous subsystem
+the solver lands where one of their inputs crosses 0.5.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from ..core.block import Block
 from ..core.errors import ParameterError, near
 from ..core.ports import Event, Input, Output, State
 from ..core.values import Array, parameter
-from .branching import Numbered, check_fits, single, truth
+from .branching import Numbered, check_fits, expect_scalar, truth
 
 _OPERATORS = {">": (1.0, 1.0), "<": (-1.0, 1.0), "<=": (1.0, 0.0), ">=": (-1.0, 0.0)}
-"""Each relation as the sign of u₁ − u₂ that is looked at, and what holds where that is positive."""
+"""For each relation: a sign s, and the value of y where s (u₁ − u₂) is positive."""
 
 
 class Compare(Block):
     """Comparison: y = 1 where u₁ > u₂ (or <, ≥, ≤), else 0, element by element; NaN passes through.
 
-    ``Compare(">")(u, 3.0)``; without a second input it compares with zero. In a continuous frame y changes by an event
-    at the crossing.
+    ``Compare(">")(u, 3.0)``; without a second input it compares with zero. In a continuous subsystem y changes by an
+    event at the crossing.
 
     Raises
     ------
     ParameterError
-        Another relation than >, <, >= and <=.
+        For another relation than >, <, >= and <=.
     ShapeError
-        Inputs of different shapes, or vectors in a continuous frame, when the diagram is built.
+        For inputs of different shapes, and for vectors in a continuous subsystem, when the diagram is built.
     """
 
     same_units = True
@@ -46,7 +46,7 @@ class Compare(Block):
     cross = Event("both", "the two sides cross")
 
     def check(self) -> None:
-        """Refuse a relation that is none."""
+        """Refuse an unknown relation."""
         if self.relation not in _OPERATORS:
             raise ParameterError(
                 f"found {self.relation!r}; expected one of {', '.join(_OPERATORS)}. Equality of signals that vary "
@@ -55,89 +55,89 @@ class Compare(Block):
                 port="relation",
             )
 
-    def decided(self, u: Any) -> Array:
-        """Return where the relation holds."""
+    def decide(self, u: Any) -> Array:
+        """Return 1 where the relation holds, else 0."""
         check_shapes(u1=u.u1, u2=u.u2)
         sign, positive = _OPERATORS[self.relation]
         left, right = (u.u1, u.u2) if sign > 0 else (u.u2, u.u1)
         return np.where(left > right, positive, np.where(left <= right, 1.0 - positive, left + right))
 
     def initial(self, u: Any) -> Array:
-        """Return the state at the start; at ticks, where shapes may differ, it is not used."""
-        return np.resize(self.decided(u), np.shape(u.u1))
+        """Return the state at the start; ticks don't use it, and may have other shapes."""
+        return np.resize(self.decide(u), np.shape(u.u1))
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> Array:
-        """Return where it holds."""
-        return x.holds if T is None else self.decided(u)
+        """Return 1 where the relation holds, else 0."""
+        return x.holds if T is None else self.decide(u)
 
     def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Keep nothing that matters: at a tick the output is that of the inputs."""
+        """Return the state unchanged: at a tick the output follows from the inputs."""
         return x.holds
 
     def indicators(self, t: Array, x: Any, u: Any) -> Array:
-        """Return how far the sides are apart."""
-        return _OPERATORS[self.relation][0] * (single(u.u1, "u1") - single(u.u2, "u2"))
+        """Return the difference of the two sides."""
+        return _OPERATORS[self.relation][0] * (expect_scalar(u.u1, "u1") - expect_scalar(u.u2, "u2"))
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> Array:
-        """Return whether it holds now."""
-        return self.decided(u)
+        """Return 1 where the relation holds after an event, else 0."""
+        return self.decide(u)
 
 
 class _Combined(Numbered):
-    """Base of `And` and `Or`: an event for each input, nothing to remember."""
+    """Base of `And` and `Or`: an event for each input, and no state."""
 
     y = Output(shape=None, description="1 or 0")
 
     @property
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """One for each input."""
+        """One event for each input."""
         return {f"change{i}": Event("both", f"u{i} crosses 0.5", name=f"change{i}") for i in range(1, self.count + 1)}
 
     def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, ...] | Array:
-        """Return how far each input is above 0.5."""
-        values = tuple(single(value, name) - 0.5 for name, value in u._asdict().items())
+        """Return the distance of each input above 0.5."""
+        values = tuple(expect_scalar(value, name) - 0.5 for name, value in u._asdict().items())
         return values if len(values) > 1 else values[0]
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[()]:
-        """Return nothing: there is no state."""
+        """Return no states, since there are none."""
         return ()
 
 
 class And(_Combined):
     """Logical and: y = 1 where all inputs are true (above 0.5), else 0, element by element; NaN passes through.
 
-    Its inputs are logic signals; what varies continuously goes through `Compare` first.
+    The inputs are logic signals; send a continuous signal through `Compare` first.
 
     Raises
     ------
     ShapeError
-        Inputs of different shapes, or vectors in a continuous frame, when the diagram is built.
+        For inputs of different shapes, and for vectors in a continuous subsystem, when the diagram is built.
     """
 
     _hint = "logical_and"
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the product of the truths."""
+        """Return the product of the inputs' truths."""
         check_shapes(**u._asdict())
-        return self.folded(u._replace(**{k: truth(v) for k, v in u._asdict().items()}), lambda a, b: a * b)
+        return self.fold(u._replace(**{k: truth(v) for k, v in u._asdict().items()}), lambda a, b: a * b)
 
 
 class Or(_Combined):
     """Logical or: y = 1 where any input is true (above 0.5), else 0, element by element; NaN passes through.
 
-    Its inputs are logic signals; what varies continuously goes through `Compare` first.
+    The inputs are logic signals; send a continuous signal through `Compare` first.
 
     Raises
     ------
     ShapeError
-        Inputs of different shapes, or vectors in a continuous frame, when the diagram is built.
+        For inputs of different shapes, and for vectors in a continuous subsystem, when the diagram is built.
     """
 
     _hint = "logical_or"
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return one less the product of the untruths."""
-        return 1.0 - self.folded(u._replace(**{k: 1.0 - truth(v) for k, v in u._asdict().items()}), lambda a, b: a * b)
+        """Return 1 less the product of the inputs' complements."""
+        return 1.0 - self.fold(u._replace(**{k: 1.0 - truth(v) for k, v in u._asdict().items()}), lambda a, b: a * b)
 
 
 class Not(Block):
@@ -146,7 +146,7 @@ class Not(Block):
     Raises
     ------
     ShapeError
-        A vector in a continuous frame, when the diagram is built.
+        For a vector in a continuous subsystem, when the diagram is built.
     """
 
     _hint = "logical_not"
@@ -155,64 +155,65 @@ class Not(Block):
     change = Event("both", "the input crosses 0.5")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the untruth."""
+        """Return the complement."""
         return 1.0 - truth(u.u)
 
     def indicators(self, t: Array, x: Any, u: Any) -> Array:
-        """Return how far the input is above 0.5."""
-        return single(u.u, "u") - 0.5
+        """Return the distance of the input above 0.5."""
+        return expect_scalar(u.u, "u") - 0.5
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[()]:
-        """Return nothing: there is no state."""
+        """Return no states, since there are none."""
         return ()
 
 
 class Switch(Block):
     """Switch: y = ``then`` where the condition is true (above 0.5), else ``otherwise``; a NaN condition passes through.
 
-    The condition is a logic signal, one for all elements or one for each; what varies continuously goes through
-    `Compare` first. The branch that is not taken does not matter, even if it is NaN.
+    The condition is a logic signal, one for all elements or one for each; send a continuous signal through `Compare`
+    first. The other branch does not matter, even if it is NaN.
 
     Raises
     ------
     ShapeError
-        Inputs of different shapes, or a vector as condition in a continuous frame, when the diagram is built.
+        For inputs of different shapes, and for a vector as condition in a continuous subsystem, when the diagram is
+        built.
     """
 
     condition = Input(shape=None, description="logic signal")
-    then = Input(shape=None, description="what is given on while it is true, of any shape")
-    otherwise = Input(shape=None, description="what is given on while it is not, of the same shape or a scalar")
+    then = Input(shape=None, description="output while the condition is true, of any shape")
+    otherwise = Input(shape=None, description="output while it is not, of the same shape or a scalar")
     y = Output(like="then", description="one of the two")
     change = Event("both", "the condition crosses 0.5")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the branch that is taken."""
+        """Return the branch that the condition chooses."""
         check_shapes(then=u.then, otherwise=u.otherwise, condition=u.condition)
         other = np.where(u.condition <= 0.5, u.otherwise, u.condition)
         return np.where(u.condition > 0.5, u.then, other)
 
     def indicators(self, t: Array, x: Any, u: Any) -> Array:
-        """Return how far the condition is above 0.5."""
-        return single(u.condition, "condition") - 0.5
+        """Return the distance of the condition above 0.5."""
+        return expect_scalar(u.condition, "condition") - 0.5
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[()]:
-        """Return nothing: there is no state."""
+        """Return no states, since there are none."""
         return ()
 
 
 class EdgeDetector(Block):
-    """Edge detector of a sampled subsystem: y[k] = 1 at the tick at which u has become true, else 0.
+    """Edge detector of a sampled subsystem: y[k] = 1 at the tick at which u becomes true, else 0.
 
-    With ``edge="falling"`` where it has become false, with ``"both"`` at either. The first tick compares with
-    ``initial_value``; without one it shows no edge. An edge has no duration in continuous time: there a `Latch`, a
-    `Counter` or a `StateMachine` acts on it.
+    With ``edge="falling"`` y is 1 at the tick at which u becomes false, with ``"both"`` at either. The first tick
+    compares with ``initial_value``; without it there is no edge. An edge has no duration in continuous time: use a
+    `Latch`, a `Counter` or a `StateMachine` there.
 
     Raises
     ------
     ParameterError
-        Another edge than these.
+        For another edge than these.
     SampleTimeError
-        In a continuous frame, when the diagram is built.
+        In a continuous subsystem, when the diagram is built.
     """
 
     edge: str = parameter(default="rising", description="'rising', 'falling' or 'both'")
@@ -222,7 +223,7 @@ class EdgeDetector(Block):
     last = State(start="initial_value", like="u", description="u at the last tick")
 
     def check(self) -> None:
-        """Refuse an edge that is none."""
+        """Refuse an unknown kind of edge."""
         if self.edge not in ("rising", "falling", "both"):
             raise ParameterError(
                 f"found {self.edge!r}; expected 'rising', 'falling' or 'both'. "
@@ -233,7 +234,7 @@ class EdgeDetector(Block):
 
     @property
     def starts_from_inputs(self) -> bool:
-        """Whether `initial` reads the inputs."""
+        """Whether `initial` computes the state."""
         return self.initial_value is None
 
     def initial(self, u: Any) -> Array:
@@ -241,7 +242,7 @@ class EdgeDetector(Block):
         return u.u
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return where there is an edge."""
+        """Return 1 where there is an edge, else 0."""
         now, before = truth(u.u), truth(x.last)
         rising, falling = now * (1.0 - before), before * (1.0 - now)
         return rising if self.edge == "rising" else falling if self.edge == "falling" else rising + falling
@@ -252,17 +253,17 @@ class EdgeDetector(Block):
 
 
 class Latch(Block):
-    """Latch: y = 1 from when ``set`` is true until ``reset`` is, of which ``reset`` goes first; else as it was.
+    """Latch: y becomes 1 while ``set`` is true, 0 while ``reset`` is, and else stays. ``reset`` wins over ``set``.
 
-    The output follows at once, in a continuous frame too.
+    The output follows at once, in a continuous subsystem too.
 
     Raises
     ------
     ShapeError
-        Inputs of different shapes, or vectors in a continuous frame, when the diagram is built.
+        For inputs of different shapes, and for vectors in a continuous subsystem, when the diagram is built.
     """
 
-    initial_value: float = parameter(default=0.0, description="1 to begin set, 0 not")
+    initial_value: float = parameter(default=0.0, description="1 to start set, 0 to start reset")
     set = Input(shape=None, description="logic signal that sets it, of any shape")
     reset = Input(shape=None, default=0.0, description="logic signal that resets it")
     y = Output(shape=None, description="1 while set, else 0")
@@ -271,33 +272,33 @@ class Latch(Block):
     resets = Event("both", "reset crosses 0.5")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return whether it is set."""
+        """Return 1 where the latch is set, else 0."""
         check_fits(u.reset, "reset", u.set, "set")
         reset = truth(u.reset)
         return (1.0 - reset) * np.where(u.set > 0.5, 1.0, np.where(u.set <= 0.5, truth(x.kept), u.set))
 
     def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Keep it."""
+        """Keep the output."""
         return self.output(t, x, u)
 
     def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return how far the inputs are above 0.5."""
-        return single(u.set, "set") - 0.5, single(u.reset, "reset") - 0.5
+        """Return the distances of the inputs above 0.5."""
+        return expect_scalar(u.set, "set") - 0.5, expect_scalar(u.reset, "reset") - 0.5
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> Array:
-        """Keep it."""
+        """Keep the output."""
         return self.output(t, x, u)
 
 
 class Counter(Block):
-    """Counter: how often u has become true, since the start or since ``reset`` was last true.
+    """Counter of the times at which u became true, since the start or since ``reset`` was last true.
 
-    u that is true from the start counts when it next becomes true. At a tick the edge of that tick counts already.
+    A u that is true at the start is not counted. At a tick the edge of that tick is counted already.
 
     Raises
     ------
     ShapeError
-        Inputs of different shapes, or vectors in a continuous frame, when the diagram is built.
+        For inputs of different shapes, and for vectors in a continuous subsystem, when the diagram is built.
     """
 
     u = Input(shape=None, description="logic signal, of any shape")
@@ -323,8 +324,8 @@ class Counter(Block):
         return self.output(t, x, u, T), u.u
 
     def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return how far the inputs are above 0.5."""
-        return single(u.u, "u") - 0.5, single(u.reset, "reset") - 0.5
+        """Return the distances of the inputs above 0.5."""
+        return expect_scalar(u.u, "u") - 0.5, expect_scalar(u.reset, "reset") - 0.5
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[Array, Array]:
         """Return the count after an event."""

@@ -15,18 +15,18 @@ from ..core.values import Array, parameter
 from .piecewise import bilinear, piecewise
 
 _BEYOND = ("hold", "extrapolate", "error")
-_SLACK = 1e-9  # part of the table's range by which an input may be outside through rounding
+_SLACK = 1e-9  # part of the table's range by which rounding may put an input outside
 
 
-def _choice(block: Block, name: str, known: tuple[str, ...]) -> None:
+def _check_choice(block: Block, name: str, known: tuple[str, ...]) -> None:
     value = getattr(block, name)
     if value not in known:
         text = f"found {value!r}; expected {', '.join(map(repr, known[:-1]))} or {known[-1]!r}. {near(value, known)}"
         raise ParameterError(text, block=block.label, port=name)
 
 
-def _breakpoints(block: Block, name: str) -> int:
-    """Return how many breakpoints there are, and refuse what can't be any."""
+def _check_breakpoints(block: Block, name: str) -> int:
+    """Return the number of breakpoints, and refuse breakpoints that don't rise."""
     points = np.asarray(getattr(block, name))
     if points.ndim != 1 or points.size < 2 or np.any(np.diff(points) <= 0):
         text = f"found {points.tolist()!r}"[:200]
@@ -39,14 +39,14 @@ def _breakpoints(block: Block, name: str) -> int:
     return points.size
 
 
-def _held(points: np.ndarray, u: Array) -> Array:
+def _clip(points: np.ndarray, u: Array) -> Array:
     """Return u within the ends of the table; NaN passes through."""
     low, high = float(points[0]), float(points[-1])
     return np.where(u < low, low, np.where(u > high, high, u))
 
 
 class _End(NamedTuple):
-    """An end of a table that an entry of an input can leave it by."""
+    """End of a table, by which an entry of an input can leave it."""
 
     entry: str
     position: int
@@ -54,18 +54,18 @@ class _End(NamedTuple):
 
     @property
     def guard(self) -> str:
-        """The name of its guard."""
+        """Name of the guard."""
         return f"{self.entry} {self.side}"
 
 
 def _ends(port: str, shape: tuple[int, ...]) -> list[_End]:
-    """Return the two ends for every entry of an input."""
+    """Return the two ends of the table for every entry of an input."""
     entries = [f"{port}[{i}]" for i in range(shape[0])] if shape else [port]
     return [_End(entry, i, side) for i, entry in enumerate(entries) for side in ("below", "above")]
 
 
 def _margins(points: np.ndarray, name: str, u: Array) -> dict[str, Array]:
-    """Return, for every entry of u, its distance from the table's ends, positive within."""
+    """Return the distances of every entry of u from the table's ends, positive within."""
     slack = _SLACK * float(points[-1] - points[0])
     low, high = float(points[0]) - slack, float(points[-1]) + slack
     shape, margins = shape_of(u), {}
@@ -75,7 +75,7 @@ def _margins(points: np.ndarray, name: str, u: Array) -> dict[str, Array]:
     return margins
 
 
-def _outside(name: str, points: dict[str, np.ndarray], u: Any) -> GuardError:
+def _range_error(name: str, points: dict[str, np.ndarray], u: Any) -> GuardError:
     """Return the error of an input beyond the table."""
     ends = ((port, end) for port in points for end in _ends(port, np.shape(getattr(u, port))))
     port, (entry, position, side) = next((port, end) for port, end in ends if end.guard == name)
@@ -91,19 +91,19 @@ class Lookup1D(Block):
     """Table of one input: y = f(u), f through the points (breakpoints[i], values[i]).
 
     ``interpolation`` is "linear", "cubic" (a spline, twice continuously differentiable, not-a-knot at its ends) or
-    "monotone" (a cubic that rises and falls only where the points do, once differentiable). Beyond the ends the
-    last value is held, the end piece continued, or the run stopped: ``beyond`` is "hold", "extrapolate" or "error".
+    "monotone" (a cubic that rises and falls only where the points do, once differentiable). Beyond the ends ``beyond``
+    holds the last value ("hold"), continues the end piece ("extrapolate"), or stops the run ("error").
 
     The values may be vectors, one row for each breakpoint; a vector u is looked up element by element. NaN passes
-    through. Derivatives of a trace are exact, and a kink needs no event. For a table over time take `PiecewiseLinear`
-    or `Recorded`: a solver lands on their times, while it may step over a short peak of a table that reads a `Clock`.
+    through. Derivatives of a trace are exact, and a kink needs no event. For a table over time use `PiecewiseLinear` or
+    `Recorded`: a solver lands on their times, while it may step over a short peak of a table that reads a `Clock`.
 
     Raises
     ------
     ParameterError
-        Breakpoints that do not rise, another number of values, an unknown choice.
+        For breakpoints that don't rise, another number of values, and an unknown choice.
     ShapeError
-        A vector u with vectors as values, or an u of two dimensions, when the diagram is built.
+        For a vector u with vectors as values, and a u of two dimensions, when the diagram is built.
     GuardError
         In a run, where u leaves the table, with beyond="error".
     """
@@ -114,13 +114,13 @@ class Lookup1D(Block):
     interpolation: str = parameter(default="linear", description="'linear', 'cubic' or 'monotone'")
     beyond: str = parameter(default="hold", description="beyond the ends: 'hold', 'extrapolate' or 'error'")
     u = Input(shape=None, description="the argument: a scalar, or a vector of them")
-    y = Output(shape=None, description="the value looked up")
+    y = Output(shape=None, description="value of the table")
 
     def check(self) -> None:
-        """Refuse tables that are none."""
-        _choice(self, "interpolation", ("linear", "cubic", "monotone"))
-        _choice(self, "beyond", _BEYOND)
-        n, shape = _breakpoints(self, "breakpoints"), np.shape(self.values)
+        """Refuse an unknown choice, breakpoints that don't rise, and values of another shape."""
+        _check_choice(self, "interpolation", ("linear", "cubic", "monotone"))
+        _check_choice(self, "beyond", _BEYOND)
+        n, shape = _check_breakpoints(self, "breakpoints"), np.shape(self.values)
         if len(shape) not in (1, 2) or shape[0] != n:
             raise ParameterError(
                 f"found shape {shape} for {n} breakpoints; expected ({n},), or ({n}, columns). Give one value, or one "
@@ -137,18 +137,18 @@ class Lookup1D(Block):
         if self.interpolation == "linear":
             slopes = np.diff(values, axis=0) / np.diff(points)[:, None]
             return np.stack([values[:-1], slopes], axis=2)
-        from scipy.interpolate import CubicSpline, PchipInterpolator  # imported late: scipy takes its time
+        from scipy.interpolate import CubicSpline, PchipInterpolator  # imported late, since it takes long
 
         made = (CubicSpline if self.interpolation == "cubic" else PchipInterpolator)(points, values).c
         return np.ascontiguousarray(made[::-1].transpose(1, 2, 0))
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the value."""
+        """Return the value of the table."""
         shape, columns = shape_of(u.u), np.ndim(self.values) == 2
         if len(shape) > (0 if columns else 1):
-            expected = "a scalar, for its values are vectors" if columns else "a scalar or a vector"
+            expected = "a scalar, since the values are vectors" if columns else "a scalar or a vector"
             raise ShapeError(f"found shape {shape}; expected {expected}. Look up one part at a time, u[0].", port="u")
-        inside = u.u if self.beyond == "extrapolate" else _held(self.breakpoints, u.u)
+        inside = u.u if self.beyond == "extrapolate" else _clip(self.breakpoints, u.u)
         entries = [inside[i] for i in range(shape[0])] if shape else [inside]
         found = [piecewise(self.breakpoints, self._coefficients, entry) for entry in entries]
         if columns:
@@ -156,24 +156,24 @@ class Lookup1D(Block):
         return np.stack([value[0] for value in found]) if shape else found[0][0]
 
     def guards(self, t: Array, x: Any, u: Any) -> dict[str, Array]:
-        """Return the distances from the ends where leaving the table is an error."""
+        """Return the distances from the ends, if leaving the table is an error."""
         return _margins(self.breakpoints, "u", u.u) if self.beyond == "error" else {}
 
     def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
         """Return the error that names the input and the table's range."""
-        return _outside(name, {"u": self.breakpoints}, u)
+        return _range_error(name, {"u": self.breakpoints}, u)
 
 
 class Lookup2D(Block):
     """Table of two inputs, bilinear: y = f(u₁, u₂), f through the points (rows[i], columns[j], values[i, j]).
 
-    Beyond the edges the nearest value of the edge is held, the outermost cell continued, or the run stopped:
-    ``beyond`` is "hold", "extrapolate" or "error". NaN passes through. Derivatives of a trace are exact.
+    Beyond the edges ``beyond`` holds the nearest value of the edge ("hold"), continues the outermost cell
+    ("extrapolate"), or stops the run ("error"). NaN passes through. Derivatives of a trace are exact.
 
     Raises
     ------
     ParameterError
-        Breakpoints that do not rise, values of another shape, an unknown choice.
+        For breakpoints that don't rise, values of another shape, and an unknown choice.
     GuardError
         In a run, where an input leaves the table, with beyond="error".
     """
@@ -185,12 +185,12 @@ class Lookup2D(Block):
     beyond: str = parameter(default="hold", description="beyond the edges: 'hold', 'extrapolate' or 'error'")
     u1 = Input(description="argument along the rows' breakpoints")
     u2 = Input(description="argument along the columns' breakpoints")
-    y = Output(description="the value looked up")
+    y = Output(description="value of the table")
 
     def check(self) -> None:
-        """Refuse tables that are none."""
-        _choice(self, "beyond", _BEYOND)
-        expected = (_breakpoints(self, "rows"), _breakpoints(self, "columns"))
+        """Refuse an unknown choice, breakpoints that don't rise, and values of another shape."""
+        _check_choice(self, "beyond", _BEYOND)
+        expected = (_check_breakpoints(self, "rows"), _check_breakpoints(self, "columns"))
         if np.shape(self.values) != expected:
             raise ParameterError(
                 f"found shape {np.shape(self.values)}; expected {expected}, a row for each of rows and a column for "
@@ -200,18 +200,18 @@ class Lookup2D(Block):
             )
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
-        """Return the value."""
+        """Return the value of the table."""
         a, b = u.u1, u.u2
         if self.beyond != "extrapolate":
-            a, b = _held(self.rows, a), _held(self.columns, b)
+            a, b = _clip(self.rows, a), _clip(self.columns, b)
         return bilinear(self.rows, self.columns, self.values, a, b)
 
     def guards(self, t: Array, x: Any, u: Any) -> dict[str, Array]:
-        """Return the distances from the edges where leaving the table is an error."""
+        """Return the distances from the edges, if leaving the table is an error."""
         if self.beyond != "error":
             return {}
         return _margins(self.rows, "u1", u.u1) | _margins(self.columns, "u2", u.u2)
 
     def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
         """Return the error that names the input and the table's range."""
-        return _outside(name, {"u1": self.rows, "u2": self.columns}, u)
+        return _range_error(name, {"u1": self.rows, "u2": self.columns}, u)

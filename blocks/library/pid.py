@@ -12,7 +12,7 @@ from ..core.errors import ParameterError
 from ..core.ports import Event, Input, Output, State
 from ..core.values import Array, parameter
 from ..tracing.discretization import hold
-from .integrators import check_limits, limited
+from .integrators import check_limits, clip
 
 _WAYS = ("back_calculation", "clamping", "none")
 
@@ -20,31 +20,32 @@ _WAYS = ("back_calculation", "clamping", "none")
 class PID(Block):
     """PID controller with two degrees of freedom, filtered derivative, output limits and anti-windup.
 
-    In parallel form (`ideal` takes the other one), after Åström and Hägglund, *Advanced PID Control* (2006):
-    u = v limited to [lower, upper], v = P + I + D, with
+    The form is parallel (`from_ideal_form` takes the ideal one), after Åström and Hägglund, *Advanced PID Control*
+    (2006): u = v limited to [lower, upper], v = P + I + D, with
 
     - P = kp (b r − y), İ = ki (r − y) + a, D = kd ẋ_f, T_f ẋ_f = c r − y − x_f;
-    - a = (u − v) / T_t, back-calculation. With ``tracking`` it is (actual − v) / T_t: the input ``actual`` is what the
-      actuator, or another controller that is in charge, really does;
+    - back-calculation, a = (u − v) / T_t. With ``tracking``, a = (actual − v) / T_t: the input ``actual`` is the true
+      control signal, of the actuator or of another controller that is in charge;
     - or clamping: İ = 0 while v is beyond a limit and ki (r − y) drives it further.
 
-    The integral gain stands under the integral, so changing it makes no bump. In a sampled frame P, D and the limits
-    are those of the tick, I[k + 1] = I[k] + T ki (r − y) + (1 − α)(u − v), and the filter and α (the factor by which a
-    lag of time constant T_t decays in T) go by the frame's method: ``exact`` is right for inputs that are held. In a
-    continuous frame clamping is a matter of events; the integral goes on once v is inside by ``clearance``, a share of
-    the range, so that it doesn't chatter.
+    The integral gain is under the integral, so a change of it makes no bump. In a sampled subsystem P, D and the limits
+    are those of the tick, and I[k + 1] = I[k] + T ki (r − y) + (1 − α)(u − v). The subsystem's method gives the filter
+    and α, the factor by which a lag of time constant T_t decays in T; ``exact`` is right for inputs that are held. In a
+    continuous subsystem clamping is by events. The integral resumes once v is inside by ``clearance``, a share of the
+    range, so that it doesn't chatter.
 
-    It starts with x_f = c r − y, so D = 0, and with I = 0 or, without a bump, so that u is ``initial_output``. With
-    ``tracking`` it looks at no input at the start, since ``actual`` depends on it: x_f = 0 and I = ``initial_output``.
+    It starts with x_f = c r − y, so that D = 0, and with I = 0 or, if ``initial_output`` is given, with the I that
+    makes u equal to it. With ``tracking`` the start reads no input, since ``actual`` depends on u: x_f = 0 and I =
+    ``initial_output``.
 
     Raises
     ------
     ParameterError
-        A gain without the time that it needs, limits in the wrong order, or anti-windup that can't work.
+        For a gain without the time that it needs, limits in the wrong order, and anti-windup that can't work.
 
     Examples
     --------
-    >>> PID.ideal(gain=2.0, integral_time=0.5, derivative_time=0.1, lower=-1, upper=1)
+    >>> PID.from_ideal_form(gain=2.0, integral_time=0.5, derivative_time=0.1, lower=-1, upper=1)
     PID(kp=2, ki=4, kd=0.2, filter_time=0.01, lower=-1, upper=1)
     """
 
@@ -67,20 +68,20 @@ class PID(Block):
     initial_output: float | None = parameter(default=None, description="u at the start; None: the integral is zero")
     r = Input(description="set-point")
     y = Input(description="measured value")
-    actual = Input(description="what the actuator does, in the unit of u; with tracking only")
+    actual = Input(description="true control signal, in the unit of u; with tracking only")
     u = Output(description="control signal")
-    excess = Output(secondary=True, description="what the limits cut off, v − u")
+    excess = Output(secondary=True, description="the part that the limits cut off, v − u")
     integral = State(start=lambda block: block.initial_output or 0.0, description="I")
     filtered = State(description="x_f; with filter_time")
     clamped = State(discrete=True, description="1 while the integral is held; with clamping")
     clamp = Event("rising", "v is beyond a limit and the integral drives it further; with clamping")
-    release = Event("rising", "that is over; with clamping")
+    release = Event("rising", "v is inside again by the clearance; with clamping")
     filter_decay: ClassVar[Array]  # computed by constants
     filter_gain: ClassVar[Array]
     tracking_share: ClassVar[Array]
 
     @classmethod
-    def ideal(
+    def from_ideal_form(
         cls,
         *,
         gain: float,
@@ -109,8 +110,8 @@ class PID(Block):
     def to_control(self) -> Any:
         """Return the linear part as a `control.StateSpace` from r and y to u, with the block's name.
 
-        Without limits, anti-windup and tracking (``actual`` is taken to be u), in continuous time, from rest. A
-        controller without ki has no integral in it, one without kd no filter.
+        It is in continuous time, starts at rest, and has neither limits nor anti-windup nor tracking (``actual`` counts
+        as u). Without ki it has no integral, without kd no filter.
         """
         import control
 
@@ -124,20 +125,23 @@ class PID(Block):
         return control.ss(A[np.ix_(kept, kept)], B[kept], C[:, kept], D, 0, **names)
 
     def check(self) -> None:
-        """Refuse what can't work."""
+        """Refuse parameters that can't work together."""
 
         def refuse(port: str, text: str) -> None:
             raise ParameterError(text, block=self.label, port=port)
 
         if self.kd and self.filter_time is None:
-            refuse("filter_time", "a derivative must be filtered; give filter_time, for instance kd / (10 kp) in s.")
+            text = "found none; expected a filter for the derivative. Give filter_time, such as kd / (10 kp) in s."
+            refuse("filter_time", text)
         if self.anti_windup not in _WAYS:
             refuse("anti_windup", f"found {self.anti_windup!r}; expected one of {', '.join(map(repr, _WAYS))}.")
         check_limits(self, None if self.tracking else "initial_output")
         if self.clamps and (self.lower is None or self.upper is None):
-            refuse("anti_windup", "clamping needs both limits; give lower and upper, or use 'back_calculation'.")
+            text = "found clamping without both limits; give lower and upper, or use 'back_calculation'."
+            refuse("anti_windup", text)
         if self.tracking and self.anti_windup != "back_calculation":
-            refuse("anti_windup", f"found {self.anti_windup!r}; tracking works by 'back_calculation'. Leave it out.")
+            text = f"found {self.anti_windup!r}; expected 'back_calculation' with tracking. Leave it out."
+            refuse("anti_windup", text)
         if self.tracks and self.tracking_time is None and self.ki and not self.kp / self.ki > 0:
             refuse(
                 "tracking_time", f"kp / ki is {self.kp / self.ki:g} s; expected a positive time. Give tracking_time."
@@ -160,25 +164,25 @@ class PID(Block):
 
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
-        """Set-point, measured value, and what the actuator does where it is tracked."""
+        """``r``, ``y``, and with tracking ``actual``."""
         cls = type(self)
         return {"r": cls.r, "y": cls.y, **({"actual": cls.actual} if self.tracking else {})}
 
     @property
     def states(self) -> Mapping[str, State]:  # type: ignore[override]
-        """The integral; the filter's state and the clamp where there are these."""
+        """``integral``, with a filter ``filtered``, with clamping ``clamped``."""
         cls = type(self)
         more = {"filtered": cls.filtered} if self.filter_time is not None else {}
         return {"integral": cls.integral, **more, **({"clamped": cls.clamped} if self.clamps else {})}
 
     @property
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """Those of the clamp, where there is one."""
+        """``clamp`` and ``release``, with clamping."""
         return {"clamp": type(self).clamp, "release": type(self).release} if self.clamps else {}
 
     @property
     def starts_from_inputs(self) -> bool:
-        """Whether `initial` reads the inputs."""
+        """Whether `initial` computes the states."""
         return not self.tracking and (len(self.states) > 1 or self.initial_output is not None)
 
     def initial(self, u: Any) -> tuple[float, ...] | float:
@@ -186,7 +190,7 @@ class PID(Block):
         proportional = self.kp * (self.b * u.r - u.y)
         integral = 0.0 if self.initial_output is None else self.initial_output - proportional
         start = {"integral": integral, "filtered": self.c * u.r - u.y}
-        start["clamped"] = float(self.clamps and self.outward(proportional + integral, u) > 0.0)
+        start["clamped"] = float(self.clamps and self.outward_excess(proportional + integral, u) > 0.0)
         made = tuple(float(start[name]) for name in self.states)
         return made if len(made) > 1 else made[0]
 
@@ -195,7 +199,7 @@ class PID(Block):
         return self.ki / self.kp if self.tracking_time is None else 1.0 / self.tracking_time
 
     def constants(self, T: float, method: str) -> dict[str, float]:
-        """Return what the filter and back-calculation make of one sample."""
+        """Return the numbers of the filter and of back-calculation for one sample."""
         made = {}
         if self.filter_time is not None:
             decay, gain = hold(np.array([[-1.0 / self.filter_time]]), T, method)
@@ -205,15 +209,15 @@ class PID(Block):
             made["tracking_share"] = 1.0 - float(hold(np.array([[-rate]]), T, method)[0][0, 0])
         return made
 
-    def unlimited(self, x: Any, u: Any) -> Array:
+    def unlimited_output(self, x: Any, u: Any) -> Array:
         """Return v."""
         v = self.kp * (self.b * u.r - u.y) + x.integral
         if self.filter_time is None:
             return v
         return v + self.kd * (self.c * u.r - u.y - x.filtered) / self.filter_time
 
-    def outward(self, v: Array, u: Any) -> Array:
-        """Return how far v is beyond the limit towards which the integral drives."""
+    def outward_excess(self, v: Array, u: Any) -> Array:
+        """Return the distance of v beyond the limit towards which the integral drives."""
         rate = self.ki * (u.r - u.y)
         return np.where(rate > 0.0, v - self.upper, np.where(rate < 0.0, self.lower - v, -self.span()))
 
@@ -223,15 +227,15 @@ class PID(Block):
         return self.upper - low
 
     def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return u and what was cut off."""
-        v = self.unlimited(x, u)
-        cut = limited(v, self.lower, self.upper)
+        """Return u and the part cut off."""
+        v = self.unlimited_output(x, u)
+        cut = clip(v, self.lower, self.upper)
         return cut, v - cut
 
     def correction(self, x: Any, u: Any) -> Array:
-        """Return what back-calculation goes by: the true control signal less v."""
-        v = self.unlimited(x, u)
-        return (u.actual if self.tracking else limited(v, self.lower, self.upper)) - v
+        """Return the true control signal less v, which back-calculation integrates."""
+        v = self.unlimited_output(x, u)
+        return (u.actual if self.tracking else clip(v, self.lower, self.upper)) - v
 
     def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, ...] | Array:
         """Return the rates of the integral and the filter."""
@@ -245,13 +249,13 @@ class PID(Block):
         return rate, (self.c * u.r - u.y - x.filtered) / self.filter_time
 
     def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return how far v is beyond a limit, and how far inside."""
-        beyond, held = self.outward(self.unlimited(x, u), u), x.clamped > 0.5
+        """Return the distances of v beyond a limit, and inside by more than the clearance."""
+        beyond, held = self.outward_excess(self.unlimited_output(x, u), u), x.clamped > 0.5
         span = self.span()
         return np.where(held, -span, beyond), np.where(held, -beyond - self.clearance * span, -span)
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[Array, ...]:
-        """Hold the integral, or let it go on."""
+        """Hold the integral, or release it."""
         clamped = np.where(fired.clamp > 0.5, 1.0, np.where(fired.release > 0.5, 0.0, x.clamped))
         return (*x[:-1], clamped)
 
@@ -262,7 +266,7 @@ class PID(Block):
         if self.tracks:
             step = step + self.tracking_share * self.correction(x, u)
         if self.clamps:
-            new["clamped"] = np.where(self.outward(self.unlimited(x, u), u) > 0.0, 1.0, 0.0)
+            new["clamped"] = np.where(self.outward_excess(self.unlimited_output(x, u), u) > 0.0, 1.0, 0.0)
             step = np.where(new["clamped"] > 0.5, 0.0, step)
         new["integral"] = x.integral + step
         if self.filter_time is not None:

@@ -1,7 +1,7 @@
 """Piecewise polynomials: evaluated by NumPy, or traced as a table that CasADi looks up.
 
-A table can't be expanded to scalar operations: what looks something up stays a CasADi MX function, in which the
-arithmetic on the coefficients is one call of a scalar (SX) function.
+A lookup can't be expanded to scalar operations: it stays a CasADi MX function, whose arithmetic on the coefficients is
+one call of a scalar (SX) function.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ __all__ = ["bilinear", "is_traced", "jet", "piecewise", "wrap"]
 
 
 def is_traced(value: Any) -> bool:
-    """Say whether ``value`` is a symbol of a trace and not a number."""
+    """Whether ``value`` is a symbol of a trace and not a number."""
     return isinstance(value, ArrayInterface)
 
 
 def wrap(s: Array, start: float, period: float) -> tuple[Array, Array]:
-    """Return the lap number of ``s`` and the rest in [start, start + period]."""
+    """Return the number of laps in ``s``, and the rest in [start, start + period]."""
     lap = np.floor((s - start) / period)
     return lap, s - lap * period
 
@@ -39,7 +39,7 @@ def piecewise(breaks: np.ndarray, coefficients: np.ndarray, s: Array) -> Array:
     Parameters
     ----------
     breaks : array, shape (pieces + 1,)
-        Where the pieces begin and end, rising.
+        Ends of the pieces, rising.
     coefficients : array, shape (pieces, K, degree + 1)
         Lowest power first.
     s : float, array or traced scalar
@@ -86,7 +86,7 @@ def _horner_function(functions: int, degree: int, highest: int) -> Any:
 
 @lru_cache(maxsize=64)
 def _constant(numbers: bytes) -> Any:
-    """Return numbers as a column of a trace: the same node each time, so that a function holds each table once."""
+    """Return numbers as a column of a trace, always the same node, so that a function holds each table once."""
     return ca.MX(ca.DM(np.frombuffer(numbers)))
 
 
@@ -94,7 +94,7 @@ def _traced_jet(breaks: np.ndarray, coefficients: np.ndarray, s: Any, highest: i
     symbol = s.to_casadi()
     if s.ndim or not isinstance(symbol, ca.MX):
         raise TraceError(
-            f"a table was given a traced argument of {s.ndim} dimensions and of the kind {type(symbol).__name__}; "
+            f"found a traced argument of {s.ndim} dimensions and of the kind {type(symbol).__name__} for a table; "
             "expected a scalar of the kind MX. Trace in MX, and look up one argument at a time."
         )
     pieces, functions, powers = coefficients.shape
@@ -108,7 +108,7 @@ def _traced_jet(breaks: np.ndarray, coefficients: np.ndarray, s: Any, highest: i
 
 
 def bilinear(rows: np.ndarray, columns: np.ndarray, values: np.ndarray, a: Array, b: Array) -> Array:
-    """Interpolate a table in two directions at (a, b): bilinear in each cell, the outermost cells continued.
+    """Interpolate a table at (a, b): bilinear in each cell, with the outermost cells continued.
 
     With the cell rows[i] ≤ a < rows[i + 1], columns[j] ≤ b < columns[j + 1] and α, β from 0 to 1 in it,
     f = (1 − α)(1 − β) v_ij + α (1 − β) v_(i+1)j + (1 − α) β v_i(j+1) + α β v_(i+1)(j+1). Derivatives are exact.
@@ -116,7 +116,7 @@ def bilinear(rows: np.ndarray, columns: np.ndarray, values: np.ndarray, a: Array
     Parameters
     ----------
     rows, columns : array, shapes (n,) and (m,)
-        Where the cells begin and end, rising.
+        Ends of the cells, rising.
     values : array, shape (n, m)
         The table.
     a, b : float or traced scalar
@@ -129,7 +129,7 @@ def bilinear(rows: np.ndarray, columns: np.ndarray, values: np.ndarray, a: Array
     if is_traced(a):
         sought, places = (a.to_casadi(), b.to_casadi()), [_constant(rows.tobytes()), _constant(columns.tobytes())]
         if not all(isinstance(symbol, ca.MX) for symbol in sought):
-            raise TraceError("a table was given traced arguments that are no MX. Trace in MX.")
+            raise TraceError("found traced arguments of another kind for a table; expected MX. Trace in MX.")
         i, j = (ca.low(at, symbol) if at.numel() > 2 else ca.MX(0) for at, symbol in zip(places, sought, strict=True))
         table = _constant(np.ascontiguousarray(values).tobytes())
         corners = ca.vertsplit(table[wide * i + j + ca.DM([0, 1, wide, wide + 1])])

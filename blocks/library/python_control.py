@@ -1,4 +1,4 @@
-"""Linear systems from python-control, and back. It takes over a second to import: only when it is asked for."""
+"""Linear systems from python-control, and back. Its import takes over a second, so it is imported when needed."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ..core.errors import ParameterError, SampleTimeError
 
 
 def check_system(cls: type[Block], system: Any, kind: str, *, discrete: bool) -> float | None:
-    """Refuse what is no system of this kind and time; return the sample time of a discrete one.
+    """Refuse anything but a system of this kind and time; return the sample time of a discrete one.
 
     Parameters
     ----------
     cls : type
-        Block that is to be made.
+        Class of the block to be made.
     system : object
-        What was given.
+        The object to check.
     kind : {"StateSpace", "TransferFunction"}
         Class of python-control that is expected.
     discrete : bool
@@ -28,7 +28,7 @@ def check_system(cls: type[Block], system: Any, kind: str, *, discrete: bool) ->
     Raises
     ------
     ParameterError
-        Another class, or the other kind of time.
+        For another class, and for the other kind of time.
     """
     import control
 
@@ -53,7 +53,7 @@ def check_system(cls: type[Block], system: Any, kind: str, *, discrete: bool) ->
 
 
 def names_of(system: Any) -> dict[str, tuple[str, ...]]:
-    """Return the names that were given to a system's signals, without those that python-control makes up."""
+    """Return the names that a user gave to a system's signals, without those that python-control makes up."""
     found = {"input_names": system.input_labels, "output_names": system.output_labels}
     if hasattr(system, "state_labels"):
         found["state_names"] = system.state_labels
@@ -61,7 +61,7 @@ def names_of(system: Any) -> dict[str, tuple[str, ...]]:
 
 
 def block_name(system: Any, name: str | None) -> str | None:
-    """Return the given name, else the system's where it can name a block; one that was made up, ``sys[0]``, can't."""
+    """Return the name given, else the system's if it is an identifier (a made-up one, ``sys[0]``, is none)."""
     return system.name if name is None and system.name.isidentifier() else name
 
 
@@ -71,7 +71,7 @@ def check_single(cls: type[Block], system: Any) -> None:
     Raises
     ------
     ParameterError
-        Not one of each.
+        For any other number of each.
     """
     if system.ninputs != 1 or system.noutputs != 1:
         raise ParameterError(
@@ -83,7 +83,7 @@ def check_single(cls: type[Block], system: Any) -> None:
 
 
 def labels(block: Any) -> dict[str, Any]:
-    """Return the keywords of python-control's constructors for the names that a block holds."""
+    """Return a block's names as keywords of python-control's constructors."""
     found = {
         "inputs": block.input_names,
         "outputs": block.output_names,
@@ -94,17 +94,17 @@ def labels(block: Any) -> dict[str, Any]:
 
 
 def sample_time_of(block: Any) -> float | bool:
-    """Return ``dt`` of a discrete block as python-control spells it: True where it is not given."""
+    """Return ``dt`` of a discrete block as python-control spells it: True if it is not given."""
     return True if block.dt is None else block.dt
 
 
 def check_names(block: Any, **numbers: int) -> None:
-    """Refuse names of signals that are not as many as the signals.
+    """Refuse a number of names that is not that of the signals.
 
     Raises
     ------
     ParameterError
-        Another number of names.
+        For another number of names.
     """
     for parameter, n in numbers.items():
         names = getattr(block, parameter)
@@ -116,15 +116,15 @@ def check_names(block: Any, **numbers: int) -> None:
             )
 
 
-class SampleTimeOfFrame:
-    """For blocks with a parameter ``dt``: it must be the sample time of the frame that the block stands in."""
+class FixedSampleTime:
+    """Part of blocks with a parameter ``dt``, which must be the sample time of the block's subsystem."""
 
     dt: Any
     label: Any
 
     def constants(self, T: float, method: str) -> dict[str, Any]:
-        """Compare the sample times where numbers are made for one."""
-        if T != 1.0:  # tracing asks with 1 s, whatever the frame's is
+        """Compare the sample times when numbers are computed for one."""
+        if T != 1.0:  # tracing passes 1 s, whatever the subsystem's sample time is
             self.check_rate(T)
         return {}
 
@@ -134,22 +134,23 @@ class SampleTimeOfFrame:
             raise SampleTimeError(self._message(T), block=self.label, port="dt")
 
     def mismatch(self, T: float) -> bool:
-        """Whether ``T`` is another sample time; both may carry a rounding error."""
+        """Whether ``T`` is another sample time than ``dt``, beyond rounding."""
         return self.dt is not None and not np.isclose(self.dt, T, rtol=1e-9, atol=0.0)
 
     def guards(self, t: Any, x: Any, u: Any, T: Any) -> dict[str, Any]:
-        """Compare them in the run as well, should the sample time have changed since."""
+        """Compare the sample times in the run as well, since they may have changed."""
         return {} if self.dt is None else {"sample_time": 1e-9 - np.abs(T / self.dt - 1.0)}
 
     def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> Any:
-        """Say that the sample times differ."""
+        """Return the error of sample times that differ."""
         from ..core.errors import GuardError
 
         return GuardError(self._message(None), block=self.label, port="dt")
 
     def _message(self, T: float | None) -> str:
-        stands = "another one" if T is None else f"one of {T:.9g} s"
+        found = "another sample time" if T is None else f"a sample time of {T:.9g} s"
         return (
-            f"it holds for a sample time of {self.dt:.9g} s, and its frame has {stands}. Sample the continuous system "
-            "with the frame's, set the frame's sample_time, or give dt=None if it is meant for any."
+            f"found {found} in the subsystem; expected {self.dt:.9g} s, for which the block is made. "
+            "Sample the continuous system with the subsystem's, set the subsystem's sample_time, or give dt=None if "
+            "the block is meant for any."
         )

@@ -1,4 +1,4 @@
-"""What a run must keep to, and when it ends: requirements and stop conditions."""
+"""Requirements on a run, and conditions that end it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from ..core.block import Block
 from ..core.errors import GuardError, ParameterError, near
 from ..core.ports import Event, Input, Output, State
 from ..core.values import Array, parameter
-from .branching import single, truth
+from .branching import expect_scalar, truth
 
 
 class StopCondition(Block):
-    """Stop condition: the run ends, normally, at the first instant at which u is true (above 0.5).
+    """Stop condition: the run ends, without an error, at the first instant at which u is true (above 0.5).
 
-    In a continuous frame that instant is found as an event, in a sampled one it is the tick. What varies continuously
-    goes through `Compare` first.
+    In a continuous subsystem that instant is an event, in a sampled one a tick. Send a continuous signal through
+    `Compare` first.
     """
 
     stops = "stopped"
@@ -28,62 +28,62 @@ class StopCondition(Block):
     reach = Event("rising", "the condition becomes true")
 
     def initial(self, u: Any) -> Array:
-        """Return whether it is true at the start."""
+        """Return 1 if the condition is true at the start, else 0."""
         return truth(np.asarray(u.u))
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> Array:
-        """Return whether the run ends."""
+        """Return 1 if the run ends, else 0."""
         return x.met if T is None else truth(u.u)
 
     def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Keep whether it was true."""
+        """Keep the condition."""
         return truth(u.u)
 
     def indicators(self, t: Array, x: Any, u: Any) -> Array:
-        """Return how far u is above 0.5."""
+        """Return the distance of u above 0.5."""
         return u.u - 0.5
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> Array:
-        """Return whether it was true."""
+        """Return 1 if the condition has been true, else 0."""
         return np.where(fired.reach > 0.5, 1.0, x.met)
 
 
 class Requirement(Block):
-    """Requirement on a signal, checked while the diagram runs, with the time at which it broke.
+    """Requirement on a signal, checked while the diagram runs, with the time of its first violation.
 
     ::
 
         Requirement("the contact force stays below 50 N", upper=50.0)(force)
         Requirement("the robot is at rest when it is released", on_violation="record")(holds)
 
-    With ``lower`` or ``upper`` every entry of u must stay within these bounds, which may be reached. Without both, u is
-    a logic signal that must stay true (above 0.5).
+    With ``lower`` or ``upper`` every entry of u must stay within these bounds, which it may reach. Without both, u is a
+    logic signal that must stay true (above 0.5).
 
-    With ``on_violation="error"`` the run stops when it is violated, with an error that names the requirement, the
-    block, the time and the value. With ``"record"`` it goes on: ``violated`` is 1 from the first violation on, and
-    ``violated_at`` is its time. In a continuous frame that time is found as an event.
+    With ``on_violation="error"`` a violation stops the run, with an error that names the requirement, the block, the
+    time and the value. With ``"record"`` the run continues: ``violated`` is 1 from the first violation on, and
+    ``violated_at`` is its time. In a continuous subsystem that time is found as an event.
 
     Raises
     ------
     GuardError
         In a run, when the requirement is violated.
     ParameterError
-        An empty text, another kind of violation, or bounds that cross.
+        For an empty text, another ``on_violation``, and bounds that cross.
     ShapeError
-        A vector in a continuous frame, when the diagram is built.
+        For a vector in a continuous subsystem, when the diagram is built.
     """
 
     requirement: str = parameter(kw_only=False, description="the requirement in words")
     lower: float | None = parameter(default=None, description="smallest value allowed")
     upper: float | None = parameter(default=None, description="largest value allowed")
     on_violation: str = parameter(default="error", description="'error' stops the run, 'record' lets it go on")
-    u = Input(shape=None, description="what is watched: a quantity, or a logic signal that must stay true")
+    u = Input(shape=None, description="a quantity, or a logic signal that must stay true")
     violated = Output(description="1 from the first violation on, 0 before")
     violated_at = Output(unit="s", description="time of the first violation, −1 before")
     broken = State(discrete=True, description="1 from the first violation on")
     when = State(unit="s", start=-1.0, discrete=True, description="time of the first violation, −1 before")
-    below = Event("rising", "the signal falls below what is required")
-    above = Event("rising", "the signal rises above what is required")
+    below = Event("rising", "the signal falls below its lower bound")
+    above = Event("rising", "the signal rises above its upper bound")
 
     def check(self) -> None:
         """Refuse an empty text, an unknown reaction, and bounds that cross."""
@@ -100,30 +100,30 @@ class Requirement(Block):
 
     @property
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """One for each side that is limited; a logic signal can only fall."""
+        """One event for each bound; a logic signal can only fall."""
         low = {"below": type(self).below} if self.lower is not None or self.upper is None else {}
         return low | ({"above": type(self).above} if self.upper is not None else {})
 
     def margins(self, u: Array) -> tuple[Array, ...]:
-        """Return how far u is below and above what is allowed; negative within, one for each event."""
+        """Return the distances of u below and above its bounds, one for each event; negative within."""
         if self.lower is None and self.upper is None:
             return (0.5 - u,)
         low = () if self.lower is None else (self.lower - u,)
         return low if self.upper is None else (*low, u - self.upper)
 
     def excess(self, u: Array) -> Array:
-        """Return the sum of all violations, zero if there are none; NaN passes through."""
+        """Return the sum of all violations, zero if there is none; NaN passes through."""
         if self.lower is None and self.upper is None:
             return np.sum(1.0 - truth(u))
         return sum(np.sum(np.where(m > 0.0, m, np.where(m <= 0.0, 0.0, m))) for m in self.margins(u))
 
     def initial(self, u: Any) -> tuple[Array, Array]:
-        """Return whether it is violated at the start."""
+        """Return 1 if it is violated at the start, else 0, and the time 0 or −1."""
         broken = float(self.excess(np.asarray(u.u)) > 0.0)
         return np.asarray(broken), np.asarray(broken - 1.0)
 
     def output(self, t: Array, x: Any, u: Any, T: Array = None) -> tuple[Array, Array]:
-        """Return whether and when it was violated."""
+        """Return 1 if it has been violated, else 0, and the time."""
         if T is None:
             return x.broken, x.when
         now = self.excess(u.u)
@@ -135,8 +135,8 @@ class Requirement(Block):
         return self.output(t, x, u, T)
 
     def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, ...] | Array:
-        """Return how far u is below and above what is allowed."""
-        values = self.margins(single(u.u, "u"))
+        """Return the distances of u below and above its bounds."""
+        values = self.margins(expect_scalar(u.u, "u"))
         return values if len(values) > 1 else values[0]
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[Array, Array]:
@@ -145,7 +145,7 @@ class Requirement(Block):
         return np.where(now, 1.0, x.broken), np.where(x.broken > 0.5, x.when, np.where(now, t, x.when))
 
     def guards(self, t: Array, x: Any, u: Any) -> dict[str, Array]:
-        """Return what must stay positive where a violation is an error."""
+        """Return the guard, if a violation is an error."""
         if self.on_violation == "record":
             return {}
         excess = self.excess(u.u)

@@ -1,4 +1,4 @@
-"""Blocks that live in sampled subsystems."""
+"""Blocks of sampled subsystems: unit delay, hold, encoder, force sensor."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from ..core.values import Array, parameter
 class UnitDelay(Block):
     """Delay by one sample: y[k] = u[k − 1].
 
-    The first output is ``initial_value``; without one it is the first input itself, so that u[0] acts in both of the
-    first two ticks.
+    The first output is ``initial_value``; without it, the first input, so that u[0] acts in both of the first two
+    ticks.
 
     Raises
     ------
     ShapeError
-        An ``initial_value`` of another shape than the input's, when the diagram is built; a number fits any.
+        For an ``initial_value`` of another shape than the input's, when the diagram is built; a number fits any.
     """
 
     initial_value: Array | None = parameter(default=None, description="first output; None takes the first input")
-    u = Input(shape=None, description="what is delayed, of any shape")
+    u = Input(shape=None, description="signal to delay, of any shape")
     y = Output(like="u", description="the input one tick ago")
     last = State(start="initial_value", like="u", description="the last input")
 
     @property
     def starts_from_inputs(self) -> bool:
-        """Whether `initial` reads the inputs."""
+        """Whether `initial` computes the state."""
         return self.initial_value is None
 
     def initial(self, u: Any) -> Array:
@@ -47,17 +47,17 @@ class UnitDelay(Block):
 
 
 class Hold(Block):
-    """Zero-order hold: y = u at the ticks of its frame, held between them.
+    """Zero-order hold: y = u at the ticks of its subsystem, held in between.
 
-    It brings a signal into the rate of the subsystem that it stands in, and says so in the drawing.
+    It brings a signal to the rate of its subsystem, and shows that in the drawing.
 
     Raises
     ------
     SampleTimeError
-        In a continuous frame, when the diagram is built.
+        In a continuous subsystem, when the diagram is built.
     """
 
-    u = Input(shape=None, description="what is sampled, of any shape")
+    u = Input(shape=None, description="signal to sample, of any shape")
     y = Output(like="u", description="the input at the last tick")
 
     def output(self, t: Array, x: Any, u: Any, T: Array) -> Array:
@@ -68,13 +68,14 @@ class Hold(Block):
 class Encoder(Block):
     """Position encoder: quantized positions, velocities by differences.
 
-    p = Δ ⌊position / Δ + ½⌋, v = (p[k] − p[k − 1]) / T; at the first tick v is the true velocity. Its derivative is
-    zero almost everywhere: it linearizes to zero. Part of the rig (docs/experiments.md), not of the paper.
+    p = Δ ⌊position / Δ + ½⌋, v = (p[k] − p[k − 1]) / T; at the first tick v is the true velocity. The derivative is
+    zero almost everywhere, so it linearizes to zero. The block is part of the rig (docs/experiments.md), not of the
+    paper.
 
     Raises
     ------
     SampleTimeError
-        In a continuous frame, when the diagram is built.
+        In a continuous subsystem, when the diagram is built.
     """
 
     quantum: float = parameter(unit="m", above=0.0, description="smallest step of the position, Δ")
@@ -96,7 +97,7 @@ class Encoder(Block):
 
 
 class ForceSensor(Block):
-    """Force sensor between the robot and its tool: the tool's inertia acts on it (E25).
+    """Force sensor between the robot and its tool, which also measures the tool's inertia (E25).
 
     F = force + contact force − m_tool · acceleration; the gravity part is tared. At t = 0 the acceleration counts as
     zero, since no force has acted yet.
@@ -106,7 +107,7 @@ class ForceSensor(Block):
     force = Input(shape=(2,), unit="N", description="external force on the robot")
     acceleration = Input(shape=(2,), unit="m/s2", description="acceleration at the end of the last step")
     contact_force = Input(shape=(2,), unit="N", default=(0.0, 0.0), description="force of a contact inside the plant")
-    measured = Output(shape=(2,), unit="N", description="F, what the sensor shows")
+    measured = Output(shape=(2,), unit="N", description="measured force F")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the measured force."""

@@ -1,7 +1,7 @@
-"""Sources that are given by a few numbers. Times in s; a change at ``t0`` acts from the first instant t ≥ t0 on.
+"""Sources: constants, references, steps, pulses, sines.
 
-Times may be off by their rounding: an instant that is less than 2e-15 t before a change counts as the change itself, so
-that a step at ``3 * 0.1`` acts at the tick at 0.3 s.
+Times are in s; a change at ``t0`` acts from the first instant t ≥ t0 on. Rounding of times is allowed for: an instant
+less than 2e-15 t before a change counts as the change itself, so that a step at ``3 * 0.1`` acts at the tick at 0.3 s.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import ParameterError
-from ..core.instants import earliest
+from ..core.instants import move_earlier
 from ..core.ports import Output
 from ..core.source import Source
 from ..core.values import Array, parameter
@@ -36,9 +36,9 @@ def smooth_step(
 
 
 class Reference(Source):
-    """A constant reference that comes with its time derivatives: y = (value, rate, acceleration)."""
+    """Constant reference with its time derivatives: y = (value, 0, 0)."""
 
-    value: float = parameter(kw_only=False, description="the value held")
+    value: float = parameter(kw_only=False, description="the value")
     y = Output(shape=(3,), description="value and its first two time derivatives, which are zero")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
@@ -47,15 +47,15 @@ class Reference(Source):
 
 
 class SmoothStep(Source):
-    """A reference made of 7th-order smooth steps, with its first two time derivatives.
+    """Reference of 7th-order smooth steps, with its first two time derivatives: y = (r, ṙ, r̈).
 
-    y = (r, ṙ, r̈), r running through ``levels``: from ``levels[i]`` to ``levels[i + 1]`` from ``start_times[i]`` on,
-    within ``durations[i]`` seconds.
+    r steps through ``levels``: from ``levels[i]`` to ``levels[i + 1]``, beginning at ``start_times[i]``, within
+    ``durations[i]`` seconds.
     """
 
-    levels: Array = parameter(description="values between the steps, one more than there are steps")
-    start_times: Array = parameter(unit="s", description="when each step starts, rising")
-    durations: Array = parameter(unit="s", above=0.0, description="how long each step takes")
+    levels: Array = parameter(description="values between the steps, one more than steps")
+    start_times: Array = parameter(unit="s", description="time at which each step starts, rising")
+    durations: Array = parameter(unit="s", above=0.0, description="duration of each step")
     y = Output(shape=(3,), description="value, rate, acceleration")
 
     def check(self) -> None:
@@ -71,13 +71,14 @@ class SmoothStep(Source):
             )
         if np.any(starts[1:] < (starts + durations)[:-1]):
             raise ParameterError(
-                "a step starts before the one before it has ended; move start_times apart.",
+                "found a step that starts before the one before it ends; expected each to end first. Move start_times "
+                "apart.",
                 block=self.label,
                 port="start_times",
             )
 
     def instants(self) -> Array:
-        """Return where each step starts and ends."""
+        """Return the times at which each step starts and ends."""
         starts = np.atleast_1d(self.start_times)
         return np.concatenate([starts, starts + self.durations])
 
@@ -93,12 +94,12 @@ class SmoothStep(Source):
 
 
 class Step(Source):
-    """Steps: y is ``initial_value``, and ``values[i]`` from ``times[i]`` on.
+    """Steps: y is ``initial_value``, then ``values[i]`` from ``times[i]`` on.
 
-    The times may be off by their rounding: a step at ``3 * 0.1`` acts at the tick at 0.3 s.
+    Rounding of the times is allowed for: a step at ``3 * 0.1`` acts at the tick at 0.3 s.
     """
 
-    times: Array = parameter(unit="s", description="when it steps, rising; a number or several")
+    times: Array = parameter(unit="s", description="times of the steps, rising; a number or several")
     values: Array = parameter(description="the value from then on, one for each time")
     initial_value: float = parameter(default=0.0, description="value before the first step")
     y = Output()
@@ -114,31 +115,31 @@ class Step(Source):
             )
 
     def instants(self) -> Array:
-        """Return when it steps."""
+        """Return the times of the steps."""
         return np.atleast_1d(self.times)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the value at t."""
         y = self.initial_value + 0.0 * t
         for time, value in zip(np.atleast_1d(self.times), np.atleast_1d(self.values), strict=True):
-            y = np.where(t >= earliest(time), value, y)
+            y = np.where(t >= move_earlier(time), value, y)
         return y
 
 
 class Pulse(Source):
-    """A smooth pulse: up at the start, down towards the end, each a 7th-order step over ``rise_time``.
+    """Smooth pulse: up at the start and down at the end, each a 7th-order step over ``rise_time``.
 
     y = A [smooth(t; t₀, r) − smooth(t; t₁ − r, r)].
     """
 
-    start_time: float = parameter(unit="s", description="when it begins to rise")
-    end_time: float = parameter(unit="s", description="when it is over")
+    start_time: float = parameter(unit="s", description="time at which the rise begins")
+    end_time: float = parameter(unit="s", description="time at which the fall ends")
     amplitude: float = parameter(description="height")
-    rise_time: float = parameter(default=0.2, unit="s", above=0.0, description="how long each flank takes")
+    rise_time: float = parameter(default=0.2, unit="s", above=0.0, description="duration of each flank")
     y = Output()
 
     def check(self) -> None:
-        """Refuse a pulse that is shorter than its two flanks."""
+        """Refuse a pulse shorter than its two flanks."""
         super().check()
         if self.end_time - self.start_time < 2 * self.rise_time * (1 - 1e-12):
             raise ParameterError(
@@ -149,7 +150,7 @@ class Pulse(Source):
             )
 
     def instants(self) -> Array:
-        """Return where its flanks start and end."""
+        """Return the times at which the flanks start and end."""
         first, last, rise = self.start_time, self.end_time, self.rise_time
         return np.array([first, first + rise, last - rise, last])
 

@@ -1,4 +1,4 @@
-"""Linear systems given by zeros, poles and gain: realized as a cascade of real sections of at most second order."""
+"""Linear systems of zeros, poles and gain, as a cascade of real sections of at most second order."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..core.ports import Input, Output, State
 from ..core.values import Array, parameter
 from .linear import Names, section
 from .python_control import (
-    SampleTimeOfFrame,
+    FixedSampleTime,
     block_name,
     check_names,
     check_single,
@@ -27,16 +27,16 @@ Numbers = tuple[complex, ...]
 
 
 class UnpairedRootError(ValueError):
-    """A complex root whose conjugate is missing."""
+    """A complex root without its conjugate."""
 
 
 def real_factors(roots: Sequence[complex]) -> list[list[complex]]:
-    """Return roots in groups of real polynomials: conjugate pairs, and real roots one by one.
+    """Return roots in groups that make real polynomials: conjugate pairs, and single real roots.
 
     Raises
     ------
     UnpairedRootError
-        A complex root whose conjugate is missing.
+        For a complex root without its conjugate.
     """
     rest = sorted((complex(r) for r in roots), key=lambda r: (r.real, abs(r.imag), r.imag))
     groups: list[list[complex]] = []
@@ -56,10 +56,10 @@ def real_factors(roots: Sequence[complex]) -> list[list[complex]]:
 
 
 def sections(zeros: Sequence[complex], poles: Sequence[complex]) -> list[tuple[list[complex], list[complex]]]:
-    """Return zeros and poles in pairs for sections, each of as many zeros as poles at most.
+    """Return zeros and poles of sections, each with at most as many zeros as poles.
 
     Real poles are joined in the order of their size, so that at most one section is of first order. Each pair of
-    complex zeros, then each real one, goes to the section with the nearest pole that has room.
+    complex zeros, then each real zero, goes to the section with room that has the nearest pole.
     """
     groups = real_factors(poles)
     reals = sorted((g[0] for g in groups if len(g) == 1), key=abs)
@@ -77,8 +77,8 @@ def _polynomial(roots: Sequence[complex]) -> np.ndarray:
     return np.atleast_1d(np.real(np.poly(np.array(roots, dtype=complex))))
 
 
-def _unfit(roots: Any) -> str | None:
-    """Return what is wrong with roots, None if they are those of a real polynomial."""
+def _find_fault(roots: Any) -> str | None:
+    """Return the fault of roots in words, None if they are those of a real polynomial."""
     try:
         if not np.all(np.isfinite([complex(r) for r in roots])):
             return ""
@@ -91,7 +91,7 @@ def _unfit(roots: Any) -> str | None:
 
 
 class _ZeroPoleGain(Block):
-    """What both kinds of time share."""
+    """Common part of zero-pole-gain blocks in continuous and in discrete time."""
 
     zeros: Numbers = parameter(default=(), structural=True, description="zeros; complex ones in conjugate pairs")
     poles: Numbers = parameter(structural=True, description="poles, at least one; complex ones in conjugate pairs")
@@ -103,10 +103,10 @@ class _ZeroPoleGain(Block):
     x = State(start=lambda block: np.zeros(len(block.poles)), description="states of the sections, one after another")
 
     def check(self) -> None:
-        """Refuse zeros and poles that are no real, proper transfer function."""
+        """Refuse zeros and poles that don't make a real, proper transfer function."""
         for name in ("zeros", "poles"):
             found = getattr(self, name)
-            why = _unfit(found)
+            why = _find_fault(found)
             if why is not None:
                 raise ParameterError(
                     f"found {found!r}{why}; expected a list of finite numbers, complex ones in conjugate pairs, such "
@@ -132,18 +132,18 @@ class _ZeroPoleGain(Block):
         return made
 
     def cascade(self, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return the output and what the sections make of their states."""
+        """Return the output, and the rates or next states of all sections."""
         signal, parts, position, gain = u.u, [], 0, 1.0
         for b, a in self.factors():
             state = x.x[position : position + len(a) - 1]
-            signal, part, factor = self.one(b, a, state, signal)
+            signal, part, factor = self.advance_section(b, a, state, signal)
             parts.append(part)
             position += len(a) - 1
             gain *= factor
         return self.gain * gain * signal, np.concatenate(parts)
 
-    def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
-        """Return output and advance of one section, and the factor that its output is short of."""
+    def advance_section(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
+        """Return output and rate or next state of one section, and the factor by which its output is too small."""
         raise NotImplementedError
 
     @classmethod
@@ -170,15 +170,15 @@ class _ZeroPoleGain(Block):
 class ZeroPoleGain(_ZeroPoleGain):
     """Zeros, poles and gain: Y(s) = k (s − z₁) … (s − z_m) / ((s − p₁) … (s − p_n)) U(s), m ≤ n; it starts at rest.
 
-    Realized as a cascade of real sections of second order, each in its own scaled frequency, zeros beside the nearest
-    poles, and its numerator scaled to coefficients of at most 1; what that leaves is put into the gain. So the poles
-    are kept to rounding, however close or far apart. Zeros and poles are fixed in the trace; the gain
-    is a parameter.
+    The realization is a cascade of real sections of second order, each in its own scaled frequency. Zeros are in the
+    section of the nearest poles; numerators are scaled to coefficients of at most 1, and the gain takes the factors. So
+    the poles are exact to rounding, however close or far apart. Zeros and poles are fixed in the trace; the gain is a
+    parameter.
 
     Raises
     ------
     ParameterError
-        Complex zeros or poles without their conjugates, or more zeros than poles.
+        For complex zeros or poles without their conjugates, and for more zeros than poles.
 
     Examples
     --------
@@ -186,7 +186,7 @@ class ZeroPoleGain(_ZeroPoleGain):
     ZeroPoleGain(poles=((-1+5j), (-1-5j)), gain=26)
     """
 
-    def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
+    def advance_section(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
         """Return output and ẋ of a section in controllable canonical form in s / ω."""
         n = len(a) - 1
         w = abs(a[2]) ** 0.5 if n == 2 and a[2] else abs(a[1]) or 1.0
@@ -209,40 +209,40 @@ class ZeroPoleGain(_ZeroPoleGain):
     def from_control(cls, system: Any, *, name: str | None = None) -> Self:
         """Return the block of a `control.TransferFunction` in continuous time, of one input and one output.
 
-        python-control keeps polynomials: zeros and poles are their roots, so several at one place come apart. It takes
-        over the names of the signals, and the system's own where that is an identifier and none is given.
+        python-control keeps polynomials: zeros and poles are their roots, so multiple ones come apart. The block has
+        the names of the system's signals. Without ``name`` its name is the system's, if that is an identifier.
 
         Raises
         ------
         ParameterError
-            No transfer function, or one in discrete time, one of several inputs or outputs, or without poles.
+            For anything but a transfer function in continuous time, of one input and one output, with poles.
         """
         return cls._from_control(system, discrete=False, name=name)
 
     def to_control(self) -> Any:
-        """Return the `control.TransferFunction`, with the names of its signals: its polynomials, multiplied out."""
+        """Return the `control.TransferFunction`, its polynomials multiplied out, with the names of its signals."""
         return self._to_control(0)
 
 
-class DiscreteZeroPoleGain(SampleTimeOfFrame, _ZeroPoleGain):
+class DiscreteZeroPoleGain(FixedSampleTime, _ZeroPoleGain):
     """Zeros, poles and gain: Y(z) = k (z − z₁) … (z − z_m) / ((z − p₁) … (z − p_n)) U(z), m ≤ n; it starts at rest.
 
-    Realized as a cascade of real sections of second order in the transposed direct form II, zeros beside the nearest
-    poles. Zeros and poles are fixed in the trace; the gain is a parameter.
+    The realization is a cascade of real sections of second order in the transposed direct form II, with zeros in the
+    section of the nearest poles. Zeros and poles are fixed in the trace; the gain is a parameter.
 
     Raises
     ------
     ParameterError
-        Complex zeros or poles without their conjugates, or more zeros than poles.
+        For complex zeros or poles without their conjugates, and for more zeros than poles.
     SampleTimeError
-        In a continuous frame, or in one whose sample time is not ``dt``, when the diagram is built.
+        In a continuous subsystem, or with a sample time other than ``dt``, when the diagram is built.
     """
 
     dt: float | None = parameter(
-        default=None, unit="s", above=0.0, structural=True, description="sample time that it holds for; None: any"
+        default=None, unit="s", above=0.0, structural=True, description="sample time that it is made for; None: any"
     )
 
-    def one(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
+    def advance_section(self, b: np.ndarray, a: np.ndarray, x: Array, u: Array) -> tuple[Array, Array, float]:
         """Return output and next state of a section."""
         return (*section(b, a, x, u), 1.0)
 
@@ -258,16 +258,16 @@ class DiscreteZeroPoleGain(SampleTimeOfFrame, _ZeroPoleGain):
     def from_control(cls, system: Any, *, name: str | None = None) -> Self:
         """Return the block of a `control.TransferFunction` in discrete time, of one input and one output.
 
-        python-control keeps polynomials: zeros and poles are their roots, so several at one place come apart. It takes
-        over the names of the signals, and the system's own where that is an identifier and none is given.
+        python-control keeps polynomials: zeros and poles are their roots, so multiple ones come apart. The block has
+        the names of the system's signals. Without ``name`` its name is the system's, if that is an identifier.
 
         Raises
         ------
         ParameterError
-            No transfer function, or one in continuous time, one of several inputs or outputs, or without poles.
+            For anything but a transfer function in discrete time, of one input and one output, with poles.
         """
         return cls._from_control(system, discrete=True, name=name)
 
     def to_control(self) -> Any:
-        """Return the `control.TransferFunction`, with the names of its signals: its polynomials, multiplied out."""
+        """Return the `control.TransferFunction`, its polynomials multiplied out, with the names of its signals."""
         return self._to_control(sample_time_of(self))

@@ -1,4 +1,4 @@
-"""Compliance: the error dynamics of section III-B and the admittance of section IV."""
+"""Compliance: the error dynamics of section III-B, and the admittance of section IV."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from ..tracing.discretization import hold
 class ErrorDynamics(Block):
     """PID error dynamics (12): v = r̈ − a₂ ė − a₁ e − a₀ ∫e dt, e = y − r.
 
-    Behind `FeedbackLinearization` it makes e⁽³⁾ + a₂ ë + a₁ ė + a₀ e = 0 (E5). Inputs are the coordinate (y, ẏ) and
-    the path reference (r, ṙ, r̈). Anti-windup: while ``excess``, the part of the motor force that a saturation cut
-    off, is not zero, the integral holds.
+    Behind `FeedbackLinearization` it makes e⁽³⁾ + a₂ ë + a₁ ė + a₀ e = 0 (E5). Inputs are the coordinate (y, ẏ) and the
+    path reference (r, ṙ, r̈). Anti-windup: the integral holds while ``excess``, the part of the motor force that a
+    saturation cut off, is not zero.
     """
 
     a2: float = parameter(unit="1/s", description="gain of the rate error")
@@ -27,7 +27,7 @@ class ErrorDynamics(Block):
     a0: float = parameter(unit="1/s3", description="gain of the integral")
     coordinate = Input(shape=(2,), unit=("m", "m/s"), description="η or ξ: value and rate")
     reference = Input(shape=(3,), unit=("m", "m/s", "m/s2"), description="path reference: value, rate, acceleration")
-    excess = Input(shape=None, default=0.0, description="what a saturation cut off, any shape; zero: none acts")
+    excess = Input(shape=None, default=0.0, description="part that a saturation cut off, of any shape")
     v = Output(unit="m/s2", description="virtual input v∥ or v⊥")
     integral = State(unit="m.s", description="∫e dt")
 
@@ -45,7 +45,7 @@ class ErrorDynamics(Block):
         Raises
         ------
         ParameterError
-            If there are not three, they don't come in conjugate pairs, or one is not in the left half plane.
+            Unless there are three, in the left half plane, complex ones in conjugate pairs.
         """
         try:
             p = np.asarray(poles, dtype=complex)
@@ -58,9 +58,8 @@ class ErrorDynamics(Block):
             or np.max(np.abs(np.imag(coefficients))) > 1e-9 * np.abs(p).max() ** 3
         ):
             raise ParameterError(
-                f"found {poles!r}; expected three poles in the left half plane, complex ones in conjugate pairs, "
-                f"such as "
-                "[-20, -20, -20].",
+                f"found {poles!r}; expected three poles in the left half plane, complex ones in conjugate pairs. Give "
+                "three, such as [-20, -20, -20].",
                 block=name or cls.__name__,
                 port="poles",
             )
@@ -83,23 +82,24 @@ class ErrorDynamics(Block):
 
 
 class AdmittanceFilter(Block):
-    """Admittance control law (15): the path reference that yields to a force like m ë + d ė + k e = F − F^d, (14).
+    """Admittance control law (15): the path reference yields to a force like m ë + d ė + k e = F − F^d, (14).
 
     e = r^p − r^d is the deviation of the path reference from the given reference; d = 2 ζ √(m k) (E7). Force tracking
-    (section IV-B) is the case k = 0 with a desired force; the damping must then be given (E8). ``offset`` is a
-    set-point without derivatives, measured from the reference: it adds k·offset to the force (E27).
+    (section IV-B) is the case k = 0 with a desired force; then the damping must be given (E8). ``offset`` is a
+    set-point without derivatives, measured from the reference; it adds k·offset to the force (E27).
 
     ``velocity_limit`` and ``acceleration_limit`` bound the path reference by conditional integration (end of section
-    IV-A): in a tick in which one would be exceeded its acceleration a is cut to the admissible value and held over the
-    tick, and r^p and ṙ^p advance by v T + a T²/2 and a T. Whether it would be is foreseen with ṙ^d + r̈^d T for the rate
-    of the reference at the next tick; what a reference with a jerk is off that (by T² times it) is cut from ṙ^p then.
-    In a continuous frame a is cut all the time; the speed limit is an event, and so is the acceleration's turn inward
-    that releases ṙ^p again. With a speed limit r^p is what is integrated there: where the reference jumps, it does not.
+    IV-A). In a tick in which one would be exceeded, the acceleration a of r^p is cut to the admissible value and held
+    over the tick; r^p and ṙ^p advance by v T + a T²/2 and a T. The prediction takes ṙ^d + r̈^d T for the rate of the
+    reference at the next tick; a reference with a jerk differs from it (by T² times the jerk), and the difference is
+    cut from ṙ^p at the next tick. In a continuous subsystem a is cut all the time. The speed limit is an event, and so
+    is the acceleration's turn inward, which releases ṙ^p. With a speed limit the state is r^p itself, so it does not
+    jump where the reference does.
     """
 
     mass: float = parameter(unit="kg", above=0.0, description="rendered mass m")
     stiffness: float = parameter(unit="N/m", minimum=0.0, description="rendered stiffness k")
-    damping_ratio: float | None = parameter(default=None, minimum=0.0, description="ζ; or give the damping itself")
+    damping_ratio: float | None = parameter(default=None, minimum=0.0, description="ζ; or give damping")
     damping: float | None = parameter(default=None, unit="N.s/m", minimum=0.0, description="rendered damping d")
     velocity_limit: float | None = parameter(default=None, unit="m/s", above=0.0, description="largest speed of r^p")
     acceleration_limit: float | None = parameter(default=None, unit="m/s2", above=0.0, description="largest |r̈^p|")
@@ -113,8 +113,8 @@ class AdmittanceFilter(Block):
     error = State(unit="m", description="e")
     error_rate = State(unit="m/s", description="ė")
     limited = State(
-        description="1 after a tick in which a limit acted: then the states hold r^p and ṙ^p, not e and ė; in a "
-        "continuous frame 1 where there is a speed limit, 2 while ṙ^p is held there",
+        description="1 after a tick in which a limit acted: the states are then r^p and ṙ^p, not e and ė; in a "
+        "continuous subsystem 1 with a speed limit, 2 while ṙ^p is held at it",
     )
     reached = Event("rising", "the speed limit is reached; with velocity_limit")
     released = Event("rising", "the acceleration turns inward; with velocity_limit")
@@ -126,7 +126,7 @@ class AdmittanceFilter(Block):
 
     @property
     def states(self) -> Mapping[str, State]:  # type: ignore[override]
-        """E and ė, and where there are limits whether one acted."""
+        """``error``, ``error_rate``, and with limits ``limited``."""
         cls = type(self)
         free = {"error": cls.error, "error_rate": cls.error_rate}
         if not self.has_limits:
@@ -136,7 +136,7 @@ class AdmittanceFilter(Block):
 
     @property
     def events(self) -> Mapping[str, Event]:  # type: ignore[override]
-        """What happens at the speed limit, if there is one."""
+        """``reached`` and ``released``, with a speed limit."""
         cls = type(self)
         return {} if self.velocity_limit is None else {"reached": cls.reached, "released": cls.released}
 
@@ -146,19 +146,19 @@ class AdmittanceFilter(Block):
         return self.velocity_limit is not None
 
     def initial(self, u: Any) -> tuple[Any, ...]:
-        """Return r^p and an admissible ṙ^p."""
+        """Return r^p, an admissible ṙ^p, and 1."""
         top: Any = self.velocity_limit
         return u.reference[0], _clip(u.reference[1], -top, top), 1.0
 
     def check(self) -> None:
-        """Refuse a damping that is given twice or not at all."""
+        """Refuse a damping that is given twice, or not at all."""
         if (self.damping is None) == (self.damping_ratio is None):
-            raise ParameterError("give either damping_ratio or damping.", block=self.label, port="damping")
+            found = "neither damping_ratio nor damping" if self.damping is None else "damping_ratio and damping"
+            raise ParameterError(f"found {found}; expected one of them. Give one.", block=self.label, port="damping")
         if self.stiffness == 0 and self.damping is None:
             raise ParameterError(
-                f"found stiffness=0 with damping_ratio={self.damping_ratio:g}; 2 ζ √(m k) would be no damping at all. "
-                f"Give "
-                "damping=… in N.s/m, for instance the value that it had before.",
+                f"found stiffness=0 with damping_ratio={self.damping_ratio:g}; 2 ζ √(m k) would be zero. Give "
+                "damping=… in N.s/m, such as the value with the former stiffness.",
                 block=self.label,
                 port="damping",
             )
@@ -177,7 +177,7 @@ class AdmittanceFilter(Block):
         return {"transition": transition, "forcing": forcing}
 
     def driving_acceleration(self, u: Any) -> Array:
-        """Return the part of ë that the force and the set-point drive."""
+        """Return the part of ë that the force and the set-point make."""
         return (u.force - u.desired_force + self.stiffness * u.offset) / self.mass
 
     def acceleration(self, e: Array, e_rate: Array, drive: Array) -> Array:
@@ -198,7 +198,7 @@ class AdmittanceFilter(Block):
         return e, e_rate
 
     def step(self, x: Any, u: Any, T: Array) -> tuple[tuple[Array, ...], Array]:
-        """Return the states at the next tick, and ë that is held over this one."""
+        """Return the states at the next tick, and the ë that is held over this tick."""
         e, e_rate = self.deviation(x, u, T)
         drive = self.driving_acceleration(u)
         a = self.acceleration(e, e_rate, drive)
@@ -228,7 +228,7 @@ class AdmittanceFilter(Block):
         return u.reference + np.stack([*self.deviation(x, u, T), self.step(x, u, T)[1]])
 
     def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, ...]:
-        """Return ė and ë; with a speed limit ṙ^p and r̈^p."""
+        """Return ė and ë, or with a speed limit ṙ^p and r̈^p."""
         if not self.has_limits:
             return x.error_rate, self.acceleration(x.error, x.error_rate, self.driving_acceleration(u))
         a = self.limited_acceleration(x, u)
@@ -250,14 +250,14 @@ class AdmittanceFilter(Block):
         return wanted if self.velocity_limit is None else np.where(x.limited > 1.5, 0.0, wanted)
 
     def indicators(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return how far ṙ^p is beyond its limit, and how r̈^p turns inward; each is −1 where it can't happen."""
+        """Return the excess of ṙ^p over its limit, and r̈^p inward; an event that can't happen now has −1."""
         held, inward = x.limited > 1.5, -np.sign(x.error_rate) * self.wanted_acceleration(x, u)
         top: Any = self.velocity_limit
-        beyond = np.abs(x.error_rate) - (1.0 + 1e-12) * top  # rounding of what was just released is not beyond
+        beyond = np.abs(x.error_rate) - (1.0 + 1e-12) * top  # the rounding of a speed just released is not beyond
         return np.where(held, -1.0, beyond), np.where(held, inward, -1.0)
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> tuple[Array, Array, Array]:
-        """Hold ṙ^p at the limit, or let it go."""
+        """Hold ṙ^p at the limit, or release it."""
         reached, released = fired.reached > 0.5, fired.released > 0.5
         top: Any = self.velocity_limit
         onto = np.where(x.error_rate > 0.0, top, -top)
@@ -270,5 +270,5 @@ class AdmittanceFilter(Block):
 
 
 def _clip(value: Array, low: Array, high: Array) -> Array:
-    """Clip, letting NaN through (a traced np.clip swallows it)."""
+    """Return a value within limits; NaN passes through (a traced np.clip loses it)."""
     return np.where(value < low, low, np.where(value > high, high, value))

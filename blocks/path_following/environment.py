@@ -1,4 +1,4 @@
-"""What the robot meets: a hand that guides it, a spring along the path."""
+"""Environments of the robot: a hand that guides it, a spring along the path."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from .transverse import PathTracking
 
 
 class HandForce(PathTracking):
-    """A hand on the robot: F = F∥ t + F⊥ n in the path frame at the foot point of the position.
+    """Hand on the robot: F = F∥ t + F⊥ n, in the path's moving frame at the foot point of the position.
 
-    The two parts are inputs, so that any source can be the hand: ``HandForce(path)(position, f_par=Pulse(…))``.
+    Its two parts are inputs, so any source can be the hand: ``HandForce(path)(position, f_par=Pulse(…))``.
     """
 
     f_par = Input(unit="N", default=0.0, description="tangential part F∥")
@@ -29,7 +29,7 @@ class HandForce(PathTracking):
 
 
 class PathSpring(PathTracking):
-    """A one-sided spring along the path: F⊥ = −k max(ξ, 0) − k₃ max(ξ, 0)³, pressing outwards once ξ > 0 (E15)."""
+    """One-sided spring along the path: F⊥ = −k max(ξ, 0) − k₃ max(ξ, 0)³, which presses outwards once ξ > 0 (E15)."""
 
     stiffness: float = parameter(default=0.0, unit="N/m", minimum=0.0, description="linear stiffness k")
     cubic_stiffness: float = parameter(default=0.0, unit="N/m3", minimum=0.0, description="cubic stiffness k₃")

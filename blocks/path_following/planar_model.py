@@ -12,17 +12,17 @@ from ..core.values import Array
 
 
 class PlanarModel(Block):
-    """A mechanical system with two coordinates x_c, two actuators, and an output in the plane.
+    """Mechanical system with two coordinates x_c, two actuators, and an output in the plane.
 
     Equation (1), with F the force on the end effector (E1, E6): ẋ_c = x_v, ẋ_v = f_v(x_c, x_v) + G_v(x_c)(u + dhᵀ F),
-    and (3): y = h(x_c). A subclass gives `f_v` and `G_v`, and `h` with its first two derivatives where h is not the
-    identity. It is a block too where it declares ports and states: the plant and the model that a controller inverts
-    are then one definition.
+    and (3): y = h(x_c). A subclass gives `f_v` and `G_v`, and `h` with its first two derivatives if h is not the
+    identity. If it declares ports and states it is a plant as well: then the plant and the model that a controller
+    inverts are one definition.
 
     Raises
     ------
     DefinitionError
-        When f_v or G_v is needed and not written.
+        If f_v or G_v is needed and not written.
     """
 
     coordinate_unit: ClassVar[str] = "m"
@@ -32,15 +32,16 @@ class PlanarModel(Block):
 
     def f_v(self, x_c: Array, x_v: Array) -> Array:
         """Return the drift f_v of (2), shape (2,), in the coordinates' unit per s²."""
-        raise self._undefined("f_v(x_c, x_v)")
+        raise self._undefined_error("f_v(x_c, x_v)")
 
     def G_v(self, x_c: Array) -> Array:  # noqa: N802 - the paper's symbol
         """Return the input matrix G_v of (2), shape (2, 2)."""
-        raise self._undefined("G_v(x_c)")
+        raise self._undefined_error("G_v(x_c)")
 
-    def _undefined(self, what: str) -> DefinitionError:
+    def _undefined_error(self, member: str) -> DefinitionError:
         return DefinitionError(
-            f"found no {what}; expected a PlanarModel to define it, equation (2). Write it.", block=type(self).__name__
+            f"found no {member}; expected a PlanarModel to define it, equation (2). Write it.",
+            block=type(self).__name__,
         )
 
     def h(self, x_c: Array) -> Array:
@@ -52,7 +53,7 @@ class PlanarModel(Block):
         return np.eye(2)
 
     def dh_rate(self, x_c: Array, x_v: Array) -> Array:
-        """Return the time derivative of the Jacobian of h, shape (2, 2): its second derivative times x_v."""
+        """Return the time derivative of the Jacobian of h, shape (2, 2), which is its derivative times x_v."""
         return np.zeros((2, 2))
 
     def output_map(self, x_c: Array, x_v: Array) -> tuple[Array, Array]:

@@ -16,20 +16,20 @@ from ..core.block import Block
 from ..core.errors import GuardError, ParameterError, PathDomainError
 from ..core.ports import Input, Output, State
 from ..core.values import Array, parameter, shorten
-from ..paths import Path, limited
+from ..paths import Path, replace_unlimited
 from .planar_model import PlanarModel
 
-_NEWTON = 4  # iterations a tick: from 1 mm off, three reach the last digit
-_CONVERGED = 1e-9  # largest remaining Newton step, as a part of the path's parameter range
+_NEWTON = 4  # iterations in a tick; from 1 mm away, three reach the last digit
+_CONVERGED = 1e-9  # largest remaining Newton step, relative to the path's parameter range
 
 
 def expect_path(block: Block) -> None:
-    """Refuse a ``path`` that is none.
+    """Refuse a ``path`` that is no `Path`.
 
     Raises
     ------
     ParameterError
-        Anything but a `Path`.
+        For anything but a `Path`.
     """
     path = block.parameters["path"]
     if not isinstance(path, Path):
@@ -42,12 +42,12 @@ def expect_path(block: Block) -> None:
 
 
 def expect_model(block: Block, model: Any) -> None:
-    """Refuse a ``model`` that is none.
+    """Refuse a ``model`` that is no `PlanarModel`.
 
     Raises
     ------
     ParameterError
-        Anything but a `PlanarModel`.
+        For anything but a `PlanarModel`.
     """
     if not isinstance(model, PlanarModel):
         raise ParameterError(
@@ -58,16 +58,16 @@ def expect_model(block: Block, model: Any) -> None:
 class PathTracking(Block):
     """Base of blocks that follow the foot point of a position on a path.
 
-    At the start the foot point is the global arg min of (4); from then on Newton's method on (6) starts from the last
-    one, so that θ counts laps (E17). The state ``foot`` is the last foot point, nothing else.
+    At the start the foot point is the global arg min of (4). From then on Newton's method on (6) starts from the last
+    foot point, so that θ counts laps (E17). The state ``foot`` is the last foot point, nothing else.
 
     Raises
     ------
     ParameterError
-        A ``path`` that is none, when the block is made.
+        For a ``path`` that is no `Path`, when the block is made.
     PathDomainError
         In a run, where the path's coordinates end: q below ``minimum_q``, at or beyond the medial axis, beyond an end
-        of an open path, or where the foot point jumps within one tick (E18).
+        of an open path, and if the foot point jumps within one tick (E18).
     """
 
     memory = True
@@ -77,11 +77,11 @@ class PathTracking(Block):
     foot = State(description="last path parameter")
 
     def check(self) -> None:
-        """Refuse a path that is none."""
+        """Refuse a path that is no `Path`."""
         expect_path(self)
 
     def initial(self, u: Any) -> float:
-        """Return the global arg min of (4), in [0, period); a rounding error before the seam counts as after it."""
+        """Return the global arg min of (4), in [0, period); within rounding before the seam counts as after it."""
         theta = float(self.path.project(np.asarray(u.position)))
         period = self.path.period
         if period is None:
@@ -90,16 +90,16 @@ class PathTracking(Block):
         return float(theta - period if theta > period * (1.0 - 1e-6) else theta)
 
     def foot_point(self, x: Any, u: Any) -> tuple[Array, Array]:
-        """Return the path parameter θ̂ of the foot point, from (6), and Newton's remaining step."""
+        """Return the path parameter θ̂ of the foot point, from (6), and the size of the next Newton step."""
         theta, residual = self.path.newton(x.foot, u.position, _NEWTON)
         return theta, residual
 
     def update(self, t: Array, x: Any, u: Any) -> Array:
-        """Keep the foot point as the next start."""
+        """Keep the foot point, from which the next tick starts."""
         return self.foot_point(x, u)[0]
 
     def guards(self, t: Array, x: Any, u: Any) -> dict[str, Array]:
-        """Return what must stay positive for the coordinates to be valid."""
+        """Return the expressions that are positive as long as the coordinates are valid."""
         theta, residual = self.foot_point(x, u)
         frame = self.path.frame(theta)
         xi = frame.normal @ (u.position - frame.sigma)
@@ -111,7 +111,7 @@ class PathTracking(Block):
             "left": left - xi,
             "right": right + xi,
         }
-        if self.path.period is not None:  # half a lap off, the lap would be a guess
+        if self.path.period is not None:  # beyond half a lap, the lap would be a guess
             checks["lap"] = 0.5 * self.path.period - np.abs(theta - x.foot)
         if self.path.domain is not None:
             slack = 1e-12 * (high - low)
@@ -119,14 +119,14 @@ class PathTracking(Block):
         return checks
 
     def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
-        """Return the `PathDomainError` with position, θ, ξ and the local reach; ``x`` tells how far the foot jumped."""
+        """Return the `PathDomainError` with position, θ, ξ and the local reach; ``x`` gives the length of a jump."""
         position = np.asarray(u.position)
         theta = float(self.path.project(position))
         frame = self.path.frame(theta)
         xi = float(frame.normal @ (position - frame.sigma))
         q = 1.0 - float(frame.curvature) * xi
         left, right = self.path.reach(theta)
-        reach = limited(float(left if xi > 0 else right))
+        reach = replace_unlimited(float(left if xi > 0 else right))
         if name in ("start", "end"):
             beyond = abs(float(frame.tangent @ (position - frame.sigma)))
             where = "before the start" if name == "start" else "beyond the end"
@@ -143,14 +143,14 @@ class PathTracking(Block):
         shown = "unlimited" if np.isinf(reach) else f"{reach:.6g} m"
         error = PathDomainError(
             f"position {position.tolist()} m has no valid path coordinates: {why}. Nearest foot point θ = {theta:.6g}, "
-            f"ξ = {xi:.6g} m, local reach on that side {shown}. Start nearer to the path, or limit what "
-            f"drives it off."
+            f"ξ = {xi:.6g} m, local reach on that side {shown}. Start nearer to the path, or limit the force that "
+            "drives the position off it."
         )
         error.position, error.theta, error.xi, error.reach = tuple(position.tolist()), theta, xi, reach
         return error
 
     def _jump(self, theta: float, x: Any) -> str:
-        """Say how far the nearest foot point is from the last one, where that is known."""
+        """Return in words the distance of the nearest foot point from the last one, if that is known."""
         if x is None or not np.all(np.isfinite(x.foot)):
             return ""
         apart = float(np.ravel(x.foot)[0]) - theta
@@ -169,7 +169,7 @@ class PathProjection(PathTracking):
     Raises
     ------
     ParameterError, PathDomainError
-        As `PathTracking`.
+        See `PathTracking`.
     """
 
     theta = Output(description="path parameter θ̂ of the foot point, counted over laps (E17)")
@@ -187,24 +187,24 @@ class TransverseTransform(Block):
 
     η₁ = g(θ̂), (5), lifted over laps (E17); ξ₁ = nᵀ(y − σ); η₂ = tᵀẏ / q; ξ₂ = nᵀẏ.
 
-    Inputs are ``theta``, the path parameter θ̂ of the foot point, then ``position`` and ``velocity``: without a model
-    the output y = h(x_c) and its rate; with one x_c and x_v, and y = h(x_c), ẏ = dh x_v, (3).
+    The inputs are ``theta``, the path parameter θ̂ of the foot point, then ``position`` and ``velocity``. Without a
+    model these are y and its rate; with a model they are x_c and x_v, and y = h(x_c), ẏ = dh x_v, (3).
 
     Raises
     ------
     ParameterError
-        A path or a model that is none, when the block is made.
+        For a path that is no `Path`, and a model that is no `PlanarModel`, when the block is made.
     """
 
     path: Path = parameter(kw_only=False, description="the path")
     model: PlanarModel | None = parameter(
-        default=None, kw_only=False, description="output map h, where it is not identity"
+        default=None, kw_only=False, description="model with the output map h; None: h is the identity"
     )
     eta = Output(shape=(2,), unit=("m", "m/s"), description="tangential state η")
     xi = Output(shape=(2,), unit=("m", "m/s"), description="transversal state ξ")
 
     def check(self) -> None:
-        """Refuse a path or a model that is none."""
+        """Refuse a path that is no `Path`, and a model that is no `PlanarModel`."""
         expect_path(self)
         if self.model is not None:
             expect_model(self, self.model)
@@ -212,7 +212,7 @@ class TransverseTransform(Block):
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
         """θ̂, and position and velocity in the model's coordinates."""
-        return {"theta": Input(name="theta"), **_measured(self.model)}
+        return {"theta": Input(name="theta"), **_position_inputs(self.model)}
 
     def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
         """Return η and ξ."""
@@ -224,12 +224,12 @@ class TransverseTransform(Block):
 
 
 class ForceProjection(Block):
-    """Force in the path frame, (13): F∥ = tᵀF, F⊥ = nᵀF, with F the force on the robot (E6).
+    """Force in the path's moving frame, (13): F∥ = tᵀF, F⊥ = nᵀF, with F the force on the robot (E6).
 
     Raises
     ------
     ParameterError
-        A path that is none, when the block is made.
+        For a path that is no `Path`, when the block is made.
     """
 
     path: Path = parameter(kw_only=False, description="the path")
@@ -239,7 +239,7 @@ class ForceProjection(Block):
     f_perp = Output(unit="N", description="transversal part F⊥")
 
     def check(self) -> None:
-        """Refuse a path that is none."""
+        """Refuse a path that is no `Path`."""
         expect_path(self)
 
     def output(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
@@ -249,26 +249,26 @@ class ForceProjection(Block):
 
 
 class FeedbackLinearization(Block):
-    """Input-output feedback linearization (10): makes η̈₁ = v∥ and ξ̈₁ = v⊥, (11).
+    """Input-output feedback linearization (10), which makes η̈₁ = v∥ and ξ̈₁ = v⊥, (11).
 
     With J = [nᵀ; tᵀ/q] the rates of (ξ₁, η₁) are J ẏ, and (9) reads ÿ~ = b + D_u (u + dhᵀF), D_u = J dh G_v (E2, E3).
     Solved for the motor force, J⁻¹ = [n, q t] in closed form (E4 orders v):
 
         u = (dh G_v)⁻¹ { n (v⊥ + κ q η₂²) + t (q v∥ − 2 κ η₂ ξ₂ − κ_s ξ₁ η₂²) − dh f_v − (dh)˙ x_v } − dhᵀ F.
 
-    For any fully actuated planar model with ẋ_v = f_v + G_v (u + dhᵀ F), y = h(x_c); the gantry is the case h =
-    identity. The measured force F on the robot is cancelled with the sign of E6.
+    It applies to any fully actuated planar model with ẋ_v = f_v + G_v (u + dhᵀ F), y = h(x_c); the gantry is the case h
+    = identity. It cancels the measured force F on the robot, with the sign of E6.
 
-    Inputs are ``theta``, θ̂ of the foot point; ``position`` x_c and ``velocity`` x_v in the model's coordinates;
-    ``force`` F on the robot; ``v_par`` and ``v_perp``, the wanted η̈₁ and ξ̈₁. The output ``motor_force`` is u in the
+    The inputs are ``theta``, θ̂ of the foot point; ``position`` x_c and ``velocity`` x_v in the model's coordinates;
+    ``force`` F on the robot; ``v_par`` and ``v_perp``, the wanted η̈₁ and ξ̈₁. The output ``motor_force`` is u, in the
     model's unit.
 
     Raises
     ------
     ParameterError
-        A path or a model that is none, or a model without f_v or G_v, when the block is made.
+        For a path that is no `Path`, and a model that is no `PlanarModel` or has no f_v or G_v, when the block is made.
     GuardError
-        In a run, where |det(dh G_v)| falls to ``minimum_determinant``.
+        In a run, if |det(dh G_v)| falls to ``minimum_determinant``.
     """
 
     path: Path = parameter(kw_only=False, description="the path")
@@ -282,7 +282,7 @@ class FeedbackLinearization(Block):
         """θ̂, the model's position and velocity, the force on the robot, v∥ and v⊥."""
         return {
             "theta": Input(name="theta"),
-            **_measured(self.model),
+            **_position_inputs(self.model),
             "force": Input(shape=(2,), unit="N", name="force"),
             "v_par": Input(unit="m/s2", name="v_par"),
             "v_perp": Input(unit="m/s2", name="v_perp"),
@@ -301,7 +301,7 @@ class FeedbackLinearization(Block):
         return Signal(self, "motor_force")
 
     def check(self) -> None:
-        """Refuse a path or a model that is none, and a model without its equations."""
+        """Refuse a path that is no `Path`, a model that is no `PlanarModel`, and a model without its equations."""
         expect_path(self)
         expect_model(self, self.model)
         for name, text in (("f_v", "f_v(x_c, x_v)"), ("G_v", "G_v(x_c)")):
@@ -329,12 +329,12 @@ class FeedbackLinearization(Block):
         return _solve(dh @ model.G_v(x_c), wanted - free) - dh.T @ u.force
 
     def guards(self, t: Array, x: Any, u: Any) -> dict[str, Array]:
-        """Return the margin to a singular model."""
+        """Return the distance of the determinant from its minimum."""
         A = self.model.dh(u.position) @ self.model.G_v(u.position)
         return {"determinant": np.abs(A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]) - self.minimum_determinant}
 
     def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> GuardError:
-        """Return the error of a model that can't be inverted where it is."""
+        """Return the error of a model that can't be inverted at its position."""
         return GuardError(
             f"|det(dh G_v)| of {type(self.model).__name__} is {value + self.minimum_determinant:.6g} at the position "
             f"{np.asarray(u.position).tolist()} {self.model.coordinate_unit}; expected more than minimum_determinant = "
@@ -342,7 +342,7 @@ class FeedbackLinearization(Block):
         )
 
 
-def _measured(model: PlanarModel | None) -> dict[str, Input]:
+def _position_inputs(model: PlanarModel | None) -> dict[str, Input]:
     unit = "m" if model is None else model.coordinate_unit
     return {
         "position": Input(shape=(2,), unit=unit, description="y, or x_c of the model", name="position"),
@@ -351,6 +351,6 @@ def _measured(model: PlanarModel | None) -> dict[str, Input]:
 
 
 def _solve(A: Array, b: Array) -> Array:
-    """Solve a 2 × 2 system in closed form."""
+    """Return the solution of a 2 × 2 system, in closed form."""
     det = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
     return np.stack([A[1, 1] * b[0] - A[0, 1] * b[1], A[0, 0] * b[1] - A[1, 0] * b[0]]) / det

@@ -1,4 +1,4 @@
-"""The base of all paths. Equation numbers are those of Flixeder, Glück, Böck and Kugi (2014).
+"""Base of all paths. Equation numbers are those of Flixeder, Glück, Böck and Kugi (2014).
 
 Conventions: t is the unit tangent, n the unit normal (t turned by +90°), κ the signed curvature, κ_s its derivative
 with respect to arc length; ξ is positive to the left of the path.
@@ -21,7 +21,7 @@ __all__ = ["UNLIMITED", "Frame", "Path"]
 
 
 class Frame(NamedTuple):
-    """The moving frame of a path at one parameter θ.
+    """Moving frame of a path at one parameter θ.
 
     Attributes
     ----------
@@ -48,11 +48,11 @@ class Frame(NamedTuple):
 
 
 class Path(Value):
-    """A regular planar path σ(θ), closed or open, with what path following needs to know of it.
+    """Regular planar path σ(θ), closed or open, with the geometry that path following needs.
 
-    A subclass gives `sigma` and either `period` (a closed path) or `domain` (an open one); all the rest follows, and
-    is overridden where there is a closed form. An open path must go straight on beyond its ends, at the speed it has
-    there::
+    A subclass gives `sigma` and either `period` (a closed path) or `domain` (an open one). All the rest follows;
+    override a method for which there is a closed form. An open path must continue straight beyond its ends, at the
+    speed it has there::
 
         class Bean(Path):
             '''σ(θ) = R (cos θ + e cos 2θ, sin θ).'''
@@ -66,13 +66,13 @@ class Path(Value):
                 y = np.cos(theta + turn) + self.bend * 2.0**order * np.cos(2.0 * theta + turn)
                 return self.radius * np.stack([y, np.sin(theta + turn)])
 
-    The path must not meet itself (its reach is next to nothing there), and its σ′ must not vanish (E19).
+    The path must not meet itself (its reach is almost zero there), and its σ′ must not vanish (E19).
 
-    All methods take a parameter θ as a number, as an array of N numbers (vectors then have the shape (2, N)) or, unless
-    they say that they are NumPy only, as a traced scalar.
+    All methods take a parameter θ as a number, as an array of N numbers (vectors then have the shape (2, N)) or as a
+    traced scalar, unless they are marked NumPy only.
     """
 
-    # --- what a subclass gives ----------------------------------------------------------------------------------------
+    # --- given by a subclass ------------------------------------------------------------------------------------------
 
     def sigma(self, theta: Array, order: int = 0) -> Array:
         """Return the point σ(θ), m, or its derivative of the given order (0 to 3) with respect to θ.
@@ -88,7 +88,7 @@ class Path(Value):
         -------
         array, shape (2,) or (2, N)
         """
-        raise self._undefined("sigma(theta, order)")
+        raise self._undefined_error("sigma(theta, order)")
 
     @property
     def period(self) -> float | None:
@@ -102,15 +102,15 @@ class Path(Value):
 
     @property
     def knots(self) -> np.ndarray:
-        """Parameters between which σ is smooth, the ends included."""
+        """Parameters between which σ is smooth, including the ends."""
         if self.period is not None:
             return np.array([0.0, self.period])
         if self.domain is None:
-            raise self._undefined("period and no domain")
+            raise self._undefined_error("period and no domain")
         return np.array(self.domain)
 
-    def _undefined(self, what: str) -> DefinitionError:
-        return DefinitionError(f"found no {what}; expected a path to define it. Write it.", block=type(self).__name__)
+    def _undefined_error(self, member: str) -> DefinitionError:
+        return DefinitionError(f"found no {member}; expected a path to define it. Write it.", block=type(self).__name__)
 
     @cached_property
     def closed(self) -> bool:
@@ -149,8 +149,8 @@ class Path(Value):
 
     @cached_property
     def _arc(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Breaks, coefficients and total of the tabulated arc length; an open path's continuations included."""
-        breaks, coefficients, total = tables.integral(lambda theta: np.hypot(*self.sigma(theta, 1)), self.knots)
+        """Breaks, coefficients and total of the tabulated arc length, including an open path's continuations."""
+        breaks, coefficients, total = tables.integrate(lambda theta: np.hypot(*self.sigma(theta, 1)), self.knots)
         if self.period is None:
             span = breaks[-1] - breaks[0]
             v0, v1 = np.hypot(*self.sigma(breaks[[0, -1]], 1))
@@ -196,7 +196,7 @@ class Path(Value):
 
     @cached_property
     def sampling(self) -> tuple[np.ndarray, np.ndarray]:
-        """Parameters so dense that searches start from them, and their arc lengths; the ends included."""
+        """Parameters dense enough for searches to start from, including the ends, and their arc lengths."""
         theta = tables.grid(self)
         lengths = np.asarray(self.arc_length(theta))
         lengths[-1] = self.length
@@ -204,7 +204,7 @@ class Path(Value):
 
     @cached_property
     def sampled(self) -> np.ndarray:
-        """The points at the sampled parameters, shape (2, N)."""
+        """Points at the parameters of `sampling`, shape (2, N)."""
         return np.asarray(self.sigma(self.sampling[0]))
 
     # --- neighbourhood ------------------------------------------------------------------------------------------------
@@ -214,11 +214,11 @@ class Path(Value):
         return tables.reach_table(self)
 
     def reach(self, theta: Array) -> tuple[Array, Array]:
-        """Return how far one may go from σ(θ) along +n and along −n while σ(θ) stays the unique nearest point, m.
+        """Return the distances along +n and −n up to which σ(θ) is the unique nearest point of the path, m.
 
         Along +n this is the least |Δ|²/(2 nᵀΔ) over all points σ(θ) + Δ of the path with nᵀΔ > 0, and 1/κ in the limit
-        Δ → 0: the distance to the medial axis, which is never beyond the evolute. `UNLIMITED` stands for no limit.
-        A tabulated reach errs on the small side, by at most about 2 %.
+        Δ → 0: the distance to the medial axis, which is never beyond the evolute. `UNLIMITED` means no limit. A
+        tabulated reach is too small by at most about 2 %, never too large.
         """
         breaks, coefficients = self._reach
         if self.period is not None:
@@ -232,7 +232,7 @@ class Path(Value):
     def project(self, y: Array) -> Array:
         """Return the parameter of the point of the path nearest to y, equation (4). NumPy only.
 
-        This is the global arg min: never a merely local one. For an open path the ends are candidates.
+        The result is the global arg min, never a local one only. For an open path the ends are candidates.
 
         Parameters
         ----------
@@ -247,13 +247,13 @@ class Path(Value):
         Raises
         ------
         ParameterError
-            A position of another shape.
+            For a position of another shape.
         """
-        y = tables.positions(self, y)
-        theta = np.array([tables.nearest(self, column) for column in y.reshape(2, -1).T])
-        return self._lapped(theta).reshape(y.shape[1:]) if y.ndim > 1 else float(self._lapped(theta)[0])
+        y = tables.as_positions(self, y)
+        theta = np.array([tables.find_nearest(self, column) for column in y.reshape(2, -1).T])
+        return self._wrap(theta).reshape(y.shape[1:]) if y.ndim > 1 else float(self._wrap(theta)[0])
 
-    def _lapped(self, theta: Array) -> Array:
+    def _wrap(self, theta: Array) -> Array:
         """Return θ within [0, period)."""
         if self.period is None:
             return theta
@@ -266,18 +266,18 @@ class Path(Value):
         Parameters
         ----------
         theta : float, array or traced scalar
-            Where to start.
+            Parameter from which to start.
         y : array, shape (2,) or (2, N)
             Position, m.
         iterations : int
-            How many steps are done, always.
+            Number of steps; all are taken.
 
         Returns
         -------
         theta : float, array or traced scalar
-            The improved parameter; it isn't wrapped to one period.
+            The improved parameter, not wrapped to one period.
         residual : float, array or traced scalar
-            |Δθ| of the step that would come next.
+            |Δθ| of the next step.
         """
         for _ in range(iterations):
             theta = theta + self._newton_step(theta, y)
@@ -307,9 +307,9 @@ class Path(Value):
         Raises
         ------
         PathDomainError
-            ξ₁ is at or beyond the reach of the path there, η₁ is beyond an end of an open path, or one is not finite.
+            If ξ₁ is at or beyond the path's reach at η₁, η₁ is beyond an end of an open path, or one is not finite.
         """
-        return self._placed(eta, xi)[0]
+        return self._place(eta, xi)[0]
 
     def to_state(self, eta: Array, xi: Array) -> tuple[Array, Array]:
         """Return position y and velocity ẏ = q η₂ t + ξ₂ n, q = 1 − κ ξ₁, the inverse of (7). NumPy only.
@@ -324,13 +324,13 @@ class Path(Value):
         Raises
         ------
         PathDomainError
-            As `to_plane`.
+            See `to_plane`.
         """
-        position, frame = self._placed(eta[0], xi[0])
+        position, frame = self._place(eta[0], xi[0])
         q = 1.0 - frame.curvature * xi[0]
         return position, q * eta[1] * frame.tangent + xi[1] * frame.normal
 
-    def _placed(self, eta: Array, xi: Array) -> tuple[Array, Frame]:
+    def _place(self, eta: Array, xi: Array) -> tuple[Array, Frame]:
         eta, xi = np.broadcast_arrays(np.asarray(eta, dtype=float), np.asarray(xi, dtype=float))
         for name, given in (("eta", eta), ("xi", xi)):
             if not np.all(np.isfinite(given)):
@@ -365,7 +365,7 @@ class Path(Value):
                 f"found eta = {eta:.6g} m, {by:.3g} m beyond its {end}; expected 0 to {self.length:.6g} m, the length "
                 f"of the open {type(self).__name__}. Stay between its ends, or lengthen the path."
             )
-            limit = tables.limited(limit)
+            limit = tables.replace_unlimited(limit)
         else:
             side, sign = ("left", "") if xi >= 0.0 else ("right", "-")
             text = (
@@ -380,7 +380,7 @@ class Path(Value):
     # --- the value ----------------------------------------------------------------------------------------------------
 
     def __getstate__(self) -> dict[str, Any]:
-        """Pickle the parameters only; tables are built again when first needed."""
+        """Return the parameters only; tables are built again when needed."""
         return self.parameters
 
 
@@ -390,7 +390,7 @@ def check_order(path: Path, order: int) -> int:
     Raises
     ------
     ParameterError
-        Any other order.
+        For any other order.
     """
     if order not in (0, 1, 2, 3):
         raise ParameterError(f"found order {order!r}; expected 0, 1, 2 or 3.", block=type(path).__name__, port="sigma")

@@ -9,14 +9,14 @@ import numpy as np
 from ..core.errors import ParameterError
 from ..core.values import Array, parameter
 from .path import UNLIMITED, Path, check_order
-from .tables import positions
+from .tables import as_positions
 
 __all__ = ["Circle", "Ellipse", "Line"]
 
-_MOST_TERMS = 128  # of the ellipse's Fourier series; a longer one (axis ratio above 7 or so) gives way to a table
+_MOST_TERMS = 128  # of the ellipse's Fourier series; a table replaces a longer one (axis ratio above about 7)
 
 
-def _turned(theta: Array, order: int) -> tuple[Array, Array]:
+def _turn(theta: Array, order: int) -> tuple[Array, Array]:
     """Return the derivatives of cos θ and sin θ of the given order."""
     c, s = np.cos(theta), np.sin(theta)
     return ((c, s), (-s, c), (-c, -s), (s, -c))[order]
@@ -25,18 +25,18 @@ def _turned(theta: Array, order: int) -> tuple[Array, Array]:
 class Ellipse(Path):
     """Ellipse σ(θ) = c + (a cos θ, ± b sin θ), counter-clockwise (+) or clockwise (−), period 2π; equation (16).
 
-    a and b are the semi-axes (E12). Its normal points inwards when it runs counter-clockwise (ξ > 0 is inside), else
-    outwards; inwards its reach is that of docs/paper.md, b²/a at the ends of the major axis.
+    a and b are the semi-axes (E12). The normal points inwards if the direction is counter-clockwise (ξ > 0 is inside),
+    else outwards. The reach inwards is that of docs/paper.md, b²/a at the ends of the major axis.
 
     Raises
     ------
     ParameterError
-        Semi-axes that are not positive.
+        For semi-axes that are not positive.
     """
 
     semi_axes: Array = parameter(unit="m", above=0.0, shape=(2,), description="semi-axes a along y and b along z")
     center: Array = parameter(default=np.zeros(2), unit="m", shape=(2,), description="the centre (y, z)")
-    clockwise: bool = parameter(default=False, description="direction in which it is run through")
+    clockwise: bool = parameter(default=False, description="True for the clockwise direction")
 
     @property
     def period(self) -> float:
@@ -45,7 +45,7 @@ class Ellipse(Path):
 
     @property
     def knots(self) -> np.ndarray:
-        """The ends of the semi-axes."""
+        """Parameters of the ends of the semi-axes."""
         return np.linspace(0.0, 2.0 * np.pi, 5)
 
     @property
@@ -55,14 +55,14 @@ class Ellipse(Path):
     def sigma(self, theta: Array, order: int = 0) -> Array:
         """Return c + (a cos θ, ± b sin θ), m, or its derivative of the given order (0 to 3)."""
         a, b = self._axes
-        c, s = _turned(theta, check_order(self, order))
+        c, s = _turn(theta, check_order(self, order))
         if order:
             return np.stack([a * c, b * s])
         return np.stack([self.center[0] + a * c, self.center[1] + b * s])
 
     @cached_property
     def _fourier(self) -> np.ndarray | None:
-        """Mean speed, then the coefficients of sin 2kθ in the arc length; None where there would be too many.
+        """Mean speed, then the coefficients of sin 2kθ in the arc length; None if there would be too many.
 
         The speed has the period π; its Fourier coefficients fall like ((a − b)/(a + b))^k, so that the trapezoidal
         rule (a DFT) gives them to rounding errors.
@@ -99,7 +99,7 @@ class Ellipse(Path):
     def reach(self, theta: Array) -> tuple[Array, Array]:
         """Return the reach to the left and to the right, m: inwards m‖σ′‖/M (m the smaller, M the larger semi-axis).
 
-        That is the medial axis, a segment of the larger axis; outwards there is no limit (`UNLIMITED`).
+        The reach ends at the medial axis, a segment of the larger axis; outwards there is no limit (`UNLIMITED`).
         """
         s1 = self.sigma(theta, 1)
         ratio = float(np.min(self.semi_axes) / np.max(self.semi_axes))
@@ -110,17 +110,17 @@ class Ellipse(Path):
     def project(self, y: Array) -> Array:
         """Return the parameter of the nearest point, equation (4); NumPy only.
 
-        It lies in the quadrant of y, and (σ − y)ᵀσ′ has one sign change there: Newton's method between brackets is
-        enough. On the medial axis, of two points equally near, that with positive sin θ (or cos θ) is taken.
+        It lies in the quadrant of y, and (σ − y)ᵀσ′ has one sign change there, so that Newton's method between brackets
+        finds it. On the medial axis, where two points are equally near, it is that with positive sin θ (or cos θ).
         """
         a, b = self.semi_axes
-        y = positions(self, y)
+        y = as_positions(self, y)
         u, v = y[0] - self.center[0], y[1] - self.center[1]
         if self.clockwise:
             v = -v
         p, q = np.abs(u), np.abs(v)
         low, high = np.zeros(np.shape(u)), np.full(np.shape(u), np.pi / 2.0)
-        theta = np.clip(np.arctan2(a * q, b * p), 1e-3, 1.57)  # not on the axes: if y is on one, that is a root
+        theta = np.clip(np.arctan2(a * q, b * p), 1e-3, 1.57)  # not on the axes: y on an axis makes that a root
         for _ in range(80):
             c, s = np.cos(theta), np.sin(theta)
             slope = (b * b - a * a) * s * c + a * p * s - b * q * c
@@ -132,7 +132,7 @@ class Ellipse(Path):
             if np.all(moved <= 1e-16):
                 break
         angle = np.where(u < 0, np.pi - theta, theta)
-        angle = self._lapped(np.where(v < 0, -angle, angle))
+        angle = self._wrap(np.where(v < 0, -angle, angle))
         return angle if angle.ndim else float(angle)
 
 
@@ -142,12 +142,12 @@ class Circle(Path):
     Raises
     ------
     ParameterError
-        A radius that is not positive.
+        For a radius that is not positive.
     """
 
     radius: float = parameter(unit="m", above=0.0, description="radius r")
     center: Array = parameter(default=np.zeros(2), unit="m", shape=(2,), description="the centre (y, z)")
-    clockwise: bool = parameter(default=False, description="direction in which it is run through")
+    clockwise: bool = parameter(default=False, description="True for the clockwise direction")
 
     @property
     def period(self) -> float:
@@ -157,7 +157,7 @@ class Circle(Path):
     def sigma(self, theta: Array, order: int = 0) -> Array:
         """Return c + r (cos θ, ± sin θ), m, or its derivative of the given order (0 to 3)."""
         r, turn = self.radius, -1.0 if self.clockwise else 1.0
-        c, s = _turned(theta, check_order(self, order))
+        c, s = _turn(theta, check_order(self, order))
         if order:
             return np.stack([r * c, turn * r * s])
         return np.stack([self.center[0] + r * c, self.center[1] + turn * r * s])
@@ -182,25 +182,25 @@ class Circle(Path):
 
     def project(self, y: Array) -> Array:
         """Return the parameter of the nearest point, equation (4) (0 for the centre); NumPy only."""
-        y = positions(self, y)
+        y = as_positions(self, y)
         v = y[1] - self.center[1]
-        theta = self._lapped(np.arctan2(-v if self.clockwise else v, y[0] - self.center[0]))
+        theta = self._wrap(np.arctan2(-v if self.clockwise else v, y[0] - self.center[0]))
         return theta if theta.ndim else float(theta)
 
 
 class Line(Path):
-    """Straight line σ(θ) = p₀ + θ (p₁ − p₀), θ from 0 to 1; it goes straight on beyond its ends.
+    """Straight line σ(θ) = p₀ + θ (p₁ − p₀), θ from 0 to 1; it continues straight beyond its ends.
 
-    Its κ is zero and its reach unlimited: path following is then that of two Cartesian axes, turned.
+    Its κ is zero and its reach unlimited, so that path following is that of two Cartesian axes, turned.
 
     Raises
     ------
     ParameterError
-        A start and an end in the same place.
+        For a start and an end in the same place.
     """
 
-    start: Array = parameter(unit="m", shape=(2,), description="where it starts (y, z)")
-    end: Array = parameter(unit="m", shape=(2,), description="where it ends (y, z)")
+    start: Array = parameter(unit="m", shape=(2,), description="the start (y, z)")
+    end: Array = parameter(unit="m", shape=(2,), description="the end (y, z)")
 
     def check(self) -> None:
         """Refuse two ends in the same place."""
@@ -244,6 +244,6 @@ class Line(Path):
 
     def project(self, y: Array) -> Array:
         """Return the parameter of the nearest point between the ends, equation (4); NumPy only."""
-        y, d = positions(self, y), self.end - self.start
+        y, d = as_positions(self, y), self.end - self.start
         theta = np.clip(((y[0] - self.start[0]) * d[0] + (y[1] - self.start[1]) * d[1]) / (d @ d), 0.0, 1.0)
         return theta if theta.ndim else float(theta)

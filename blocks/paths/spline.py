@@ -20,24 +20,26 @@ class CubicSpline(Path):
     σ(θ) = Σⱼ cᵢⱼ (θ − θᵢ)ʲ, j = 0 … 3, between the points i and i + 1.
 
     The parameter θ is the accumulated distance of the points (chord length, m), 0 at the first. A closed spline goes
-    from the last point back to the first. An open one is natural (σ″ = 0 at its ends) and goes straight on beyond them.
+    from the last point back to the first. An open one is natural (σ″ = 0 at its ends) and continues straight beyond
+    them.
 
-    Its κ is continuous and its κ_s jumps at the points: off the path, a moving robot's motor force (10) jumps there.
+    κ is continuous and κ_s jumps at the points, so the motor force (10) of a robot that moves beside the path jumps
+    there.
 
     Raises
     ------
     ParameterError
-        Too few points, points that coincide, or a curve with a cusp, where σ′ vanishes (E19).
+        For too few points, points that coincide, and a curve with a cusp, where σ′ vanishes (E19).
     """
 
     points: Array = parameter(unit="m", description="the points (y, z) it passes through, shape (N, 2)")
-    closed: bool = parameter(default=False, description="whether it returns to the first point")
+    closed: bool = parameter(default=False, description="True to return to the first point")
 
     def check(self) -> None:
-        """Refuse too few points, points that coincide, and a curve that comes to a halt."""
+        """Refuse too few points, points that coincide, and a curve whose speed vanishes."""
         points, least = np.asarray(self.points), 3 if self.closed else 2
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < least:
-            raise self._bad(
+            raise self._error(
                 f"found an array of shape {np.shape(points)}; expected (N, 2) with at least {least} points for "
                 f"{'a closed' if self.closed else 'an open'} spline. Give one row (y, z) for each point."
             )
@@ -46,17 +48,17 @@ class CubicSpline(Path):
         for i in np.flatnonzero(chords <= 1e-12 * scale):
             j = (i + 1) % len(points)
             step = "Leave the last one out; a closed spline returns by itself." if j == 0 else "Leave one of them out."
-            raise self._bad(
+            raise self._error(
                 f"points {i} and {j} are both {points[i].tolist()}; expected consecutive points to differ. {step}"
             )
         slowest, theta = self._slowest()
         if slowest < 1e-6:  # chord length makes the speed about 1
-            raise self._bad(
+            raise self._error(
                 f"the spline's speed falls to {slowest:.3g} at theta = {theta:.6g} m, where it has a cusp or turns "
                 "back; expected a smooth curve. Move the points there, or add some."
             )
 
-    def _bad(self, text: str) -> ParameterError:
+    def _error(self, text: str) -> ParameterError:
         return ParameterError(text, block=type(self).__name__, port="points")
 
     def _chords(self) -> np.ndarray:
@@ -66,8 +68,8 @@ class CubicSpline(Path):
 
     @cached_property
     def _cubics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Breaks and coefficients (pieces, 2, 4), an open spline's straight continuations included."""
-        from scipy.interpolate import CubicSpline as Interpolant  # imported late: scipy takes its time
+        """Breaks and coefficients (pieces, 2, 4), including an open spline's straight continuations."""
+        from scipy.interpolate import CubicSpline as Interpolant  # imported late, since it takes long
 
         breaks = np.concatenate([[0.0], np.cumsum(self._chords())])
         points = np.vstack([self.points, self.points[:1]]) if self.closed else self.points
@@ -85,7 +87,7 @@ class CubicSpline(Path):
         return breaks, coefficients
 
     def _slowest(self) -> tuple[float, float]:
-        """Return the least speed, and where it is (the roots of the derivative of its square in every piece)."""
+        """Return the least speed and its parameter, from the roots of the derivative of its square in every piece."""
         breaks, coefficients = self._cubics
         least, where = np.inf, 0.0
         for start, h, c in zip(breaks, np.diff(breaks), coefficients, strict=False):
@@ -111,7 +113,7 @@ class CubicSpline(Path):
 
     @property
     def knots(self) -> np.ndarray:
-        """The parameters of the points; a closed spline's first point also at the end."""
+        """Parameters of the points; a closed spline's first point is also the last."""
         return self._cubics[0] if self.closed else self._cubics[0][1:-1]
 
     def sigma(self, theta: Array, order: int = 0) -> Array:

@@ -14,16 +14,16 @@ from numpy.polynomial import chebyshev, polynomial
 from ..core.errors import ParameterError
 
 UNLIMITED = 1e6
-"""What a path's reach is where there is no limit, m: a number, so that equations can be traced and compared."""
+"""Reach of a path without a limit, m: a finite number, so that equations can be traced and compared."""
 
 
-def limited(reach: float) -> float:
-    """Return the reach as it is told: infinite where there is no limit."""
+def replace_unlimited(reach: float) -> float:
+    """Return the reach, infinite in place of `UNLIMITED`, for messages."""
     return math.inf if reach >= UNLIMITED * (1.0 - 1e-9) else reach
 
 
 class Curve(Protocol):
-    """A path, as far as its tables need it; `Path` says what each part is."""
+    """The members of a `Path` that its tables need."""
 
     @property
     def period(self) -> float | None:
@@ -59,10 +59,10 @@ class Curve(Protocol):
 
 
 _DEGREE = 12  # of the polynomials that are fitted to the speed
-_MOST_MINIMA = 256  # of a sampled distance: more of them are rounding errors, as at the centre of an arc
-_CROWDED = 1e9  # 1/m, the largest inverse reach that is tabulated: where a path meets itself
-_SLACK = 5e-4  # relative error of the inverse reach between two nodes that is let pass, and then added to it
-_GENEROUS = 1e-2  # the same where the error is on the safe side
+_MOST_MINIMA = 256  # of a sampled distance; more of them are rounding errors, as at the centre of an arc
+_CROWDED = 1e9  # 1/m, the largest inverse reach in the table, where a path meets itself
+_SLACK = 5e-4  # allowed relative error of the inverse reach between two nodes; it is then added to the table
+_GENEROUS = 1e-2  # the same for an error on the safe side
 
 
 # --- arc length ------------------------------------------------------------------------------------------------------
@@ -70,7 +70,7 @@ _GENEROUS = 1e-2  # the same where the error is on the safe side
 
 @lru_cache(maxsize=1)
 def _fit_matrices() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return nodes in [0, 1], values → Chebyshev coefficients, and those → powers of the integral from 0."""
+    """Return nodes in [0, 1], and the matrices values → Chebyshev coefficients → powers of the integral from 0."""
     x = chebyshev.chebpts1(_DEGREE + 1)
     analysis = np.linalg.inv(chebyshev.chebvander(x, _DEGREE))
     integrals = np.zeros((_DEGREE + 2, _DEGREE + 1))
@@ -83,10 +83,10 @@ def _fit_matrices() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (x + 1.0) / 2.0, analysis, integrals
 
 
-def integral(speed: Callable[[np.ndarray], np.ndarray], knots: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+def integrate(speed: Callable[[np.ndarray], np.ndarray], knots: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Return breaks, coefficients (pieces, 1, powers) and total of the integral of ``speed`` from the first knot on.
 
-    Intervals are halved until the Chebyshev coefficients of the speed on them have decayed to rounding errors.
+    Intervals are halved until the Chebyshev coefficients of the speed on each have decayed to rounding errors.
     """
     nodes, analysis, integrals = _fit_matrices()
     start, width = np.asarray(knots[:-1], dtype=float), np.diff(knots)
@@ -118,16 +118,16 @@ def integral(speed: Callable[[np.ndarray], np.ndarray], knots: np.ndarray) -> tu
 # --- sampling and searches --------------------------------------------------------------------------------------------
 
 
-def _subdivided(knots: np.ndarray) -> np.ndarray:
-    """Return the knots and equally many points between each two of them, at least 64 intervals in all."""
+def _subdivide(knots: np.ndarray) -> np.ndarray:
+    """Return the knots with equally many points between each two of them, at least 64 intervals in all."""
     cells = max(4, -(-64 // (len(knots) - 1)))
     parts = [np.linspace(a, b, cells, endpoint=False) for a, b in pairwise(knots)]
     return np.append(np.concatenate(parts), knots[-1])
 
 
 def grid(path: Curve) -> np.ndarray:
-    """Return path parameters so dense that no cell turns by more than 0.05 rad or is longer than length/400."""
-    theta = _subdivided(path.knots)
+    """Return path parameters whose cells turn by at most 0.05 rad and are at most length/400 long."""
+    theta = _subdivide(path.knots)
     for _ in range(14):
         middle = (theta[1:] + theta[:-1]) / 2.0
         ends, mids = path.frame(theta), path.frame(middle)
@@ -157,13 +157,13 @@ def invert(path: Curve, s: np.ndarray) -> np.ndarray:
     return result
 
 
-def positions(path: Curve, y: object) -> np.ndarray:
-    """Return positions as an array, and refuse what is none.
+def as_positions(path: Curve, y: object) -> np.ndarray:
+    """Return positions as an array, and refuse other shapes.
 
     Raises
     ------
     ParameterError
-        Another shape than (2,) or (2, N).
+        For another shape than (2,) or (2, N).
     """
     try:
         array = np.asarray(y, dtype=float)
@@ -178,12 +178,12 @@ def positions(path: Curve, y: object) -> np.ndarray:
     return array
 
 
-def nearest(path: Curve, y: np.ndarray) -> float:
+def find_nearest(path: Curve, y: np.ndarray) -> float:
     """Return the parameter of the point of the path nearest to y, among all of it.
 
     Around every dip of the sampled distance that may be the least, three cells to both sides are resampled 16 times as
-    fine, twice: two minima may share a cell, as they do near a cusp of the evolute. What is then a dip is polished by
-    Newton steps within its bracket, and the best of all is taken.
+    finely, twice, since two minima may share a cell near a cusp of the evolute. The dips left are polished by Newton
+    steps within their brackets, and the best is returned.
     """
     if not np.all(np.isfinite(y)):
         return float("nan")
@@ -212,14 +212,14 @@ def nearest(path: Curve, y: np.ndarray) -> float:
 
 
 def _dips(values: np.ndarray) -> np.ndarray:
-    """Say which values are no larger than their neighbours along the last axis."""
+    """Return a mask of the values that are no larger than their neighbours along the last axis."""
     padded = np.pad(values, [(0, 0)] * (values.ndim - 1) + [(1, 1)], constant_values=np.inf)
     dips: np.ndarray = (values <= padded[..., :-2]) & (values <= padded[..., 2:])
     return dips
 
 
 def polish(path: Curve, y: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the roots of (σ − y)ᵀσ′, rising, between the brackets: Newton, halving where it would leave them."""
+    """Return the rising roots of (σ − y)ᵀσ′ between brackets, by Newton steps, or halving if one would leave them."""
     theta: np.ndarray = (low + high) / 2.0
     for _ in range(60):
         s0, s1, s2 = path.derivatives(theta, 2)
@@ -247,13 +247,13 @@ class _Contact:
         self.near = 1e-4 * path.length / np.pi
         theta, _ = path.sampling
         points = path.sampled
-        if path.period is not None:  # one more cell at both ends, so that every maximum has two neighbours
+        if path.period is not None:  # one more cell at both ends gives every maximum two neighbours
             theta = np.concatenate([[theta[-2] - path.period], theta, [theta[1] + path.period]])
             points = np.concatenate([points[:, -2:-1], points, points[:, 1:2]], axis=1)
         self.phi, self.points = theta, points
 
     def curvature(self, theta: np.ndarray, phi: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Evaluate it for θ (M,), φ (M, P) and σ(φ) (2, M, P); near θ by its series, κ + κ_s Δs/3."""
+        """Return the curvature for θ (M,), φ (M, P) and σ(φ) (2, M, P); near θ its series, κ + κ_s Δs/3."""
         frame = self.path.frame(theta)
         apart = phi - theta[:, None]
         if self.path.period is not None:
@@ -315,14 +315,14 @@ class _Contact:
 def reach_table(path: Curve) -> tuple[np.ndarray, np.ndarray]:
     """Return breaks and coefficients (pieces, 2, 2) of the inverse reach, left and right, linear between the nodes.
 
-    The inverse reach is a maximum of smooth functions: where it has kinks, straight lines lie above it, on the safe
-    side. Intervals are cut in three until the line is near enough at both thirds, and the slack is added everywhere.
+    The inverse reach is a maximum of smooth functions, so at its kinks straight lines lie above it, on the safe side.
+    Intervals are cut in three until the line is near enough at both thirds; then the slack is added everywhere.
     """
     contact = _Contact(path)
-    flat = 0.15 / path.length  # what hardly matters: a reach of many times the path's size
-    theta = _subdivided(path.knots)
+    flat = 0.15 / path.length  # errors below it don't matter: the reach is then many times the path's size
+    theta = _subdivide(path.knots)
     values = contact.inverse_reach(theta)
-    open_ = np.ones(len(theta) - 1, dtype=bool)  # intervals still to be examined
+    open_ = np.ones(len(theta) - 1, dtype=bool)  # intervals still to examine
     for _ in range(8):
         index = np.flatnonzero(open_)
         thirds, exact, bad = [], [], np.zeros(len(index), dtype=bool)

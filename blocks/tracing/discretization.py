@@ -1,4 +1,4 @@
-"""How a continuous block advances over one sample when its inputs are held."""
+"""Discretization: the step of a continuous linear block over one sample, with its inputs held."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
         Sample time in s.
     method : {"exact", "forward", "semi_implicit", "trapezoidal"}
         ``exact`` is the zero-order hold, Ad = exp(A T) and Φ = ∫₀ᵀ exp(A s) ds. ``forward`` is forward Euler.
-        ``semi_implicit`` is Euler with the states renewed from the last to the first, each with those already renewed:
-        for (position, velocity) the velocity first, then the position with the new velocity. ``trapezoidal`` is
-        Ad = (I − A T/2)⁻¹ (I + A T/2) and Φ = T (I − A T/2)⁻¹, of second order: x(t + T) = x + T/2 (ẋ(t) + ẋ(t + T)).
-        With g held it is not Tustin's method, which averages g over both ends.
+        ``semi_implicit`` is Euler with the states renewed from the last to the first, each from those already renewed:
+        of (position, velocity) the velocity comes first, and the position uses the new one. ``trapezoidal`` is Ad = (I
+        − A T/2)⁻¹ (I + A T/2) and Φ = T (I − A T/2)⁻¹, of second order: x(t + T) = x + T/2 (ẋ(t) + ẋ(t + T)). With g
+        held it is not Tustin's method, which averages g over both ends.
 
     Raises
     ------
     SampleTimeError
-        Another method, or a trapezoidal step whose I − A T/2 is singular.
+        For another method, and for a trapezoidal step whose I − A T/2 is singular.
     """
     check_method(method)
     n = len(A)

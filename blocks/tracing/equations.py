@@ -1,4 +1,4 @@
-"""What a block's equations must look like and what they must return, checked before anything is made of it."""
+"""Checks of a block's equations: their arguments, and the values that they return."""
 
 from __future__ import annotations
 
@@ -32,62 +32,62 @@ _SAMPLED = ("output", "update", "guards")  # may take T besides
 
 
 def check_definition(block: Block) -> None:
-    """Refuse equations that are no functions of the arguments they get, and ports that hide them.
+    """Refuse equations with other arguments than theirs, and ports that hide an equation.
 
     Raises
     ------
     DefinitionError
-        A port that is named like an equation, or like an attribute that every block has.
+        For a port that is named like an equation, or like an attribute of every block.
     TraceError
-        An equation with other arguments.
+        For an equation with other arguments.
     """
     cls = type(block)
     ports: dict[str, Port] = {**block.inputs, **block.states, **block.outputs, **block.events}
     for name in ports:
         hides = isinstance(inspect.getattr_static(cls, name, None), Port)  # ports made by a property hide nothing
         if hides and (name in _ARGUMENTS or hasattr(Block, name)):
-            what = "an equation" if name in _ARGUMENTS else "an attribute of every block"
-            raise DefinitionError(f"a port can't be called {name!r}, the name of {what}; rename the port.", port=name)
-    for what, names in _ARGUMENTS.items():
-        function = getattr(block, what, None)
+            owner = "an equation" if name in _ARGUMENTS else "an attribute of every block"
+            raise DefinitionError(f"a port can't be called {name!r}, the name of {owner}; rename the port.", port=name)
+    for equation, names in _ARGUMENTS.items():
+        function = getattr(block, equation, None)
         if function is None:
             continue
-        last = ", and T where the sample time is needed" if what in _SAMPLED else ""
-        expected = f"expected {what}(self, {', '.join(names)}){last}"
+        last = ", and T where the sample time is needed" if equation in _SAMPLED else ""
+        expected = f"expected {equation}(self, {', '.join(names)}){last}"
         if not callable(function):
-            raise TraceError(f"its {what} is {_named(function)}; {expected}. Define it as a function.")
+            raise TraceError(f"its {equation} is {_describe(function)}; {expected}. Define it as a function.")
         try:
             signature = inspect.signature(function)
-            given = {"T": None} if what in (*_SAMPLED, "derivative") and "T" in signature.parameters else {}
+            given = {"T": None} if equation in (*_SAMPLED, "derivative") and "T" in signature.parameters else {}
             signature.bind(*names, **given)
         except (TypeError, ValueError):
-            written = str(inspect.signature(getattr(cls, what))).partition(" ->")[0]
-            raise TraceError(f"found {what}{written}; {expected}. Give it these arguments.") from None
+            written = str(inspect.signature(getattr(cls, equation))).partition(" ->")[0]
+            raise TraceError(f"found {equation}{written}; {expected}. Give it these arguments.") from None
 
 
 def takes_update(block: Block, sampled: bool) -> bool:
-    """Whether the states advance by ``update``: in a sampled frame, else where nothing else advances them."""
+    """Whether the states advance by ``update``: in a sampled subsystem, else where nothing else advances them."""
     if not hasattr(block, "update"):
         return False
     return sampled or not (hasattr(block, "derivative") or (block.events and not block.memory))
 
 
-def untraceable(error: Exception, block: Block, what: str) -> TraceError:
-    """Return the error that says which line of the user's equations an operation failed on."""
-    # by the code's own file, which a notebook's cell and a script have too; helpers beside the equation count as well
-    equation: Any = inspect.unwrap(block.written(what))
-    while isinstance(equation, functools.partial):
-        equation = equation.func
-    if not hasattr(equation, "__code__"):  # an object that can be called
-        equation = type(equation).__call__
-    file = getattr(getattr(equation, "__code__", None), "co_filename", None)
+def trace_error(error: Exception, block: Block, equation: str) -> TraceError:
+    """Return the error of a trace that failed, with the line of the user's equations."""
+    # the line is found by its file, which a notebook's cell and a script have too, and helpers of the equation share
+    function: Any = inspect.unwrap(block.equation_function(equation))
+    while isinstance(function, functools.partial):
+        function = function.func
+    if not hasattr(function, "__code__"):  # an object that can be called
+        function = type(function).__call__
+    file = getattr(getattr(function, "__code__", None), "co_filename", None)
     line, step = "", error.__traceback__
     while step is not None:
         if step.tb_frame.f_code.co_filename == file:
             code = linecache.getline(file, step.tb_lineno).strip()
             line = f" in line {step.tb_lineno} of {file}" + (f", {code!r}" if code else "")
         step = step.tb_next
-    text = f"its {what} can't be traced{line}: {type(error).__name__}: {error}."
+    text = f"its {equation} can't be traced{line}: {type(error).__name__}: {error}."
     if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
         mistake = TraceError(f"{text} Correct the equation there.")
         mistake.is_mistake = True
@@ -99,8 +99,8 @@ def untraceable(error: Exception, block: Block, what: str) -> TraceError:
     )
 
 
-def _named(value: Any) -> str:
-    """Say in words what an equation returned."""
+def _describe(value: Any) -> str:
+    """Name in words the value that an equation returned."""
     if value is None:
         return "nothing"
     shape = _shape(value)
@@ -123,45 +123,48 @@ def _shape(value: Any) -> Shape | None:
     return array.shape if array.dtype.kind in "biuf" else None
 
 
-def parts_of(result: Any, names: list[str], what: str) -> list[Any]:
+def parts_of(result: Any, names: list[str], equation: str) -> list[Any]:
     """Return the values of an equation, one for each name.
 
     Raises
     ------
     TraceError
-        It returned nothing, or not as many values as there are names.
+        If it returned nothing, or not as many values as there are names.
     """
     if result is None and names:
-        raise TraceError(f"its {what} returned nothing; expected {_expected(names)}. End it with a return.")
+        raise TraceError(f"its {equation} returned nothing; expected {_describe_values(names)}. End it with a return.")
     if len(names) == 1:
         return [result]
     if isinstance(result, list | tuple) and len(result) == len(names):
         return list(result)
     raise TraceError(
-        f"its {what} returned {_named(result)}; expected {_expected(names)}. Write return {', '.join(names)}."
+        f"its {equation} returned {_describe(result)}; expected {_describe_values(names)}. Write return "
+        f"{', '.join(names)}."
     )
 
 
-def _expected(names: list[str]) -> str:
+def _describe_values(names: list[str]) -> str:
     return f"the value of {names[0]}" if len(names) == 1 else f"a tuple of {len(names)}: {', '.join(names)}"
 
 
-def split(result: Any, declared: Mapping[str, Shape | None], what: str) -> tuple[dict[str, Any], dict[str, Shape]]:
-    """Match what an equation returned with the ports declared: columns, and shapes.
+def match_ports(
+    result: Any, declared: Mapping[str, Shape | None], equation: str
+) -> tuple[dict[str, Any], dict[str, Shape]]:
+    """Return columns and shapes of the values that an equation returned, by the names of the declared ports.
 
     Raises
     ------
     TraceError, ShapeError
-        Not one value for each port, or one that is no array of the declared shape.
+        If there is not one value for each port, or one is no array of the declared shape.
     """
     made, shapes = {}, {}
     names = list(declared)
-    for name, part in zip(names, parts_of(result, names, what), strict=True):
-        made[name], shapes[name] = _column(part, declared[name], name, what)
+    for name, part in zip(names, parts_of(result, names, equation), strict=True):
+        made[name], shapes[name] = _column(part, declared[name], name, equation)
     return made, shapes
 
 
-def _column(part: Any, expected: Shape | None, name: str, what: str) -> tuple[Any, Shape]:
+def _column(part: Any, expected: Shape | None, name: str, equation: str) -> tuple[Any, Shape]:
     shape = _shape(part)
     if shape is None:
         n = len(part) if isinstance(part, list | tuple) else 0
@@ -176,16 +179,18 @@ def _column(part: Any, expected: Shape | None, name: str, what: str) -> tuple[An
             step = "Return the value itself, without brackets or a comma behind it."
         else:
             step = "Compute it with NumPy functions of t, x and u."
-        raise TraceError(f"its {what} returned {_named(part)} for {name}; expected {wanted}. {step}", port=name)
+        raise TraceError(f"its {equation} returned {_describe(part)} for {name}; expected {wanted}. {step}", port=name)
     if expected is not None and shape != expected:
         if len(expected) == 1 and size(shape) == 1:
             step = f"Return a vector: np.stack([…]) of {expected[0]}."
         else:
             step = "Return another one, or declare this shape."
-        raise ShapeError(f"its {what} gives shape {shape}; expected {expected} as declared. {step}", port=name)
+        raise ShapeError(f"its {equation} gives shape {shape}; expected {expected} as declared. {step}", port=name)
     flat = flat_column(part)
     if flat.numel() != size(shape):
-        raise ShapeError(f"its {what} gives {flat.numel()} entries for shape {shape}; index it explicitly.", port=name)
+        raise ShapeError(
+            f"its {equation} gives {flat.numel()} entries for shape {shape}; index it explicitly.", port=name
+        )
     return ca.densify(flat), shape
 
 
@@ -195,11 +200,11 @@ def guards_of(result: Any) -> dict[str, Any]:
     Raises
     ------
     TraceError, ShapeError
-        No dictionary, or an expression that is no scalar.
+        If they are no dictionary, or an expression is no scalar.
     """
     if not isinstance(result, Mapping) or not all(isinstance(name, str) for name in result):
         raise TraceError(
-            f"its guards returned {_named(result)}; expected a dictionary of expressions by name, which must stay "
+            f"its guards returned {_describe(result)}; expected a dictionary of expressions by name, which must stay "
             "positive, such as {'margin': 1.0 - x.y}. Return one."
         )
     made = {}
@@ -207,7 +212,7 @@ def guards_of(result: Any) -> dict[str, Any]:
         shape = _shape(value)
         if shape != ():
             raise ShapeError(
-                f"its guard {name!r} is {_named(value)}; expected a scalar. Take np.min of it, or name each entry."
+                f"its guard {name!r} is {_describe(value)}; expected a scalar. Take np.min of it, or name each entry."
             )
         made[name] = flat_column(value)
     return made
@@ -219,9 +224,9 @@ def start_values(block: Block, shapes: Mapping[str, Shape]) -> dict[str, np.ndar
     Raises
     ------
     DefinitionError
-        A start or a ``like`` that names nothing, or a start that is no number.
+        If a start or a ``like`` names nothing, or a start is no number.
     ShapeError
-        A start value that doesn't fit the input whose shape the state takes.
+        If a start value doesn't fit the input whose shape the state takes.
     """
     values = {}
     for name, port in block.states.items():
@@ -255,7 +260,7 @@ def start_values(block: Block, shapes: Mapping[str, Shape]) -> dict[str, np.ndar
 
 
 def start_shapes(block: Block) -> list[Shape]:
-    """Return the shapes that the start values have by themselves, whatever the inputs' shapes are."""
+    """Return the shapes of the start values as they are written, before any is broadcast to an input's shape."""
     shapes = []
     for port in block.states.values():
         alone = State(start=port.start)
@@ -269,14 +274,14 @@ def initial_state(block: Any, states: Mapping[str, Shape], u: Any) -> np.ndarray
     Raises
     ------
     TraceError, ShapeError
-        Not one value for each state, or one of another shape.
+        If there is not one value for each state, or one has another shape.
     """
     names = list(states)
     columns = [np.zeros(0)]
     for name, part in zip(names, parts_of(block.initial(u), names, "initial"), strict=True):
         shape = _shape(part)
         if shape is None:
-            raise TraceError(f"its initial returned {_named(part)} for {name}; expected numbers.", port=name)
+            raise TraceError(f"its initial returned {_describe(part)} for {name}; expected numbers.", port=name)
         if size(shape) != size(states[name]):
             raise ShapeError(f"its initial gives shape {shape}; expected {states[name]}, as the state has.", port=name)
         columns.append(np.ravel(np.asarray(part, dtype=float)))

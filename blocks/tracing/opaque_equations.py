@@ -1,8 +1,8 @@
-"""Equations in arbitrary Python, as functions that a trace calls.
+"""Opaque equations: arbitrary Python, as functions that a trace calls.
 
 An exception can't pass through CasADi: the last one is kept in `Foreign.failures`, and the results are NaN, at which
-every run stops. Who looks for the reason of a NaN clears the failures, evaluates again, and looks there first, with
-`raise_failure`: a solver may have got over an earlier one by a shorter step.
+every run stops. To find the reason of a NaN, clear the failures, evaluate again and call `raise_failure`: an old
+failure may be one that a solver got over by a shorter step.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ..core.ports import Shape
 from .equations import parts_of
 from .symbols import bundle, size, with_values, wrap
 
-_STEP = float(np.cbrt(np.finfo(float).eps))  # of a difference: what rounding does to it is 4e-11 of the value
+_STEP = float(np.cbrt(np.finfo(float).eps))  # of a difference, relative: rounding changes it by 4e-11 of the value
 
 
 class Foreign:
@@ -33,7 +33,7 @@ class Foreign:
     shapes, starts
         Shapes of the inputs, start values of the states.
     numbers : sequence of (str, value)
-        What p holds, in order; "T" is the sample time.
+        Entries of p, in order; "T" is the sample time.
     """
 
     def __init__(
@@ -48,81 +48,84 @@ class Foreign:
         self.functions: dict[str, _Equation] = {}
         nominals = [np.full(v.shape, block.states[n].nominal or 1.0) for n, v in starts.items()]
         inputs = [np.full(size(s), block.inputs[n].nominal or 1.0) for n, s in shapes.items()]
-        self.nominals = [np.ones(1), _joined(nominals), *inputs, np.ones(sum(np.size(v) for _, v in numbers))]
+        self.nominals = [np.ones(1), _join(nominals), *inputs, np.ones(sum(np.size(v) for _, v in numbers))]
 
-    def call(self, what: str, arguments: Sequence[Any], *, sample_time: bool) -> Any:
-        """Return what an equation returns, as symbols, for columns t, x, the inputs, p, and the events that fire."""
-        if what not in self.functions:
-            self.functions[what] = _Equation(self, what, self._results(what, sample_time), sample_time)
-        equation = self.functions[what]
-        columns = equation.call(list(arguments))
-        made = {n: wrap(c, s) for (n, s), c in zip(equation.results.items(), columns, strict=True)}
-        if what == "guards":
+    def call(self, equation: str, arguments: Sequence[Any], *, sample_time: bool) -> Any:
+        """Return an equation's results as symbols, for columns t, x, the inputs, p, and the events that fire."""
+        if equation not in self.functions:
+            self.functions[equation] = _Equation(self, equation, self._results(equation, sample_time), sample_time)
+        function = self.functions[equation]
+        columns = function.call(list(arguments))
+        made = {n: wrap(c, s) for (n, s), c in zip(function.results.items(), columns, strict=True)}
+        if equation == "guards":
             return made
         return next(iter(made.values())) if len(made) == 1 else tuple(made.values())
 
-    def evaluate(self, what: str, at: Sequence[np.ndarray], *, sample_time: bool) -> Any:
+    def evaluate(self, equation: str, at: Sequence[np.ndarray], *, sample_time: bool) -> Any:
         """Call an equation with numbers: flat t, x, inputs, p and fired events."""
         t, x, *rest = at
         n = len(self.shapes)
-        numbers = _parts(rest[n], {name: np.shape(v) for name, v in self.numbers})
+        numbers = _split(rest[n], {name: np.shape(v) for name, v in self.numbers})
         T = numbers.pop("T")
         block = with_values(self.block, numbers) if numbers else self.block
-        states = bundle("x", _parts(x, {name: v.shape for name, v in self.starts.items()}))
-        inputs = bundle("u", {k: _shaped(v, s) for (k, s), v in zip(self.shapes.items(), rest[:n], strict=True)})
-        fired = [bundle("fired", _parts(v, dict.fromkeys(self.block.events, ()))) for v in rest[n + 1 :]]
+        states = bundle("x", _split(x, {name: v.shape for name, v in self.starts.items()}))
+        inputs = bundle("u", {k: _reshape(v, s) for (k, s), v in zip(self.shapes.items(), rest[:n], strict=True)})
+        fired = [bundle("fired", _split(v, dict.fromkeys(self.block.events, ()))) for v in rest[n + 1 :]]
         with np.errstate(all="ignore"):
-            return getattr(block, what)(np.float64(t[0]), states, inputs, *fired, **({"T": T} if sample_time else {}))
+            return getattr(block, equation)(
+                np.float64(t[0]), states, inputs, *fired, **({"T": T} if sample_time else {})
+            )
 
     def keep(self, failure: BaseException) -> None:
-        """Keep the last failure; an interrupt is never given up for another."""
+        """Keep the last failure; an interrupt is never replaced."""
         if not self.failures or isinstance(self.failures[0], Exception):
             self.failures[:] = [failure]
 
-    def _results(self, what: str, sample_time: bool) -> dict[str, Shape]:
-        """Return name and shape of what an equation gives; what is not declared is found by one trial call."""
+    def _results(self, equation: str, sample_time: bool) -> dict[str, Shape]:
+        """Return name and shape of an equation's results; shapes that are not declared come from one trial call."""
         block = self.block
         states = {n: v.shape for n, v in self.starts.items()}
         declared: dict[str, Shape | None]
-        if what == "output":
+        if equation == "output":
             declared = {n: port.shape for n, port in block.outputs.items() if n not in states}
-        elif what == "indicators":
+        elif equation == "indicators":
             declared = dict.fromkeys(block.events, ())
-        elif what == "derivative":
+        elif equation == "derivative":
             declared = {n: s for n, s in states.items() if not block.states[n].discrete}
         else:
             declared = dict(states)
-        if what != "guards" and None not in declared.values():
+        if equation != "guards" and None not in declared.values():
             return {n: s for n, s in declared.items() if s is not None}
-        at = [np.zeros(1), _joined([*self.starts.values()]), *map(_trial, self.shapes.values())]
+        at = [np.zeros(1), _join([*self.starts.values()]), *map(_trial_values, self.shapes.values())]
         try:
             made = self.evaluate(
-                what, [*at, _joined([np.asarray(v) for _, v in self.numbers])], sample_time=sample_time
+                equation, [*at, _join([np.asarray(v) for _, v in self.numbers])], sample_time=sample_time
             )
         except LoopwrightError:
             raise
         except Exception as error:
             raise TraceError(
-                f"its {what} failed when it was tried with 1, 1/2, 1/3, … at each input, for the shape of its outputs: "
-                f"{type(error).__name__}: {error}. Correct it, or declare the outputs' shapes: it is not tried then."
+                f"its {equation} failed when it was tried with 1, 1/2, 1/3, … at each input, for the shape of its "
+                f"outputs: {type(error).__name__}: {error}. Correct it, or declare the outputs' shapes: it is not "
+                "tried then."
             ) from error
-        if what == "guards":
+        if equation == "guards":
             return dict.fromkeys(made, ())
-        parts = parts_of(made, list(declared), what)
-        return {n: _array(v, n, what).shape for n, v in zip(declared, parts, strict=True)}
+        parts = parts_of(made, list(declared), equation)
+        return {n: _array(v, n, equation).shape for n, v in zip(declared, parts, strict=True)}
 
-    def numbers_of(self, what: str, result: Any, results: Mapping[str, Shape]) -> list[np.ndarray]:
-        """Return what an equation returned as flat arrays of the shapes expected."""
-        if what == "guards":
+    def flatten_results(self, equation: str, result: Any, results: Mapping[str, Shape]) -> list[np.ndarray]:
+        """Return an equation's results as flat arrays, checked against the shapes expected."""
+        if equation == "guards":
             result = [result[name] for name in results]
             result = result[0] if len(result) == 1 else result
         flat = []
-        for (name, shape), part in zip(results.items(), parts_of(result, list(results), what), strict=True):
-            array = _array(part, name, what)
+        for (name, shape), part in zip(results.items(), parts_of(result, list(results), equation), strict=True):
+            array = _array(part, name, equation)
             if array.shape != shape:
                 raise ShapeError(
-                    f"its {what} gives shape {array.shape}; expected {shape}, as declared or as it gave first. Return "
-                    "another one, or declare this shape.",
+                    f"its {equation} gives shape {array.shape}; expected {shape}, as declared or as it gave first. "
+                    "Return another one, or declare this shape.",
                     port=name,
                 )
             flat.append(array.ravel())
@@ -130,7 +133,7 @@ class Foreign:
 
 
 class _Foreign(ca.Callback):
-    """A function of flat columns that Python evaluates."""
+    """A CasADi function of flat columns that Python evaluates."""
 
     def __init__(self, name: str, inputs: Sequence[Any], outputs: Sequence[Any], options: Mapping[str, Any]):
         ca.Callback.__init__(self)
@@ -154,23 +157,23 @@ class _Foreign(ca.Callback):
 
 
 class _Equation(_Foreign):
-    """An equation of an opaque block."""
+    """One equation of an opaque block."""
 
-    def __init__(self, foreign: Foreign, what: str, results: dict[str, Shape], sample_time: bool):
-        self.foreign, self.what, self.results, self.sample_time = foreign, what, results, sample_time
+    def __init__(self, foreign: Foreign, equation: str, results: dict[str, Shape], sample_time: bool):
+        self.foreign, self.equation, self.results, self.sample_time = foreign, equation, results, sample_time
         self.kept: list[Any] = []
-        self.nominals = [*foreign.nominals, *([np.ones(len(foreign.block.events))] if what == "jump" else [])]
+        self.nominals = [*foreign.nominals, *([np.ones(len(foreign.block.events))] if equation == "jump" else [])]
         columns = [ca.Sparsity.dense(len(v), 1) for v in self.nominals]
-        super().__init__(what, columns, [ca.Sparsity.dense(size(s), 1) for s in results.values()], {})
+        super().__init__(equation, columns, [ca.Sparsity.dense(size(s), 1) for s in results.values()], {})
 
     def at(self, arguments: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return the results at flat arguments; those of a call that fails are NaN."""
         foreign = self.foreign
         try:
-            made = foreign.evaluate(self.what, [v.copy() for v in arguments], sample_time=self.sample_time)
-            return foreign.numbers_of(self.what, made, self.results)
+            made = foreign.evaluate(self.equation, [v.copy() for v in arguments], sample_time=self.sample_time)
+            return foreign.flatten_results(self.equation, made, self.results)
         except BaseException as error:
-            foreign.keep(_failure(error, self.what, foreign, arguments))
+            foreign.keep(_failure(error, self.equation, foreign, arguments))
             return [np.full(size(s), np.nan) for s in self.results.values()]
 
     def eval_buffer(self, arguments: Any, results: Any) -> int:
@@ -189,9 +192,9 @@ class _Equation(_Foreign):
 
 
 class _Differences(_Foreign):
-    """The Jacobian of an equation, by central differences of fourth order.
+    """Jacobian of an equation, by central differences of fourth order.
 
-    Their steps are relative to the value, or to its nominal value where that is larger.
+    The steps are relative to the value, or to its nominal value where that is larger.
     """
 
     def __init__(self, equation: _Equation, name: str, options: Mapping[str, Any]):
@@ -216,7 +219,7 @@ class _Differences(_Foreign):
     def _slope(self, point: list[np.ndarray], values: np.ndarray, k: int, nominal: float) -> list[np.ndarray]:
         """Return the derivative of every result with respect to one entry."""
         middle = values[k]
-        if not np.isfinite(middle):  # the sample time in a continuous frame
+        if not np.isfinite(middle):  # the sample time, in a continuous subsystem
             return [np.zeros(size(s)) for s in self.equation.results.values()]
         step = _STEP * max(abs(middle), nominal)
 
@@ -238,16 +241,18 @@ def raise_failure(failures: list[BaseException], path: str) -> None:
         raise last.at(block=path) if isinstance(last, LoopwrightError) else last
 
 
-def _failure(error: BaseException, what: str, foreign: Foreign, arguments: Sequence[np.ndarray]) -> BaseException:
-    """Return the error that tells of an exception in a user's equation."""
+def _failure(error: BaseException, equation: str, foreign: Foreign, arguments: Sequence[np.ndarray]) -> BaseException:
+    """Return the error for an exception in a user's equation."""
     if not isinstance(error, Exception):
         return error  # an interrupt
     t = float(arguments[0][0])
     if isinstance(error, SimulationError):
         return error.at(t=t)
     inputs = zip(foreign.shapes.items(), arguments[2:], strict=False)
-    shown = ", ".join(f"{name} = {_shaped(v, s).tolist()}" for (name, s), v in inputs)
-    text = str(error) if isinstance(error, LoopwrightError) else f"its {what} failed: {type(error).__name__}: {error}."
+    shown = ", ".join(f"{name} = {_reshape(v, s).tolist()}" for (name, s), v in inputs)
+    text = (
+        str(error) if isinstance(error, LoopwrightError) else f"its {equation} failed: {type(error).__name__}: {error}."
+    )
     told = SimulationError(f"{text} Its inputs then: {shown or 'none'}. Correct the function.", t=t)
     told.port = getattr(error, "port", None)
     told.__cause__ = error
@@ -258,29 +263,30 @@ def _read(buffer: Any) -> np.ndarray:
     return np.zeros(0) if buffer is None or not len(buffer) else np.frombuffer(buffer)
 
 
-def _trial(shape: Shape) -> np.ndarray:
-    """Return entries that most functions take: positive, different, none of them large; a matrix can be inverted."""
+def _trial_values(shape: Shape) -> np.ndarray:
+    """Return values that most functions accept: positive, different, none large; a matrix of them can be inverted."""
     result: np.ndarray = 1.0 / np.arange(1.0, size(shape) + 1.0)
     return result
 
 
-def _joined(arrays: Sequence[np.ndarray]) -> np.ndarray:
+def _join(arrays: Sequence[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.zeros(0), *map(np.ravel, arrays)])
 
 
-def _shaped(flat: np.ndarray, shape: Shape) -> Any:
+def _reshape(flat: np.ndarray, shape: Shape) -> Any:
     return np.float64(flat[0]) if shape == () else flat.reshape(shape)
 
 
-def _parts(flat: np.ndarray, shapes: Mapping[str, Shape]) -> dict[str, Any]:
-    return {name: _shaped(flat[where], shapes[name]) for name, where in Layout.of(shapes).slices.items()}
+def _split(flat: np.ndarray, shapes: Mapping[str, Shape]) -> dict[str, Any]:
+    return {name: _reshape(flat[where], shapes[name]) for name, where in Layout.of(shapes).slices.items()}
 
 
-def _array(value: Any, name: str, what: str) -> np.ndarray:
+def _array(value: Any, name: str, equation: str) -> np.ndarray:
     try:
         return np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         raise TraceError(
-            f"its {what} returned a {type(value).__name__} for {name}; expected numbers. Return a number or an array.",
+            f"its {equation} returned a {type(value).__name__} for {name}; expected numbers. Return a number or an "
+            "array.",
             port=name,
         ) from None

@@ -26,12 +26,12 @@ def _tuple_type(kind: str, names: tuple[str, ...]) -> Any:
 
 
 def bundle(kind: str, values: Mapping[str, Any]) -> Any:
-    """Return a named tuple of states, inputs or outputs, as equations get it."""
+    """Return a named tuple of states, inputs or outputs, as equations take it."""
     return _tuple_type(kind, tuple(values))(*values.values())
 
 
-def expanded(function: Any) -> Any:
-    """Return the function in scalar (SX) operations, each done once, or as it is where it looks up tables."""
+def expand(function: Any) -> Any:
+    """Return the function in scalar (SX) operations, each done once; with a table lookup in it, unchanged."""
     try:
         scalar = function.expand()
     except RuntimeError:
@@ -41,7 +41,7 @@ def expanded(function: Any) -> Any:
 
 
 def with_values(block: Any, values: Mapping[str, Any]) -> Any:
-    """Return a copy of ``block`` whose attributes are replaced, without going through its constructor."""
+    """Return a copy of ``block`` with attributes replaced, without a call of its constructor."""
     copy = object.__new__(type(block))
     copy.__dict__.update(block.__dict__)
     nested: dict[str, dict[str, Any]] = {}

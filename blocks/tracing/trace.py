@@ -1,15 +1,16 @@
-"""Tracing: a block's equations, run once on CasADi's symbols through their NumPy interface.
+"""Tracing: a block's equations run once on CasADi's symbols, through their NumPy interface.
 
-What is traced becomes one CasADi function per block,
+The result is one CasADi function for each block,
 
     F(t, x, u₁ … uₘ, p) → (y₁ … yₖ, next, guards),
 
-with flat columns (vectors and matrices in C order). ``next`` is the state at the next tick in a sampled frame, the time
-derivative in a continuous one. ``p`` holds the parameters, then the sample time, then what was computed from them.
-Parameters are symbols, except exact zeros, which are structure. Traces are shared among blocks of equal structure: the
-library's own in the whole process, those of users' classes within one build of a diagram.
+with flat columns (vectors and matrices in C order). ``next`` is the state at the next tick in a sampled subsystem, and
+the time derivative in a continuous one. ``p`` holds the parameters, the sample time, and the numbers computed from
+them. Parameters are symbols, except exact zeros, which are structure. Blocks of equal structure share a trace: blocks
+of the library in the whole process, blocks of users' classes within one build of a diagram.
 
-Events add two functions in a continuous frame, indicators(t, x, u₁ … uₘ, p) → z and jump(t, x, u₁ … uₘ, p, fired) → x⁺.
+In a continuous subsystem events add two functions, indicators(t, x, u₁ … uₘ, p) → z and jump(t, x, u₁ … uₘ, p, fired) →
+x⁺.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ from ..core.layout import Layout
 from ..core.ports import Shape
 from ..core.values import Value, identity
 from .discretization import hold
-from .equations import check_definition, guards_of, split, start_values, takes_update, untraceable
+from .equations import check_definition, guards_of, match_ports, start_values, takes_update, trace_error
 from .numpy_check import GUARDS, NEXT, compare
 from .opaque_equations import Foreign
-from .symbols import bundle, expanded, flat_column, size, with_values, wrap
-from .trapezoid import trapezoidal
+from .symbols import bundle, expand, flat_column, size, with_values, wrap
+from .trapezoid import trapezoidal_step
 
 
 @dataclass(frozen=True, eq=False)
 class Traced:
-    """The traced equations of a block for given input shapes in a given kind of frame."""
+    """Traced equations of a block, for given shapes of its inputs, in a sampled or a continuous subsystem."""
 
     function: Any
     """CasADi function of (t, x, one column per input, p)."""
@@ -46,23 +47,23 @@ class Traced:
     states: dict[str, Shape]
     guards: tuple[str, ...]
     depends: dict[str, frozenset[str]]
-    """For each output, `NEXT` and `GUARDS`: the inputs (and "t", "x") that it depends on."""
+    """The inputs (and "t", "x") that each output, `NEXT` and `GUARDS` depend on."""
     advance: str
-    """How the states advance: "none", "update", "derivative", "integrator", "affine" or a method's name."""
+    """Kind of the states' advance: "none", "update", "derivative", "integrator", "affine" or a method's name."""
     system_matrix: Any
     """CasADi function p → A where ``advance`` is "affine", else None."""
     method: str
     indicators: Any = None
     """CasADi function of (t, x, one column per input, p), one entry for each event; None without events."""
     jump: Any = None
-    """CasADi function of the same and a column of ones and zeros, to all states; None without events."""
+    """CasADi function of the same and a column of ones and zeros (fired), to all states; None without events."""
     failures: list[BaseException] = field(default_factory=list)
-    """What an opaque block's equations raised last, with NaN as their result; see `raise_failure`."""
+    """The last exception of an opaque block's equations, whose results are then NaN; see `raise_failure`."""
     foreign: Foreign | None = None
-    """The equations of an opaque block: their functions live as long as this does."""
+    """The equations of an opaque block, kept alive with the functions that call them."""
 
     def pack(self, block: Block, T: float) -> np.ndarray:
-        """Return the numbers of ``p`` for ``block`` (of this structure) at the sample time T."""
+        """Return ``p`` for ``block`` (of this structure) at the sample time T."""
         numbers = [np.ravel(v) for _, v in traced_parameters(block)]
         p = np.concatenate([*numbers, [T], *(np.ravel(v) for v in constants_of(block, T, self.method).values())])
         if self.system_matrix is None:
@@ -73,7 +74,7 @@ class Traced:
 
 
 def traced_parameters(block: Value, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted name and value of every parameter that is a symbol in the trace; a nested block's included."""
+    """Yield dotted name and value of every parameter that is a symbol in the trace, nested blocks' included."""
     for name, spec in type(block).parameter_specs.items():
         value = block.__dict__[name]
         if isinstance(value, Block):
@@ -83,7 +84,7 @@ def traced_parameters(block: Value, prefix: str = "") -> Iterator[tuple[str, Any
 
 
 def structure(block: Value) -> Any:
-    """Return what the trace depends on besides the shapes: class, fixed values, which numbers are exactly zero."""
+    """Return the key of a trace besides the shapes: class, fixed values, and which numbers are exactly zero."""
     items: list[Any] = [type(block)]
     for name, spec in type(block).parameter_specs.items():
         value = block.__dict__[name]
@@ -128,21 +129,21 @@ def trace(
     shapes : mapping
         Shape of every input.
     sampled : bool
-        Whether it stands in a sampled frame.
+        Whether the block is in a sampled subsystem.
     method : str
-        Discretization of a continuous block in a sampled frame.
+        Discretization of a continuous block in a sampled subsystem.
     zeros : bool
-        Whether parameters that are exactly zero are structure; False keeps every number a symbol (for export).
+        Whether parameters that are exactly zero are structure; False keeps every number a symbol, for export.
     cache : dict, optional
-        Traces of users' blocks that may be shared: one dictionary for each build of a diagram. The library's own
-        blocks share theirs in the whole process.
+        Traces of users' blocks that may be shared: one dictionary for each build of a diagram. Blocks of the library
+        share theirs in the whole process.
 
     Raises
     ------
     TraceError
-        An operation that can't be traced, or whose traced result differs from NumPy's.
+        For an operation that can't be traced, or whose traced result differs from NumPy's.
     ShapeError
-        An equation that returns another shape than declared.
+        For an equation that returns another shape than declared.
     """
     shared = None if block.opaque else _CACHE if _is_ours(block) else cache
     key = (structure(block), tuple(shapes.items()), sampled, method, zeros)
@@ -165,10 +166,10 @@ _OURS = __name__.partition(".")[0]
 
 
 def _is_ours(value: Any) -> bool:
-    """Whether a value's meaning is in it: it is data, or its class and those of its parameters come from this package.
+    """Whether a value is data, or an object of this package whose parameters are data or of this package too.
 
-    The equations of other classes, and functions, may read what changes between two builds: a constant of their
-    module, a class attribute, a helper.
+    Functions, and the equations of other classes, may change between two builds: they may read a constant of their
+    module, a class attribute or a helper.
     """
     if isinstance(value, Value):
         own = type(value).__module__.partition(".")[0] == _OURS
@@ -210,7 +211,7 @@ class _Tracer:
         p = ca.MX.sym("p", self.p.numel() + hold_numbers.numel())
         parts = ca.vertsplit(p, [0, self.p.numel(), p.numel()])
         results = ca.substitute(results, [self.p, hold_numbers], parts)
-        function = expanded(ca.Function("block", [self.t, self.x, *self.u, p], results))
+        function = expand(ca.Function("block", [self.t, self.x, *self.u, p], results))
         arguments = ("t", "x", *self.shapes)
         depends = {
             name: frozenset(a for j, a in enumerate(arguments) if function.jac_sparsity(i, j).nnz())
@@ -238,7 +239,7 @@ class _Tracer:
 
     def _shadow(self) -> Block:
         """Return the block with symbols for its numbers; exact zeros are structure."""
-        numbers = [*self.entries, ("", 0.0), *self.constants.items()]  # in between, the sample time's place
+        numbers = [*self.entries, ("", 0.0), *self.constants.items()]  # between them the place of the sample time
         slices = Layout.of({str(i): np.shape(value) for i, (_, value) in enumerate(numbers)}).slices
         values: dict[str, Any] = {}
         for (name, value), where in zip(numbers, slices.values(), strict=True):
@@ -250,30 +251,30 @@ class _Tracer:
         shadow: Block = with_values(self.block, values)
         return shadow
 
-    def _call(self, what: str, x: Any = None, *more: Any) -> Any:
-        """Call an equation; ``x`` replaces the states' own symbols, and ``more`` follows the inputs."""
-        sample_time = self._wants_sample_time(what)
+    def _call(self, equation: str, x: Any = None, *more: Any) -> Any:
+        """Call an equation with symbols; ``x`` replaces those of the states, ``more`` follows the inputs."""
+        sample_time = self._wants_sample_time(equation)
         if self.foreign is not None:
             fired = [ca.vertcat(*map(flat_column, bundled)) for bundled in more]
             arguments = [self.t, self.x if x is None else x, *self.u, self.p, *fired]
-            return self.foreign.call(what, arguments, sample_time=sample_time)
+            return self.foreign.call(equation, arguments, sample_time=sample_time)
         states = bundle("x", self._columns(self.states, self.x if x is None else x))
         inputs = bundle("u", {n: wrap(c, s) for (n, s), c in zip(self.shapes.items(), self.u, strict=True)})
         keywords = {"T": wrap(self.T, ())} if sample_time else {}
         try:
-            return getattr(self._shadow(), what)(wrap(self.t, ()), states, inputs, *more, **keywords)
+            return getattr(self._shadow(), equation)(wrap(self.t, ()), states, inputs, *more, **keywords)
         except LoopwrightError:
             raise
         except Exception as error:
-            raise untraceable(error, self.block, what) from error
+            raise trace_error(error, self.block, equation) from error
 
-    def _wants_sample_time(self, what: str) -> bool:
-        declared = inspect.signature(getattr(type(self.block), what)).parameters.get("T")
+    def _wants_sample_time(self, equation: str) -> bool:
+        declared = inspect.signature(getattr(type(self.block), equation)).parameters.get("T")
         if declared is None:
             return False
         if not self.sampled and declared.default is inspect.Parameter.empty:
             raise SampleTimeError(
-                f"its {what} needs a sample time, and it stands in a continuous frame; put it into a "
+                f"its {equation} needs a sample time, and the block is in a continuous subsystem; put it into a "
                 "@subsystem(sample_time=…).",
                 block=self.block.label,
             )
@@ -284,14 +285,14 @@ class _Tracer:
         return {name: wrap(flat[where], shapes[name]) for name, where in Layout.of(shapes).slices.items()}
 
     def _outputs(self) -> tuple[dict[str, Any], dict[str, Shape]]:
-        """Return columns and shapes of all outputs."""
+        """Return columns and shapes of all outputs, by name."""
         own = {n: port.shape for n, port in self.block.outputs.items() if n not in self.states}
         made: dict[str, Any] = {}
         shapes: dict[str, Shape] = {}
         if own:
             if not hasattr(self.block, "output"):
                 raise TraceError(f"it declares the outputs {', '.join(own)} but has no output(t, x, u); write it.")
-            made, shapes = split(self._call("output"), own, "output")
+            made, shapes = match_ports(self._call("output"), own, "output")
         for name, value in self._columns(self.states, self.x).items():
             if name in self.block.outputs:
                 made[name], shapes[name] = flat_column(value), self.states[name]
@@ -315,43 +316,42 @@ class _Tracer:
                     "discrete=True out."
                 )
             return None, None
-        for what in ("indicators", "jump"):
-            if not hasattr(self.block, what):
-                raise TraceError(f"it declares the events {', '.join(events)} but has no {what}; write it.")
-        if self.sampled:  # its update does at the ticks what its jumps do between them
+        for equation in ("indicators", "jump"):
+            if not hasattr(self.block, equation):
+                raise TraceError(f"it declares the events {', '.join(events)} but has no {equation}; write it.")
+        if self.sampled:  # its update acts at the ticks in place of its jumps
             return None, None
         fired = ca.MX.sym("fired", len(events))
-        z = ca.vertcat(*split(self._call("indicators"), dict.fromkeys(events, ()), "indicators")[0].values())
+        z = ca.vertcat(*match_ports(self._call("indicators"), dict.fromkeys(events, ()), "indicators")[0].values())
         after = self._call("jump", None, bundle("fired", self._columns(dict.fromkeys(events, ()), fired)))
-        x_next = ca.vertcat(*split(after, self.states, "jump")[0].values()) if self.states else ca.MX(0, 1)
+        x_next = ca.vertcat(*match_ports(after, self.states, "jump")[0].values()) if self.states else ca.MX(0, 1)
         arguments = [self.t, self.x, *self.u, self.p]
-        indicators = expanded(ca.Function("indicators", arguments, [z]))
-        jump = expanded(ca.Function("jump", [*arguments, fired], [x_next]))
+        indicators = expand(ca.Function("indicators", arguments, [z]))
+        jump = expand(ca.Function("jump", [*arguments, fired], [x_next]))
         self.check(indicators, ["indicators"])
         self.check(jump, ["jump"])
         return indicators, jump
 
     def _advance(self) -> tuple[str, Any, Any, Any]:
-        """Return how the states advance, A(p) where needed, the new states (or rates), and symbols for Ad and Φ."""
+        """Return the kind of advance, A(p) where needed, the new states (or rates), and symbols for Ad and Φ."""
         none, x = ca.MX(0, 1), self.x
         if not self.states:
             return "none", None, none, ca.MX.sym("none", 0)
         update, derivative = hasattr(self.block, "update"), hasattr(self.block, "derivative")
         if self.sampled and self.block.events and not update:
             raise SampleTimeError(
-                f"it has events ({', '.join(self.block.events)}), and it stands in a sampled frame; put it outside of "
-                "it, or give it an update(t, x, u), which acts at the ticks instead of them."
+                f"it has events ({', '.join(self.block.events)}), and it is in a sampled subsystem; put it outside of "
+                "it, or give it an update(t, x, u), which acts at the ticks instead of the events."
             )
 
-        def states_from(what: str, x: Any = None) -> Any:
-            return ca.vertcat(*split(self._call(what, x), self.states, what)[0].values())
+        def states_from(equation: str, x: Any = None) -> Any:
+            return ca.vertcat(*match_ports(self._call(equation, x), self.states, equation)[0].values())
 
         unused = ca.MX.sym("none", 0)
         if takes_update(self.block, self.sampled):
             if not self.sampled and not self.block.memory:
-                raise SampleTimeError(
-                    "a sampled block stands in a continuous frame; put it into a @subsystem(sample_time=…)."
-                )
+                text = "a sampled block is in a continuous subsystem; put it into a @subsystem(sample_time=…)."
+                raise SampleTimeError(text)
             return "update", None, states_from("update"), unused
         discrete = {name for name, port in self.block.states.items() if port.discrete}
         if not derivative and len(discrete) < len(self.states):
@@ -363,9 +363,9 @@ class _Tracer:
         if not self.sampled:
             return "derivative", None, dx, unused
         n, arguments = x.numel(), [self.t, x, *self.u, self.p]
-        jacobian = expanded(ca.Function("A", arguments, [ca.jacobian(dx, x)]))
+        jacobian = expand(ca.Function("A", arguments, [ca.jacobian(dx, x)]))
         if not any(jacobian.jac_sparsity(0, i).nnz() for i in range(2 + len(self.u))):
-            if self.method == "trapezoidal":  # what depends on time is the mean of both ends
+            if self.method == "trapezoidal":  # terms that depend on time are the mean of both ends
                 dx = (dx + ca.substitute(dx, self.t, self.t + self.T)) / 2
             if jacobian.nnz_out(0) == 0:
                 return "integrator", None, x + self.T * dx, unused
@@ -375,9 +375,9 @@ class _Tracer:
             Ad, Phi = (ca.reshape(numbers[i * n * n : (i + 1) * n * n], n, n).T for i in (0, 1))
             return "affine", matrix, Ad @ x + Phi @ ca.substitute(dx, x, ca.MX(ca.DM.zeros(n))), numbers
         if self.method == "trapezoidal":
-            rates = expanded(ca.Function("rates", arguments, [dx]))
+            rates = expand(ca.Function("rates", arguments, [dx]))
             nominals = [np.full(size(self.states[n]), port.nominal or 1.0) for n, port in self.block.states.items()]
-            new, self.solved = trapezoidal(rates, arguments, self.T, np.concatenate(nominals))
+            new, self.solved = trapezoidal_step(rates, arguments, self.T, np.concatenate(nominals))
             return "trapezoidal", None, new, unused
         if self.method == "semi_implicit":
             new = [x[i] for i in range(n)]
@@ -389,12 +389,12 @@ class _Tracer:
     def _rates(self, discrete: set[str]) -> Any:
         """Return the time derivatives of all states, zero for the discrete ones."""
         continuous = {n: s for n, s in self.states.items() if n not in discrete}
-        made = split(self._call("derivative"), continuous, "derivative")[0] if continuous else {}
+        made = match_ports(self._call("derivative"), continuous, "derivative")[0] if continuous else {}
         dx = ca.vertcat(*(made[n] if n in made else ca.MX.zeros(size(s)) for n, s in self.states.items()))
-        self.check(expanded(ca.Function("derivative", [self.t, self.x, *self.u, self.p], [dx])), ["derivative"])
+        self.check(expand(ca.Function("derivative", [self.t, self.x, *self.u, self.p], [dx])), ["derivative"])
         return dx
 
     def check(self, function: Any, names: list[str]) -> None:
-        """Compare results of a traced function with NumPy's own."""
+        """Compare the results of a traced function with NumPy's."""
         if self.foreign is None:
             compare(self.block, function, names, self.shapes, self.starts, self.entries, self.constants, self.sampled)

@@ -8,24 +8,24 @@ import casadi as ca
 import numpy as np
 
 _STEPS = 5
-_TOLERANCE = 1e-9  # of what is left after the last step, relative to each state and to its nominal value
+_TOLERANCE = 1e-9  # of the correction after the last step, relative to each state and to its nominal value
 
 
-def trapezoidal(
+def trapezoidal_step(
     rates: Any, arguments: list[Any], T: Any, nominals: np.ndarray, *, steps: int = _STEPS
 ) -> tuple[Any, Any]:
     """Return the states at the end of a step, x⁺ = x + T/2 (f(t, x, u) + f(t + T, x⁺, u)), and a guard.
 
-    Newton's method starts from x (an explicit guess would be far off in a stiff block), with the exact Jacobian, and
-    takes a fixed number of steps. The guard is negative where the correction that would follow is larger than 1e-9 of
-    any state and of its nominal value. A NaN makes no guard fail: it goes on to the states.
+    Newton's method starts from x (an explicit guess would be far off in a stiff block), has the exact Jacobian, and
+    takes a fixed number of steps. The guard is negative if the correction that would follow is larger, for any state,
+    than 1e-9 of it and its nominal value together. A NaN fails no guard: it goes on to the states.
 
     Parameters
     ----------
     rates : casadi.Function
         f of ``arguments``.
     arguments : list
-        t, x and what else f takes.
+        t, x and the other arguments of f.
     T : symbol
         The sample time.
     nominals : (n,) ndarray
@@ -33,8 +33,8 @@ def trapezoidal(
 
     Notes
     -----
-    The linear equations are solved in scalar operations, as many as n³ where all states are coupled: 0.4 s to trace and
-    0.2 ms a step for 10 of them, 3.5 s and 1 ms for 20.
+    The linear equations are solved in scalar operations, about n³ of them if all states are coupled. 10 such states
+    take 0.4 s to trace and 0.2 ms a step, 20 take 3.5 s and 1 ms.
     """
     t, x, *held = arguments
     n = x.numel()
@@ -45,7 +45,7 @@ def trapezoidal(
     new = x
 
     def newton(new: Any) -> tuple[Any, Any]:
-        """Return the correction that is due, and the rates at the end."""
+        """Return the next correction, and the rates at the end."""
         after = rates(t + T, new, *held)
         matrix = ca.MX(ca.DM.eye(n)) - T / 2 * jacobian(t + T, new, *held)
         return solve(ca.project(matrix, solve.sparsity_in(0)), new - x - T / 2 * (start + after)), after
@@ -58,6 +58,6 @@ def trapezoidal(
 
 
 def _solver(sparsity: Any) -> Any:
-    """Return A⁻¹b as a function of scalar operations (QR), so that the step stays one."""
+    """Return A⁻¹b as a function of scalar operations (QR), so that the step expands to scalar operations too."""
     A, b = ca.SX.sym("A", sparsity), ca.SX.sym("b", sparsity.size1())
     return ca.Function("solve", [A, b], [ca.solve(A, b)])

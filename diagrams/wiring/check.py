@@ -21,7 +21,7 @@ from ...blocks.core.errors import (
 )
 from ...blocks.core.ports import Shape
 from ...blocks.core.units import describe_mismatch, same_unit
-from ...blocks.library.python_control import SampleTimeOfFrame
+from ...blocks.library.python_control import FixedSampleTime
 from ...blocks.tracing.equations import start_shapes
 from ...blocks.tracing.trace import Traced, trace, traced_parameters
 from .structure import Structure, Wire
@@ -260,7 +260,7 @@ def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, 
     frame = table.frame_of[path]
     sampled, method, rate = table.is_sampled(frame), table.method(frame), table.rate(frame)
     try:
-        if rate is not None and isinstance(block, SampleTimeOfFrame):
+        if rate is not None and isinstance(block, FixedSampleTime):
             block.check_rate(float(rate))
         return trace(block, shapes, sampled=sampled, method=method, cache=shared)
     except LoopwrightError as error:

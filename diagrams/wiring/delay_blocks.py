@@ -23,7 +23,7 @@ def add_delay_blocks(table: Structure) -> Structure:
         rate = table.rate(table.frame_of[path])
         if block.transport and rate is not None:
             try:
-                sampled[path] = block.sampled(rate)
+                sampled[path] = block.discretize(rate)
             except LoopwrightError as error:
                 error.block = path
                 raise

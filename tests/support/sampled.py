@@ -1,4 +1,4 @@
-"""A block alone in a sampled frame, under a wave: for the tests of discretization."""
+"""A block alone in a sampled subsystem, under a wave: for the tests of discretization."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ def wave(t):
 
 
 def run_of(block, signal, method="exact", sample_time=T, ticks=TICKS):
-    """A run of the block alone in a sampled frame."""
+    """A run of the block alone in a sampled subsystem."""
 
     @subsystem(sample_time=sample_time, method=method)
     def box(u):

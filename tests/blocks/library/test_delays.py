@@ -35,7 +35,7 @@ def test_a_delay_of_many_steps_is_traced_in_little_time():
 
 @pytest.mark.parametrize("block", [Delay(steps=2), Hold()], ids=lambda block: block.label)
 def test_sampled_blocks_are_refused_in_a_continuous_frame(block):
-    with pytest.raises(SampleTimeError, match=rf"{block.label}: .*continuous frame; put it into a @subsystem"):
+    with pytest.raises(SampleTimeError, match=rf"{block.label}: .*continuous subsystem; put it into a @subsystem"):
         trace(block, {"u": ()}, sampled=False)
 
 
@@ -67,8 +67,8 @@ def test_steps_are_a_whole_number_of_at_least_one(changes):
 def test_a_transport_delay_in_a_sampled_frame_is_one_by_whole_samples(delay, T, steps):
     block = TransportDelay(delay=delay, initial_value=[1.0, 2.0], name="pipe")
     assert block.transport
-    assert block.sampled(T) == Delay(steps=steps, initial_value=[1.0, 2.0])
-    assert block.sampled(T).label == "pipe"
+    assert block.discretize(T) == Delay(steps=steps, initial_value=[1.0, 2.0])
+    assert block.discretize(T).label == "pipe"
 
 
 @pytest.mark.parametrize(
@@ -80,11 +80,11 @@ def test_a_transport_delay_in_a_sampled_frame_is_one_by_whole_samples(delay, T, 
 )
 def test_a_delay_that_is_no_multiple_names_the_nearest(delay, text):
     with pytest.raises(SampleTimeError, match=text):
-        TransportDelay(delay=delay).sampled(0.1)
+        TransportDelay(delay=delay).discretize(0.1)
 
 
 def test_a_transport_delay_has_no_equation_of_its_own():
-    with pytest.raises(SampleTimeError, match=r"Use Delay\(steps=…\) in a sampled frame, PadeDelay"):
+    with pytest.raises(SampleTimeError, match=r"Use Delay\(steps=…\) in a sampled subsystem, PadeDelay"):
         trace(TransportDelay(delay=0.1), {"u": ()}, sampled=False)
 
 

@@ -115,7 +115,7 @@ def test_what_is_no_filter_is_refused():
         IIR(b=[1.0, 2.0], a=[[1.0, 2.0]])
     with pytest.raises(ParameterError, match=r"iir.a: found a first coefficient of zero"):
         IIR(b=[1.0, 2.0], a=[0.0, 2.0])
-    with pytest.raises(ParameterError, match=r"found one coefficient each; use Gain"):
+    with pytest.raises(ParameterError, match=r"found one coefficient each; expected two or more. Use Gain"):
         IIR(b=[1.0], a=[2.0])
     with pytest.raises(ParameterError, match=r"f.sections: found shape \(2, 5\); expected rows of six numbers"):
         IIR.from_sos(np.ones((2, 5)), name="f")
@@ -129,5 +129,5 @@ def test_what_is_no_filter_is_refused():
     ids=lambda block: block.label,
 )
 def test_they_are_refused_in_a_continuous_frame(block):
-    with pytest.raises(SampleTimeError, match=rf"{block.label}: .*continuous frame; put it into a @subsystem"):
+    with pytest.raises(SampleTimeError, match=rf"{block.label}: .*continuous subsystem; put it into a @subsystem"):
         trace(block, dict.fromkeys(block.inputs, ()), sampled=False)

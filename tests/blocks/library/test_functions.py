@@ -136,8 +136,8 @@ def test_two_are_equal_where_the_function_is_the_same():
     ("arguments", "message"),
     [
         ({"function": 3}, r"function\.function: found 3; expected a function, such as np\.sin"),
-        ({"function": lambda *u: u}, r"arguments: found the function .* can't be told; expected names for the inputs"),
-        ({"function": lambda: 1.0}, "can't be told"),
+        ({"function": lambda *u: u}, r"arguments: found the function .* can't be found; expected names for the inputs"),
+        ({"function": lambda: 1.0}, "can't be found"),
         ({"function": product, "results": "a"}, r"results: found 'a', the name of an input too; expected another"),
         ({"function": product, "results": "name"}, "found 'name'; expected names"),
         ({"function": product, "results": "function"}, "found 'function'; expected names"),
@@ -287,7 +287,7 @@ def test_the_numbers_of_an_opaque_block_are_those_of_the_run():
 
 
 class Counter(Block):
-    """Counts how often its input has risen above a level: jumps in a continuous frame, an update in a sampled one."""
+    """Counts how often its input has risen above a level: jumps in a continuous subsystem, an update in a sampled one."""
 
     opaque = True
     u = Input()

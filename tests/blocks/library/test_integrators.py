@@ -120,14 +120,16 @@ def test_a_nan_passes_the_limits():
 
 @pytest.mark.parametrize("block", [LimitedIntegrator(upper=1.0), ResettableIntegrator(upper=1.0)])
 def test_a_vector_with_limits_is_refused_in_a_continuous_frame(block):
-    with pytest.raises(ShapeError, match=r"u: found shape \(2,\); expected a scalar in a continuous frame.* Index the"):
+    with pytest.raises(
+        ShapeError, match=r"u: found shape \(2,\); expected a scalar in a continuous subsystem.* Index the"
+    ):
         trace(block, {"u": (2,), "reset": ()} if "reset" in block.inputs else {"u": (2,)}, sampled=False)
 
 
 @pytest.mark.parametrize(
     ("limits", "text"),
     [
-        ({}, "no limit is given; give lower, upper or both, or use Integrator"),
+        ({}, "found no limit; expected one or two. Give lower, upper or both, or use Integrator"),
         ({"lower": 1.0, "upper": 1.0}, "found lower=1 and upper=1; expected lower below upper"),
         ({"lower": 1.0, "upper": 2.0}, "initial_value: found 0.0; expected a value within the limits, 1 to 2"),
         ({"upper": 1.0, "initial_value": [0.0, 2.0]}, "expected a value within the limits, -inf to 1"),

@@ -124,7 +124,7 @@ def test_the_first_tick_shows_an_edge_only_where_the_value_before_is_told():
 
 def test_an_edge_has_no_place_in_continuous_time():
     with pytest.raises(
-        SampleTimeError, match="edge_detector: a sampled block stands in a continuous frame; put it into"
+        SampleTimeError, match="edge_detector: a sampled block is in a continuous subsystem; put it into"
     ):
         Driven(EdgeDetector(), False, u=np.sin)
 
@@ -197,9 +197,7 @@ def test_what_is_no_number_passes_through(block):
 @pytest.mark.parametrize("block", ALL[:7], ids=lambda b: type(b).__name__)
 def test_a_vector_is_refused_in_a_continuous_frame(block):
     given = dict.fromkeys(block.inputs, of(np.zeros(2)))
-    with pytest.raises(
-        ShapeError, match=r"found shape \(2,\); in a continuous frame it switches by events and takes a"
-    ):
+    with pytest.raises(ShapeError, match=r"found shape \(2,\); expected a scalar in a continuous subsystem, where it"):
         Driven(block, False, **given)
 
 

@@ -81,7 +81,7 @@ def test_values_may_be_vectors(interpolation):
         want = [float(np.squeeze(value(block.replace(values=column), u))) for column in rows.T]
         np.testing.assert_allclose(value(block, u), want, rtol=0, atol=1e-13)
     with pytest.raises(
-        ShapeError, match=r"lookup_1d\.u: found shape \(2,\); expected a scalar, for its values are vectors"
+        ShapeError, match=r"lookup_1d\.u: found shape \(2,\); expected a scalar, since the values are vectors"
     ):
         value(block, np.zeros(2))
 

@@ -151,7 +151,9 @@ def test_play_at_fine_ticks_comes_to_that_of_continuous_time():
 
 
 def test_play_in_continuous_time_needs_the_rate_of_its_input():
-    with pytest.raises(SampleTimeError, match=r"backlash\.rate: in a continuous frame it needs the rate of its input"):
+    with pytest.raises(
+        SampleTimeError, match=r"backlash\.rate: found no rate; expected the rate of u in a continuous sub"
+    ):
         Driven(Backlash(width=1.0), False, u=np.sin)
 
 
@@ -196,7 +198,9 @@ def test_in_continuous_time_it_lags_within_its_limits():
 
 
 def test_in_continuous_time_it_needs_a_lag():
-    with pytest.raises(SampleTimeError, match=r"rate_limiter\.time_constant: in a continuous frame it follows with a"):
+    with pytest.raises(
+        SampleTimeError, match=r"rate_limiter\.time_constant: found none; expected a lag in a continuous"
+    ):
         Driven(RateLimiter(rising=1.0), False, u=np.sin)
 
 
@@ -222,7 +226,7 @@ def test_what_is_no_number_passes_through(block):
 def test_a_vector_is_refused_in_a_continuous_frame(block):
     given = dict.fromkeys(block.inputs, of(np.zeros(2)))
     with pytest.raises(
-        ShapeError, match=r"\.u: found shape \(2,\); in a continuous frame it switches by events and takes"
+        ShapeError, match=r"\.u: found shape \(2,\); expected a scalar in a continuous subsystem, where it switches"
     ):
         Driven(block, False, **given)
 

@@ -48,12 +48,12 @@ def test_its_linear_part_goes_to_python_control(gains, states):
 
 
 def test_the_ideal_form_is_the_parallel_one():
-    block = PID.ideal(gain=2.0, integral_time=0.5, derivative_time=0.1, ratio=8.0, b=0.6, name="speed")
+    block = PID.from_ideal_form(gain=2.0, integral_time=0.5, derivative_time=0.1, ratio=8.0, b=0.6, name="speed")
     s = 1.0 + 2.0j
     want = 2.0 * (0.6 + 1 / (0.5 * s)), -2.0 * (1 + 1 / (0.5 * s) + 0.1 * s / (0.1 / 8.0 * s + 1))
     np.testing.assert_allclose(response(Alone(block).matrices(["r", "y"], "u"), s)[0], want, rtol=1e-13)
     assert block.label == "speed"
-    assert PID.ideal(gain=2.0) == PID(kp=2.0)
+    assert PID.from_ideal_form(gain=2.0) == PID(kp=2.0)
 
 
 DECAYS = {
@@ -211,12 +211,16 @@ def test_anti_windup_takes_the_overshoot_away():
 @pytest.mark.parametrize(
     ("parameters", "port", "text"),
     [
-        ({"kd": 1.0}, "filter_time", "a derivative must be filtered; give filter_time"),
+        ({"kd": 1.0}, "filter_time", "expected a filter for the derivative. Give filter_time"),
         ({"anti_windup": "magic"}, "anti_windup", "found 'magic'; expected one of 'back_calculation', 'clamping'"),
         ({"lower": 1.0, "upper": -1.0}, "lower", "found lower=1 and upper=-1; expected lower below upper"),
         ({"upper": 1.0, "initial_output": 2.0}, "initial_output", "found 2.0; expected a value within the limits"),
-        ({"upper": 1.0, "anti_windup": "clamping"}, "anti_windup", "clamping needs both limits; give lower and upper"),
-        ({"tracking": True, "anti_windup": "none"}, "anti_windup", "tracking works by 'back_calculation'"),
+        (
+            {"upper": 1.0, "anti_windup": "clamping"},
+            "anti_windup",
+            "found clamping without both limits; give lower and upper",
+        ),
+        ({"tracking": True, "anti_windup": "none"}, "anti_windup", "expected 'back_calculation' with tracking"),
         ({"kp": 0.0, "ki": 1.0, "upper": 1.0}, "tracking_time", r"kp / ki is 0 s; expected a positive time"),
         ({"kp": -1.0, "ki": 1.0, "upper": 1.0}, "tracking_time", r"kp / ki is -1 s; .* Give tracking_time"),
     ],

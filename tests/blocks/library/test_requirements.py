@@ -112,7 +112,7 @@ def test_a_requirement_that_is_none_is_refused(make, text):
 
 def test_a_vector_is_refused_in_a_continuous_frame():
     with pytest.raises(
-        ShapeError, match=r"requirement\.u: found shape \(2,\); in a continuous frame it switches by events"
+        ShapeError, match=r"requirement\.u: found shape \(2,\); expected a scalar in a continuous subsystem"
     ):
         Driven(Requirement("x", upper=1.0), False, u=lambda t: np.zeros(2))
 

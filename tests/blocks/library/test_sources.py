@@ -129,7 +129,7 @@ def test_smooth_steps_follow_each_other_through_their_levels():
 
 
 def test_smooth_steps_that_overlap_or_do_not_fit_are_refused():
-    with pytest.raises(ParameterError, match=r"start_times: a step starts before the one before it has ended"):
+    with pytest.raises(ParameterError, match=r"start_times: found a step that starts before the one before it ends"):
         SmoothStep(levels=(0, 1, 2), start_times=(0.0, 0.9), durations=(1.0, 1.0))
     with pytest.raises(ParameterError, match=r"levels: found 2 levels, 2 start times and 2 durations"):
         SmoothStep(levels=(0, 1), start_times=(0.0, 2.0), durations=(1.0, 1.0))

@@ -107,7 +107,7 @@ def test_what_is_no_real_proper_function_is_refused(z, p, text):
 
 
 def test_another_sample_time_is_refused():
-    with pytest.raises(SampleTimeError, match=r"it holds for a sample time of 0.2 s, and its frame has one of 0.1 s"):
+    with pytest.raises(SampleTimeError, match=r"found a sample time of 0.1 s in the subsystem; expected 0.2 s"):
         Alone(DiscreteZeroPoleGain(poles=[0.5], dt=0.2), T=0.1)
 
 

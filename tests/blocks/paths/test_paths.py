@@ -116,9 +116,11 @@ def test_piecewise_polynomials_agree_with_scipy_in_numpy_and_in_a_trace(pieces, 
 
 def test_a_lookup_refuses_what_it_cant_trace():
     breaks, coefficients = np.array([0.0, 1.0]), np.ones((1, 1, 2))
-    with pytest.raises(TraceError, match="of 1 dimensions and of the kind MX; expected a scalar of the kind MX"):
+    with pytest.raises(
+        TraceError, match="of 1 dimensions and of the kind MX for a table; expected a scalar of the kind MX"
+    ):
         piecewise(breaks, coefficients, ArrayInterface(ca.MX.sym("s", 1, 3), ndim=1))
-    with pytest.raises(TraceError, match="of the kind SX; expected a scalar of the kind MX"):
+    with pytest.raises(TraceError, match="of the kind SX for a table; expected a scalar of the kind MX"):
         piecewise(breaks, coefficients, ArrayInterface(ca.SX.sym("s"), ndim=0))
     assert is_traced(ArrayInterface(ca.MX.sym("s"), ndim=0))
     assert not is_traced(1.0)

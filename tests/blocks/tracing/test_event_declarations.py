@@ -165,7 +165,7 @@ def test_an_event_may_have_no_states_behind_it():
 
 def test_a_sampled_block_without_events_stays_refused_in_a_continuous_frame():
     kept = type("Kept", (Block,), {"u": Input(), "x": State(), "update": lambda self, t, x, u: u.u})
-    with pytest.raises(SampleTimeError, match="a sampled block stands in a continuous frame"):
+    with pytest.raises(SampleTimeError, match="a sampled block is in a continuous subsystem"):
         traced(kept())
 
 
@@ -198,7 +198,7 @@ def test_nothing_stops_a_run_and_no_instant_is_special_unless_a_block_says_so():
 
 
 def test_events_without_an_update_are_refused_in_a_sampled_frame():
-    with pytest.raises(SampleTimeError, match=r"thermostat: it has events \(cold, warm\), and it stands in a sampled"):
+    with pytest.raises(SampleTimeError, match=r"thermostat: it has events \(cold, warm\), and it is in a sampled"):
         traced(Thermostat(), sampled=True)
 
 

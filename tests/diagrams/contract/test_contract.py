@@ -135,7 +135,7 @@ def test_a_frame_that_a_block_refuses_is_reported_with_its_reason_and_an_error_w
     report = check_block(UnitDelay(), shapes={"u": (2,)})
     assert report.frames["sampled"] == "checked"
     assert "put it into a @subsystem(sample_time=…)" in report.frames["continuous"]
-    with pytest.raises(SampleTimeError, match="unit_delay: a sampled block stands in a continuous frame"):
+    with pytest.raises(SampleTimeError, match="unit_delay: a sampled block is in a continuous subsystem"):
         check_block(UnitDelay(), frames=["continuous"])
 
 

@@ -289,7 +289,9 @@ def test_in_a_sampled_box_of_another_raster_it_is_refused_when_the_diagram_is_bu
     def box(t):
         return TransportDelay(delay=0.25, name="late")(t)
 
-    with pytest.raises(SampleTimeError, match=r"box\.late.*delay of 0\.25 s in a frame with a sample time of 0\.1 s"):
+    with pytest.raises(
+        SampleTimeError, match=r"box\.late.*delay of 0\.25 s in a subsystem with a sample time of 0\.1 s"
+    ):
         Diagram("d", box(Clock()))
 
 

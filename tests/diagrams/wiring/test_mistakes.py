@@ -341,7 +341,7 @@ def test_initial_values_that_wait_for_each_other_are_an_error_of_their_own():
 
 def test_a_sampled_block_in_a_continuous_frame():
     with pytest.raises(
-        SampleTimeError, match=r"delay: a sampled block stands in a continuous frame; put it into a @subsystem"
+        SampleTimeError, match=r"delay: a sampled block is in a continuous subsystem; put it into a @subsystem"
     ):
         Diagram("d", UnitDelay(initial_value=0, name="delay")(Constant(value=1)))
 
