@@ -1,4 +1,7 @@
-"""Independent confirmations: closed-loop eigenvalues beside a limit, encirclements with a delay, Hamiltonian levels."""
+"""Independent confirmations: closed-loop eigenvalues beside a limit, encirclements with a delay, Hamiltonian levels.
+
+Each ``confirm_…`` raises ConfirmationError if its computation disagrees, and else returns it as a text.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +12,17 @@ import numpy as np
 from ...blocks.core.errors import ConfirmationError
 from .crossings import Crossing
 from .features import Features
-from .nyquist import winding
+from .nyquist import winding_number
 from .realization import Realization
 
 STEP = 0.01
 LEVEL = 1e-3
 
 
-def beside(value: float, others: Sequence[float], nominal: float) -> tuple[float, float]:
-    """Return the two values, 1 % to both sides of a limit or nearer, at which stability is asked for.
+def pick_test_values(value: float, others: Sequence[float], nominal: float) -> tuple[float, float]:
+    """Return two values at which stability is tested, 1 % to both sides of a limit; the nominal side comes first.
 
-    Nearer where another limit, or the nominal value, would lie in between.
+    They are nearer where another limit, or the nominal value, would lie in between.
     """
     apart = [abs(o - value) / abs(value) for o in (*others, nominal) if abs(o - value) > 1e-9 * abs(value)]
     h = min([STEP, *(0.5 * a for a in apart)])
@@ -27,31 +30,31 @@ def beside(value: float, others: Sequence[float], nominal: float) -> tuple[float
     return (inner, outer) if abs(nominal - inner) < abs(nominal - outer) else (outer, inner)
 
 
-def limit(
+def confirm_limit(
     name: str, value: float, others: Sequence[float], nominal: float, stable: Callable[[float], bool], how: str
 ) -> str:
-    """Confirm that stability ends at a limit, seen from the nominal value; return how.
+    """Confirm that stability ends at a limit, seen from the nominal value; return the computation.
 
     Raises
     ------
     ConfirmationError
         If the loop is not stable on the near side and unstable on the far side.
     """
-    inside, outside = beside(value, others, nominal)
+    inside, outside = pick_test_values(value, others, nominal)
     found = stable(inside), stable(outside)
     if found != (True, False):
         words = ["stable" if s else "unstable" for s in found]
         raise ConfirmationError(
             f"found the limit {value:.12g}, but {how} say {words[0]} at {inside:.12g} and {words[1]} at "
-            f"{outside:.12g}; expected stable before it and unstable beyond. Look at closed_loop_poles: the "
-            "realization may be too ill-conditioned for one of the two.",
+            f"{outside:.12g}; expected stable before it and unstable beyond it. Look at closed_loop_poles: the "
+            "realization may be ill-conditioned.",
             block=name,
         )
     return f"{how}: stable at {inside:.9g}, unstable at {outside:.9g}"
 
 
-def none(name: str, values: Sequence[float], stable: Callable[[float], bool], how: str) -> str:
-    """Confirm that there is no limit: stable at all the values; return how."""
+def confirm_no_limit(name: str, values: Sequence[float], stable: Callable[[float], bool], how: str) -> str:
+    """Confirm that the loop is stable at all the values; return the computation."""
     bad = [v for v in values if not stable(v)]
     if bad:
         raise ConfirmationError(
@@ -61,8 +64,8 @@ def none(name: str, values: Sequence[float], stable: Callable[[float], bool], ho
     return f"{how}: stable at " + ", ".join(f"{v:.6g}" for v in values)
 
 
-def at_crossing(r: Realization, c: Crossing, factor: complex, name: str) -> str:
-    """Confirm that the loop with this factor has a closed-loop pole at the frequency of the crossing."""
+def confirm_crossing(r: Realization, c: Crossing, factor: complex, name: str) -> str:
+    """Confirm that the loop, multiplied by this factor, has a closed-loop pole at the crossing's frequency."""
     if np.isinf(c.omega):
         ok = abs(1 + factor * r.D[0, 0]) < 1e-9
         where = "1 + D vanishes with this factor: a closed-loop pole passes through infinity"
@@ -73,15 +76,15 @@ def at_crossing(r: Realization, c: Crossing, factor: complex, name: str) -> str:
         where = "a closed-loop eigenvalue lies there with this factor"
     if not ok:
         raise ConfirmationError(
-            f"found a crossing at {c.omega:.12g} rad/s, but no closed-loop eigenvalue is there with the factor "
-            f"{factor:.6g}; expected one. The realization may be too ill-conditioned.",
+            f"found a crossing at {c.omega:.12g} rad/s, but no closed-loop eigenvalue there with the factor "
+            f"{factor:.6g}; expected one. Look at closed_loop_poles: the realization may be ill-conditioned.",
             block=name,
         )
     return where
 
 
-def sensitivity(r: Realization, a: float, b: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return matrices of b I + (a − b) (I + L)⁻¹; a sampled one is mapped to continuous time, which keeps its norm."""
+def sensitivity_matrices(r: Realization, a: float, b: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the matrices of b I + (a − b) (I + L)⁻¹ in continuous time; a sampled one is mapped with its norm kept."""
     eye = np.eye(len(r.D))
     inverse = np.linalg.inv(eye + r.D)
     A, B, C, D = r.A - r.B @ inverse @ r.C, r.B @ inverse, -(a - b) * inverse @ r.C, b * eye + (a - b) * inverse
@@ -92,12 +95,13 @@ def sensitivity(r: Realization, a: float, b: float) -> tuple[np.ndarray, np.ndar
     return A, B * ratio, C / ratio, D
 
 
-def levels(r: Realization, a: float, b: float, gamma: float) -> np.ndarray | None:
-    """Return eigenvalues of the Hamiltonian that are imaginary where a singular value of (a + b L)(1 + L)⁻¹ is gamma.
+def find_level_eigenvalues(r: Realization, a: float, b: float, gamma: float) -> np.ndarray | None:
+    """Return the eigenvalues of the Hamiltonian of (a + b L)(1 + L)⁻¹ for the level gamma.
 
-    None where the value at infinite frequency (at z = −1) is above gamma.
+    An eigenvalue jω lies on the imaginary axis where a singular value is gamma at ω. None where the value at infinite
+    frequency (at z = −1) is above gamma.
     """
-    A, B, C, D = sensitivity(r, a, b)
+    A, B, C, D = sensitivity_matrices(r, a, b)
     R = gamma**2 * np.eye(len(D)) - D.T @ D
     if np.linalg.eigvalsh(R).min() <= 0:
         return None
@@ -111,24 +115,27 @@ def levels(r: Realization, a: float, b: float, gamma: float) -> np.ndarray | Non
     return np.asarray(np.linalg.eigvals(H))
 
 
-def level_frequencies(r: Realization, a: float, b: float, gamma: float) -> np.ndarray | None:
-    """Return where a singular value of (a + b L)(1 + L)⁻¹ is gamma, rad/s; None where `levels` gives none."""
-    eigenvalues = levels(r, a, b, gamma)
+def find_level_frequencies(r: Realization, a: float, b: float, gamma: float) -> np.ndarray | None:
+    """Return the frequencies at which a singular value of (a + b L)(1 + L)⁻¹ is gamma, rad/s.
+
+    None where `find_level_eigenvalues` gives none.
+    """
+    eigenvalues = find_level_eigenvalues(r, a, b, gamma)
     if eigenvalues is None:
         return None
     omega = np.sort(np.abs(eigenvalues[np.abs(eigenvalues.real) <= 1e-4 * np.abs(eigenvalues)].imag))
     return np.asarray(2 / r.dt * np.arctan(omega * r.dt / 2) if r.dt else omega)
 
 
-def peak(r: Realization, a: float, b: float, value: float, name: str) -> str:
-    """Confirm a largest singular value over frequency by Hamiltonian eigenvalues for levels on both sides of it.
+def confirm_peak(r: Realization, a: float, b: float, value: float, name: str) -> str:
+    """Confirm a largest singular value over frequency by Hamiltonian eigenvalues for levels below and above it.
 
-    Below it some lie on the axis, up to rounding; above it they have left it. How far rounding takes them depends on
-    the realization, so the two distances are compared with each other.
+    For the lower level some eigenvalues lie on the imaginary axis, for the upper one none. Rounding moves them by an
+    amount that depends on the realization, so the two distances from the axis are compared with each other.
     """
     apart = []
     for level in (value * (1 - LEVEL), value * (1 + LEVEL)):
-        eigenvalues = levels(r, a, b, level)
+        eigenvalues = find_level_eigenvalues(r, a, b, level)
         if eigenvalues is None:
             apart.append(0.0)
         else:
@@ -138,46 +145,46 @@ def peak(r: Realization, a: float, b: float, value: float, name: str) -> str:
         raise ConfirmationError(
             f"found the peak {value:.12g}, but the Hamiltonian eigenvalues are {below:.3g} from the axis at "
             f"{1 - LEVEL:g} of it and {above:.3g} at {1 + LEVEL:g}, relative to their size; expected them on the axis "
-            "only below. A very narrow resonance may have been missed.",
+            "at the first only. Look at closed_loop_poles for a very narrow resonance, which a scan may miss.",
             block=name,
         )
     return f"Hamiltonian eigenvalues: level reached at {1 - LEVEL:g}, not at {1 + LEVEL:g} of it"
 
 
-def delay(r: Realization, features: Features, value: float, others: Sequence[float]) -> str:
+def confirm_delay(r: Realization, features: Features, value: float, others: Sequence[float]) -> str:
     """Confirm the delay margin of a continuous loop by the encirclements of 1 + L e^(−sτ)."""
     unstable = features.unstable_poles()
 
     def stable(tau: float) -> bool:
-        return winding(r, features, delay=tau) + unstable == 0
+        return winding_number(r, features, delay=tau) + unstable == 0
 
-    return limit("delay_margin", value, others, 0.0, stable, "encirclements of 1 + L exp(−sτ)")
+    return confirm_limit("delay_margin", value, others, 0.0, stable, "encirclements of 1 + L exp(−sτ)")
 
 
-def on_the_limit(r: Realization, n: int) -> None:
-    """Confirm that n samples of delay in series put closed-loop poles on the limit of stability; up to 100 samples."""
+def confirm_on_limit(r: Realization, n: int) -> None:
+    """Confirm that n samples of delay in series put a closed-loop pole on the unit circle; beyond 100 do nothing."""
     if n > 100:
         return
     delayed = r
     for _ in range(n):
-        delayed = delayed.delayed()
+        delayed = delayed.delay_once()
     nearest = float(np.min(np.abs(delayed.growth(delayed.eigenvalues()))))
     if nearest > 1e-6:
         raise ConfirmationError(
-            f"found a margin of {n} samples, but with these no closed-loop pole is nearer than {nearest:.3g} to the "
-            "unit circle; expected one on it. Look at closed_loop_poles.",
+            f"found a margin of {n} samples, but with that delay no closed-loop pole is nearer than {nearest:.3g} to "
+            "the unit circle; expected one on it. Look at closed_loop_poles.",
             block="delay_margin",
         )
 
 
-def whole_samples(r: Realization, features: Features, n: int) -> int:
+def count_unstable(r: Realization, features: Features, n: int) -> int:
     """Return the number of closed-loop poles that are not stable with n samples of delay in series.
 
-    By eigenvalues; beyond 100 samples by encirclements.
+    Eigenvalues count them up to 100 samples, encirclements beyond.
     """
     if n > 100:
-        return winding(r, features, delay=n * r.dt) + features.unstable_poles()
+        return winding_number(r, features, delay=n * r.dt) + features.unstable_poles()
     delayed = r
     for _ in range(n):
-        delayed = delayed.delayed()
-    return delayed.unstable()
+        delayed = delayed.delay_once()
+    return delayed.count_unstable()

@@ -1,18 +1,19 @@
-"""Crossings and peaks of a loop's frequency response, as polished roots."""
+"""Crossings and peaks of a loop's frequency response: found on a scan, then refined as roots."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from .features import Features, scan
 from .realization import Realization
 
-Function = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]  # of L and dL/d(log ω): value, slope
-POLISHED = 20  # candidates of a peak that are polished
+Function = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""From L and dL/d(log ω) to a value and its slope over log ω."""
+POLISHED = 20
+"""Number of candidates of a peak that are refined."""
 
 
 @dataclass(frozen=True)
@@ -22,13 +23,13 @@ class Crossing:
     Parameters
     ----------
     omega : float
-        The frequency, rad/s.
+        Frequency, rad/s.
     L : complex
-        The loop there.
+        Value of the loop there.
     slope : float
-        How the polished function rises there, per unit of log ω; zero at the ends of the axis.
+        Slope over log ω of the function whose root the frequency is; zero at the ends of the axis.
     error : float
-        Relative rounding error of L there.
+        Relative rounding error of L.
     """
 
     omega: float
@@ -44,14 +45,14 @@ class Crossing:
 
 @dataclass(frozen=True)
 class Peak:
-    """The largest value of a function of frequency, and where it is taken (rad/s)."""
+    """The largest value of a function of frequency, and its frequency in rad/s."""
 
     value: float
     omega: float
 
 
 class Scan:
-    """A loop with one channel, scanned once; all crossings and peaks are roots polished from there.
+    """Frequency response of a loop with one channel, sampled once; crossings and peaks are refined from the samples.
 
     Parameters
     ----------
@@ -65,23 +66,23 @@ class Scan:
         self.segments = scan(r, self.features)
         self.samples = [self._response(omega) for omega in self.segments]
 
-    def gain_crossovers(self) -> list[Crossing]:
-        """Return where |L| = 1, by rising frequency; also where it begins or ends there."""
+    def find_gain_crossovers(self) -> list[Crossing]:
+        """Return the crossings of |L| = 1 by rising frequency, the ends of the axis included."""
 
         def gain(L: np.ndarray, dL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return np.log(np.abs(L)), np.real(dL / L)
 
-        inside = [self._crossing(omega, gain) for omega in self._roots(gain)]
+        inside = [self._make_crossing(omega, gain) for omega in self._find_roots(gain)]
         ends = [Crossing(omega, L, 0.0, 1e-13) for omega, L in self.ends() if abs(abs(L) - 1) < 1e-13]
         return sorted(inside + ends, key=lambda c: c.omega)
 
-    def phase_crossovers(self) -> list[Crossing]:
-        """Return where L is real and negative, by rising frequency; also at 0, at π/T, and at infinity (D < 0)."""
+    def find_phase_crossovers(self) -> list[Crossing]:
+        """Return the points with L real and negative by rising frequency; also at 0, at π/T and at infinity (D < 0)."""
 
         def sine(L: np.ndarray, dL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return L.imag / np.abs(L), np.real(L) / np.abs(L) * np.imag(dL / L)
 
-        inside = [self._crossing(omega, sine) for omega in self._roots(sine)]
+        inside = [self._make_crossing(omega, sine) for omega in self._find_roots(sine)]
         found = [c for c in inside if c.L.real < 0 and c.slope != 0.0]
         zeros = {a.omega for a in self.features.axis_zeros}
         for omega, value in self.ends():
@@ -91,15 +92,15 @@ class Scan:
         return sorted(found, key=lambda c: c.omega)
 
     def ends(self) -> list[tuple[float, complex]]:
-        """Return L at ω = 0 and at π/T or infinity, where it is real; infinite at a pole."""
+        """Return frequency and L at both ends of the axis, 0 and π/T or ∞; L is real there, infinite at a pole."""
         at = {a.omega for a in self.features.axis_poles}
         zero = complex(np.inf) if 0.0 in at else self._value(0.0)
         top = self.r.nyquist
         last = complex(self.r.D[0, 0]) if not self.r.dt else complex(np.inf) if top in at else self._value(top)
         return [(0.0, zero), (top, last)]
 
-    def peak(self, a: float, b: float) -> Peak:
-        """Return the largest |(a + b L)/(1 + L)|: S is a, b = 1, 0, and T is 0, 1."""
+    def find_peak(self, a: float, b: float) -> Peak:
+        """Return the largest |(a + b L)/(1 + L)|: a, b = 1, 0 is S, and 0, 1 is T."""
 
         def slope(L: np.ndarray, dL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return np.real(b * dL / (a + b * L) - dL / (1 + L)), np.zeros(len(L))
@@ -116,23 +117,23 @@ class Scan:
             samples += [Peak(float(v), float(w)) for v, w in zip(values, omega, strict=True)]
             turns = np.flatnonzero((rise[:-1] > 0) & (rise[1:] <= 0))
             spans += [(float(values[k]), (float(omega[k]), float(omega[k + 1]))) for k in turns]
-        spans = sorted(spans, reverse=True)[:POLISHED]  # a flat response turns often, by rounding
-        roots = [self._polish(lambda w: self._at(slope, w, 0), span) for _, span in spans]
+        spans = sorted(spans, reverse=True)[:POLISHED]  # rounding gives a flat response many of them
+        roots = [self._polish(lambda w: self._evaluate(slope, w, 0), span) for _, span in spans]
         polished = [Peak(value(self._value(omega)), omega) for omega in roots]
         found = [*ends, *polished, *samples]
         best = max(p.value for p in found)
         return next(p for p in found if p.value >= best * (1 - 1e-12))
 
-    def falls_below(self, level: float) -> float:
+    def find_fall_below(self, level: float) -> float:
         """Return the lowest frequency at which |T| crosses ``level`` downwards; infinite if it never does."""
 
         def gain(L: np.ndarray, dL: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             return np.log(np.abs(L / (1 + L)) / level), np.real(dL / (L * (1 + L)))
 
-        roots = [omega for omega in self._roots(gain) if gain(*self._response(omega))[1][0] < 0]
+        roots = [omega for omega in self._find_roots(gain) if gain(*self._response(omega))[1][0] < 0]
         return min(roots, default=np.inf)
 
-    def _response(self, omega: Any) -> tuple[np.ndarray, np.ndarray]:
+    def _response(self, omega: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
         """Return L and dL/d(log ω)."""
         L, dL = self.r.response(omega)
         return L, dL * omega
@@ -140,12 +141,12 @@ class Scan:
     def _value(self, omega: float) -> complex:
         return complex(self.r.response(omega)[0][0])
 
-    def _crossing(self, omega: float, function: Function) -> Crossing:
+    def _make_crossing(self, omega: float, function: Function) -> Crossing:
         L, dL = self._response(omega)
         return Crossing(omega, complex(L[0]), float(function(L, dL)[1][0]), self.r.error(omega))
 
-    def _roots(self, function: Function) -> list[float]:
-        """Return the roots of a function; two of them between two samples are found by its slope."""
+    def _find_roots(self, function: Function) -> list[float]:
+        """Return the roots of a function; its slope shows two of them between two samples."""
         found: list[float] = []
         for omega, (L, dL) in zip(self.segments, self.samples, strict=True):
             with np.errstate(all="ignore"):
@@ -158,16 +159,17 @@ class Scan:
                 if left == 0.0:
                     found.append(span[0])
                 elif left * right < 0:
-                    if max(abs(left), abs(right)) > 1e-11:  # else the rounding of a constant
-                        found.append(self._polish(lambda w: self._at(function, w, 0), span))
+                    if max(abs(left), abs(right)) > 1e-11:  # smaller ones are the rounding of a constant
+                        found.append(self._polish(lambda w: self._evaluate(function, w, 0), span))
                 elif left * slope[k] < 0 and right * slope[k + 1] > 0:
-                    turn = self._polish(lambda w: self._at(function, w, 1), span)
-                    if self._at(function, turn, 0) * left < 0:
-                        found.append(self._polish(lambda w: self._at(function, w, 0), (span[0], turn)))
-                        found.append(self._polish(lambda w: self._at(function, w, 0), (turn, span[1])))
+                    turn = self._polish(lambda w: self._evaluate(function, w, 1), span)
+                    if self._evaluate(function, turn, 0) * left < 0:
+                        found.append(self._polish(lambda w: self._evaluate(function, w, 0), (span[0], turn)))
+                        found.append(self._polish(lambda w: self._evaluate(function, w, 0), (turn, span[1])))
         return found
 
-    def _at(self, function: Function, omega: float, which: int) -> float:
+    def _evaluate(self, function: Function, omega: float, which: int) -> float:
+        """Return the value (0) or the slope (1) of a function."""
         return float(function(*self._response(omega))[which][0])
 
     @staticmethod
@@ -176,6 +178,6 @@ class Scan:
 
         low, high = np.log(span[0]), np.log(span[1])
         ends = function(np.exp(low)), function(np.exp(high))
-        if ends[0] * ends[1] > 0:  # the ends moved by rounding: the root is at one of them
+        if ends[0] * ends[1] > 0:  # rounding has moved the ends: the root is at one of them
             return span[0] if abs(ends[0]) < abs(ends[1]) else span[1]
         return float(np.exp(brentq(lambda x: function(np.exp(x)), low, high, xtol=1e-14, rtol=1e-14)))

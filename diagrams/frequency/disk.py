@@ -1,41 +1,49 @@
-"""Disk margins: of one channel, and of several at once by the structured singular value with D scaling."""
+"""Disk margins of one channel, and of several channels at once by the structured singular value with D scaling."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...blocks.core.errors import ConfirmationError, ParameterError
-from . import confirm
+from .confirm import confirm_limit, confirm_peak
 from .features import Features, scan
 from .margins import EIGENVALUES
 from .number import Number
 from .realization import Realization
+from .state_space import make_state_space, read_matrices
+
+if TYPE_CHECKING:
+    from control import StateSpace
+
+    from .state_space import LinearSystem
 
 
 @dataclass(frozen=True)
 class DiskMargin:
-    """Every factor f = (1 + (1 − σ)/2 δ) / (1 − (1 + σ)/2 δ) with |δ| < α in each channel leaves the loop stable.
+    """Size α of the disk of factors that leave a loop stable.
+
+    The factors are f = (1 + (1 − σ)/2 δ) / (1 − (1 + σ)/2 δ) with |δ| < α, another one in each channel.
 
     Parameters
     ----------
     alpha : Number
-        α, by an upper bound of the structured singular value: no smaller perturbation destabilizes.
+        α, from an upper bound of the structured singular value: no smaller perturbation destabilizes the loop.
     skew : float
-        σ; 0 is the symmetric disk (S − T), 1 that of S, −1 that of T.
+        σ: 0 gives the symmetric disk (S − T), 1 that of S, −1 that of T.
     frequency : Number
-        Where the bound is taken, rad/s.
+        Frequency of the largest bound, rad/s.
     gain_low, gain_high : float
-        Every channel's gain may vary between these at once.
+        Range of gains that all channels may take at once.
     phase_deg : float
-        Every channel's phase may vary by this to both sides at once; gain and phase within the disk.
+        Phase by which all channels may turn at once, to either side.
     destabilizing : tuple of complex
-        Factors, one a channel, with which the closed loop has a pole at the frequency: the smallest that were found.
+        Smallest factors found, one a channel, with which the closed loop has a pole at the frequency.
     destabilizing_alpha : float
-        Their |δ|. For up to three channels it equals α; for more it may be larger.
+        |δ| of those factors: α for up to three channels, α or more beyond.
     """
 
     alpha: Number
@@ -48,7 +56,7 @@ class DiskMargin:
     destabilizing_alpha: float
 
 
-def disk_margin(loop: Any, *, delay: int = 0, skew: float = 0.0) -> DiskMargin:
+def disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> DiskMargin:
     """Return the disk margin of a loop with one channel, α = 1/max|S + (σ − 1)/2|.
 
     Parameters
@@ -58,7 +66,7 @@ def disk_margin(loop: Any, *, delay: int = 0, skew: float = 0.0) -> DiskMargin:
     delay : int
         Whole samples of delay in series with a sampled loop.
     skew : float
-        σ.
+        σ; see `DiskMargin`.
 
     Raises
     ------
@@ -67,36 +75,35 @@ def disk_margin(loop: Any, *, delay: int = 0, skew: float = 0.0) -> DiskMargin:
     ParameterError
         If the closed loop is not stable.
     """
-    return _disk(Realization.of(loop, delay=delay), skew)
+    return _compute_disk_margin(Realization.of(loop, delay=delay), skew)
 
 
-def mimo_disk_margin(loop: Any, *, delay: int = 0, skew: float = 0.0) -> DiskMargin:
+def mimo_disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> DiskMargin:
     """Return the disk margin of a square loop with independent perturbations in all channels at once.
 
-    1/α is the largest structured singular value of S + (σ − 1)/2 I, S = (I + L)⁻¹, over frequency. Its bound by
-    D scaling is exact for up to three channels; for two it is a closed form.
+    1/α is the largest structured singular value of S + (σ − 1)/2 I, S = (I + L)⁻¹, over frequency. D scaling bounds
+    it: exactly for up to three channels, in closed form for two.
 
     Parameters
     ----------
     loop : control.StateSpace
-        L at the plant's input or output; `loop_at` makes it from plant and controller, also for both at once.
+        L at the plant's input or output; `loop_at` makes it from plant and controller, for both places at once too.
     delay : int
         Whole samples of delay in every channel of a sampled loop.
     skew : float
-        σ.
+        σ; see `DiskMargin`.
 
     Raises
     ------
     ConfirmationError
-        If no destabilizing perturbation of the size that is claimed is found (up to three channels), or eigenvalues
-        disagree.
+        If no destabilizing perturbation of size α is found (up to three channels), or eigenvalues disagree.
     ParameterError
         If the closed loop is not stable, or the loop is not square.
     """
-    return _disk(Realization.of(loop, delay=delay), skew)
+    return _compute_disk_margin(Realization.of(loop, delay=delay), skew)
 
 
-def loop_at(plant: Any, controller: Any, where: str = "input") -> Any:
+def loop_at(plant: StateSpace, controller: StateSpace, where: str = "input") -> StateSpace:
     """Return the loop transfer matrix at the plant's input (C P), its output (P C), or both at once.
 
     Parameters
@@ -104,7 +111,7 @@ def loop_at(plant: Any, controller: Any, where: str = "input") -> Any:
     plant, controller : control.StateSpace
         P and C of u = −C y, y = P u.
     where : {"input", "output", "both"}
-        ``both``: independent perturbations at all inputs and outputs, [[0, C], [−P, 0]].
+        Place of the perturbations; ``both`` perturbs all inputs and outputs independently, [[0, C], [−P, 0]].
     """
     import control
 
@@ -114,18 +121,19 @@ def loop_at(plant: Any, controller: Any, where: str = "input") -> Any:
         return plant * controller
     if where != "both":
         raise ParameterError(f"found where={where!r}; expected 'input', 'output' or 'both'.", block="loop_at")
-    P, C = control.ss(plant), control.ss(controller)
-    both = control.append(C, -P)
-    inputs, outputs = P.ninputs, P.noutputs
-    order = [*range(outputs, outputs + inputs), *range(outputs)]  # (u, y) feed (P, C)
-    return control.ss(both.A, both.B[:, np.argsort(order)], both.C, both.D[:, np.argsort(order)], both.dt)
+    P = control.ss(plant)
+    both = read_matrices(control.append(control.ss(controller), -P))
+    inputs, outputs = int(P.ninputs), int(P.noutputs)
+    order = np.argsort([*range(outputs, outputs + inputs), *range(outputs)])  # (u, y) feed (P, C)
+    return make_state_space(both.A, both.B[:, order], both.C, both.D[:, order], both.dt)
 
 
 def mu_bound(M: np.ndarray, *, polish: bool = True) -> float:
-    """Return the upper bound of the structured singular value for independent complex scalars: min σ̄(D M D⁻¹).
+    """Return the upper bound min σ̄(D M D⁻¹) of the structured singular value for independent complex scalars.
 
-    Two channels: with d² = |m₂₁|/|m₁₂| the Frobenius norm, and so σ̄ at the given determinant, is smallest. More: the
-    bound is convex in log D and minimized; without ``polish`` only roughly, which is a bound as well.
+    Two channels have a closed form: d² = |m₂₁|/|m₁₂| makes the Frobenius norm smallest, and so σ̄, as the determinant
+    is given. For more channels the bound is convex in log D and minimized. Without ``polish`` the minimum is rough;
+    it still is a bound.
     """
     n = len(M)
     if n == 1:
@@ -134,14 +142,14 @@ def mu_bound(M: np.ndarray, *, polish: bool = True) -> float:
         square = abs(M[0, 0]) ** 2 + abs(M[1, 1]) ** 2 + 2 * abs(M[0, 1] * M[1, 0])
         det = abs(np.linalg.det(M))
         return float(np.sqrt((square + np.sqrt(max(square**2 - 4 * det**2, 0.0))) / 2))
-    return _minimal_scaling(M, polish=polish)
+    return _minimize_scaling(M, polish=polish)
 
 
-def _minimal_scaling(M: np.ndarray, *, polish: bool = True) -> float:
-    """Minimize σ̄(D M D⁻¹) over log D by its gradient, σ̄ (|u|² − |v|²); then, where σ̄ has a kink, without one."""
+def _minimize_scaling(M: np.ndarray, *, polish: bool = True) -> float:
+    """Minimize σ̄(D M D⁻¹) over log D by its gradient σ̄ (|u|² − |v|²), and without a gradient where σ̄ has a kink."""
     from scipy.optimize import minimize
 
-    def scaled(x: np.ndarray) -> tuple[float, np.ndarray]:
+    def bound_and_gradient(x: np.ndarray) -> tuple[float, np.ndarray]:
         d = np.exp(np.append(np.clip(x, -20, 20), 0.0))
         U, sigma, V = np.linalg.svd(d[:, None] * M / d)
         return float(sigma[0]), sigma[0] * (np.abs(U[:, 0]) ** 2 - np.abs(V[0]) ** 2)[:-1]
@@ -150,21 +158,22 @@ def _minimal_scaling(M: np.ndarray, *, polish: bool = True) -> float:
         return 0.0
     size = np.abs(M) + 1e-12 * np.abs(M).max()
     d = np.ones(len(M))
-    for _ in range(20):  # Osborne: rows and columns of one size
+    for _ in range(20):  # Osborne's balancing: rows and columns get one size
         row, column = np.linalg.norm(d[:, None] * size / d, axis=1), np.linalg.norm(d[:, None] * size / d, axis=0)
         d = d * np.sqrt(column / row)
     x = np.log(d[:-1] / d[-1])
-    found = minimize(scaled, x, jac=True, method="BFGS")
-    best = min(float(found.fun), scaled(x)[0])
-    if polish and np.max(np.abs(found.jac)) > 1e-7 * best:
+    found = minimize(bound_and_gradient, x, jac=True, method="BFGS")
+    x_found, gradient = np.asarray(found.x), np.asarray(found.jac)
+    best = min(float(found.fun), bound_and_gradient(x)[0])
+    if polish and float(np.max(np.abs(gradient))) > 1e-7 * best:
         options = {"xatol": 1e-9, "fatol": 1e-12 * best, "maxiter": 2000}
-        again = minimize(lambda x: scaled(x)[0], found.x, method="Nelder-Mead", options=options)
+        again = minimize(lambda x: bound_and_gradient(x)[0], x_found, method="Nelder-Mead", options=options)
         best = min(best, float(again.fun))
     return best
 
 
-def mu_lower(M: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the lower bound max ρ(M Q) over diagonal unitary Q, and the perturbation δ with det(I − M δ) = 0."""
+def mu_lower_bound(M: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the lower bound max ρ(M Q) over diagonal unitary Q, and its perturbation δ with det(I − M δ) = 0."""
     from scipy.optimize import minimize, minimize_scalar
 
     def radius(x: np.ndarray) -> float:
@@ -180,53 +189,54 @@ def mu_lower(M: np.ndarray) -> tuple[float, np.ndarray]:
         found = minimize_scalar(
             lambda g: radius(np.array([g])), bounds=span, method="bounded", options={"xatol": 1e-12}
         )
-        x = np.array([found.x if found.fun < radius(grid[k : k + 1]) else grid[k]])
+        x = np.array([float(found.x) if float(found.fun) < radius(grid[k : k + 1]) else grid[k]])
     else:
         rng = np.random.default_rng(0)
         starts = [np.zeros(n - 1), *rng.uniform(-np.pi, np.pi, (24, n - 1))]
         options = {"xatol": 1e-10, "fatol": 1e-13, "maxiter": 4000}
         runs = [minimize(radius, s, method="Nelder-Mead", options=options) for s in starts]
-        x = min(runs, key=lambda run: run.fun).x
+        x = np.asarray(min(runs, key=lambda run: float(run.fun)).x)
     turn = np.exp(1j * np.append(0.0, x))
     eigenvalues = np.linalg.eigvals(M * turn)
     largest = eigenvalues[np.argmax(np.abs(eigenvalues))]
     return float(abs(largest)), turn / largest if largest else np.full(n, np.inf, dtype=complex)
 
 
-def factor(delta: Any, skew: float = 0.0) -> Any:
+def factor(delta: np.ndarray | float, skew: float = 0.0) -> np.ndarray:
     """Return f = (1 + (1 − σ)/2 δ) / (1 − (1 + σ)/2 δ); infinite where the denominator vanishes."""
     bottom = 1 - (1 + skew) / 2 * np.asarray(delta)
     infinite = np.abs(bottom) < 1e-12
     return np.where(infinite, np.inf, (1 + (1 - skew) / 2 * delta) / np.where(infinite, 1.0, bottom))
 
 
-def _disk(r: Realization, skew: float) -> DiskMargin:
+def _compute_disk_margin(r: Realization, skew: float) -> DiskMargin:
     n = len(r.D)
     if r.D.shape != (n, n):
         raise ParameterError(f"found a loop of shape {r.D.shape}; expected a square one.", block="disk_margin")
-    if not r.order or not r.stable():
+    if not r.order or not r.is_stable():
         raise ParameterError(
-            f"found a closed loop with {r.unstable()} poles of {r.order} that are not stable; expected a stable one: "
-            "this one has no margin.",
+            f"found {r.count_unstable()} of {r.order} closed-loop poles that are not stable; expected a stable closed "
+            "loop: this one has no margin. Look at margins(loop).closed_loop_poles.",
             block="disk_margin",
         )
 
     def matrix(omega: float) -> np.ndarray:
-        return _inverse(r, omega) + (skew - 1) / 2 * np.eye(n)
+        return _sensitivity_at(r, omega) + (skew - 1) / 2 * np.eye(n)
 
-    _, omega = _largest(r, lambda w: mu_bound(matrix(w), polish=False))
+    _, omega = _find_largest(r, lambda w: mu_bound(matrix(w), polish=False))
     bound = mu_bound(matrix(omega))
     alpha = 1 / bound
-    lower, delta = mu_lower(matrix(omega))
+    lower, delta = mu_lower_bound(matrix(omega))
     if n <= 3 and lower < bound * (1 - 1e-5):
         raise ConfirmationError(
-            f"found α = {alpha:.9g}, but the smallest destabilizing perturbation that was found is {1 / lower:.9g}; "
-            "expected them to agree for up to three channels.",
+            f"found α = {alpha:.9g}, but {1 / lower:.9g} as the smallest destabilizing perturbation; expected the same "
+            "for up to three channels. Look at the response of the loop near "
+            f"{omega:.6g} rad/s: it may be ill-conditioned.",
             block="disk_margin",
         )
-    how = _destabilizes(r, delta, skew)
+    how = _confirm_destabilizing(r, delta, skew)
     if n == 1:
-        how += "; " + confirm.peak(r, (1 + skew) / 2, -(1 - skew) / 2, bound, "disk_margin")
+        how += "; " + confirm_peak(r, (1 + skew) / 2, -(1 - skew) / 2, bound, "disk_margin")
     else:
         how += f"; smallest perturbation found: {1 / lower:.9g}"
     low, high, phase = disk_gains(alpha, skew)
@@ -244,10 +254,11 @@ def _disk(r: Realization, skew: float) -> DiskMargin:
 
 
 def disk_gains(alpha: float, skew: float = 0.0) -> tuple[float, float, float]:
-    """Return the smallest and largest gain and the phase in degrees that a disk of size α allows.
+    """Return the smallest gain, the largest gain and the phase in degrees that a disk of size α allows.
 
-    Its real points are f(−α) and f(α), and the phase is where the unit circle meets it: cos φ = (1 + f(−α) f(α)) /
-    (f(−α) + f(α)). Where 1 − (1 + σ)/2 α ≤ 0 it is a half plane, or the outside of a circle, without an upper gain.
+    The disk meets the real axis at f(−α) and f(α), and the unit circle at the phase φ with
+    cos φ = (1 + f(−α) f(α)) / (f(−α) + f(α)). Where 1 − (1 + σ)/2 α ≤ 0 the disk becomes a half plane or the outside
+    of a circle, without a largest gain.
     """
     low, bottom = float(factor(-alpha, skew)), 1 - (1 + skew) / 2 * alpha
     if abs(bottom) < 1e-12:
@@ -258,32 +269,34 @@ def disk_gains(alpha: float, skew: float = 0.0) -> tuple[float, float, float]:
     return max(low, 0.0), high, 180.0 if abs(cosine) > 1 else float(np.degrees(np.arccos(cosine)))
 
 
-def _destabilizes(r: Realization, delta: np.ndarray, skew: float) -> str:
+def _confirm_destabilizing(r: Realization, delta: np.ndarray, skew: float) -> str:
+    """Confirm that the loop loses its stability when the perturbation grows to δ; return the computation."""
+
     def stable(size: float) -> bool:
-        return r.stable(np.diag(factor(size * delta, skew)))
+        return r.is_stable(np.diag(factor(size * delta, skew)))
 
     try:
-        return confirm.limit("disk_margin", 1.0, [], 0.0, stable, EIGENVALUES + " with δ scaled")
+        return confirm_limit("disk_margin", 1.0, [], 0.0, stable, EIGENVALUES + " with δ scaled")
     except np.linalg.LinAlgError:
         return "I + L F is singular at infinite frequency with δ"
 
 
-def _inverse(r: Realization, omega: float) -> np.ndarray:
+def _sensitivity_at(r: Realization, omega: float) -> np.ndarray:
+    """Return S = (I + L)⁻¹ at ω, by the closed loop: it is finite where the loop has poles on the axis."""
     n = len(r.D)
     if np.isinf(omega):
         return np.asarray(np.linalg.inv(np.eye(n) + r.D))
-    # through the closed loop, which is finite where the loop has poles on the axis
     p = complex(r.point(np.array(1j * omega)))
     inverse = np.linalg.inv(np.eye(n) + r.D)
-    states = np.linalg.solve(p * np.eye(r.order) - r.closed(), r.B @ inverse)
+    states = np.linalg.solve(p * np.eye(r.order) - r.closed_matrix(), r.B @ inverse)
     return np.asarray(inverse - inverse @ r.C @ states)
 
 
-def _largest(r: Realization, function: Callable[[float], float]) -> tuple[float, float]:
-    """Return the largest value over frequency and where, scanned and polished."""
+def _find_largest(r: Realization, function: Callable[[float], float]) -> tuple[float, float]:
+    """Return the largest value over frequency, and its frequency, from a scan that is refined."""
     from scipy.optimize import minimize_scalar
 
-    omega = np.unique(np.concatenate([[0.0], *_grid(r), [r.nyquist]]))
+    omega = np.unique(np.concatenate([[0.0], *_make_grid(r), [r.nyquist]]))
     values = np.array([function(w) for w in omega])
     best, where = float(values.max()), float(omega[np.argmax(values)])
     inside = [k for k in range(1, len(omega) - 1) if values[k - 1] <= values[k] >= values[k + 1] and omega[k - 1] > 0]
@@ -295,13 +308,13 @@ def _largest(r: Realization, function: Callable[[float], float]) -> tuple[float,
             method="bounded",
             options={"xatol": 1e-12},
         )
-        if -found.fun > best:
-            best, where = -float(found.fun), float(np.exp(found.x))
+        if -float(found.fun) > best:
+            best, where = -float(found.fun), float(np.exp(float(found.x)))
     return best, where
 
 
-def _grid(r: Realization) -> list[np.ndarray]:
-    """Return frequencies around every open- and closed-loop pole, and 20 a decade."""
+def _make_grid(r: Realization) -> list[np.ndarray]:
+    """Return frequencies around every open-loop and closed-loop pole, and 20 a decade besides."""
     features = Features.of(r)
     if len(r.D) == 1:
         return [segment[:: max(1, len(segment) // 1000)] for segment in scan(r, features)]

@@ -1,4 +1,4 @@
-"""Where a loop's frequency response has its features: poles and zeros, and a grid that sees them all."""
+"""Poles and zeros of a loop, and a grid of frequencies that resolves all of them."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ GAP = 2e-9  # relative distance that a scan keeps from a pole or zero on the axi
 
 @dataclass(frozen=True)
 class AxisPole:
-    """A pole on the limit of stability.
+    """A pole, or a zero, on the limit of stability.
 
     Parameters
     ----------
     omega : float
-        Its frequency, rad/s, not negative.
+        Frequency, rad/s, not negative.
     multiplicity : int
-        How many coincide.
+        Number of coinciding poles.
     scatter : float
-        How far its computed eigenvalues lie apart, rad/s.
+        Largest distance of a computed eigenvalue from their mean, rad/s.
     """
 
     omega: float
@@ -34,7 +34,10 @@ class AxisPole:
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Poles and zeros of a loop in the s plane: those on the axis in clusters, and the others."""
+    """Poles and zeros of a loop in the s plane, those on the axis gathered and apart from the others.
+
+    ``closed`` are the closed-loop poles.
+    """
 
     axis_poles: tuple[AxisPole, ...]
     poles: np.ndarray
@@ -44,10 +47,10 @@ class Features:
 
     @classmethod
     def of(cls, r: Realization) -> Features:
-        """Find them by eigenvalues."""
-        axis_poles, poles = clusters(r, np.linalg.eigvals(r.A), r.scale)
+        """Return the features of a loop, found by eigenvalues."""
+        axis_poles, poles = split_axis_poles(r, np.linalg.eigvals(r.A), r.scale)
         zeros = transmission_zeros(r)
-        axis_zeros, zeros = clusters(r, zeros, max(r.scale, float(np.abs(zeros).max(initial=0.0))))
+        axis_zeros, zeros = split_axis_poles(r, zeros, max(r.scale, float(np.abs(zeros).max(initial=0.0))))
         try:
             closed = r.logarithm(r.eigenvalues())
         except np.linalg.LinAlgError:
@@ -55,11 +58,11 @@ class Features:
         return cls(axis_poles, poles, axis_zeros, zeros, closed[np.isfinite(closed)])
 
     def unstable_poles(self) -> int:
-        """Return the number of open-loop poles beyond the limit of stability, those on it not counted."""
+        """Return the number of open-loop poles beyond the limit of stability; those on it are not counted."""
         return int(np.sum(self.poles.real > 0))
 
     def sizes(self) -> np.ndarray:
-        """Return the magnitudes of all that is not at s = 0, sorted, rad/s."""
+        """Return the magnitudes of all poles and zeros that are not at s = 0, sorted, rad/s."""
         points = [np.abs(self.poles), np.abs(self.zeros), np.abs(self.closed)]
         on_axis = [a.omega for a in (*self.axis_poles, *self.axis_zeros)]
         sizes = np.concatenate([*points, on_axis])
@@ -68,14 +71,14 @@ class Features:
         return sizes[sizes > floor]
 
     def points(self) -> np.ndarray:
-        """Return all points near which the response bends."""
+        """Return all poles and zeros off the axis: the response bends near them."""
         return np.concatenate([self.poles, self.zeros, self.closed])
 
 
-def clusters(r: Realization, p: np.ndarray, scale: float) -> tuple[tuple[AxisPole, ...], np.ndarray]:
-    """Split poles into those on the limit of stability, gathered, and the others, both as s.
+def split_axis_poles(r: Realization, p: np.ndarray, scale: float) -> tuple[tuple[AxisPole, ...], np.ndarray]:
+    """Split poles into those on the limit of stability, with coinciding ones gathered, and the others, all as s.
 
-    m coinciding poles are computed with a scatter of ε^(1/m); their mean is accurate to ε.
+    m coinciding poles are computed with a scatter of ε^(1/m), ε the rounding; their mean is accurate to ε.
     """
     left, found = list(np.asarray(p, dtype=complex)), []
     for m in range(min(len(left), 8), 0, -1):
@@ -124,10 +127,11 @@ def transmission_zeros(r: Realization) -> np.ndarray:
 
 
 def scan(r: Realization, features: Features, *, delay: float = 0.0) -> list[np.ndarray]:
-    """Return frequencies in rad/s dense enough to see every feature, cut at poles and zeros on the axis.
+    """Return segments of frequencies in rad/s that resolve every pole and zero, cut at those on the axis.
 
-    40 a decade, more around poles and zeros in proportion to their distance from the axis, then bisected until the
-    response, with a further delay in s, turns by less than 0.15 rad and changes by less than 0.3 in its logarithm.
+    The grid has 40 points a decade, and more around each pole and zero in proportion to its distance from the axis. It
+    is then bisected until the response L e^(−jω delay) turns by less than 0.15 rad and changes by less than 0.3 in its
+    logarithm from one point to the next.
     """
     sizes = features.sizes()
     low, high = (sizes[0] / 1e4, sizes[-1] * 1e4) if len(sizes) else (1e-3, 1e3)
@@ -163,7 +167,7 @@ def _refine(r: Realization, omega: np.ndarray, delay: float) -> np.ndarray:
         with np.errstate(divide="ignore", invalid="ignore"):
             step = np.log(L[1:] / L[:-1])
         coarse = ~((np.abs(step.real) < 0.3) & (np.abs(step.imag) < 0.15)) & (np.diff(omega) > 1e-12 * omega[1:])
-        if delay:  # a delay turns without end; where |L| is small that does not matter
+        if delay:  # a delay turns L without end, which does not matter where |L| is small
             coarse &= np.maximum(np.abs(L[1:]), np.abs(L[:-1])) > 0.3
         if not coarse.any() or len(omega) > 40_000:
             break

@@ -1,4 +1,4 @@
-"""A number of a report, with what can be said for it."""
+"""A number of a report, with its unit, its tolerance and its confirmation."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Number:
-    """A number that a control engineer can trust: value, unit, tolerance, and how it was confirmed.
+    """A number with unit, tolerance, and the computation that confirmed it.
 
     Parameters
     ----------
     value : float
-        The value; infinite where there is no limit, NaN where the quantity does not exist.
+        Value; infinite where there is no limit, NaN where the quantity does not exist.
     unit : str
-        Its unit, "1" where it has none.
+        Unit, "1" of a pure number.
     tolerance : float
         Absolute bound of the numerical error of the value, in its unit.
     confirmed_by : str
@@ -45,5 +45,5 @@ class Number:
         return f"{self.value:.6g}" + ("" if self.unit == "1" else f" {self.unit}")
 
     def as_dict(self) -> dict[str, float | str]:
-        """Return the four entries by name, as they stand in a report's JSON."""
+        """Return the four entries by name, as in a report's JSON."""
         return {name: getattr(self, name) for name in ("value", "unit", "tolerance", "confirmed_by")}

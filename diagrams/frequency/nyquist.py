@@ -1,9 +1,9 @@
-"""Encirclements of −1 by the Nyquist curve, counted by its winding and confirmed by eigenvalues."""
+"""Encirclements of −1 by the Nyquist curve: the winding number of 1 + L, confirmed by eigenvalues."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,19 +11,23 @@ from ...blocks.core.errors import ConfirmationError, ParameterError
 from .features import Features, scan
 from .realization import Realization
 
+if TYPE_CHECKING:
+    from .state_space import LinearSystem
+
 
 @dataclass(frozen=True)
 class NyquistCount:
-    """The Nyquist criterion Z = N + P, counted.
+    """Numbers of the Nyquist criterion Z = N + P.
 
     Parameters
     ----------
     encirclements : int
-        N: clockwise encirclements of −1, by the winding of 1 + L along the contour, poles on it passed on the right.
+        N, clockwise encirclements of −1: the winding number of 1 + L along a contour that passes poles on the axis on
+        the right.
     open_loop : int
-        P: open-loop poles beyond the limit of stability.
+        P, open-loop poles beyond the limit of stability.
     closed_loop : int
-        Z = N + P: closed-loop poles beyond it, as the eigenvalues say as well.
+        Z = N + P, closed-loop poles beyond the limit; the eigenvalues agree.
     """
 
     encirclements: int
@@ -31,20 +35,20 @@ class NyquistCount:
     closed_loop: int
 
 
-def nyquist_count(loop: Any, *, delay: int = 0) -> NyquistCount:
-    """Return the clockwise encirclements of −1, confirmed by the eigenvalues of open and closed loop.
+def nyquist_count(loop: LinearSystem, *, delay: int = 0) -> NyquistCount:
+    """Count the clockwise encirclements of −1, and confirm them by the eigenvalues of open and closed loop.
 
     Parameters
     ----------
     loop : control.StateSpace
         Loop transfer function L with one channel, S = 1/(1 + L).
     delay : int
-        Whole samples of delay in series with it.
+        Whole samples of delay in series with a sampled loop.
 
     Raises
     ------
     ConfirmationError
-        If the winding and the eigenvalues disagree.
+        If the winding number and the eigenvalues disagree.
 
     Examples
     --------
@@ -53,63 +57,66 @@ def nyquist_count(loop: Any, *, delay: int = 0) -> NyquistCount:
     NyquistCount(encirclements=-1, open_loop=1, closed_loop=0)
     """
     r = Realization.of(loop, delay=delay)
-    return count(r, Features.of(r))
+    return count_encirclements(r, Features.of(r))
 
 
-def count(r: Realization, features: Features) -> NyquistCount:
-    """Return the count for a realization."""
-    eigenvalues, open_loop = r.unstable(), features.unstable_poles()
-    n = winding(r, features)
+def count_encirclements(r: Realization, features: Features) -> NyquistCount:
+    """Count the encirclements of a realization; see `nyquist_count`."""
+    eigenvalues, open_loop = r.count_unstable(), features.unstable_poles()
+    n = winding_number(r, features)
     if n + open_loop != eigenvalues:
         raise ConfirmationError(
             f"found {n} clockwise encirclements of −1 and {open_loop} unstable open-loop poles, but {eigenvalues} "
-            "unstable eigenvalues of the closed loop; expected Z = N + P. A closed-loop pole may lie on the limit of "
-            "stability: look at closed_loop_poles.",
+            "unstable eigenvalues of the closed loop; expected Z = N + P. Look at closed_loop_poles: one may lie on "
+            "the limit of stability.",
             block="nyquist",
         )
     return NyquistCount(n, open_loop, eigenvalues)
 
 
-def winding(r: Realization, features: Features, *, delay: float = 0.0) -> int:
+def winding_number(r: Realization, features: Features, *, delay: float = 0.0) -> int:
     """Return the clockwise encirclements of 0 by 1 + L e^(−sτ) along the limit of stability.
 
     A sampled loop takes a delay τ of whole samples.
 
-    The upper half of the contour is followed, the lower one is its mirror image. Around poles on the axis it takes
-    half-circles to the right, smaller than the distance to any other pole or closed-loop pole.
+    Only the upper half of the contour is followed: the lower one is its mirror image. The contour passes each pole on
+    the axis by a half-circle to the right, smaller than the distance to any other pole, zero or closed-loop pole.
     """
     if len(r.D) != 1:
-        raise ParameterError(f"found a loop of {len(r.D)} channels; expected one. Open one wire.", block="nyquist")
+        raise ParameterError(f"found a loop of {len(r.D)} channels; expected one. Open a single wire.", block="nyquist")
     if delay and not r.dt and abs(r.D[0, 0]) >= 1:
         raise ParameterError(
-            f"found |D| = {abs(r.D[0, 0]):.6g}; expected less than 1 where a delay is counted.", block="nyquist"
+            f"found |D| = {abs(r.D[0, 0]):.6g}; expected less than 1: with a delay the curve turns around −1 without "
+            "end. Leave the delay out.",
+            block="nyquist",
         )
-    path = _contour(r, features, delay)
+    path = _make_contour(r, features, delay)
     total, last = 0.0, 0j
     for s in path:
-        values = _follow(r, s, delay)
+        values = _follow_loop(r, s, delay)
         if last:
             total += float(np.angle(values[0] / last))
         total += float(np.sum(np.angle(values[1:] / values[:-1])))
         last = values[-1]
-    if not r.dt:  # along the arc at infinity
+    if not r.dt:  # the arc at infinity
         total += float(np.angle((1.0 if delay else 1 + r.D[0, 0]) / last))
     turns = -total / np.pi
     if abs(turns - round(turns)) > 1e-3:
         raise ConfirmationError(
-            f"the winding of 1 + L is {turns:.6f} half turns; expected a whole number. A closed-loop pole may lie on "
-            "the limit of stability: look at closed_loop_poles.",
+            f"found {turns:.6f} half turns of 1 + L; expected a whole number. Look at closed_loop_poles: one may lie "
+            "on the limit of stability.",
             block="nyquist",
         )
     return round(turns)
 
 
-def _contour(r: Realization, features: Features, delay: float) -> list[np.ndarray]:
+def _make_contour(r: Realization, features: Features, delay: float) -> list[np.ndarray]:
+    """Return the upper half of the contour as lines and arcs of points s."""
     segments = scan(r, features, delay=delay)
     others = np.concatenate([features.poles, features.closed, features.zeros])
     spots = [a.omega for a in features.axis_poles]
     top = segments[-1][-1]
-    if delay and not r.dt:  # beyond the last sample with |L| ≥ 0.95 nothing turns around 0
+    if delay and not r.dt:  # beyond the last sample with |L| ≥ 0.95 the curve does not turn around 0
         every = np.concatenate(segments)
         large = np.flatnonzero(np.abs(r.response(every)[0]) >= 0.95)
         top = every[min(large[-1] + 1, len(every) - 1)] if len(large) else every[0]
@@ -142,14 +149,14 @@ def _contour(r: Realization, features: Features, delay: float) -> list[np.ndarra
     return path + ([1j * line] if len(line) else [])
 
 
-def _follow(r: Realization, s: np.ndarray, delay: float) -> np.ndarray:
-    """Return 1 + L along points, bisected until it turns by less than 0.5 rad from one to the next."""
+def _follow_loop(r: Realization, s: np.ndarray, delay: float) -> np.ndarray:
+    """Return 1 + L e^(−s delay) along points, bisected until it turns by less than 0.5 rad from one to the next."""
     for _ in range(30):
         L, _ = r.values(s)
         f = 1 + L * np.exp(-s * delay)
         if np.any(f == 0):
             raise ConfirmationError(
-                "1 + L vanishes on the contour: a closed-loop pole lies on the limit of stability. Look at "
+                "found 1 + L = 0 on the contour; expected no closed-loop pole on the limit of stability. Look at "
                 "closed_loop_poles.",
                 block="nyquist",
             )

@@ -1,4 +1,4 @@
-"""One BLAS thread for many small matrices: a team of threads costs more there than the arithmetic."""
+"""One BLAS thread for many small matrices: several threads cost more there than the arithmetic."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ from typing import ParamSpec, TypeVar
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_lock = Lock()  # held by whoever has set the limit, and who alone gives it back
+_lock = Lock()  # held by the caller that has set the limit; only that one restores it
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Let the BLAS libraries of NumPy and SciPy use one thread inside; what was set before is there again afterwards.
+    """Limit the BLAS libraries of NumPy and SciPy to one thread inside the ``with`` block, and restore them after it.
 
-    The limit is one of the whole process: who enters while it is set leaves it alone, nested or in another thread.
+    The limit belongs to the whole process: a caller that enters while it is set, nested or in another thread, leaves
+    it alone.
     """
     if not _lock.acquire(blocking=False):
         yield
         return
     try:
-        import scipy.linalg  # noqa: F401 - it brings a BLAS of its own, which must be loaded to be limited
+        import scipy.linalg  # noqa: F401 - brings its own BLAS, which must be loaded to be limited
         from threadpoolctl import threadpool_limits
 
         with threadpool_limits(1, user_api="blas"):

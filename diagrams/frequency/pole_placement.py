@@ -6,36 +6,42 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...blocks.core.errors import ConfirmationError, ParameterError
 
 Integral = Literal["forward", "backward", "trapezoidal"]
-AGREE = 1e-6  # of the largest coefficient of the scaled characteristic polynomials
+AGREE = 1e-6
+"""Largest difference of characteristic polynomials that agree, relative to the largest scaled coefficient."""
 
 
-def place(A: Any, B: Any, poles: Sequence[complex]) -> np.ndarray:
-    """Return K with which A − B K has given poles, multiple ones included.
+def place(A: ArrayLike, B: ArrayLike, poles: Sequence[complex]) -> np.ndarray:
+    """Return K that gives A − B K the poles, multiple ones included.
 
-    Distinct poles, or as many coinciding as there are inputs, are placed by SciPy; a single input by Ackermann's
-    formula; more coinciding poles by dealing them out to chains of integrators, one an input (Brunovsky), or where
-    pairs do not fit in, by a feedback that makes one input reach all states (Heymann) and Ackermann. Found and asked
-    poles are compared as characteristic polynomials: multiple
-    eigenvalues scatter.
+    SciPy places distinct poles, and as many coinciding ones as there are inputs. Ackermann's formula places those of a
+    single input. More coinciding poles are dealt out to chains of integrators, one an input (Brunovsky). Where
+    conjugate pairs don't fit into the chains, a feedback makes one input reach all states (Heymann), and Ackermann's
+    formula places them. The result is confirmed by characteristic polynomials, since multiple eigenvalues scatter.
 
     Parameters
     ----------
     A, B : array_like
-        Continuous or sampled system, controllable.
+        Continuous or sampled system, controllable; shapes (n, n) and (n, m).
     poles : sequence of complex
-        As many as states, complex ones in conjugate pairs.
+        n poles, complex ones in conjugate pairs.
+
+    Returns
+    -------
+    ndarray
+        K, shape (m, n).
 
     Raises
     ------
     ParameterError
-        If the number of poles or the pairs are wrong, or the system is not controllable.
+        If shapes or conjugate pairs don't fit, entries are not finite, or the system is not controllable.
     ConfirmationError
         If the polynomials differ: the problem is too ill-conditioned.
 
@@ -44,9 +50,11 @@ def place(A: Any, B: Any, poles: Sequence[complex]) -> np.ndarray:
     >>> place([[0, 1], [0, 0]], [[0], [1]], [-2, -2])
     array([[4., 4.]])
     """
-    A, B = np.atleast_2d(np.asarray(A, dtype=float)), np.asarray(B, dtype=float)
-    B = B[:, None] if B.ndim == 1 else B
-    wanted = np.asarray(poles, dtype=complex)
+    system, inputs = np.atleast_2d(np.asarray(A, dtype=float)), np.asarray(B, dtype=float)
+    return _place(system, inputs[:, None] if inputs.ndim == 1 else inputs, np.asarray(poles, dtype=complex))
+
+
+def _place(A: np.ndarray, B: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     n = len(A)
     if A.shape != (n, n) or B.shape[0] != n or wanted.shape != (n,):
         raise ParameterError(
@@ -66,20 +74,18 @@ def place(A: Any, B: Any, poles: Sequence[complex]) -> np.ndarray:
     if rank > 1 and multiplicity <= rank:
         from scipy.signal import place_poles
 
-        _controllable(A, B)
-        with (
-            warnings.catch_warnings()
-        ):  # it warns that the most robust choice is not reached: the poles are checked below
-            warnings.simplefilter("ignore")
-            K = place_poles(A, B, wanted).gain_matrix
+        _check_controllable(A, B)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about robustness: the poles are confirmed below
+            K: np.ndarray | None = np.asarray(place_poles(A, B, wanted).gain_matrix)
     elif B.shape[1] == 1:
-        _controllable(A, B)
-        K = _ackermann(A, B, polynomial)
+        _check_controllable(A, B)
+        K = _place_by_ackermann(A, B, polynomial)
     else:
-        _controllable(A, B)
-        K = _chains(A, B, wanted)
+        _check_controllable(A, B)
+        K = _place_in_chains(A, B, wanted)
         if K is None or relative_difference(np.poly(A - B @ K), polynomial, float(np.linalg.norm(A))) > AGREE:
-            K = _heymann(A, B, polynomial)
+            K = _place_by_heymann(A, B, polynomial)
     _confirm_polynomial(np.poly(A - B @ K), polynomial, "place", float(np.linalg.norm(A)))
     return np.asarray(K)
 
@@ -90,12 +96,15 @@ def _real_polynomial(poles: np.ndarray) -> np.ndarray:
     size = np.poly(-np.abs(poles))
     if np.any(np.abs(np.imag(c)) > 1e-9 * np.abs(size) + 1e-300):
         raise ParameterError(
-            f"found the poles {list(poles)!r}; expected complex ones in conjugate pairs.", block="place", port="poles"
+            f"found the poles {list(poles)!r}; expected complex ones in conjugate pairs. Add the missing conjugates.",
+            block="place",
+            port="poles",
         )
     return np.asarray(np.real(c))
 
 
-def _controllable(A: np.ndarray, B: np.ndarray) -> None:
+def _check_controllable(A: np.ndarray, B: np.ndarray) -> None:
+    """Refuse a system with a mode that no input reaches (Popov, Belevitch, Hautus)."""
     n, scale = len(A), np.linalg.norm(A) + 1e-300
     for value in np.linalg.eigvals(A):
         pencil = np.hstack([(A - value * np.eye(n)) / scale, B / (np.linalg.norm(B) + 1e-300)])
@@ -107,12 +116,12 @@ def _controllable(A: np.ndarray, B: np.ndarray) -> None:
             )
 
 
-def _ackermann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarray:
-    """Return eₙᵀ [B, AB, …]⁻¹ p(A), the states and time scaled so that the matrix is well-conditioned."""
+def _place_by_ackermann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarray:
+    """Return eₙᵀ [B, AB, …]⁻¹ p(A), with states and time scaled so that the matrix is well-conditioned."""
     from scipy.linalg import matrix_balance
 
     n = len(A)
-    _, (d, _) = matrix_balance(A, permute=False, separate=True)
+    d = np.asarray(matrix_balance(A, permute=False, separate=True)[1][0])
     size = np.linalg.norm(A * d / d[:, None]) or 1.0
     M, b = A * d / d[:, None] / size, B / d[:, None]
     reached = np.hstack([np.linalg.matrix_power(M, k) @ b for k in range(n)])
@@ -123,10 +132,11 @@ def _ackermann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarr
     return np.asarray((row @ value * size / d)[None, :])
 
 
-def _chains(A: np.ndarray, B: np.ndarray, poles: np.ndarray) -> np.ndarray | None:
-    """Return K that gives each of Brunovsky's chains of integrators its own poles; None if pairs don't fit in.
+def _place_in_chains(A: np.ndarray, B: np.ndarray, poles: np.ndarray) -> np.ndarray | None:
+    """Return K that gives each of Brunovsky's chains of integrators poles of its own; None if pairs don't fit.
 
-    With the last rows qᵢ of the chains, K = [qᵢ A^(κᵢ−1) B]⁻¹ [qᵢ pᵢ(A)]: Ackermann's formula, chain by chain.
+    K = [qᵢ A^(κᵢ−1) B]⁻¹ [qᵢ pᵢ(A)] with the last row qᵢ and the length κᵢ of each chain: Ackermann's formula, chain
+    by chain.
     """
     n, m = len(A), B.shape[1]
     columns: list[list[np.ndarray]] = [[] for _ in range(m)]
@@ -143,7 +153,7 @@ def _chains(A: np.ndarray, B: np.ndarray, poles: np.ndarray) -> np.ndarray | Non
             basis = np.hstack([basis, (rest / np.linalg.norm(rest))[:, None]])
         power = A @ power
     lengths = [len(c) for c in columns if c]
-    shared = _share(poles, lengths)
+    shared = _share_poles(poles, lengths)
     if basis.shape[1] < n or shared is None:
         return None
     ends = np.linalg.inv(np.column_stack([v for c in columns for v in c]))[np.cumsum(lengths) - 1]
@@ -157,8 +167,8 @@ def _chains(A: np.ndarray, B: np.ndarray, poles: np.ndarray) -> np.ndarray | Non
     return np.asarray(np.linalg.pinv(np.array(reach)) @ np.array(feedback))
 
 
-def _share(poles: np.ndarray, lengths: list[int]) -> list[list[complex]] | None:
-    """Deal poles out to chains of given lengths, in their order, pairs together; None if that can't be."""
+def _share_poles(poles: np.ndarray, lengths: list[int]) -> list[list[complex]] | None:
+    """Deal poles out to chains of given lengths in order, pairs together; None if they don't fit."""
     groups: list[list[complex]] = [[] for _ in lengths]
     pairs = [(p, p.conjugate()) for p in poles if p.imag > 0]
     for group in [*pairs, *((p,) for p in poles if p.imag == 0)]:
@@ -169,10 +179,10 @@ def _share(poles: np.ndarray, lengths: list[int]) -> list[list[complex]] | None:
     return groups if [len(g) for g in groups] == lengths else None
 
 
-def _heymann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarray:
-    """Return a feedback that makes a combination of the inputs reach all states, plus Ackermann's for that one.
+def _place_by_heymann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarray:
+    """Return a feedback that makes a combination of the inputs reach all states, plus Ackermann's for that input.
 
-    Of some candidates, drawn the same every time, the one with the smallest gain that places the poles best is taken.
+    40 candidates are drawn, the same each time; the one with the smallest gain and the best poles is taken.
     """
     rng = np.random.default_rng(0)
     size = max(np.linalg.norm(A), np.max(np.abs(polynomial[1:]) ** (1 / np.arange(1, len(polynomial)))))
@@ -181,7 +191,7 @@ def _heymann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarray
         F = rng.normal(size=(B.shape[1], len(A))) * size / (np.linalg.norm(B) * np.sqrt(B.shape[1] * len(A)))
         q = rng.normal(size=(B.shape[1], 1))
         try:
-            K = F + q @ _ackermann(A - B @ F, B @ q, polynomial)
+            K = F + q @ _place_by_ackermann(A - B @ F, B @ q, polynomial)
         except np.linalg.LinAlgError:
             continue
         cost = float(np.linalg.norm(K)) * (
@@ -190,14 +200,18 @@ def _heymann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> np.ndarray
         if best is None or cost < best[0]:
             best = cost, K
     if best is None:
-        raise ParameterError("no combination of the inputs reaches all states; is A, B controllable?", block="place")
+        raise ParameterError(
+            "found no combination of the inputs that reaches all states; expected a controllable system. Leave out the "
+            "modes that no input reaches.",
+            block="place",
+        )
     return best[1]
 
 
 def relative_difference(found: np.ndarray, wanted: np.ndarray, size: float = 0.0) -> float:
-    """Return the largest difference of two monic polynomials' coefficients, time scaled by the size of the roots.
+    """Return the largest difference of two monic polynomials' coefficients, relative to the largest wanted one.
 
-    ``size`` is taken where all roots that are wanted are at zero.
+    Time is scaled by the size of the wanted roots, or by ``size`` where all of them are zero.
     """
     n = len(wanted) - 1
     roots = float(np.max(np.abs(wanted[1:]) ** (1 / np.arange(1, n + 1)), initial=0.0))
@@ -205,32 +219,33 @@ def relative_difference(found: np.ndarray, wanted: np.ndarray, size: float = 0.0
     return float(np.max(np.abs(found - wanted) / scale) / np.max(np.abs(wanted) / scale))
 
 
-def _confirm_polynomial(found: np.ndarray, wanted: np.ndarray, who: str, size: float = 0.0) -> None:
+def _confirm_polynomial(found: np.ndarray, wanted: np.ndarray, caller: str, size: float = 0.0) -> None:
     difference = relative_difference(found, wanted, size)
     if not difference < AGREE:
         raise ConfirmationError(
-            f"the characteristic polynomial that was found differs from the one asked for by {difference:.3g} of its "
-            f"largest coefficient; expected less than {AGREE:g}. The system is nearly uncontrollable, or badly scaled.",
-            block=who,
+            f"found a characteristic polynomial that differs from the wanted one by {difference:.3g} of its largest "
+            f"coefficient; expected less than {AGREE:g}. Scale the states, or leave out modes that are nearly "
+            "uncontrollable.",
+            block=caller,
         )
 
 
 @dataclass(frozen=True)
 class SampledDesign:
-    """What a sampled PID loop around a chain of integrators really is.
+    """Gains and true poles of a sampled PID loop around a chain of integrators.
 
     Parameters
     ----------
     gains : tuple of float
-        (a₀, a₁, …): gain of the integral, of the error, of its rate, …
+        (a₀, a₁, a₂, …): gains of the integral, of the error, of its rate, …
     sample_time : float
         T in s.
     delay : int
         Samples between measurement and hold.
     poles : tuple of complex
-        All closed-loop poles, as s = log(z)/T in 1/s, the slowest first. Multiple ones scatter.
+        All closed-loop poles as s = log(z)/T in 1/s, the slowest first. Multiple ones scatter.
     poles_z : tuple of complex
-        The same in the z plane.
+        The same poles in the z plane.
     polynomial : tuple of float
         Characteristic polynomial in w = (z − 1)/T, highest power first.
     """
@@ -251,23 +266,23 @@ class SampledDesign:
 def sampled_poles(
     gains: Sequence[float], sample_time: float, *, delay: int = 0, integral: Integral = "forward"
 ) -> SampledDesign:
-    """Return the poles that a sampled implementation of the error dynamics really has.
+    """Return the poles that a sampled implementation of the error dynamics has.
 
-    v = −(a₀ ∫e + a₁ e + a₂ ė + …) is held over each sample, in front of a chain of as many integrators as there are
-    gains of e and its rates, which are measured at the ticks. `ErrorDynamics` integrates by forward Euler.
+    v = −(a₀ ∫e + a₁ e + a₂ ė + …) is held over each sample and drives a chain of integrators, one for each gain but
+    a₀. e and its rates are measured at the ticks. `ErrorDynamics` integrates by forward Euler.
 
     Parameters
     ----------
     gains : sequence of float
-        (a₀, a₁, a₂): of the integral, the error, its rate; more for a longer chain.
+        (a₀, a₁, a₂): of the integral, of the error, of its rate; more for a longer chain.
     sample_time : float
         T in s.
     delay : int
         Samples between measurement and hold.
     integral : {"forward", "backward", "trapezoidal"}
-        How ∫e is summed: without the error of this tick, with it, or with half of it.
+        Sum that stands for ∫e: without the error of this tick, with it, or with half of it.
     """
-    base, parts = _pencil(len(gains), sample_time, delay, integral)
+    base, parts = _affine_polynomial(len(gains), sample_time, delay, integral)
     polynomial = base.copy()
     for a, part in zip(gains, parts, strict=True):
         polynomial[-len(part) :] += a * part
@@ -288,11 +303,11 @@ def sampled_poles(
 def sampled_gains(
     poles: Sequence[complex], sample_time: float, *, delay: int = 0, integral: Integral = "forward"
 ) -> SampledDesign:
-    """Return the gains with which the sampled loop really has the poles that are asked for, multiple ones included.
+    """Return the gains that give the sampled loop the poles, multiple ones included.
 
-    The characteristic polynomial is affine in the gains; it vanishes at each z = exp(s T), and so do as many of its
-    derivatives as the pole has further multiplicity. These are linear equations. A delay adds one pole a sample that
-    can't be chosen: they are in the result too.
+    The characteristic polynomial is affine in the gains. It must be divisible by the polynomial of the wanted poles
+    z = exp(s T), which gives linear equations. A delay adds one pole a sample that can't be chosen; the result holds
+    these too.
 
     Parameters
     ----------
@@ -303,26 +318,26 @@ def sampled_gains(
     delay : int
         Samples between measurement and hold.
     integral : {"forward", "backward", "trapezoidal"}
-        How ∫e is summed.
+        Sum that stands for ∫e; see `sampled_poles`.
 
     Raises
     ------
     ParameterError
-        If the poles are not stable or not in pairs, or those that the delay adds come out unstable.
+        If the poles are not stable or not in pairs, or a pole that the delay adds is unstable.
     ConfirmationError
-        If the polynomial with these gains has not the roots that were asked for.
+        If the polynomial with these gains does not have the wanted roots.
     """
     wanted = np.asarray(poles, dtype=complex)
     if wanted.ndim != 1 or not len(wanted) or not np.all(wanted.real < 0) or not np.isfinite(wanted).all():
         raise ParameterError(
-            f"found {list(poles)!r}; expected poles in the left half plane, one for each gain.",
+            f"found {list(poles)!r}; expected poles in the left half plane, one for each gain, in 1/s. Give s, not z.",
             block="sampled_gains",
             port="poles",
         )
     w = np.expm1(wanted * sample_time) / sample_time
     asked = _real_polynomial(w)
-    base, parts = _pencil(len(w), sample_time, delay, integral)
-    # the remainders of a division by the polynomial that is asked for vanish: multiplicities need no case of their own
+    base, parts = _affine_polynomial(len(w), sample_time, delay, integral)
+    # a vanishing remainder covers multiple poles, too
     size = float(np.max(np.abs(w)))
     columns = [_remainder(part, asked, size) for part in parts]
     gains = np.linalg.solve(np.array(columns).T, -_remainder(base, asked, size))
@@ -332,8 +347,8 @@ def sampled_gains(
     others = 1 + sample_time * np.roots(quotient)
     if np.any(np.abs(others) >= 1):
         raise ParameterError(
-            f"found gains that put the poles there, but the delay adds others at z = {others.round(6).tolist()}, which "
-            "are not stable; expected |z| < 1. Ask for slower poles.",
+            f"found gains for these poles, but the delay adds others at z = {others.round(6).tolist()}, which are not "
+            "stable; expected |z| < 1. Ask for slower poles.",
             block="sampled_gains",
             port="poles",
         )
@@ -341,14 +356,14 @@ def sampled_gains(
 
 
 def _remainder(polynomial: np.ndarray, divisor: np.ndarray, size: float) -> np.ndarray:
-    """Return the remainder of a division of polynomials in w/size, padded to the degree of the divisor."""
+    """Return the remainder of a division of polynomials in w, computed in w/size to keep its digits."""
     scaled = polynomial * size ** np.arange(len(polynomial) - 1, -1, -1.0)
     by = divisor * size ** np.arange(len(divisor) - 1, -1, -1.0)
     return _divide(np.append(np.zeros(max(0, len(by) - len(scaled))), scaled), by)[1]
 
 
 def _divide(polynomial: np.ndarray, divisor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return quotient and remainder, which has as many coefficients as the divisor has roots (np.polydiv's varies)."""
+    """Return quotient and remainder; the remainder has one coefficient for each root of the divisor."""
     rest, steps = np.array(polynomial, dtype=float), len(polynomial) - len(divisor) + 1
     quotient = np.zeros(steps)
     for k in range(steps):
@@ -357,33 +372,35 @@ def _divide(polynomial: np.ndarray, divisor: np.ndarray) -> tuple[np.ndarray, np
     return quotient, rest[steps:]
 
 
-def _pencil(gains: int, T: float, delay: int, integral: Integral) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return p₀ and pᵢ of the characteristic polynomial p₀ + Σ aᵢ pᵢ in w = (z − 1)/T.
+def _affine_polynomial(gains: int, T: float, delay: int, integral: Integral) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Return p₀ and the pᵢ of the characteristic polynomial p₀ + Σ aᵢ pᵢ in w = (z − 1)/T.
 
-    A chain of k integrators behind a hold is T^k E_k(z)/(k! (z − 1)^k) with the Eulerian polynomial E_k.
+    A chain of k integrators behind a hold has the transfer function T^k E_k(z)/(k! (z − 1)^k), with the Eulerian
+    polynomial E_k.
     """
     chain = gains - 1
     if chain < 1 or not (np.isfinite(T) and T > 0) or delay < 0 or int(delay) != delay:
         raise ParameterError(
             f"found {gains} gains, a sample time of {T} s and a delay of {delay} samples; expected two gains or more, "
-            "a positive time, and a whole number.",
+            "a positive sample time, and a whole number of samples that is not negative. Correct it.",
             block="sampled_design",
         )
     sums = {"forward": [1.0], "backward": [T, 1.0], "trapezoidal": [T / 2, 1.0]}
     if integral not in sums:
         raise ParameterError(
-            f"found integral={integral!r}; expected 'forward', 'backward' or 'trapezoidal'.", block="sampled_design"
+            f"found integral={integral!r}; expected 'forward', 'backward' or 'trapezoidal'. Choose one of them.",
+            block="sampled_design",
         )
     base = np.array([1.0] + [0.0] * (chain + 1))
     for _ in range(int(delay)):
         base = np.polymul(base, [T, 1.0])
-    # a₁ sees the whole chain, the last gain a single integrator
-    parts = [np.polymul(_held(k, T), [1.0] + [0.0] * (chain + 1 - k)) for k in range(chain, 0, -1)]
-    return base, [np.polymul(sums[integral], _held(chain, T)), *parts]
+    # a₁ multiplies the output of the whole chain, the last gain that of its first integrator
+    parts = [np.polymul(_eulerian_polynomial(k, T), [1.0] + [0.0] * (chain + 1 - k)) for k in range(chain, 0, -1)]
+    return base, [np.polymul(sums[integral], _eulerian_polynomial(chain, T)), *parts]
 
 
-def _held(k: int, T: float) -> np.ndarray:
-    """Return E_k(z)/k! in w, where z = 1 + T w."""
+def _eulerian_polynomial(k: int, T: float) -> np.ndarray:
+    """Return the Eulerian polynomial E_k(z)/k! in w, where z = 1 + T w."""
     eulerian = [1.0]
     for n in range(2, k + 1):
         longer = [0.0] * n

@@ -1,42 +1,49 @@
-"""What python-control says about the same loop, beside our numbers, and which of the two is right."""
+"""Margins by python-control beside ours, with a verdict and its reason where they differ."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from ...blocks.core.errors import ConfirmationError, ParameterError
-from . import confirm
+from .confirm import confirm_limit, pick_test_values
 from .crossings import Scan
 from .margins import Margins, margins
 from .one_thread import on_one_thread
 from .realization import Realization
 
-SAME = 1e-4  # relative difference up to which two values are called the same
+if TYPE_CHECKING:
+    from control import StateSpace
+
+    from .state_space import LinearSystem
+
+SAME = 1e-4
+"""Relative difference up to which two values are the same."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One number by us and by python-control.
+    """One number of a loop, by Loopwright and by python-control.
 
     Parameters
     ----------
     name : str
         Name as in `Margins`.
     value : float
-        Ours.
+        Value by Loopwright.
     control : float
-        python-control's, in our unit; NaN where it gives none.
+        Value by python-control in the same unit; NaN where it gives none.
     function : str
-        The function that gave it.
+        Function of python-control.
     right : str
         "both", "ours" (also where python-control gives none), or "neither is refuted".
     why : str
-        What decides it.
+        Reason for the verdict.
     """
 
     name: str
@@ -47,11 +54,11 @@ class Comparison:
     why: str
 
 
-def compare_with_control(loop: Any, *, delay: int = 0) -> tuple[Comparison, ...]:
-    """Return each margin beside python-control's value, with the one that is right and why.
+def compare_with_control(loop: LinearSystem, *, delay: int = 0) -> tuple[Comparison, ...]:
+    """Return each margin beside python-control's value, with a verdict and its reason.
 
-    A value that differs is tried with closed-loop eigenvalues at 0.99 and 1.01 of it (gain, phase), or held against
-    the response (frequencies, peaks).
+    A value that differs is tested: gains and phases by closed-loop eigenvalues at 0.99 and 1.01 of it, frequencies and
+    peaks by the frequency response.
 
     Parameters
     ----------
@@ -70,31 +77,32 @@ def compare_with_control(loop: Any, *, delay: int = 0) -> tuple[Comparison, ...]
     ours = margins(loop, delay=delay)
     if not ours.stable:
         raise ParameterError(
-            "found a closed loop that is not stable; expected a stable one: it has no margins to compare.",
+            "found a closed loop that is not stable; expected a stable one: this one has no margins to compare. Look "
+            "at margins(loop).closed_loop_poles.",
             block="compare_with_control",
         )
     L = control.ss(loop)
     for _ in range(delay):
         L = L * control.ss(0, 1, 1, 0, L.dt)
-    return compared(Realization.of(loop, delay=delay), ours, L)
+    return compare_margins(Realization.of(loop, delay=delay), ours, L)
 
 
 @on_one_thread
-def compared(r: Realization, ours: Margins, L: Any) -> tuple[Comparison, ...]:
-    """Return margins that are there already beside python-control's of L, of which r is the realization."""
+def compare_margins(r: Realization, ours: Margins, L: StateSpace) -> tuple[Comparison, ...]:
+    """Return computed margins beside python-control's values for L; r is the realization of L."""
     theirs = _ControlValues(L)
     judge = _Judge(r, ours)
     found = []
     for name, (function, value, reason) in theirs.values(ours).items():
-        mine = ours.encirclements if name == "encirclements" else getattr(ours, name).value
-        found.append(judge.compare(name, float(mine), value, function, reason))
+        mine = float(ours.encirclements) if name == "encirclements" else ours.numbers()[name].value
+        found.append(judge.compare(name, mine, value, function, reason))
     return tuple(found)
 
 
 class _ControlValues:
-    """python-control's numbers of a loop; what raises is NaN with its message."""
+    """python-control's numbers of a loop; a function that raises gives NaN and its message."""
 
-    def __init__(self, L: Any):
+    def __init__(self, L: StateSpace):
         self.L = L
 
     def values(self, ours: Margins) -> dict[str, tuple[str, float, str]]:
@@ -113,7 +121,7 @@ class _ControlValues:
             return float(control.nyquist_response(L).count)
 
         out: dict[str, tuple[str, float, str]] = {}
-        margins_of, why = _quiet(lambda: control.stability_margins(L))
+        margins_of, why = _call_quietly(lambda: control.stability_margins(L))
         gm, pm, sm, _, wgc, _ = margins_of if margins_of is not None else (np.nan,) * 6
         low = gm if gm < 1 else np.nan
         high = gm if gm > 1 else np.nan
@@ -132,12 +140,13 @@ class _ControlValues:
             ("bandwidth", "bandwidth", bandwidth),
             ("encirclements", "nyquist_response", encirclements),
         ):
-            value, message = _quiet(call)
+            value, message = _call_quietly(call)
             out[name] = (function, np.nan if value is None else value, message)
         return out
 
 
-def _quiet(call: Callable[[], Any]) -> tuple[Any, str]:
+def _call_quietly(call: Callable[[], T]) -> tuple[T | None, str]:
+    """Return the result of a call without its warnings, and "" or the text of the error that it raises."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -147,7 +156,7 @@ def _quiet(call: Callable[[], Any]) -> tuple[Any, str]:
 
 
 class _Judge:
-    """Decides between two values of one loop."""
+    """Verdicts between two values of one loop."""
 
     def __init__(self, r: Realization, ours: Margins):
         self.r, self.ours, self.scan = r, ours, Scan(r)
@@ -162,24 +171,24 @@ class _Judge:
         if np.isnan(theirs):
             return Comparison(name, mine, theirs, function, "ours", f"{reason or 'it gives none'}; {how}")
         try:
-            refuted = self._refuted(name, mine, theirs)
+            refuted = self._refute(name, mine, theirs)
         except (np.linalg.LinAlgError, ArithmeticError) as error:
             refuted, reason = "", f"theirs can't be judged ({error})"
         return Comparison(
             name, mine, theirs, function, "ours" if refuted else "neither is refuted", f"{refuted or reason}; {how}"
         )
 
-    def _refuted(self, name: str, mine: float, value: float) -> str:
-        """Return why a value can't be right, empty if it may be."""
+    def _refute(self, name: str, mine: float, value: float) -> str:
+        """Return the reason why a value is wrong, or "" if it may be right."""
         r = self.r
         if name in ("gain_margin_low", "gain_margin_high"):
             if value in (0.0, np.inf):
                 return f"it says that there is none, and the factor {mine:.9g} ends stability"
-            return self._no_limit(value, 1.0, r.stable)
+            return self._refute_limit(value, 1.0, r.is_stable)
         if name == "phase_margin_deg":
             if not np.isfinite(value):
                 return "|L| = 1 somewhere, and a rotation there ends stability"
-            return self._no_limit(value, 0.0, lambda degrees: r.stable(np.exp(-1j * np.radians(degrees))))
+            return self._refute_limit(value, 0.0, lambda degrees: r.is_stable(np.exp(-1j * np.radians(degrees))))
         if name == "encirclements":
             return "it is not Z − P of the eigenvalues"
         if name == "bandwidth":
@@ -190,18 +199,19 @@ class _Judge:
             text = f"|T| is {fall:.6f} of its low-frequency value there, not 1/√2 = {2**-0.5:.6f}"
             return text + (" (10^(−3/20) = 0.707946 is used)" if abs(fall - 10**-0.15) < 1e-5 else "")
         if name == "modulus_margin":
-            nearest = 1 / self.scan.peak(1, 0).value
+            nearest = 1 / self.scan.find_peak(1, 0).value
             return f"L comes as near as {nearest:.9g} to −1" if nearest < value else "L does not come as near to −1"
         if name == "disk_margin":
-            return f"max|S − T|/2 is {self.scan.peak(0.5, -0.5).value:.9g}, the reciprocal of ours"
+            return f"max|S − T|/2 is {self.scan.find_peak(0.5, -0.5).value:.9g}, the reciprocal of ours"
         return "its phase margin or crossover is another" if name == "delay_margin_s" else ""
 
     @staticmethod
-    def _no_limit(value: float, nominal: float, stable: Callable[[float], bool]) -> str:
+    def _refute_limit(value: float, nominal: float, stable: Callable[[float], bool]) -> str:
+        """Return the reason why stability does not end at a value, or "" if it does."""
         try:
-            confirm.limit("control", value, [], nominal, stable, "closed-loop eigenvalues")
+            confirm_limit("control", value, [], nominal, stable, "closed-loop eigenvalues")
         except ConfirmationError:
-            inside, outside = (stable(v) for v in confirm.beside(value, [], nominal))
+            inside, outside = (stable(v) for v in pick_test_values(value, [], nominal))
             words = ["stable" if s else "unstable" for s in (inside, outside)]
             return f"closed-loop eigenvalues say {words[0]} just before it and {words[1]} just beyond"
         return ""

@@ -1,29 +1,39 @@
-"""A loop as balanced matrices: its frequency response, its slope, and its closed-loop matrix."""
+"""A loop as balanced matrices, with its frequency response and its closed-loop poles."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...blocks.core.errors import ParameterError
+from .state_space import read_matrices
+
+if TYPE_CHECKING:
+    from .state_space import LinearSystem
 
 Matrices = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-HIDDEN = 1e-11  # relative size of a coupling that counts as none when hidden modes are split off
-STRUCTURE = 1e-14  # relative size, all scaled, below which an entry is what rounding has left of a zero
-ROUNDING = (1e-8, 1e-10, 1e-12)  # sizes below which it perhaps is, tried in this order and held against the response
-MARGINAL = 1e-14  # relative to the largest pole: one that near to the limit of stability is taken to lie on it
-LARGE = 1e4  # |L| above which a difference shows nowhere in the closed loop
+HIDDEN = 1e-11
+"""Relative size of a coupling below which a mode counts as hidden."""
+STRUCTURE = 1e-14
+"""Size of an entry, relative to the largest after scaling, below which it is a zero that rounding has changed."""
+ROUNDING = (1e-8, 1e-10, 1e-12)
+"""Sizes below which an entry may be such a zero; each is tried, and kept if the response stays the same."""
+MARGINAL = 1e-14
+"""Distance from the limit of stability, relative to the largest pole, below which a pole counts as on it."""
+LARGE = 1e4
+"""|L| above which a difference does not show in the closed loop."""
 
 
 @dataclass(frozen=True, eq=False)
 class Realization:
     """A linear system (p I − A) x = B u, y = C x + D u with p = s, or p = z − 1 where it is sampled.
 
-    The shift z − 1 keeps a loop accurate far below the sampling frequency, where several poles at z = 1 would
-    otherwise cancel all digits. Frequencies and points of the contour are given as s in both cases: p = exp(s T) − 1.
+    The shift z − 1 keeps a loop accurate far below the sampling frequency, where several poles at z = 1 would cancel
+    all digits. Frequencies and points of the contour are given as s in both cases: p = exp(s T) − 1. ``hidden`` are
+    the poles, in the plane of p, that the reduction has removed.
     """
 
     A: np.ndarray
@@ -34,7 +44,7 @@ class Realization:
     hidden: np.ndarray
 
     @classmethod
-    def of(cls, loop: Any, *, delay: int = 0) -> Realization:
+    def of(cls, loop: LinearSystem, *, delay: int = 0) -> Realization:
         """Return the balanced, minimal realization of a linear system of python-control.
 
         Parameters
@@ -42,45 +52,51 @@ class Realization:
         loop : control.StateSpace or control.TransferFunction
             Continuous (dt = 0) or sampled (dt = T in s).
         delay : int
-            Whole samples of delay in series with it.
-        """
-        import control
+            Whole samples of delay in series with a sampled loop.
 
-        who = getattr(loop, "name", None) or "loop"
+        Raises
+        ------
+        ParameterError
+            If it is no linear system, has no definite sample time or entries that are not finite, or the delay is not
+            a number of samples.
+        """
+        name = str(getattr(loop, "name", None) or "loop")
         try:
-            system = control.ss(loop)
+            A, B, C, D, dt = read_matrices(loop)
         except Exception as error:
             raise ParameterError(
-                f"found {type(loop).__name__}, of which python-control makes no state space ({error}); expected a "
-                "control.StateSpace.",
-                block=who,
+                f"found {type(loop).__name__}, which python-control can't turn into a state space ({error}); expected "
+                "a control.StateSpace. Make one with control.ss(A, B, C, D, dt).",
+                block=name,
             ) from error
-        dt = system.dt
         if dt is None or dt is True:
             raise ParameterError(
                 f"found dt={dt}; expected 0 (continuous) or the sample time in s. Set it: control.ss(A, B, C, D, dt).",
-                block=who,
+                block=name,
                 port="dt",
             )
         if int(delay) != delay or delay < 0 or (delay and not dt):
             raise ParameterError(
-                f"found a delay of {delay!r} samples; expected a whole number that is not negative, of a sampled loop.",
-                block=who,
+                f"found a delay of {delay!r} samples; expected a whole number, not negative, and 0 for a continuous "
+                "loop. For a continuous one take control.pade.",
+                block=name,
                 port="delay",
             )
-        A, B, C, D = (np.array(getattr(system, name), dtype=float) for name in "ABCD")
         if not all(np.isfinite(m).all() for m in (A, B, C, D)):
-            raise ParameterError("found NaN or infinity in A, B, C or D; look at the operating point.", block=who)
+            raise ParameterError(
+                "found NaN or infinity in A, B, C or D; expected finite entries. Look at the operating point.",
+                block=name,
+            )
         if dt:
             A = A - np.eye(len(A))
-        if len(A):  # a feedthrough that rounding has left would be crossings near infinity
-            size = max(float(np.abs(M).max(initial=0.0)) for M in _scaled(A, B, C))
+        if len(A):  # a feedthrough left by rounding would make crossings near infinity
+            size = max(float(np.abs(M).max(initial=0.0)) for M in _scale(A, B, C))
             D = np.where(np.abs(D) <= STRUCTURE * size, 0.0, D)
         for _ in range(int(delay)):
-            A, B, C, D = _delayed(A, B, C, D)
-        made = cls(*_balanced(A, B, C), D, float(dt), np.zeros(0)).minimal()
-        # once more, with input and output: A alone may have been scaled by what rounding has left in it
-        return cls(*_scaled(made.A, made.B, made.C), D, made.dt, made.hidden)
+            A, B, C, D = _delay_inputs(A, B, C, D)
+        made = cls(*_balance(A, B, C), D, float(dt), np.zeros(0)).reduce()
+        # scaled once more, with input and output: rounding in A alone may have set the first scales
+        return cls(*_scale(made.A, made.B, made.C), D, made.dt, made.hidden)
 
     @property
     def order(self) -> int:
@@ -93,11 +109,11 @@ class Realization:
         return np.pi / self.dt if self.dt else np.inf
 
     def point(self, s: np.ndarray) -> np.ndarray:
-        """Return p at s."""
+        """Return p at points s."""
         return np.asarray(np.expm1(s * self.dt) if self.dt else s, dtype=complex)
 
     def logarithm(self, p: np.ndarray) -> np.ndarray:
-        """Return s at p; −∞ for z = 0."""
+        """Return s at points p; −∞ for z = 0."""
         p = np.asarray(p, dtype=complex)
         if not self.dt:
             return p
@@ -106,11 +122,11 @@ class Realization:
             real = 0.5 * np.log1p(np.maximum(2 * p.real + np.abs(p) ** 2, -1.0))
             return np.asarray((real + 1j * np.angle(1 + p)) / self.dt)
 
-    def matrix(self, s: Any) -> np.ndarray:
+    def matrix(self, s: np.ndarray) -> np.ndarray:
         """Return the transfer matrix at the points s, shape (..., outputs, inputs)."""
         return np.asarray(self.D + self.C @ self._states(np.atleast_1d(s)))
 
-    def response(self, omega: Any) -> tuple[np.ndarray, np.ndarray]:
+    def response(self, omega: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
         """Return L and dL/dω of a loop with one channel at the frequencies ω."""
         s = 1j * np.atleast_1d(np.asarray(omega, dtype=float))
         return self.values(s, slope=1j)
@@ -123,63 +139,63 @@ class Realization:
         return (self.D + self.C @ x)[:, 0, 0], -slope * rate * (self.C @ twice)[:, 0, 0]
 
     def error(self, omega: float) -> float:
-        """Return an estimate of the relative rounding error of L at ω: the adjoint solution compared."""
+        """Return an estimate of the relative rounding error of L at ω: the difference to the adjoint solution."""
         s = np.array([1j * omega])
         direct = self.matrix(s)[0]
-        adjoint = self.D + (_dual(self).C @ _dual(self)._states(s))[0].T
+        adjoint = self.D + (_transpose(self).C @ _transpose(self)._states(s))[0].T
         return 1e-13 + 10 * float(np.max(np.abs(direct - adjoint)) / (np.max(np.abs(direct)) + 1e-300))
 
-    def closed(self, factor: Any = 1.0) -> np.ndarray:
-        """Return the closed-loop matrix A − B F (I + D F)⁻¹ C, F multiplying the loop (scalar or matrix)."""
+    def closed_matrix(self, factor: complex | np.ndarray = 1.0) -> np.ndarray:
+        """Return the closed-loop matrix A − B F (I + D F)⁻¹ C; F, a number or a matrix, multiplies the loop."""
         m = len(self.D)
         F = factor * np.eye(m) if np.ndim(factor) == 0 else np.asarray(factor)
         return np.asarray(self.A - self.B @ F @ np.linalg.solve(np.eye(m) + self.D @ F, self.C))
 
-    def eigenvalues(self, factor: Any = 1.0) -> np.ndarray:
-        """Return the closed-loop poles in the plane of p."""
-        return np.linalg.eigvals(self.closed(factor))
+    def eigenvalues(self, factor: complex | np.ndarray = 1.0) -> np.ndarray:
+        """Return the closed-loop poles in the plane of p; see `closed_matrix`."""
+        return np.linalg.eigvals(self.closed_matrix(factor))
 
     def growth(self, p: np.ndarray) -> np.ndarray:
-        """Return how far poles are beyond the limit of stability: Re s, or |z| − 1."""
+        """Return the distance of poles beyond the limit of stability: Re s, or |z| − 1."""
         if not self.dt:
             return np.asarray(np.real(p))
         square = 2 * np.real(p) + np.abs(p) ** 2
         return np.asarray(square / (1 + np.sqrt(1 + square)))
 
-    def unstable(self, factor: Any = 1.0) -> int:
-        """Return the number of closed-loop poles that are not stable; within rounding of the limit is not stable."""
+    def count_unstable(self, factor: complex | np.ndarray = 1.0) -> int:
+        """Return the number of closed-loop poles that are not stable; poles on the limit, up to rounding, count."""
         poles = self.eigenvalues(factor)
         rounding = MARGINAL * float(np.abs(poles).max(initial=0.0))
         return int(np.sum(self.growth(poles) >= -rounding))
 
-    def stable(self, factor: Any = 1.0) -> bool:
+    def is_stable(self, factor: complex | np.ndarray = 1.0) -> bool:
         """Whether all closed-loop poles are stable."""
-        return self.unstable(factor) == 0
+        return self.count_unstable(factor) == 0
 
     @cached_property
     def scale(self) -> float:
-        """Size of A."""
+        """Frobenius norm of A."""
         return float(np.linalg.norm(self.A)) if self.order else 0.0
 
-    def delayed(self) -> Realization:
+    def delay_once(self) -> Realization:
         """Return this sampled system with one more sample of delay."""
-        return Realization(*_delayed(self.A, self.B, self.C, self.D), self.dt, self.hidden)
+        return Realization(*_delay_inputs(self.A, self.B, self.C, self.D), self.dt, self.hidden)
 
-    def minimal(self) -> Realization:
-        """Return the part that is controllable and observable; what was split off is kept in ``hidden``."""
-        whole = self._without(*_connected(self, STRUCTURE))
+    def reduce(self) -> Realization:
+        """Return the controllable and observable part; the poles of the rest go to ``hidden``."""
+        whole = self._replace_by(*_keep_connected(self, STRUCTURE))
         for tolerance in ROUNDING:
-            fewer = whole._without(*_connected(whole, tolerance))
+            fewer = whole._replace_by(*_keep_connected(whole, tolerance))
             if fewer.order < whole.order and fewer.agrees(whole):
                 whole = fewer
-        part, first = _split(whole)
-        part, second = _split(_dual(part))
-        return whole._without(_dual(part), np.concatenate([first, second]))
+        part, first = _split_uncontrollable(whole)
+        part, second = _split_uncontrollable(_transpose(part))
+        return whole._replace_by(_transpose(part), np.concatenate([first, second]))
 
     def agrees(self, other: Realization) -> bool:
-        """Whether the responses are the same to 1e-9 around every open- and closed-loop pole.
+        """Whether the responses are the same to 1e-9 around every open-loop and closed-loop pole.
 
-        Where they are very large, near several poles at s = 0 that scatter, nothing depends on them.
+        Very large responses are left out: they occur near several poles at s = 0, which scatter, and don't matter.
         """
         p = [np.linalg.eigvals(other.A)]
         if other.B.shape[1] == len(other.C) and np.linalg.cond(np.eye(len(other.D)) + other.D) < 1e12:
@@ -192,21 +208,21 @@ class Realization:
         omega = omega[(omega < self.nyquist) & (omega > 1e-3 * around.min())]
         one, two = self.matrix(1j * omega), other.matrix(1j * omega)
         size, apart = np.max(np.abs(two), axis=(1, 2)), np.max(np.abs(one - two), axis=(1, 2))
-        judged = size < LARGE
-        return bool(judged.any() and np.all(apart[judged] <= 1e-9 * size[judged]))
+        counts = size < LARGE
+        return bool(counts.any() and np.all(apart[counts] <= 1e-9 * size[counts]))
 
-    def _without(self, part: Realization, hidden: np.ndarray) -> Realization:
-        """Return a part of this system whose response is the same, with the poles of the rest; else this system."""
+    def _replace_by(self, part: Realization, hidden: np.ndarray) -> Realization:
+        """Return a part of this system if its response is the same, with ``hidden`` added; else this system."""
         if part.order == self.order:
             return self
-        part = Realization(*_scaled(part.A, part.B, part.C), self.D, self.dt, np.concatenate([self.hidden, hidden]))
+        part = Realization(*_scale(part.A, part.B, part.C), self.D, self.dt, np.concatenate([self.hidden, hidden]))
         poles = self.logarithm(np.linalg.eigvals(self.A))
         size = np.abs(poles[np.isfinite(poles)])
         top = min(10 * size.max(initial=1.0), self.nyquist)
         s = 1j * np.geomspace(top * 1e-5, top, 101) * (1 + 1e-4)
         before, after = self.matrix(s), part.matrix(s)
         size = np.max(np.abs(before), axis=(1, 2)) + 1e-300
-        # far above 1 an error does not show in the closed loop, and integrators amplify rounding there
+        # far above 1 an error does not show in the closed loop, and integrators amplify rounding
         worst = np.max(np.abs(before - after), axis=(1, 2)) / (size * np.maximum(1.0, np.sqrt(size)))
         return part if np.max(worst) < 1e-9 else self
 
@@ -217,12 +233,12 @@ class Realization:
         return self._solve(s, np.broadcast_to(self.B.astype(complex), (len(s), *self.B.shape)))
 
 
-def _dual(r: Realization) -> Realization:
+def _transpose(r: Realization) -> Realization:
     return Realization(r.A.T, r.C.T, r.B.T, r.D.T, r.dt, r.hidden)
 
 
-def _delayed(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Matrices:
-    """Put z⁻¹ behind the inputs: z d = u, so p d = u − d."""
+def _delay_inputs(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Matrices:
+    """Put a delay of one sample behind the inputs: z d = u, so p d = u − d."""
     n, m = len(A), B.shape[1]
     bottom = np.hstack([np.zeros((m, n)), -np.eye(m)])
     return (
@@ -233,8 +249,8 @@ def _delayed(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray) -> Matr
     )
 
 
-def _balanced(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Scale the states by powers of two, so that A's rows and columns are of one size."""
+def _balance(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scale the states by powers of two, so that A's rows and columns get one size."""
     if not len(A):
         return A, B, C
     d = _scales(A)
@@ -242,17 +258,18 @@ def _balanced(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _scales(M: np.ndarray) -> np.ndarray:
+    """Return the factors that balance a matrix, powers of two."""
     from scipy.linalg import matrix_balance
 
-    with np.errstate(invalid="ignore"):  # SciPy reads a permutation out of the factors, which may be too large for one
+    with np.errstate(invalid="ignore"):  # SciPy casts the factors to whole numbers, for which they may be too large
         _, (d, _) = matrix_balance(M, permute=False, separate=True)
     return np.asarray(d)
 
 
-def _scaled(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Scale the states so that input, states and output are of one size.
+def _scale(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scale the states so that input, states and output get one size.
 
-    A chain of integrators has no loop that fixes its scale: balanced alone, it is scaled by what rounding has left.
+    A chain of integrators has no loop that fixes its scale: balancing A alone would scale it by rounding errors.
     """
     n = len(A)
     if not n:
@@ -263,9 +280,9 @@ def _scaled(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> tuple[np.ndarray, np
     return A * d / d[:, None], B / d[:, None], C * d
 
 
-def _connected(r: Realization, tolerance: float) -> tuple[Realization, np.ndarray]:
-    """Return what the input reaches and the output sees along couplings above rounding, and the poles of the rest."""
-    A, B, C = _scaled(r.A, r.B, r.C)
+def _keep_connected(r: Realization, tolerance: float) -> tuple[Realization, np.ndarray]:
+    """Return the states that couplings above a tolerance connect to input and output, and the poles of the others."""
+    A, B, C = _scale(r.A, r.B, r.C)
     n = len(A)
     whole = np.block([[A, B], [C, np.zeros((len(C), B.shape[1]))]])
     size = np.abs(whole).max(initial=0.0)
@@ -280,8 +297,8 @@ def _connected(r: Realization, tolerance: float) -> tuple[Realization, np.ndarra
     return part, np.linalg.eigvals(r.A[np.ix_(~keep, ~keep)])
 
 
-def _split(r: Realization) -> tuple[Realization, np.ndarray]:
-    """Return the controllable part, and the poles of the rest (block Krylov staircase)."""
+def _split_uncontrollable(r: Realization) -> tuple[Realization, np.ndarray]:
+    """Return the controllable part and the poles of the rest, by a block Krylov staircase."""
     if not r.order:
         return r, np.zeros(0)
     size = np.linalg.norm(r.B, axis=0)
@@ -302,5 +319,6 @@ def _split(r: Realization) -> tuple[Realization, np.ndarray]:
 
 
 def _range(M: np.ndarray, scale: float) -> np.ndarray:
+    """Return an orthonormal basis of the columns that are larger than a hidden coupling."""
     U, sigma, _ = np.linalg.svd(M, full_matrices=False)
     return np.asarray(U[:, sigma > HIDDEN * scale])

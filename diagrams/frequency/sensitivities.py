@@ -1,14 +1,20 @@
-"""Sensitivity functions of a closed loop, and how much delay a plant behind a hold really bears."""
+"""Sensitivity functions of a closed loop, and the delay that a sampled loop bears in front of its hold."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...blocks.core.errors import ConfirmationError, ParameterError
 from .number import Number
+from .state_space import Matrices, make_state_space, read_matrices
+
+if TYPE_CHECKING:
+    from control import StateSpace
+
+    from .state_space import LinearSystem
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,33 +24,33 @@ class GangOfFour:
     Parameters
     ----------
     S : control.StateSpace
-        Sensitivity 1/(1 + P C): reference to error.
+        Sensitivity 1/(1 + P C), from reference to error.
     PS : control.StateSpace
-        Load disturbance to output.
+        From load disturbance to output.
     CS : control.StateSpace
-        Noise to command.
+        From noise to command.
     T : control.StateSpace
         Complementary sensitivity P C/(1 + P C).
     """
 
-    S: Any
-    PS: Any
-    CS: Any
-    T: Any
+    S: StateSpace
+    PS: StateSpace
+    CS: StateSpace
+    T: StateSpace
 
 
-def sensitivity(loop: Any) -> Any:
-    """Return S = (I + L)⁻¹ of a square loop as a state space on L's states."""
-    return _closed(loop, complementary=False)
+def sensitivity(loop: LinearSystem) -> StateSpace:
+    """Return S = (I + L)⁻¹ of a square loop, with L's states."""
+    return _close_loop(loop, complementary=False)
 
 
-def complementary(loop: Any) -> Any:
-    """Return T = (I + L)⁻¹ L of a square loop as a state space on L's states."""
-    return _closed(loop, complementary=True)
+def complementary(loop: LinearSystem) -> StateSpace:
+    """Return T = (I + L)⁻¹ L of a square loop, with L's states."""
+    return _close_loop(loop, complementary=True)
 
 
-def gang_of_four(plant: Any, controller: Any) -> GangOfFour:
-    """Return S, PS, CS and T as state spaces, all on the states of plant and controller.
+def gang_of_four(plant: LinearSystem, controller: LinearSystem) -> GangOfFour:
+    """Return S, PS, CS and T, all with the states of plant and controller.
 
     Parameters
     ----------
@@ -58,71 +64,84 @@ def gang_of_four(plant: Any, controller: Any) -> GangOfFour:
     """
     import control
 
-    P, C = control.ss(plant), control.ss(controller)
-    S = sensitivity(P * C)
-    x, n, m = np.eye(P.noutputs), P.nstates + C.nstates, P.noutputs
+    first, second = control.ss(plant), control.ss(controller)
+    S = sensitivity(first * second)
+    P, C, dt = read_matrices(first), read_matrices(second), read_matrices(S).dt
+    x, n, m = np.eye(P.outputs), P.states + C.states, P.outputs
     # y = P (d − C w), w = y + r: from r and d to y and C w, once, on the joint states
-    zero = np.zeros((C.nstates, P.nstates))
-    inverse = _solved(x + P.D @ C.D)
+    zero = np.zeros((C.states, P.states))
+    inverse = _invert(x + P.D @ C.D)
     Cy = inverse @ np.hstack([P.C, -P.D @ C.C])
     Dy = inverse @ np.hstack([-P.D @ C.D, P.D])
-    select = np.hstack([np.eye(m), np.zeros((m, P.ninputs))])
+    select = np.hstack([np.eye(m), np.zeros((m, P.inputs))])
     Cw, Dw = Cy, Dy + select
-    Cu = np.hstack([np.zeros((C.noutputs, P.nstates)), C.C]) + C.D @ Cw
+    Cu = np.hstack([np.zeros((C.outputs, P.states)), C.C]) + C.D @ Cw
     Du = C.D @ Dw
-    load = np.hstack([np.zeros((P.ninputs, m)), np.eye(P.ninputs)])
-    A = np.block([[P.A, np.zeros((P.nstates, C.nstates))], [zero, C.A]])
+    load = np.hstack([np.zeros((P.inputs, m)), np.eye(P.inputs)])
+    A = np.block([[P.A, np.zeros((P.states, C.states))], [zero, C.A]])
     A = A + np.vstack([-P.B @ Cu, C.B @ Cw]) if n else A
     B = np.vstack([P.B @ (load - Du), C.B @ Dw])
-    PS = control.ss(A, B[:, m:], Cy, Dy[:, m:], S.dt)
-    CS = control.ss(A, B[:, :m], Cu, Du[:, :m], S.dt)
-    T = control.ss(A, B[:, :m], -Cy, -Dy[:, :m], S.dt)
-    return GangOfFour(S, PS, CS, T)
+    return GangOfFour(
+        S=S,
+        PS=make_state_space(A, B[:, m:], Cy, Dy[:, m:], dt),
+        CS=make_state_space(A, B[:, :m], Cu, Du[:, :m], dt),
+        T=make_state_space(A, B[:, :m], -Cy, -Dy[:, :m], dt),
+    )
 
 
-def delayed_hold(plant: Any, sample_time: float, delay: float = 0.0) -> Any:
-    """Return a continuous plant behind a zero-order hold and a delay, exactly, as a sampled state space.
+def delayed_hold(plant: LinearSystem, sample_time: float, delay: float = 0.0) -> StateSpace:
+    """Return the exact sampled state space of a continuous plant behind a zero-order hold and a delay.
 
     The delay need not be whole samples: within a tick the old command acts for its fraction, then the new one
-    (the modified z-transform). The plant must be strictly proper.
+    (modified z-transform).
 
     Parameters
     ----------
     plant : control.StateSpace
-        Continuous plant.
+        Continuous plant without direct feedthrough.
     sample_time : float
         T in s.
     delay : float
         Delay in s between tick and hold.
+
+    Raises
+    ------
+    ParameterError
+        If the plant is sampled or has direct feedthrough, or a time has the wrong sign.
     """
-    import control
+    return make_state_space(*_delay_hold(read_matrices(plant), sample_time, delay))
+
+
+def _delay_hold(P: Matrices, sample_time: float, delay: float) -> Matrices:
     from scipy.linalg import expm
 
-    P = control.ss(plant)
     if P.dt != 0 or np.any(P.D):
         raise ParameterError(
-            f"found dt={P.dt} and D={P.D.tolist()}; expected a continuous plant without direct feedthrough.",
+            f"found dt={P.dt} and D={P.D.tolist()}; expected a continuous plant without direct feedthrough. Leave "
+            "sensor and actuator dynamics in the plant, or put the feedthrough into the controller.",
             block="delayed_hold",
         )
     if not (sample_time > 0 and delay >= 0):
         raise ParameterError(
-            f"found a sample time of {sample_time} s and a delay of {delay} s; expected T > 0 and a delay ≥ 0.",
+            f"found a sample time of {sample_time} s and a delay of {delay} s; expected T > 0 and a delay ≥ 0. Give "
+            "both in seconds.",
             block="delayed_hold",
         )
-    n, m = P.nstates, P.ninputs
+    n, m = P.states, P.inputs
     samples = int(np.floor(delay / sample_time * (1 + 1e-14)))
     fraction = max(0.0, delay - samples * sample_time)
 
-    def over(t: float) -> tuple[np.ndarray, np.ndarray]:
-        both = expm(np.block([[P.A, P.B], [np.zeros((m, n + m))]]) * t)
+    def hold_over(t: float) -> tuple[np.ndarray, np.ndarray]:
+        both = np.asarray(expm(np.block([[P.A, P.B], [np.zeros((m, n + m))]]) * t))
         return both[:n, :n], both[:n, n:]
 
-    Phi, _ = over(sample_time)
-    rest, new = over(sample_time - fraction)
-    old = rest @ over(fraction)[1]
+    Phi, _ = hold_over(sample_time)
+    rest, new = hold_over(sample_time - fraction)
+    old = rest @ hold_over(fraction)[1]
     kept = samples + (fraction > 0)  # commands underway: u[k − 1], u[k − 2], …
+    none = np.zeros((P.outputs, m))
     if not kept:
-        return control.ss(Phi, new, P.C, 0, sample_time)
+        return Matrices(Phi, new, P.C, none, sample_time)
     states = n + m * kept
     A, B = np.zeros((states, states)), np.zeros((states, m))
     A[:n, :n] = Phi
@@ -133,42 +152,46 @@ def delayed_hold(plant: Any, sample_time: float, delay: float = 0.0) -> Any:
             B[:n] += gain
         else:
             A[:n, n + m * (lag - 1) : n + m * lag] += gain
-    return control.ss(A, B, np.hstack([P.C, np.zeros((P.noutputs, states - n))]), 0, sample_time)
+    return Matrices(A, B, np.hstack([P.C, np.zeros((P.outputs, states - n))]), none, sample_time)
 
 
-def delayed_hold_margin(plant: Any, controller: Any, *, largest: float = 200.0) -> Number:
-    """Return the delay in s between controller and hold at which a sampled loop ends to be stable, exactly.
+def delayed_hold_margin(plant: LinearSystem, controller: LinearSystem, *, largest: float = 200.0) -> Number:
+    """Return the smallest delay in s between controller and hold that ends the stability of a sampled loop.
 
-    The first such delay on a scan of a tenth of a sample, refined; the loop may become stable again beyond.
+    A scan in steps of a tenth of a sample finds the delay, and a root search refines it. Beyond it the loop may become
+    stable again.
 
     Parameters
     ----------
     plant : control.StateSpace
-        Continuous plant.
+        Continuous plant without direct feedthrough.
     controller : control.StateSpace
         Sampled controller, u = −C y.
     largest : float
-        Where the scan ends, in samples.
+        End of the scan in samples.
 
     Raises
     ------
     ParameterError
         If the loop is not stable without delay.
+    ConfirmationError
+        If the loop is not stable at 0.99 and unstable at 1.01 of the delay.
     """
     import control
     from scipy.optimize import brentq
 
     C = control.ss(controller)
-    T = C.dt
+    T = float(C.dt)
 
     def radius(delay: float) -> float:
-        loop = delayed_hold(plant, T, delay) * C
-        A = loop.A - loop.B @ _solved(np.eye(len(loop.D)) + loop.D) @ loop.C
+        loop = read_matrices(delayed_hold(plant, T, delay) * C)
+        A = loop.A - loop.B @ _invert(np.eye(len(loop.D)) + loop.D) @ loop.C
         return float(np.max(np.abs(np.linalg.eigvals(A)))) - 1.0
 
     if radius(0.0) >= 0:
         raise ParameterError(
-            f"found a closed loop with |z| = {1 + radius(0.0):.6g} without any delay; expected a stable one.",
+            f"found a closed-loop pole with |z| = {1 + radius(0.0):.6g} without any delay; expected |z| < 1. Look at "
+            "margins(loop).closed_loop_poles.",
             block="delayed_hold_margin",
         )
     step = 0.1 * T
@@ -180,25 +203,27 @@ def delayed_hold_margin(plant: Any, controller: Any, *, largest: float = 200.0) 
     if not low < 0 < high:
         raise ConfirmationError(
             f"found {found:.9g} s, but |z| − 1 is {low:.3g} at 0.99 and {high:.3g} at 1.01 of it; expected a change of "
-            "sign.",
+            "sign. Scale the states of the plant: it may be ill-conditioned.",
             block="delayed_hold_margin",
         )
     how = "closed-loop eigenvalues with the delayed hold: stable at 0.99, unstable at 1.01 of it"
     return Number(found, "s", 1e-10 * found, how)
 
 
-def _solved(M: np.ndarray) -> np.ndarray:
+def _invert(M: np.ndarray) -> np.ndarray:
     if np.linalg.cond(M) > 1e12:
-        raise ParameterError("found I + L singular at infinite frequency: an algebraic loop.", block="sensitivity")
+        raise ParameterError(
+            "found I + L singular at infinite frequency, an algebraic loop; expected an inverse. Look at D of plant "
+            "and controller.",
+            block="sensitivity",
+        )
     return np.asarray(np.linalg.inv(M))
 
 
-def _closed(loop: Any, *, complementary: bool) -> Any:
-    import control
-
-    L = control.ss(loop)
-    inverse = _solved(np.eye(len(L.D)) + L.D)
+def _close_loop(loop: LinearSystem, *, complementary: bool) -> StateSpace:
+    L = read_matrices(loop)
+    inverse = _invert(np.eye(len(L.D)) + L.D)
     A = L.A - L.B @ inverse @ L.C
     if complementary:
-        return control.ss(A, L.B @ inverse, inverse @ L.C, inverse @ L.D, L.dt)
-    return control.ss(A, L.B @ inverse, -inverse @ L.C, inverse, L.dt)
+        return make_state_space(A, L.B @ inverse, inverse @ L.C, inverse @ L.D, L.dt)
+    return make_state_space(A, L.B @ inverse, -inverse @ L.C, inverse, L.dt)

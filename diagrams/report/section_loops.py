@@ -11,7 +11,7 @@ from ...blocks.core.errors import LoopwrightError
 from ..frequency.disk import mimo_disk_margin
 from ..frequency.margins import Margins, margins
 from ..frequency.number import Number
-from ..frequency.python_control import Comparison, compared
+from ..frequency.python_control import Comparison, compare_margins
 from ..frequency.realization import Realization
 from . import plots as figures
 from .case import FRICTION, SIDES, Case, in_s
@@ -110,7 +110,7 @@ def _wire(case: Case, key: str, wire: str) -> Section | None:
             try:
                 with np.errstate(all="ignore"):
                     r = Realization.of(L)
-                    rows = compared(r, m, _as_control(r))
+                    rows = compare_margins(r, m, _as_control(r))
             except (LoopwrightError, np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
                 notes.append(TEXTS.line("not_compared", variant=v.title, error=error))
                 continue

@@ -105,7 +105,7 @@ def _asked(case: Case, side: str, wire: str, block: Any, numbers: dict[str, Numb
         except LoopwrightError:
             continue
         if not r.dt:
-            got = np.poly(r.closed())
+            got = np.poly(r.closed_matrix())
             how = "characteristic polynomials of the loop at the virtual input"
             off = _off(got, asked)
             if len(got) != len(asked) and not off <= SAME:  # the plant has dynamics of its own
@@ -117,15 +117,18 @@ def _asked(case: Case, side: str, wire: str, block: Any, numbers: dict[str, Numb
             rows.append((v.title, _listed(np.roots(got)), numbers[f"{side}.{v.key}.polynomial_difference"]))
             continue
         if v.key.endswith(FRICTION):
-            rows.append((v.title, _listed(in_s(1 + np.linalg.eigvals(r.closed()), r.dt)), ""))
+            rows.append((v.title, _listed(in_s(1 + np.linalg.eigvals(r.closed_matrix()), r.dt)), ""))
             continue
         design = sampled_poles([block.a0, block.a1, block.a2], r.dt, delay=v.delay)
-        got, formula = np.poly(r.closed()), np.array(design.polynomial) * r.dt ** np.arange(len(design.polynomial))
+        got, formula = (
+            np.poly(r.closed_matrix()),
+            np.array(design.polynomial) * r.dt ** np.arange(len(design.polynomial)),
+        )
         formula = formula / formula[0]  # in z − 1 in place of (z − 1)/T
         off = _off(got, formula)
         how = "closed form of the sampled chain of integrators against the diagram's own loop"
         if not off <= SAME:
-            rows.append((v.title, _listed(in_s(1 + np.linalg.eigvals(r.closed()), r.dt)), ""))
+            rows.append((v.title, _listed(in_s(1 + np.linalg.eigvals(r.closed_matrix()), r.dt)), ""))
             continue
         numbers[f"{side}.{v.key}.polynomial_difference"] = Number(off, "1", 1e-9, how)
         for i, s in enumerate(design.poles[:3], 1):

@@ -178,11 +178,13 @@ def test_a_closed_loop_on_the_limit_is_not_called_stable_by_rounding():
 def test_two_crossings_between_two_samples_are_found_by_the_slope():
     r = Realization.of(control.tf([1.05 * 0.2 * 5, 0.0], [1, 0.2 * 5, 25]))  # |L| = 1.05 at 5 rad/s, nothing else
     scan = Scan(r)
-    assert len(scan.gain_crossovers()) == 2
+    assert len(scan.find_gain_crossovers()) == 2
     scan.segments = [np.array([0.5, 4.0, 6.0, 50.0])]
     scan.samples = [(L, dL * w) for w, (L, dL) in zip(scan.segments, map(r.response, scan.segments), strict=True)]
     assert np.all(np.abs(scan.samples[0][0]) < 1)
-    assert [c.omega for c in scan.gain_crossovers()] == pytest.approx([c.omega for c in Scan(r).gain_crossovers()])
+    assert [c.omega for c in scan.find_gain_crossovers()] == pytest.approx(
+        [c.omega for c in Scan(r).find_gain_crossovers()]
+    )
 
 
 def test_hidden_modes_are_split_off_and_named():
@@ -233,11 +235,11 @@ def test_states_at_one_that_only_rounding_couples_do_not_make_a_loop_unstable(no
     [
         (control.ss(-1, 1, 1, 0, True), {}, r"found dt=True; expected 0 \(continuous\) or the sample time"),
         (control.ss(-np.eye(2), np.eye(2), np.eye(2), 0), {}, "2 inputs and 2 outputs.*Use mimo_disk_margin"),
-        (control.ss(-1, 1, 1, 0), {"delay": 1}, "delay of 1 samples; expected a whole number.*sampled loop"),
+        (control.ss(-1, 1, 1, 0), {"delay": 1}, "delay of 1 samples; expected a whole number.*0 for a continuous loop"),
         (control.ss(0.5, 1, 1, 0, 0.1), {"delay": 0.5}, "delay of 0.5 samples"),
-        (control.ss(-1, 1, 0, 2), {}, "the constant 2: no state is both reached and seen"),
+        (control.ss(-1, 1, 0, 2), {}, "the constant 2: no state is controllable and observable"),
         (control.ss(-1, 1, 1, -1), {}, "L = −1 at infinite frequency"),
-        ("L", {}, "found str, of which python-control makes no state space"),
+        ("L", {}, "found str, which python-control can.t turn into a state space"),
     ],
 )
 def test_a_loop_that_has_no_margins_is_refused_with_a_next_step(loop, options, message):
@@ -267,44 +269,47 @@ def test_every_number_says_its_unit_tolerance_and_confirmation_and_goes_into_jso
 def test_a_wrong_limit_is_not_confirmed():
     r = Realization.of(triple(20.0))
     with pytest.raises(ConfirmationError, match="found the limit 0.12, but eigenvalues say stable at .* and stable at"):
-        confirm.limit("gain_margin_low", 0.12, [], 1.0, r.stable, "eigenvalues")
+        confirm.confirm_limit("gain_margin_low", 0.12, [], 1.0, r.is_stable, "eigenvalues")
     with pytest.raises(ConfirmationError, match="found no limit, but eigenvalues say unstable at 0.1"):
-        confirm.none("gain_margin_low", [0.5, 0.1], r.stable, "eigenvalues")
+        confirm.confirm_no_limit("gain_margin_low", [0.5, 0.1], r.is_stable, "eigenvalues")
     assert issubclass(ConfirmationError, LoopwrightError)
 
 
 @pytest.mark.parametrize("wrong", [0.99, 1.01])
 def test_a_wrong_peak_is_not_confirmed(wrong):
     r = Realization.of(triple(20.0))
-    assert "level reached" in confirm.peak(r, 0.0, 1.0, 9 / 7, "mt")
+    assert "level reached" in confirm.confirm_peak(r, 0.0, 1.0, 9 / 7, "mt")
     with pytest.raises(ConfirmationError, match="found the peak"):
-        confirm.peak(r, 0.0, 1.0, 9 / 7 * wrong, "mt")
+        confirm.confirm_peak(r, 0.0, 1.0, 9 / 7 * wrong, "mt")
 
 
 @pytest.mark.parametrize("what", ["gain", "phase", "delay", "peak", "bandwidth"])
 def test_a_scan_that_goes_wrong_is_an_error(what, monkeypatch):
     from loopwright.diagrams.frequency import crossings as _crossings
+    from loopwright.diagrams.frequency import margins as _margins
 
     def off(self):
         return [_crossings.Crossing(c.omega * 1.05, c.L * 1.05, c.slope, c.error) for c in real(self)]
 
     if what in ("gain", "phase"):
-        real = getattr(_crossings.Scan, f"{what}_crossovers")
-        monkeypatch.setattr(_crossings.Scan, f"{what}_crossovers", off)
+        real = getattr(_crossings.Scan, f"find_{what}_crossovers")
+        monkeypatch.setattr(_crossings.Scan, f"find_{what}_crossovers", off)
     elif what == "delay":
-        real = _crossings.Scan.gain_crossovers
-        monkeypatch.setattr(confirm, "at_crossing", lambda *_: "")
+        real = _crossings.Scan.find_gain_crossovers
+        monkeypatch.setattr(_margins, "confirm_crossing", lambda *_: "")
         monkeypatch.setattr(
             _crossings.Scan,
-            "gain_crossovers",
+            "find_gain_crossovers",
             lambda self: [_crossings.Crossing(c.omega * 1.05, c.L, c.slope, c.error) for c in real(self)],
         )
     elif what == "peak":
-        peak = _crossings.Scan.peak
-        monkeypatch.setattr(_crossings.Scan, "peak", lambda *a: _crossings.Peak(peak(*a).value * 0.99, peak(*a).omega))
+        peak = _crossings.Scan.find_peak
+        monkeypatch.setattr(
+            _crossings.Scan, "find_peak", lambda *a: _crossings.Peak(peak(*a).value * 0.99, peak(*a).omega)
+        )
     else:
-        fall = _crossings.Scan.falls_below
-        monkeypatch.setattr(_crossings.Scan, "falls_below", lambda *a: fall(*a) * 1.01)
+        fall = _crossings.Scan.find_fall_below
+        monkeypatch.setattr(_crossings.Scan, "find_fall_below", lambda *a: fall(*a) * 1.01)
     with pytest.raises(ConfirmationError):
         margins(triple(20.0))
 
@@ -387,7 +392,7 @@ def test_a_delay_margin_of_exactly_one_sample_is_confirmed():
     assert found.delay_margin_s.value == pytest.approx(0.1, abs=1e-13)
     assert "on the limit at n = 1" in found.delay_margin_samples.confirmed_by
     with pytest.raises(ConfirmationError, match="no closed-loop pole is nearer"):
-        confirm.on_the_limit(Realization.of(control.tf([0.9], [1.0, -1.0], 0.1)), 1)
+        confirm.confirm_on_limit(Realization.of(control.tf([0.9], [1.0, -1.0], 0.1)), 1)
 
 
 @pytest.mark.parametrize(("dt", "pole"), [(0, 2.0), (0.1, 1.2)])

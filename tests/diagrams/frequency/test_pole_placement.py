@@ -94,9 +94,9 @@ def test_what_can_not_be_placed_is_refused(A, B, poles, message):
 
 
 def test_a_gain_that_does_not_place_the_poles_is_an_error(monkeypatch):
-    monkeypatch.setattr(placement, "_ackermann", lambda *_: np.array([[8000.0, 1200.0, 60.1]]))
+    monkeypatch.setattr(placement, "_place_by_ackermann", lambda *_: np.array([[8000.0, 1200.0, 60.1]]))
     A, B = np.diag([1.0, 1.0], 1), np.array([[0.0], [0.0], [1.0]])
-    with pytest.raises(ConfirmationError, match="differs from the one asked for"):
+    with pytest.raises(ConfirmationError, match="differs from the wanted one"):
         place(A, B, [-20.0] * 3)
 
 
@@ -183,7 +183,7 @@ def test_gains_with_which_the_delay_adds_an_unstable_pole_are_refused():
     [
         (lambda: sampled_gains([-20, -20, 20], 1e-3), "expected poles in the left half plane"),
         (lambda: sampled_gains([-20, -20 + 1j, -20], 1e-3), "conjugate pairs"),
-        (lambda: sampled_poles([1.0, 2.0, 3.0], 0.0), "expected two gains or more, a positive time"),
+        (lambda: sampled_poles([1.0, 2.0, 3.0], 0.0), "expected two gains or more, a positive sample time"),
         (lambda: sampled_poles([1.0, 2.0, 3.0], 1e-3, integral="euler"), "expected 'forward', 'backward'"),
         (lambda: sampled_poles([1.0, 2.0, 3.0], 1e-3, delay=0.5), "a whole number"),
     ],

@@ -9,7 +9,7 @@ import pytest
 from loopwright.blocks import ParameterError
 from loopwright.diagrams import compare_with_control, disk_margin, margins, nyquist_count, place
 from loopwright.diagrams.frequency.features import Features, scan
-from loopwright.diagrams.frequency.python_control import _Judge, compared
+from loopwright.diagrams.frequency.python_control import _Judge, compare_margins
 from loopwright.diagrams.frequency.realization import Realization
 from support.loops import sampled_triple, triple
 
@@ -207,7 +207,7 @@ def test_a_value_that_cannot_be_judged_does_not_end_the_comparison(monkeypatch):
     def fails(*args):
         raise np.linalg.LinAlgError("did not converge")
 
-    monkeypatch.setattr(_Judge, "_refuted", fails)
+    monkeypatch.setattr(_Judge, "_refute", fails)
     row = rows(control.ss(control.tf([0.1], [1.0, -1.0], 0.1)))["gain_margin_high"]
     assert row.right == "neither is refuted"
     assert "did not converge" in row.why
@@ -217,5 +217,5 @@ def test_margins_that_are_there_are_compared_without_a_second_reduction(monkeypa
     loop = triple(20.0)
     ours = margins(loop)
     monkeypatch.setattr("loopwright.diagrams.frequency.python_control.margins", None)
-    found = compared(Realization.of(loop), ours, loop)
+    found = compare_margins(Realization.of(loop), ours, loop)
     assert {row.name for row in found} >= {"gain_margin_low", "phase_margin_deg"}
