@@ -49,6 +49,7 @@ from .results.saved_state import RunState
 from .results.stored import Occurrence, Stopped
 from .simulation.run_options import RunOptions
 from .simulation.simulation import Simulation
+from .simulation.view import SimulationView
 from .wiring.structure import Frame, Wire
 from .wiring.subsystem import Subsystem, subsystem
 
@@ -83,6 +84,7 @@ __all__ = [
     "SampledDesign",
     "Section",
     "Simulation",
+    "SimulationView",
     "Snapshot",
     "StabilityLimit",
     "StabilityMap",

@@ -34,7 +34,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, Self
 
 
 class LoopwrightError(Exception):
@@ -65,10 +65,20 @@ class LoopwrightError(Exception):
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (type(self), self.__dict__.copy())
 
-    def at(self, *, block: str | None = None, port: str | None = None, t: float | None = None) -> LoopwrightError:
+    def at(self, *, block: str | None = None, port: str | None = None, t: float | None = None) -> Self:
         """Fill in block, port and time where they are not known yet, and return self."""
         self.block, self.port = self.block or block, self.port or port
         self.t = t if self.t is None else self.t
+        return self
+
+    def blame(self, block: str) -> Self:
+        """Name another block as the one concerned, such as the full path of one that knew only its name."""
+        self.block = block
+        return self
+
+    def add(self, text: str) -> Self:
+        """Add to the message, and return self."""
+        self.message += text
         return self
 
 
@@ -160,6 +170,11 @@ class SimulationError(LoopwrightError, RuntimeError):
 
     run: Any = None
     state: str | None = None
+
+    def keep(self, run: Any) -> Self:
+        """Keep what was recorded until the run stopped, and return self."""
+        self.run = run
+        return self
 
 
 class NonFiniteError(SimulationError):

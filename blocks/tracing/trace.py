@@ -16,7 +16,7 @@ x⁺.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,11 +27,12 @@ from ..core.block import SOLVED, Block
 from ..core.errors import LoopwrightError, SampleTimeError, TraceError
 from ..core.layout import Layout
 from ..core.ports import Shape
-from ..core.values import Value, identity
+from ..core.values import Value
 from .discretization import hold
 from .equations import check_definition, guards_of, match_ports, start_values, takes_update, trace_error
 from .numpy_check import GUARDS, NEXT, compare
 from .opaque_equations import Foreign
+from .structure import structure, traced_parameters
 from .symbols import bundle, expand, flat_column, size, with_values, wrap
 from .trapezoid import trapezoidal_step
 
@@ -71,30 +72,6 @@ class Traced:
         n = sum(size(s) for s in self.states.values())
         A = np.array(self.system_matrix(p)).reshape(n, n)
         return np.concatenate([p, *(m.ravel() for m in hold(A, T, self.method))])
-
-
-def traced_parameters(block: Value, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted name and value of every parameter that is a symbol in the trace, nested blocks' included."""
-    for name, spec in type(block).parameter_specs.items():
-        value = block.__dict__[name]
-        if isinstance(value, Block):
-            yield from traced_parameters(value, f"{prefix}{name}.")
-        elif isinstance(value, float | np.ndarray) and not spec.structural:
-            yield prefix + name, value
-
-
-def structure(block: Value) -> Any:
-    """Return the key of a trace besides the shapes: class, fixed values, and which numbers are exactly zero."""
-    items: list[Any] = [type(block)]
-    for name, spec in type(block).parameter_specs.items():
-        value = block.__dict__[name]
-        if isinstance(value, Block):
-            items.append((name, structure(value)))
-        elif isinstance(value, float | np.ndarray) and not spec.structural:
-            items.append((name, np.shape(value), (np.asarray(value) == 0).tobytes()))
-        else:
-            items.append((name, identity(value)))
-    return tuple(items)
 
 
 def constants_of(block: Block, T: float, method: str) -> dict[str, Any]:

@@ -19,8 +19,9 @@ from ...blocks.core.signals import Signal, as_signal
 from ...blocks.core.values import Array, parameter
 from ...blocks.tracing.equations import initial_state, start_values
 from ...blocks.tracing.numpy_check import GUARDS, NEXT, evaluate
+from ...blocks.tracing.structure import traced_parameters
 from ...blocks.tracing.symbols import bundle
-from ...blocks.tracing.trace import Traced, constants_of, traced_parameters
+from ...blocks.tracing.trace import Traced, constants_of
 from ..diagram import Diagram
 from ..wiring.structure import Collector
 from ..wiring.subsystem import exact_time

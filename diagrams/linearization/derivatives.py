@@ -19,7 +19,7 @@ from ..flat.flat_diagram import FlatDiagram
 from ..flat.functions import active_loops
 from ..flat.layout import Clock
 from ..results.signal_names import resolve
-from ..simulation.workspace import Machine
+from ..simulation.workspace import Workspace
 from ..wiring.structure import Wire, join
 from .findings import Finding, StepsOnly
 
@@ -102,13 +102,13 @@ class Parts:
         for s in openings:
             self.cut.setdefault(s.port, set()).update(s.entries)
         self._functions: dict[Any, Any] = {}
-        self._machine = Machine(flat) if flat.loops.slices else None
+        self._workspace = Workspace(flat) if flat.loops.slices else None
 
     @cached_property
     def varies(self) -> bool:
         """Whether the flow between ticks depends on time."""
         t, x, w, p = self.flat.symbols()
-        return bool(ca.depends_on(self.flat.flow(t, x, w, p), t)) or self._machine is not None
+        return bool(ca.depends_on(self.flat.flow(t, x, w, p), t)) or self._workspace is not None
 
     def _taps(self, d: Any, c: Any) -> dict[tuple[str, str], Any]:
         injected: dict[tuple[str, str], list[tuple[int, int]]] = {}
@@ -177,13 +177,7 @@ class Parts:
 
     def _solved(self, acting: frozenset[Clock], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return x with the algebraic loops solved at an instant."""
-        machine = self._machine
-        solve = None if machine is None else machine.loop_solver(acting, machine.here)
-        if machine is None or solve is None:
-            return x
-        machine.here.t[0], machine.here.x[:], machine.here.w[:] = t, x, w
-        solve()
-        return machine.here.x.copy()
+        return x if self._workspace is None else self._workspace.solve_loops(acting, t, x, w)
 
     def at(self, acting: frozenset[Clock], t: float, x: np.ndarray, w: np.ndarray) -> dict[Any, Any]:
         """Return the values x⁺, z, y, dx and, by name and argument, their derivatives at an instant.

@@ -374,6 +374,6 @@ def batch(
             for point in points:
                 made.append(linearize(variant, point, **options))
         except LoopwrightError as error:
-            error.message = f"{error.message} (with {dict(changes)}, at {point!r})"
+            error.add(f" (with {dict(changes)}, at {point!r})")
             raise
     return made

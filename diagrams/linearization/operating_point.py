@@ -26,25 +26,22 @@ MORE = {"linearize": ("inputs", "outputs", "openings", "plants"), "operating_poi
 def capture(simulation: Any, how: PointOrigin = PointOrigin.RUN) -> OperatingPoint:
     """Return the operating point at the tick that a simulation has reached."""
     flat: FlatDiagram = simulation.flat
-    machine = simulation._machine
-    n = flat.log.total
-    x = machine.log[n : n + flat.width].copy()
-    w = machine.log[: flat.plant_outputs.total].copy()
-    plants = {path: plant.operating_point() for path, plant in simulation._plants}
-    values = {name: machine.log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
+    view = simulation.view
+    plants = {path: plant.operating_point() for path, plant in view.plants.items()}
+    values = {name: view.log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
     point = OperatingPoint(
-        simulation.t,
-        simulation._tick,
+        view.t,
+        view.tick,
         flat.base,
-        x,
-        w,
-        machine.z.copy(),
+        view.x.copy(),
+        view.w.copy(),
+        view.z.copy(),
         plants,
         how=how,
         values=values,
         layout=layout_of(flat),
     )
-    return judged(flat, point, machine.x_next)
+    return judged(flat, point, view.x_next)
 
 
 def judged(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) -> OperatingPoint:
@@ -175,7 +172,7 @@ def at_time(diagram: WiredDiagram, t: float, options: Mapping[str, Any]) -> Oper
                 block=diagram.name,
                 port="operating point",
             )
-        events = [e for e in simulation._recorder.events if e.t == simulation.t]
+        events = simulation.view.events
         if events:
             raise OptionError(
                 f"at t = {t:g} s the event {events[-1].event!r} of {events[-1].block!r} fires, so there is no linear "

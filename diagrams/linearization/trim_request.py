@@ -10,7 +10,7 @@ import numpy as np
 
 from ...blocks.core.errors import OptionError, ParameterError, UnknownNameError, near
 from ...blocks.core.values import Value
-from ...blocks.tracing.trace import traced_parameters
+from ...blocks.tracing.structure import traced_parameters
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.wired_diagram import WiredDiagram
 from ..results.operating_point import OperatingPoint, PointOrigin

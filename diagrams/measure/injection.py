@@ -20,7 +20,7 @@ from ..linearization.derivatives import Signal
 from ..results.operating_point import OperatingPoint
 from ..simulation.run_options import RunOptions
 from ..simulation.simulation import Simulation
-from ..simulation.start_at_point import carried
+from ..simulation.start_at_point import copy_states
 from ..wiring.structure import Frame, Structure, Wire
 
 NEVER = 1e12
@@ -181,8 +181,8 @@ class Experiment:
 
     def play(self, waveform: Waveform, entry: int, ramp: float) -> None:
         """Begin a test signal at one entry of the wire, now."""
-        path, flat = self.made.source, self.flat
-        block: Any = flat.table.blocks[path]
+        path = self.made.source
+        block: Any = self.flat.table.blocks[path]
         direction = np.zeros(np.size(block.direction))
         direction[entry] = 1.0
         shape = np.shape(block.direction)
@@ -191,9 +191,7 @@ class Experiment:
             frequency=waveform.frequency, sweep=waveform.sweep, phase=waveform.phase, start_time=self.t, ramp=ramp,
             period=waveform.period,
         )  # fmt: skip
-        rate = flat.table.rate(flat.table.frame_of[path])
-        packed = flat.checked.traced[path].pack(changed, float("nan") if rate is None else float(rate))
-        flat.p[flat.parameters.slices[path]] = packed  # the run's functions read it there
+        self.simulation.set_parameters(path, changed)
 
     def go(self, count: int, every: int) -> None:
         """Go on by so many samples."""
@@ -201,8 +199,8 @@ class Experiment:
 
     def stands(self) -> np.ndarray:
         """Return the states of all blocks, and the outputs of all FMUs, at the last tick."""
-        here = self.simulation._machine.here
-        return np.concatenate([here.x[: self.flat.states.total], here.w])
+        view = self.simulation.view
+        return np.concatenate([view.x_next[: self.flat.states.total], view.w])
 
     def record(self, count: int, every: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Go on by so many samples; return v, u and the outputs, a row for each sample, both ends included.
@@ -211,8 +209,8 @@ class Experiment:
         """
         simulation = self.simulation
         simulation.run(final=False)  # what was recorded before is left
-        first = simulation._tick
-        simulation._recorder.row(simulation.t, simulation._machine.log)
+        first = simulation.view.tick
+        simulation.record_instant()
         self.go(count, every)
         run = simulation.run(final=False)
         times = np.array([simulation.time_of(first + i * every) for i in range(count + 1)])
@@ -239,7 +237,7 @@ def _translated(point: OperatingPoint, old: FlatDiagram, made: Injected, signal:
     """Return an operating point as the diagram with the injection takes it."""
     new = made.diagram.flatten(point.base)
     x = new.x0.copy()
-    carried(point.x, old, new, x)
+    copy_states(point.x, old, new, x)
     known = {**point.values, f"{made.sum}.y": point.values[".".join(signal.port)]}
     for layout in (new.held, new.loops):
         for name, where in layout.slices.items():

@@ -6,19 +6,15 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
-import numpy as np
-
 from ...blocks.core.errors import OptionError
 from ..flat.wired_diagram import WiredDiagram
 from ..linearization.operating_point import capture, operating_point
 from ..results.operating_point import OperatingPoint, PointOrigin
 from ..results.run import Snapshot
-from ..simulation.start_at_point import carried, placed
+from ..simulation.start_at_point import apply_point
 
 STEP = Fraction(1, 1000)
 """Communication step in s at which a diagram without a clock is run to its operating point."""
-PASSES = 120
-"""How many ticks states without a value, such as those of a delay, are given to take theirs."""
 
 
 def point_of(diagram: WiredDiagram, where: Any, source: WiredDiagram | None = None) -> OperatingPoint:
@@ -62,19 +58,6 @@ def taken_over(
     old = source.flatten(point.base)
     if not diagram.has_clock:
         options = {**options, "step": point.base}
-    with Simulation(placed(diagram, point), RunOptions.of(options, block=diagram.name)) as simulation:
-        machine, flat = simulation._machine, simulation.flat
-        x, marked = machine.here.x, np.zeros(flat.width)
-        carried(point.x, old, flat, x)
-        carried(np.ones(point.x.size), old, flat, marked)
-        known = marked > 0
-        kept = x.copy()
-        tick = machine.tick(flat.acting(0))
-        for _ in range(PASSES):
-            tick()
-            new = np.where(known, kept, machine.x_next)
-            if np.array_equal(new, x):
-                break
-            x[:] = new
-        tick()
+    with Simulation(apply_point(diagram, point), RunOptions.of(options, block=diagram.name)) as simulation:
+        simulation.take_over(point.x, old)
         return replace(capture(simulation, point.how), parameters=point.parameters)

@@ -39,6 +39,14 @@ class Recording:
         if self.to is not None and not isinstance(self.to, str | os.PathLike):
             raise OptionError(f"found to={self.to!r}; expected the path of a folder.", block=self.name)
 
+    def stay_in_memory(self) -> None:
+        """Let the next recorder keep its samples in memory: what is on disk stays."""
+        self.to = None
+
+    def allow_overwriting(self) -> None:
+        """Let the next recorder replace what is on disk."""
+        self.overwrite = True
+
     @property
     def width(self) -> int:
         """Entries of the vector of a sample, without the residual."""

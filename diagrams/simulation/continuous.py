@@ -13,13 +13,13 @@ from ...blocks.core.errors import NonFiniteError, OptionError, SimulationError
 from ...blocks.core.instants import is_before, left_of
 from ..flat.functions import active_loops
 from ..results.stored import Occurrence
-from ..solvers.base import Problem
+from ..solvers.base import Problem, Step
 from ..solvers.choose import make_solver
-from .diagnosis import failure, forget_trials, opaque_failure, state_values
+from .diagnosis import forget_trials, opaque_failure, state_values
 from .events import Domains
-from .solver_setup import absolute_tolerances, recall, remembers, solver_memory, time_scale_of
+from .solver_setup import absolute_tolerances, remembers, time_scale_of
 from .transport_delays import delays_of, driven_function, step_inputs
-from .workspace import Machine
+from .workspace import Workspace
 
 NOTHING: frozenset[Any] = frozenset()
 TIGHT, ONE_STEP = 1e-9, ("auto", "RK23", "RK45", "DOP853", "Radau")
@@ -31,7 +31,7 @@ class Continuous:
 
     Parameters
     ----------
-    machine : Machine
+    workspace : Workspace
         The run's numbers and functions.
     name : str
         The diagram's name.
@@ -39,29 +39,33 @@ class Continuous:
         See `Diagram.simulate`.
     on_event : callable
         Told every event that fires.
+    is_stopped : callable
+        Tells whether a stop condition is true in what was evaluated last.
     """
 
     def __init__(
         self,
-        machine: Machine,
+        workspace: Workspace,
         name: str,
         solver: str,
         rtol: float,
         atol: float,
         max_step: float | None,
         on_event: Callable[[Occurrence], None],
+        is_stopped: Callable[[], bool],
     ):
-        flat = machine.flat
-        self.machine, self.flat, self.name, self.on_event = machine, flat, name, on_event
+        flat = workspace.flat
+        self.workspace, self.flat, self.name = workspace, flat, name
+        self.on_event, self.is_stopped = on_event, is_stopped
         self.where = flat.continuous
         self._edge, self._left, self._sources_edge = math.inf, math.inf, math.inf
-        self.beyond: tuple[float, np.ndarray] | None = None
+        self._beyond: tuple[float, np.ndarray] | None = None
         """The last trial of the solver at which a rate was not finite."""
         self._resolution = rtol, atol
         self._loops = active_loops(flat, NOTHING)
         self._opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
         self.delays = delays_of(flat)
-        self._flow, self._jacobian = machine.flow(), None
+        self._flow, self._jacobian = workspace.flow(), None
         problem = Problem(self.where.size, self._rate, self._slope, flat.continuous_labels)
         self.time_scale = time_scale_of(flat)
         longest = max_step
@@ -91,12 +95,12 @@ class Continuous:
             )
         self.domains: Domains | None = None
         if flat.events:
-            self._indicators, self._opened = machine.indicators()
+            self._indicators, self._opened = workspace.indicators()
             self.domains = Domains(flat, self._g, self._opened, self.time_scale)
-            self._jump, self._fired = machine.jump()
+            self._jump = workspace.bind_jump()
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
-            self._drive = machine.plain(driven_function(flat), [self._driven], machine.trial)
+            self._drive = workspace.plain(driven_function(flat), [self._driven], workspace.trial)
         self.sources = [
             (path, flat.table.blocks[path])
             for path in sorted(flat.checked.traced)
@@ -109,9 +113,9 @@ class Continuous:
     def _time(self, t: float) -> float:
         t = self._left if t >= self._edge else t
         if self.delays is not None:
-            self.delays.outputs_at(t, self.machine.trial.w)
+            self.delays.outputs_at(t, self.workspace.trial.w)
         if self._loops:  # whatever was tried in between: Newton's method starts from the last accepted solution
-            self.machine.trial.x[self._loops] = self.machine.here.x[self._loops]
+            self.workspace.trial.x[self._loops] = self.workspace.here.x[self._loops]
         return t
 
     def _rate(self, t: float, x: np.ndarray) -> np.ndarray:
@@ -120,12 +124,12 @@ class Continuous:
         except SimulationError:  # a loop without a solution: the solver shortens the step, if it can
             rates = np.full(self.where.size, math.nan)
         if not np.isfinite(rates).all():
-            self.beyond = (t, x.copy())
+            self._beyond = (t, x.copy())
         return rates
 
     def _slope(self, t: float, x: np.ndarray) -> np.ndarray:
         if self._jacobian is None:
-            self._jacobian = self.machine.jacobian()  # type: ignore[assignment]
+            self._jacobian = self.workspace.jacobian()  # type: ignore[assignment]
         return self._jacobian(self._time(t), x)  # type: ignore[misc, no-any-return]
 
     def _g(self, t: float, x: np.ndarray) -> np.ndarray:
@@ -137,30 +141,24 @@ class Continuous:
     def _not_finite(self, t: float, x: np.ndarray, g: np.ndarray) -> SimulationError:
         """Return the error of an indicator that is not finite: that of the block which made the first such value."""
         event = self.flat.events[int(np.flatnonzero(~np.isfinite(g) & (self._opened > 0.5))[0])]
-        self._put(t, x)
-        self.machine.look()
-        if not self.machine.ok[0]:
-            return failure(self.machine, NOTHING).at(t=t)  # type: ignore[return-value]
-        return NonFiniteError(
+        made = self._failure_at(t, x)
+        return made or NonFiniteError(
             f"its indicator {event.name!r} is not a finite number; expected one. Look at roots and quotients in it.",
             block=event.path,
             t=t,
         )
 
-    def made_by(self) -> SimulationError | None:
-        """Return the error of the block that made the last trial's rates not finite; the instant is lost with it."""
-        if self.beyond is None:
-            return None
-        t, x = self.beyond
+    def _failure_at(self, t: float, x: np.ndarray) -> SimulationError | None:
         self._put(t, x)
         try:
-            self.machine.look()
+            self.workspace.evaluate()
+            self.workspace.check()
         except SimulationError as error:
             return error
-        return None if self.machine.ok[0] else failure(self.machine, NOTHING).at(t=t)  # type: ignore[return-value]
+        return None
 
     def _inputs_of_delays(self, t: float, x: np.ndarray) -> np.ndarray:
-        trial = self.machine.trial
+        trial = self.workspace.trial
         trial.t[0] = self._time(t)
         trial.x[self.where] = x
         self._drive()
@@ -171,49 +169,45 @@ class Continuous:
     def at(self, t: float) -> None:
         """Take an instant from the right: beyond any discontinuity there."""
         self._edge = self._left = math.inf
-        here = self.machine.here
+        here = self.workspace.here
         here.t[0] = t
         if self.delays is not None:
-            self.delays.middle = t + 1.0
+            self.delays.look_from(t + 1.0)
             self.delays.outputs_at(t, here.w)
         self._synchronize()
 
     def _put(self, t: float, x: np.ndarray) -> None:
-        here = self.machine.here
+        here = self.workspace.here
         here.t[0] = self._left if t >= self._edge else t
         here.x[self.where] = x
         if self.delays is not None:
             self.delays.outputs_at(here.t[0], here.w)
 
     def _synchronize(self) -> None:
-        here, trial = self.machine.here, self.machine.trial
+        here, trial = self.workspace.here, self.workspace.trial
         trial.x[:] = here.x
         trial.w[:] = here.w
 
     def accept(self) -> None:
         """Evaluate the instant that is reached, and renew what blocks and loops remember."""
-        machine = self.machine
-        machine.look()
-        if not machine.ok[0]:
-            raise failure(machine, NOTHING).at(t=float(machine.here.t[0]))
+        self.workspace.tick()
         if self._opaque:
-            forget_trials(machine)
-        machine.here.x[:] = machine.x_next
+            forget_trials(self.flat)
         self._synchronize()
 
     def begin(self) -> None:
         """Take the domains of the indicators at the start."""
-        self.at(float(self.machine.here.t[0]))
+        self.at(float(self.workspace.here.t[0]))
         if self.domains is not None:
-            self.domains.begin(float(self.machine.here.t[0]), self.machine.here.x[self.where])
+            self.domains.begin(float(self.workspace.here.t[0]), self.workspace.here.x[self.where])
         if self.delays is not None:
-            self.delays.edge(float(self.machine.here.t[0]))
+            self.delays.edge(float(self.workspace.here.t[0]))
 
     def settle(self, t: float) -> bool:
         """Fire what has changed its domain at an instant; return whether anything did."""
         if self.domains is None:
             return False
-        fired = self.domains.changed(t, self.machine.here.x[self.where])
+        fired = self.domains.changed(t, self.workspace.here.x[self.where])
         if not fired.any():
             return False
         self._fire(t, fired)
@@ -221,18 +215,16 @@ class Continuous:
 
     def _fire(self, t: float, fired: np.ndarray) -> None:
         assert self.domains is not None
-        machine, domains = self.machine, self.domains
+        workspace, domains = self.workspace, self.domains
         for _ in range(domains.most):
-            self._fired[:] = fired
-            before = machine.here.x.copy()
-            self._jump()
-            machine.here.x[:] = machine.x_next
+            before = workspace.here.x.copy()
+            self._jump(fired)
             for i in np.flatnonzero(fired):
                 self._tell(t, self.flat.events[int(i)], before)
                 self._reset_domains(self.flat.events[int(i)])
             domains.count(t, fired, self.name)
             self._synchronize()
-            fired = domains.changed(t, machine.here.x[self.where])
+            fired = domains.changed(t, workspace.here.x[self.where])
             if not fired.any():
                 if self.delays is not None:
                     self.delays.edge(t)
@@ -244,12 +236,12 @@ class Continuous:
         """Where a box has just been enabled and its states start anew, so do the domains of its events."""
         if not event.box or self.flat.table.frames[event.path].when != "reset":
             return
-        if self.machine.here.x[self.flat.gates.slices[event.path]][0] > 0.5:
+        if self.workspace.here.x[self.flat.gates.slices[event.path]][0] > 0.5:
             assert self.domains is not None
             self.domains.reset(event.path)
 
     def _tell(self, t: float, event: Any, before: np.ndarray) -> None:
-        states = [{} if event.box else state_values(self.flat, event.path, x) for x in (before, self.machine.here.x)]
+        states = [{} if event.box else state_values(self.flat, event.path, x) for x in (before, self.workspace.here.x)]
         self.on_event(Occurrence(t, event.path, event.name, *states))
 
     # --- from tick to tick -------------------------------------------------------------------------------------------
@@ -269,7 +261,7 @@ class Continuous:
         float or None
             Time at which a stop condition has ended the run.
         """
-        machine, where = self.machine, self.where
+        workspace = self.workspace
         times = iter(grid)
         pending = next(times, math.inf)
         while t < end:
@@ -277,27 +269,27 @@ class Continuous:
             edge = jump if is_before(jump, end) else end
             self._edge, self._left = edge, max(t, left_of(edge))
             if self.delays is not None:
-                self.delays.middle = 0.5 * (t + edge)
+                self.delays.look_from(0.5 * (t + edge))
             self._synchronize()
-            self.solver.restart(t, machine.here.x[where], edge)
+            self._restart(t, edge)
             found = None
             while found is None and t < edge:
-                step = self.solver.step()
+                step = self._step()
                 if self.domains is not None:
                     found = self.domains.locate(step.t_old, step.t, step.interpolate)
-                    solved = machine.trial.x[self._loops]
+                    solved = workspace.trial.x[self._loops]
                 t = step.t if found is None else found[0]
                 while pending < t or (pending == t < edge and found is None):
                     self._put(pending, step.interpolate(pending))
-                    machine.look()
-                    if self._recorded(pending, sample):
+                    workspace.evaluate()
+                    if self._record(pending, sample):
                         return pending
                     pending = next(times, math.inf)
                 if self.delays is not None and t > step.t_old:
                     step_inputs(self.delays, step.t_old, t, step.interpolate, self._inputs_of_delays, self._resolution)
                 self._put(t, step.x if found is None else step.interpolate(t))
                 if found is not None:  # the loops as the indicators saw them, to the last bit
-                    machine.here.x[self._loops] = solved
+                    workspace.here.x[self._loops] = solved
                 self.accept()
             happened = found is not None
             if found is not None:
@@ -307,25 +299,49 @@ class Continuous:
             if t == edge < end:  # a discontinuity of a source, or one that comes out of a delay
                 self.at(t)
                 happened |= self.settle(t)
-                machine.look()
+                workspace.evaluate()
             if pending == t < end:
-                if self._recorded(t, sample):
+                if self._record(t, sample):
                     return t
                 pending = next(times, math.inf)
             elif happened and self._stops_at(t, sample):
                 return t
         return None
 
-    def _recorded(self, t: float, sample: Callable[[float], bool]) -> bool:
-        if not self.machine.ok[0]:
-            raise failure(self.machine, NOTHING).at(t=t)
+    def _restart(self, t: float, edge: float) -> None:
+        try:
+            self.solver.restart(t, self.workspace.here.x[self.where], edge)
+        except SimulationError as error:
+            found = self._explain(error)
+            raise found from found.__cause__
+
+    def _step(self) -> Step:
+        try:
+            return self.solver.step()
+        except SimulationError as error:
+            found = self._explain(error)
+            raise found from found.__cause__
+
+    def _explain(self, error: SimulationError) -> SimulationError:
+        """Return the error behind that of the solver: what an opaque block raised, or who made a trial not finite."""
+        opaque = opaque_failure(self.flat)
+        if opaque is not None:
+            forget_trials(self.flat)
+            return opaque.at(t=error.t)
+        if error.block is not None or error.state is None:
+            return error
+        error.blame(error.state.rpartition(".")[0])
+        made = None if self._beyond is None else self._failure_at(*self._beyond)
+        if made is None or made.block == error.block:
+            return error
+        return made.add(f" The solver could not go on without it: {error.message}")
+
+    def _record(self, t: float, sample: Callable[[float], bool]) -> bool:
+        self.workspace.check()
         return sample(t)
 
     def _stops_at(self, t: float, sample: Callable[[float], bool]) -> bool:
         return self.is_stopped() and (sample(t) or True)
-
-    is_stopped: Callable[[], bool] = staticmethod(lambda: False)
-    """Whether a stop condition is true in what was evaluated last; set by the run."""
 
     def _next_edge(self, t: float) -> float:
         self._sources_edge = min((_next_instant(path, source, t) for path, source in self.sources), default=math.inf)
@@ -338,7 +354,7 @@ class Continuous:
         return {
             "domains": None if self.domains is None else self.domains.save(),
             "delays": None if self.delays is None else self.delays.save(),
-            "solver": solver_memory(self.solver),
+            "solver": self.solver.save(),
         }
 
     def restore(self, saved: Mapping[str, Any]) -> None:
@@ -347,7 +363,7 @@ class Continuous:
             self.domains.restore(saved["domains"])
         if self.delays is not None and saved["delays"] is not None:
             self.delays.restore(saved["delays"])
-        recall(self.solver, saved["solver"])
+        self.solver.restore(saved["solver"])
 
 
 def _next_instant(path: str, block: Block, t: float) -> float:
@@ -369,22 +385,3 @@ def _next_instant(path: str, block: Block, t: float) -> float:
             t=t,
         )
     return found
-
-
-def check_solver(error: SimulationError, machine: Machine, continuous: Continuous | None = None) -> SimulationError:
-    """Return the error behind that of a solver: what an opaque block raised, or the block that made a trial not finite.
-
-    Else say which block has the state at which the solver failed.
-    """
-    opaque = opaque_failure(machine)
-    if opaque is not None:
-        return opaque.at(t=error.t)  # type: ignore[return-value]
-    if error.block is not None:
-        return error
-    if error.state is not None:
-        error.block = error.state.rpartition(".")[0]
-    made = continuous.made_by() if continuous is not None and error.block is not None else None
-    if made is None or made.block == error.block:
-        return error
-    made.message = f"{made.message} The solver could not go on without it: {error.message}"
-    return made

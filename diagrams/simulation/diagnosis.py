@@ -1,4 +1,4 @@
-"""Who made a value that is not finite: the instant is evaluated again, block by block, with numbers."""
+"""The block that made a value that is not finite: the instant is evaluated again, block by block, with numbers."""
 
 from __future__ import annotations
 
@@ -13,13 +13,24 @@ from ...blocks.tracing.symbols import bundle
 from ..flat.evaluate import Pass
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.layout import Clock
-from .workspace import Machine
+from .vectors import Vectors
 
 
-def failure(machine: Machine, acting: frozenset[Clock]) -> SimulationError:
-    """Return the error of the first block that made a value that is not finite, or whose guard fails, at ``here``."""
-    flat, here = machine.flat, machine.here
-    forget_trials(machine)
+def failure(flat: FlatDiagram, here: Vectors, log: np.ndarray, acting: frozenset[Clock]) -> SimulationError:
+    """Return the error of the first block that made a value that is not finite, or whose guard fails.
+
+    Parameters
+    ----------
+    flat : FlatDiagram
+        The diagram.
+    here : Vectors
+        The instant.
+    log : ndarray
+        The outputs of all blocks there.
+    acting : frozenset of Clock
+        The clocks that act there.
+    """
+    forget_trials(flat)
     for name, where in flat.plant_outputs.slices.items():
         if not np.all(np.isfinite(here.w[where])):
             path, port = flat.ports[name]
@@ -32,23 +43,23 @@ def failure(machine: Machine, acting: frozenset[Clock]) -> SimulationError:
             if error is not None:
                 found.append(error)
 
-    done = Pass(flat, acting, float(here.t[0]), here.x, here.w, flat.p, visit=visit)
+    done = Pass(flat, acting, float(here.t[0]), here.x, here.w, here.p, visit=visit)
     done.run()
-    return opaque_failure(machine) or (found[0] if found else _overflow(machine))
+    return opaque_failure(flat) or (found[0] if found else _overflow(flat, log))
 
 
-def forget_trials(machine: Machine) -> None:
+def forget_trials(flat: FlatDiagram) -> None:
     """Forget what opaque blocks have raised in trials that the solver got over; an interrupt is raised."""
-    for trace in machine.flat.checked.traced.values():
+    for trace in flat.checked.traced.values():
         if trace.failures:
             last = trace.failures.pop()
             if not isinstance(last, Exception):
                 raise last
 
 
-def opaque_failure(machine: Machine) -> SimulationError | None:
+def opaque_failure(flat: FlatDiagram) -> SimulationError | None:
     """Return what an opaque block has raised since its failures were looked at; an interrupt is raised."""
-    for path, trace in machine.flat.checked.traced.items():
+    for path, trace in flat.checked.traced.items():
         try:
             raise_failure(trace.failures, path)
         except SimulationError as error:
@@ -96,11 +107,10 @@ def state_values(flat: FlatDiagram, path: str, x: np.ndarray) -> dict[str, np.nd
     return {name: part.copy() for name, part in flat.states.of_block[path].split(x).items()}
 
 
-def _overflow(machine: Machine) -> NonFiniteError:
-    layout = machine.flat.log
-    sizes = {name: float(np.max(np.abs(machine.log[where]), initial=0.0)) for name, where in layout.slices.items()}
+def _overflow(flat: FlatDiagram, log: np.ndarray) -> NonFiniteError:
+    sizes = {name: float(np.max(np.abs(log[where]), initial=0.0)) for name, where in flat.log.slices.items()}
     largest = max(sizes, key=lambda name: sizes[name])
-    path, port = machine.flat.ports[largest]
+    path, port = flat.ports[largest]
     return NonFiniteError(
         f"found {sizes[largest]:g}; the signals of this tick overflow when they are added up, and this "
         "is the largest. Look at what drives it in the last samples of error.run.",

@@ -12,50 +12,52 @@ from ...blocks.tracing.equations import initial_state
 from ...blocks.tracing.symbols import bundle
 from ..flat.evaluate import Pass, above
 from ..flat.flat_diagram import FlatDiagram
-from .diagnosis import failure, inputs_text, shaped_inputs
-from .workspace import Machine
+from ..flat.layout import Clock
+from .diagnosis import inputs_text, shaped_inputs
+from .plants import Plant
+from .transport_delays import Delays
+from .workspace import Workspace
 
 _MAX_PASSES = 100  # over inputs and outputs of the FMUs at the start
 _SETTLED = 1e-13  # relative change of an input between two passes, a few hundred ulps
 
 
-def initialize(machine: Machine, plants: list[tuple[str, Any]], delays: Any) -> None:
+def initialize(workspace: Workspace, plants: Mapping[str, Plant], delays: Delays | None) -> None:
     """Find values of everything at t = 0.
 
     In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). What they change is given on
     until it changes no more than by rounding.
     """
-    flat = machine.flat
+    flat = workspace.flat
     acting = flat.acting(0)
-    machine.here.t[0] = 0.0
+    workspace.here.t[0] = 0.0
     if delays is not None:
-        delays.outputs_at(0.0, machine.here.w)
+        delays.outputs_at(0.0, workspace.here.w)
     passes, last = 0, np.full(flat.width, np.nan)
-    most = _MAX_PASSES * (10 if machine.looped else 1)
+    most = _MAX_PASSES * (10 if workspace.looped else 1)
     while True:
-        _states(machine)
-        _boxes(machine)
-        machine.tick(acting)()
-        if not machine.ok[0]:
-            raise failure(machine, acting)
-        before = machine.z.copy()
-        for _, plant in plants:
+        _states(workspace)
+        _boxes(workspace)
+        workspace.evaluate(acting)
+        workspace.check(acting)
+        before = workspace.z.copy()
+        for plant in plants.values():
             plant.exchange()
         if delays is not None:
-            delays.begin(machine.z, machine.here.w)
-        machine.tick(acting)()
+            delays.begin(workspace.z, workspace.here.w)
+        workspace.evaluate(acting)
         passes += 1
-        found = not machine.looped or np.allclose(last, machine.here.x, rtol=_SETTLED, atol=_SETTLED)
-        if found and np.allclose(before, machine.z, rtol=_SETTLED, atol=0.0, equal_nan=True):
+        found = not workspace.looped or np.allclose(last, workspace.here.x, rtol=_SETTLED, atol=_SETTLED)
+        if found and np.allclose(before, workspace.z, rtol=_SETTLED, atol=0.0, equal_nan=True):
             break
         if passes == most:
-            raise _unsettled(machine, before) if found else _unsolved_start(machine, last)
-        last = machine.here.x.copy()
+            raise _unsettled(workspace, before) if found else _unsolved_start(workspace, last)
+        last = workspace.here.x.copy()
 
 
-def _states(machine: Machine) -> None:
+def _states(workspace: Workspace) -> None:
     """Compute the initial states of the blocks that ask for their inputs first."""
-    flat, x = machine.flat, machine.here.x
+    flat, x = workspace.flat, workspace.here.x
     blocks = flat.table.blocks
     if any(blocks[path].starts_from_inputs for path in flat.checked.traced):
         ready: set[str] = set()
@@ -69,9 +71,8 @@ def _states(machine: Machine) -> None:
                 u = bundle("u", shaped_inputs(trace, inputs))
                 x[flat.states.slices[path]] = _initial(path, block, u, trace.states)
 
-        Pass(
-            flat, frozenset(), 0.0, x, machine.here.w, flat.p, opened=True, order=flat.start_order.steps, before=before
-        ).run()
+        args = flat, frozenset[Clock](), 0.0, x, workspace.here.w, workspace.p
+        Pass(*args, opened=True, order=flat.start_order.steps, before=before).run()
     for path, where in flat.starts.slices.items():
         x[where] = x[flat.states.slices[path]]
 
@@ -92,12 +93,12 @@ def _check_finite(flat: FlatDiagram, path: str, port: str, column: Any) -> None:
         )
 
 
-def _boxes(machine: Machine) -> None:
+def _boxes(workspace: Workspace) -> None:
     """Let every box put out once what it would at the start, and remember what controls it."""
-    flat, x = machine.flat, machine.here.x
+    flat, x = workspace.flat, workspace.here.x
     if not flat.held.slices and not flat.gates.slices:
         return
-    done = Pass(flat, frozenset(), 0.0, x, machine.here.w, flat.p, opened=True).run()
+    done = Pass(flat, frozenset(), 0.0, x, workspace.here.w, workspace.p, opened=True).run()
     for name, column in done.held.items():
         where = flat.held.slices[name]
         x[where] = np.ravel(np.array(column))
@@ -119,8 +120,8 @@ def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]
         ) from error
 
 
-def _unsolved_start(machine: Machine, last: np.ndarray) -> SimulationError:
-    flat, x = machine.flat, machine.here.x
+def _unsolved_start(workspace: Workspace, last: np.ndarray) -> SimulationError:
+    flat, x = workspace.flat, workspace.here.x
     path = next(
         (p for p, s in flat.states.slices.items() if not np.allclose(last[s], x[s], rtol=_SETTLED, atol=_SETTLED)), ""
     )
@@ -132,8 +133,8 @@ def _unsolved_start(machine: Machine, last: np.ndarray) -> SimulationError:
     )
 
 
-def _unsettled(machine: Machine, before: np.ndarray) -> SimulationError:
-    flat, z = machine.flat, machine.z
+def _unsettled(workspace: Workspace, before: np.ndarray) -> SimulationError:
+    flat, z = workspace.flat, workspace.z
     slices = flat.plant_inputs.slices
     name = next(n for n, s in slices.items() if not np.allclose(before[s], z[s], rtol=_SETTLED, atol=0.0))
     path, port = flat.ports[name]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from typing import Any, Protocol
 
@@ -12,7 +12,7 @@ from ...blocks.core.errors import LoopwrightError, SimulationError
 from ...blocks.core.layout import Layout
 from ..flat.flat_diagram import FlatDiagram
 from ..wiring.structure import stepped_blocks
-from .workspace import Machine
+from .workspace import Workspace
 
 
 class Plant(Protocol):
@@ -90,12 +90,12 @@ def loaded(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) -> Iter
             raise
 
 
-def bind(machine: Machine, plants: Iterable[tuple[str, Plant]]) -> None:
+def bind(workspace: Workspace, plants: Mapping[str, Plant]) -> None:
     """Let the plants read their inputs from z and write their outputs to w."""
-    flat = machine.flat
-    for path, plant in plants:
-        inputs = _part(flat, flat.plant_inputs, path, machine.z)
-        plant.bind(inputs, _part(flat, flat.plant_outputs, path, machine.here.w))
+    flat = workspace.flat
+    for path, plant in plants.items():
+        inputs = _part(flat, flat.plant_inputs, path, workspace.z)
+        plant.bind(inputs, _part(flat, flat.plant_outputs, path, workspace.here.w))
 
 
 def _part(flat: FlatDiagram, layout: Layout, path: str, vector: np.ndarray) -> np.ndarray:

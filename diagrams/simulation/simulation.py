@@ -46,35 +46,33 @@ from contextlib import ExitStack
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
+
+from ...blocks.core.block import Block
 from ...blocks.core.errors import SimulationError
-from ..flat.evaluate import TRUE
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.wired_diagram import WiredDiagram
 from ..results.operating_point import OperatingPoint
 from ..results.recorder import Recorder
 from ..results.recording import Recording
 from ..results.run import Run
-from ..results.saved_state import RunState, check_fits, layout_of, not_open_error
+from ..results.saved_state import RunState, check_fits, not_open_error
 from ..results.stored import Occurrence, Stopped
-from ..solvers.base import solver_name
-from ..wiring.structure import join
-from .continuous import Continuous, check_solver
-from .diagnosis import failure
 from .duration import default_step, ticks_in
-from .initialize import initialize
-from .plants import bind, has_plants, loaded
+from .engine import Engine
+from .plants import has_plants
 from .progress import progress_bar
 from .run_options import RunOptions
-from .start_at_point import place, placed
-from .ticks import CHUNK, run_ticks
-from .workspace import Machine
+from .save import can_save, restore_state, save_state
+from .start_at_point import apply_point
+from .view import SimulationView
 
 
 class Simulation:
     """A run in the making: made by `Diagram.simulation`, used in a ``with`` statement.
 
     ``advance`` goes on, ``save`` returns the complete state, ``restore`` goes back to one, ``run`` is what was
-    recorded.
+    recorded. ``view`` shows the instant that it has reached.
 
     Examples
     --------
@@ -102,7 +100,7 @@ class Simulation:
         start, step = options.start, options.step
         self._point = start if isinstance(start, OperatingPoint) else None
         if self._point is not None:
-            diagram = placed(diagram, self._point)
+            diagram = apply_point(diagram, self._point)
             if not diagram.is_continuous and not diagram.has_clock:
                 step = step or self._point.base
         self.diagram = diagram
@@ -117,50 +115,23 @@ class Simulation:
         )
         self._stack = ExitStack()
         self._start_state = saved
-        self._machine = Machine(self.flat)
-        self._plants: list[tuple[str, Any]] = []
-        self._every_tick = base is not None or has_plants(self.flat)
+        every_tick = base is not None or has_plants(self.flat)
         self._last: int | None = None
         if duration is not None:
             self._last = ticks_in(duration, self.flat.base, diagram.name)
             first = 0 if start is None else start.tick
             self._last += first
-            self._recording.check_memory(self._last - first, every_tick=self._every_tick)
-        self._continuous: Continuous | None = None
-        if self.flat.hybrid:
-            self._continuous = Continuous(
-                self._machine,
-                diagram.name,
-                options.solver,
-                options.rtol,
-                options.atol,
-                options.max_step,
-                self._on_event,
-            )
-            self._continuous.is_stopped = self._is_stopped
-            self._every_tick |= self._continuous.fixed
-        elif options.solver != "auto":
-            solver_name(options.solver)  # an unknown one is an error here, too
-        self._stops = self._stop_ports()
-        self._tick, self._count, self._elapsed, self._begun = 0, 0, 0.0, False
-        self._stopped: Stopped | None = None
+            self._recording.check_memory(self._last - first, every_tick=every_tick)
+        self._engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=self._on_event)
+        self._elapsed, self._begun = 0.0, False
         self._open: bool | None = None  # until it begins; False once it has ended
         self._recorder = self._new_recorder()
 
     # --- what belongs to it ------------------------------------------------------------------------------------------
 
     def _new_recorder(self) -> Recorder:
-        every_tick = self._every_tick or not self.flat.distinct
+        every_tick = self._engine.every_tick or not self.flat.distinct
         return self._recording.begin(None if self._last is None or not every_tick else self._last + 1)
-
-    def _stop_ports(self) -> list[tuple[int, str]]:
-        """Return the entries of the log that end the run, with the blocks that they belong to."""
-        found = []
-        for path in sorted(self.flat.checked.traced):
-            port = self.flat.table.blocks[path].stops
-            if port is not None:
-                found.append((self.flat.log.slices[join(path, port)].start, path))
-        return found
 
     def __enter__(self) -> Simulation:
         if self._open is not None:
@@ -181,55 +152,50 @@ class Simulation:
         self._stack.__exit__(*error)
 
     def _load(self) -> None:
-        since = 0.0 if self._point is None else self._point.t
         try:
-            for path, plant in loaded(self.flat, self._stack, since):
-                self._plants.append((path, plant))
+            self._engine.load(self._stack, 0.0 if self._point is None else self._point.t)
         except SimulationError as error:
-            self._attach(error)
-            raise
+            raise self._with_run(error) from error.__cause__
 
     def _finish(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         """End a run on disk that `run` was not asked for."""
         if self._recorder.is_open:
             cut = [] if error is None else [f"This run was cut off at t = {self.t:g} s: {kind.__name__}: {error}"]
-            self._recorder.finish(elapsed=self._elapsed, messages=(*self._messages, *cut), stopped=self._stopped)
+            self._recorder.finish(elapsed=self._elapsed, messages=(*self._messages, *cut), stopped=self.stopped)
 
     def _begin(self) -> None:
-        machine = self._machine
+        engine = self._engine
         try:
-            bind(machine, self._plants)
-            delays = None if self._continuous is None else self._continuous.delays
-            initialize(machine, self._plants, delays)
-            for _, plant in self._plants:
-                plant.begin()
-            if self._start_state is not None:
+            engine.initialize()
+            if self._start_state is None:
+                engine.take_first_tick(self._point, self._recorder.row)
+                self._begun = True
+            else:
                 self.restore(self._start_state)
-                return
-            first = 0 if self._point is None else place(self, self._point)
-            if self._continuous is not None:
-                self._continuous.begin()
-            self._begun = True
-            self._at_tick(first)
         except SimulationError as error:
-            culprit = self._who(error)
-            culprit.at(t=self.t)
-            self._attach(culprit)
-            raise culprit from culprit.__cause__
+            culprit = engine.blame(error).at(t=self.t)
+            raise self._with_run(culprit) from culprit.__cause__
 
     def time_of(self, k: int) -> float:
         """Return the time of tick ``k`` in s."""
-        return k * self.flat.base.numerator / self.flat.base.denominator
+        return self._engine.position.time_of(k)
 
     @property
     def t(self) -> float:
         """Time that the run has reached in s."""
-        return self.time_of(self._tick) if self._stopped is None else self._stopped.t
+        return self._engine.position.t
 
     @property
     def stopped(self) -> Stopped | None:
         """The stop condition that has ended the run."""
-        return self._stopped
+        return self._engine.position.stopped
+
+    @property
+    def view(self) -> SimulationView:
+        """The instant that it has reached, to be read: its states, signals and plants."""
+        return self._engine.view
+
+    # --- going on ----------------------------------------------------------------------------------------------------
 
     def advance(self, duration: float, *, progress: Any = None) -> None:
         """Go on for a duration in s, a multiple of the step between ticks.
@@ -243,7 +209,7 @@ class Simulation:
         """
         if not self._open:
             raise not_open_error(self._open, self.diagram.name)
-        last = self._tick + ticks_in(duration, self.flat.base, self.diagram.name)
+        last = self._engine.position.tick + ticks_in(duration, self.flat.base, self.diagram.name)
         started = time.perf_counter()
 
         def tell(t: float) -> None:
@@ -252,128 +218,69 @@ class Simulation:
                 progress(t)
 
         try:
-            if self._stopped is None:
-                self._go(last, tell)
+            if self.stopped is None:
+                self._engine.go(last, self._recorder.row, tell)
         except SimulationError as error:
             self._elapsed += time.perf_counter() - started
-            self._attach(error)
-            raise
+            raise self._with_run(error) from error.__cause__
         except KeyboardInterrupt as interrupt:
             self._elapsed += time.perf_counter() - started
             interrupt.run = self.run(final=False)  # type: ignore[attr-defined]
             raise
         self._elapsed += time.perf_counter() - started
 
-    def _go(self, last: int, progress: Any) -> None:
-        try:
-            if self._continuous is not None:
-                self._go_hybrid(last, progress)
-            else:
-                run_ticks(
-                    self._machine,
-                    [plant for _, plant in self._plants],
-                    self._tick,
-                    last,
-                    every=self._every_tick,
-                    row=self._recorder.row,
-                    arrived=self._arrived,
-                    progress=progress,
-                )
-        except SimulationError as error:
-            culprit = self._who(error)
-            raise culprit from culprit.__cause__
-
-    def _go_hybrid(self, last: int, progress: Any) -> None:
-        """Run ticks up to ``last`` with a solver between them."""
-        continuous = self._continuous
-        assert continuous is not None
-        clocks, count, width = self.flat.distinct, 0, float(self.flat.base)
-        while self._tick < last:
-            k = self._tick
-            sampled = self._every_tick or not clocks
-            every = continuous.fixed or self._plants or (continuous.lands and sampled)
-            following = k + 1 if every else min([*(c.after(k) for c in clocks), last])
-            between = range(k + 1, following) if sampled else range(0)
-            now = self.time_of(k)
-
-            def sample(t: float, progress: Any = progress) -> bool:
-                self._recorder.row(t, self._machine.log)
-                self._count += 1
-                if self._count % CHUNK == 0:
-                    progress(t)
-                return self._is_stopped()
-
-            ended = continuous.advance(now, self.time_of(following), map(self.time_of, between), sample)
-            if ended is not None:
-                self._note_stop(ended)
-                return
-            for _, plant in self._plants:
-                plant.step(now, width)
-            self._at_tick(following)
-            if self._stopped is not None:
-                return
-            count += 1
-            if count % 16 == 0:
-                progress(self.t)
-        progress(self.t)
-
-    def _at_tick(self, k: int) -> None:
-        """Evaluate and record tick ``k``: at the start, and in a hybrid run."""
-        machine, continuous = self._machine, self._continuous
-        machine.here.t[0] = now = self.time_of(k)
-        acting = self.flat.acting(k)
-        if continuous is not None:
-            continuous.at(now)
-            if k > 0 and acting:
-                continuous.settle(now)  # what changes by itself at this instant, boxes see changed
-        machine.tick(acting)()
-        if not machine.ok[0]:
-            raise failure(machine, acting).at(t=now)
-        machine.here.x[:] = machine.x_next
-        if continuous is not None:
-            continuous.at(now)
-            if (acting or self._plants) and continuous.delays is not None:
-                continuous.delays.edge(now)  # what is held has jumped
-            before = machine.log[self.flat.log.total :].copy()
-            if continuous.settle(now):
-                taken = self.flat.taken_at(acting)
-                machine.log[self.flat.log.total :][taken] = before[taken]
-        self._recorder.row(now, machine.log)
-        self._tick = k
-        self._ended()
-
     def _on_event(self, event: Occurrence) -> None:
         self._recorder.event(event)
 
-    def _arrived(self, k: int) -> bool:
-        """Take note of a tick that has been recorded; return whether it ends the run."""
-        self._tick = k
-        return bool(self._stops) and self._ended()
+    def set_parameters(self, path: str, block: Block) -> None:
+        """Let a block go on with the parameters of a variant of it, from this instant.
 
-    def _is_stopped(self) -> bool:
-        return any(self._machine.log[i] > TRUE for i, _ in self._stops)
+        The states stay as they are. A saved state does not hold parameters, and `diagram` stays as it was.
 
-    def _ended(self) -> bool:
-        """Whether a stop condition is true at this tick, which then ends the run."""
-        if self._stopped is None and self._is_stopped():
-            self._note_stop(self.t)
-        return self._stopped is not None
+        Parameters
+        ----------
+        path : str
+            Path of the block.
+        block : Block
+            The variant, such as ``simulation.diagram[path].replace(gain=2.0)``.
 
-    def _note_stop(self, t: float) -> None:
-        path = next(path for i, path in self._stops if self._machine.log[i] > TRUE)
-        self._stopped = Stopped(t, path)
+        Raises
+        ------
+        UnknownNameError
+            If no block that is evaluated is there; a plant that is stepped takes no parameters in a run.
+        ParameterError
+            If the block's equations change, or the times at which a source is not smooth: they are planned ahead.
+        """
+        self._engine.set_parameters(path, block)
+
+    def take_over(self, x: np.ndarray, of: FlatDiagram) -> None:
+        """Put the blocks to the states of another diagram, by their names, and evaluate this tick anew.
+
+        States that only this diagram has, such as those of a delay, take the values that they settle at while the
+        others are held; plants stay as they are. What was recorded does not change.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+            The states, laid out as ``of`` says.
+        of : FlatDiagram
+            The other diagram.
+
+        Raises
+        ------
+        OptionError
+            If the run has not begun, or has ended.
+        SimulationError
+            If a value is not finite there, or a guard fails.
+        """
+        if not self._open:
+            raise not_open_error(self._open, self.diagram.name)
+        self._engine.take_over(x, of)
 
     # --- what it has made --------------------------------------------------------------------------------------------
 
-    def _who(self, error: SimulationError) -> SimulationError:
-        for path, plant in self._plants:
-            if plant.failed:
-                error.block = path
-        return check_solver(error, self._machine, self._continuous)
-
-    def _attach(self, error: SimulationError) -> None:
-        if error.run is None:
-            error.run = self.run(final=False)
+    def _with_run(self, error: SimulationError) -> SimulationError:
+        return error if error.run is not None else error.keep(self.run(final=False))
 
     def run(self, *, final: bool = True) -> Run:
         """Return what was recorded since the start, or since `restore`; afterwards recording begins anew.
@@ -383,12 +290,12 @@ class Simulation:
         final : bool
             Whether the complete state at the end is kept with it, as ``run.final_state``, where that can be had.
         """
-        recorder, machine = self._recorder, self._machine
+        recorder = self._recorder
         state = self.save() if final and self.can_save else None
         if final and self._begun:
-            recorder.last(self.t if self._stopped is None else self._stopped.t, machine.log)
+            recorder.last(self.t, self._engine.workspace.log)
         messages = self._messages
-        t, data = recorder.finish(elapsed=self._elapsed, messages=messages, stopped=self._stopped)
+        t, data = recorder.finish(elapsed=self._elapsed, messages=messages, stopped=self.stopped)
         run = Run(
             t=t,
             data=data,
@@ -399,26 +306,29 @@ class Simulation:
             elapsed=self._elapsed,
             messages=messages,
             events=recorder.events,
-            stopped=self._stopped,
+            stopped=self.stopped,
             residual=recorder.residual,
             columns=recorder.columns,
             has_states=self._recording.states,
             final_state=state,
             recipe=self.recipe,
         )
-        self._recording.to = None  # what comes now does not replace it
+        self._recording.stay_in_memory()  # what comes now does not replace it
         self._recorder, self._elapsed = self._new_recorder(), 0.0
         return run
 
+    def record_instant(self) -> None:
+        """Record the instant that it has reached: after `run`, as the first sample of what comes."""
+        self._recorder.row(self.t, self._engine.workspace.log)
+
     @property
     def _messages(self) -> tuple[str, ...]:
-        return tuple(m for _, plant in self._plants for m in plant.messages)
+        return tuple(m for plant in self._engine.plants.values() for m in plant.messages)
 
     @property
     def can_save(self) -> bool:
         """Whether the complete state can be saved: every FMU can turn its state into bytes."""
-        begun = self._begun and (self._open or not self._plants)
-        return begun and all(plant.can_serialize and not plant.failed for _, plant in self._plants)
+        return self._begun and bool(self._open or not self._engine.plants) and can_save(self._engine)
 
     def save(self) -> RunState:
         """Return the complete state at this tick, that of the FMUs included.
@@ -430,23 +340,9 @@ class Simulation:
         OptionError
             If the run has not begun, or has ended and its FMUs are freed.
         """
-        if not self._begun or (self._plants and not self._open):
+        if not self._begun or (self._engine.plants and not self._open):
             raise not_open_error(self._open, self.diagram.name)
-        machine = self._machine
-        return RunState(
-            t=self.t if self._stopped is None else self._stopped.t,
-            tick=self._tick,
-            base=self.flat.base,
-            diagram=self.diagram.name,
-            x=machine.here.x.copy(),
-            w=machine.here.w.copy(),
-            z=machine.z.copy(),
-            log=machine.log.copy(),
-            layout=layout_of(self.flat),
-            continuous=None if self._continuous is None else self._continuous.save(),
-            fmus={path: plant.serialize() for path, plant in self._plants},
-            stopped=self._stopped,
-        )
+        return save_state(self._engine)
 
     def restore(self, state: RunState) -> None:
         """Go back, or ahead, to a state; what was recorded before is forgotten, and the state is the first sample.
@@ -460,19 +356,13 @@ class Simulation:
         if not self._open:
             raise not_open_error(self._open, self.diagram.name)
         check_fits(state, self.flat, self.diagram.name)
-        machine = self._machine
-        for path, plant in self._plants:
-            plant.restore(plant.deserialize(state.fmus[path]))
-        machine.here.t[0] = state.t
-        machine.here.x[:], machine.here.w[:], machine.z[:], machine.log[:] = state.x, state.w, state.z, state.log
-        if self._continuous is not None and state.continuous is not None:
-            self._continuous.restore(state.continuous)
-        self._tick, self._stopped, self._elapsed, self._begun = state.tick, state.stopped, 0.0, True
+        restore_state(self._engine, state)
+        self._elapsed, self._begun = 0.0, True
         if self._recorder.is_open:
             self._recorder.finish()
-            self._recording.overwrite = True
+            self._recording.allow_overwriting()
         self._recorder = self._new_recorder()
-        self._recorder.row(state.t, machine.log)
+        self._recorder.row(state.t, self._engine.workspace.log)
 
 
 def simulate(diagram: WiredDiagram, duration: float, options: RunOptions, *, progress: bool | None = None) -> Run:

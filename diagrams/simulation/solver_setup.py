@@ -1,4 +1,4 @@
-"""What a solver is told of a diagram, and what it remembers."""
+"""Facts of a diagram that a solver is set up with."""
 
 from __future__ import annotations
 
@@ -8,30 +8,6 @@ from typing import Any
 import numpy as np
 
 from ..flat.flat_diagram import FlatDiagram
-
-_MEMORY = ("planned", "_hits", "_misses", "_easy")
-
-
-def solver_memory(solver: Any) -> dict[str, Any]:
-    """Return what a solver would do next: its step, and the method that the default has chosen."""
-    kept = {name: getattr(solver, name) for name in _MEMORY if hasattr(solver, name)}
-    if hasattr(solver, "_active"):
-        kept["active"] = solver._active.name
-        kept["methods"] = {m.name: solver_memory(m) for m in (solver._explicit, solver._implicit)}
-    return kept
-
-
-def recall(solver: Any, kept: dict[str, Any]) -> None:
-    """Let a solver go on as the one did whose `solver_memory` it is; another method starts anew."""
-    for name in _MEMORY:
-        if name in kept and hasattr(solver, name):
-            setattr(solver, name, kept[name])
-    if "active" in kept and hasattr(solver, "_active"):
-        for method in (solver._explicit, solver._implicit):
-            if method.name in kept["methods"]:
-                recall(method, kept["methods"][method.name])
-            if method.name == kept["active"]:
-                solver._active = method
 
 
 def time_scale_of(flat: FlatDiagram) -> float:

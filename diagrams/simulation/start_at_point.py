@@ -8,11 +8,16 @@ import numpy as np
 
 from ...blocks.core.errors import FmuError, LoopwrightError, OptionError
 from ..flat.flat_diagram import FlatDiagram
+from ..flat.layout import Clock
 from ..flat.wired_diagram import WiredDiagram
 from ..results.operating_point import OperatingPoint
+from .workspace import Workspace
+
+PASSES = 120
+"""How many ticks states without a value, such as those of a delay, are given to take theirs."""
 
 
-def placed(diagram: WiredDiagram, point: OperatingPoint) -> WiredDiagram:
+def apply_point(diagram: WiredDiagram, point: OperatingPoint) -> WiredDiagram:
     """Return the diagram with the parameters of an operating point, and with its FMUs started in their states there.
 
     Raises
@@ -36,7 +41,7 @@ def placed(diagram: WiredDiagram, point: OperatingPoint) -> WiredDiagram:
     return variant.replace(blocks) if blocks else variant
 
 
-def carried(values: np.ndarray, old: FlatDiagram, new: FlatDiagram, into: np.ndarray) -> None:
+def copy_states(values: np.ndarray, old: FlatDiagram, new: FlatDiagram, into: np.ndarray) -> None:
     """Write a vector x of one diagram into that of another, whatever stands under the same name in both."""
     for name in ("states", "held", "gates", "starts", "loops"):
         theirs, mine = getattr(old, name), getattr(new, name)
@@ -45,30 +50,63 @@ def carried(values: np.ndarray, old: FlatDiagram, new: FlatDiagram, into: np.nda
                 into[mine.slices[key]] = values[where]
 
 
-def place(simulation: Any, point: OperatingPoint) -> int:
+def start_at(workspace: Workspace, point: OperatingPoint, name: str) -> int:
     """Put a run that has just been initialized to what is just before an operating point's tick, and return that tick.
+
+    Parameters
+    ----------
+    name : str
+        The diagram's name.
 
     Raises
     ------
     OptionError
         A point of another diagram, or one that stands on none of the run's ticks.
     """
-    flat, here = simulation.flat, simulation._machine.here
+    flat, here = workspace.flat, workspace.here
     tick = point.tick * point.base / flat.base
     if tick.denominator != 1:
         raise OptionError(
             f"the operating point is at t = {point.t:.9g} s; this run has ticks of {float(flat.base):g} s, and none of "
             f"them is there. Give step={float(point.base):g}, or find the point with this step.",
-            block=simulation.diagram.name,
+            block=name,
             port="start",
         )
     if point.x.size != here.x.size or point.w.size != here.w.size:
         raise OptionError(
             f"it is the operating point of another diagram: found {point.x.size} entries of state, expected "
             f"{here.x.size}. Find one with diagram.trim(…) or diagram.operating_point(…) of this diagram.",
-            block=simulation.diagram.name,
+            block=name,
             port="start",
         )
-    here.t[0] = point.t
-    here.x[:], here.w[:] = point.x, point.w
+    workspace.put(point.t, point.x, point.w)
     return int(tick)
+
+
+def take_over(workspace: Workspace, x: np.ndarray, of: FlatDiagram, acting: frozenset[Clock]) -> None:
+    """Put a run to the states of another diagram, whatever stands under the same name in both, and go through a tick.
+
+    States that only this diagram has, such as those of a delay, take the values that they settle at while the others
+    are held.
+
+    Parameters
+    ----------
+    x : ndarray
+        The states, laid out as ``of`` says.
+    of : FlatDiagram
+        The other diagram.
+    acting : frozenset of Clock
+        The clocks that act.
+    """
+    flat, here = workspace.flat, workspace.here
+    marked = np.zeros(flat.width)
+    copy_states(x, of, flat, here.x)
+    copy_states(np.ones(x.size), of, flat, marked)
+    known, kept = marked > 0, here.x.copy()
+    for _ in range(PASSES):
+        workspace.evaluate(acting)
+        new = np.where(known, kept, workspace.x_next)
+        if np.array_equal(new, here.x):
+            break
+        here.x[:] = new
+    workspace.tick(acting)

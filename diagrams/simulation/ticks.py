@@ -1,32 +1,37 @@
-"""From tick to tick where nothing happens between them."""
+"""From tick to tick: this is where time advances."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ...blocks.core.errors import SimulationError
 from ..flat.layout import Clock
-from .diagnosis import failure
-from .workspace import Machine
+from .continuous import Continuous
+from .plants import Plant
+from .view import Position
+from .workspace import Workspace
 
 CHUNK = 1000  # ticks between two looks at the progress bar
 
+Row = Callable[[float, np.ndarray], None]
+Progress = Callable[[float], Any]
+
 
 def run_ticks(
-    machine: Machine,
-    plants: Sequence[Any],
+    workspace: Workspace,
+    plants: Sequence[Plant],
     k: int,
     last: int,
     *,
     every: bool,
-    row: Callable[[float, np.ndarray], None],
+    row: Row,
     arrived: Callable[[int], bool],
-    progress: Callable[[float], None],
+    progress: Progress,
 ) -> None:
-    """Run the ticks after tick ``k`` up to ``last``.
+    """Run the ticks after tick ``k`` up to ``last`` where nothing happens between them.
 
     Parameters
     ----------
@@ -39,11 +44,11 @@ def run_ticks(
     progress : callable
         Told the time now and then, and at the end.
     """
-    flat = machine.flat
-    t, x, x_next, ok, log = machine.here.t, machine.here.x, machine.x_next, machine.ok, machine.log
+    flat = workspace.flat
+    t, log = workspace.here.t, workspace.log
     only = plants[0].step if len(plants) == 1 else None
     n, d, h = flat.base.numerator, flat.base.denominator, float(flat.base)
-    always = machine.tick(flat.acting(0)) if all(c == Clock() for c in flat.distinct) else None
+    always = workspace.bind_tick(flat.acting(0)) if all(c == Clock() for c in flat.distinct) else None
     count, now = 0, k * n / d
     for k in flat.ticks(k, last, every=every):  # noqa: B020
         try:
@@ -58,11 +63,8 @@ def run_ticks(
         if always is not None:
             always()
         else:
-            machine.tick(flat.acting(k))()
-        if not ok[0]:
-            raise failure(machine, flat.acting(k)).at(t=now)
+            workspace.tick(flat.acting(k))
         row(now, log)
-        x[:] = x_next
         if arrived(k):
             return
         count += 1
@@ -70,3 +72,99 @@ def run_ticks(
             progress(now)
             count = 0
     progress(now)
+
+
+def run_hybrid(
+    workspace: Workspace,
+    continuous: Continuous,
+    plants: Mapping[str, Plant],
+    position: Position,
+    last: int,
+    *,
+    every: bool,
+    row: Row,
+    arrived: Callable[[int], bool],
+    progress: Progress,
+) -> float | None:
+    """Run the ticks up to ``last`` with a solver between them.
+
+    Parameters
+    ----------
+    every, row, arrived, progress
+        As for `run_ticks`.
+
+    Returns
+    -------
+    float or None
+        Time in s at which a stop condition has ended the run between two ticks.
+    """
+    flat, time_of = workspace.flat, position.time_of
+    clocks, count, samples, width = flat.distinct, 0, 0, float(flat.base)
+
+    def sample(t: float) -> bool:
+        nonlocal samples
+        row(t, workspace.log)
+        samples += 1
+        if samples % CHUNK == 0:
+            progress(t)
+        return continuous.is_stopped()
+
+    while position.tick < last:
+        k = position.tick
+        sampled = every or not clocks
+        lands = continuous.fixed or plants or (continuous.lands and sampled)
+        following = k + 1 if lands else min([*(c.after(k) for c in clocks), last])
+        between = range(k + 1, following) if sampled else range(0)
+        now = time_of(k)
+        ended = continuous.advance(now, time_of(following), map(time_of, between), sample)
+        if ended is not None:
+            return ended
+        for plant in plants.values():
+            plant.step(now, width)
+        take_tick(workspace, continuous, plants, time_of(following), flat.acting(following))
+        row(time_of(following), workspace.log)
+        if arrived(following):
+            return None
+        count += 1
+        if count % 16 == 0:
+            progress(position.t)
+    progress(position.t)
+    return None
+
+
+def take_tick(
+    workspace: Workspace,
+    continuous: Continuous | None,
+    plants: Mapping[str, Plant],
+    now: float,
+    acting: frozenset[Clock],
+    *,
+    first: bool = False,
+) -> None:
+    """Go through one tick with the events before and after it, and leave in ``log`` what is to be recorded.
+
+    Parameters
+    ----------
+    now : float
+        Its time in s.
+    acting : frozenset of Clock
+        The clocks that act at it.
+    first : bool
+        Whether it is tick 0, before which nothing fires.
+    """
+    if continuous is None:
+        workspace.here.t[0] = now
+        workspace.tick(acting)
+        return
+    continuous.at(now)
+    if acting and not first:
+        continuous.settle(now)  # what changes by itself at this instant, boxes see changed
+    workspace.tick(acting)
+    continuous.at(now)
+    if (acting or plants) and continuous.delays is not None:
+        continuous.delays.edge(now)  # what is held has jumped
+    states = workspace.log[workspace.flat.log.total :]
+    before = states.copy()
+    if continuous.settle(now):
+        taken = workspace.flat.taken_at(acting)
+        states[taken] = before[taken]

@@ -40,9 +40,19 @@ class Delays:
         Where the inputs stand in z, and the outputs in w.
     starts : list of ndarray
         Output of each until its delay has passed; None takes the first input.
+    smoothed : bool
+        Whether a state stands between any output and any input of a delay.
     """
 
-    def __init__(self, taus: list[float], inputs: list[slice], outputs: list[slice], starts: list[np.ndarray | None]):
+    def __init__(
+        self,
+        taus: list[float],
+        inputs: list[slice],
+        outputs: list[slice],
+        starts: list[np.ndarray | None],
+        *,
+        smoothed: bool = True,
+    ):
         self.taus, self.inputs, self.outputs, self.starts = taus, inputs, outputs, starts
         self._from_input = [start is None for start in starts]
         self.shortest = min(taus, default=math.inf)
@@ -54,10 +64,8 @@ class Delays:
         self._to: list[float] = []
         self._samples: list[np.ndarray] = []
         self._edges: list[tuple[float, int]] = []
-        self.smoothed = True
-        """Whether a state stands between any output and any input of a delay."""
-        self.middle = 0.0
-        """An instant within the segment that is being solved: tells which side of a discontinuity is meant."""
+        self.smoothed = smoothed
+        self._middle = 0.0  # an instant within the segment that is being solved
 
     def begin(self, z: np.ndarray, w: np.ndarray) -> None:
         """Take the inputs at the start where there is no initial value, and put them out."""
@@ -65,6 +73,10 @@ class Delays:
             if self._from_input[i]:
                 self.starts[i] = z[where].copy()
         self.outputs_at(0.0, w)
+
+    def look_from(self, t: float) -> None:
+        """Take the side of a discontinuity that is towards a time within the segment that is being solved."""
+        self._middle = t
 
     def times(self, t_old: float, t: float) -> np.ndarray:
         """Return the instants of a step at which `keep` wants the inputs."""
@@ -109,7 +121,7 @@ class Delays:
     def outputs_at(self, t: float, w: np.ndarray) -> None:
         """Write the outputs at a time into w."""
         for tau, into, where, start in zip(self.taus, self.outputs, self.inputs, self.starts, strict=True):
-            w[into] = self._value(t - tau, self.middle - tau, where, start)
+            w[into] = self._value(t - tau, self._middle - tau, where, start)
 
     def _value(self, s: float, inside: float, where: slice, start: Any) -> Any:
         nudged = s + 1e-9 * (inside - s)
@@ -196,12 +208,11 @@ def delays_of(flat: FlatDiagram) -> Delays | None:
                 port="initial_value",
             ) from None
     outputs = [flat.plant_outputs.slices[join(p, "y")] for p in paths]
-    delays = Delays([b.delay for b in blocks], inputs, outputs, starts)
     rows, columns = driven_function(flat).jac_sparsity(0, 2).get_triplet()
     into, out = (np.concatenate([np.arange(s.start, s.stop) for s in part]) for part in (inputs, outputs))
     straight = bool(np.any(np.isin(rows, into) & np.isin(columns, out)))  # from one delay into another one, or itself
-    delays.smoothed = not (flat.loops.slices or straight)
-    return delays
+    smoothed = not (flat.loops.slices or straight)
+    return Delays([b.delay for b in blocks], inputs, outputs, starts, smoothed=smoothed)
 
 
 def driven_function(flat: FlatDiagram) -> Any:

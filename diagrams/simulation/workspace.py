@@ -1,4 +1,4 @@
-"""The numbers of a run: its vectors, and a diagram's functions bound to them."""
+"""The workspace of a run: its numbers, and a diagram's functions bound to them."""
 
 from __future__ import annotations
 
@@ -8,24 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import SimulationError
+from ...blocks.core.block import Block
+from ...blocks.core.errors import ParameterError, SimulationError
+from ...blocks.tracing.structure import is_traced_by
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.functions import NONE, active_loops
 from ..flat.layout import Clock
+from .diagnosis import failure
+from .vectors import Vectors
 
 TOLERANCE = 1e-9
 """Largest residual of an algebraic loop that counts as solved, relative to 1 + the size of its values."""
 _ITERATIONS = 50
 _ROUNDING = 1e-14
-
-
-class Vectors:
-    """t, x and w: what all functions of a diagram are evaluated at."""
-
-    def __init__(self, flat: FlatDiagram):
-        self.t = np.zeros(1)
-        self.x = flat.x0.copy()
-        self.w = np.zeros(flat.plant_outputs.total)
 
 
 class Bound:
@@ -47,45 +42,146 @@ def view(vector: np.ndarray) -> Any:
     return memoryview(vector)  # type: ignore[arg-type]
 
 
-class Machine:
-    """A diagram's functions with the numbers of one run.
+class Workspace:
+    """The numbers of one run, with the diagram's functions bound to them.
 
-    ``here`` is the instant that the run has reached, ``trial`` the one that a solver tries.
+    `evaluate` looks at an instant; `tick` and `jump` go beyond it: they take over the next states.
+
+    Attributes
+    ----------
+    here, trial : Vectors
+        The instant that the run has reached, and the one that a solver tries.
+    p : ndarray
+        Parameters of this run.
+    x_next : ndarray
+        x after the instant that was evaluated last.
+    z : ndarray
+        Inputs of plants and of transport delays there.
+    log : ndarray
+        Outputs there, as `FlatDiagram.log` lays them out; then x before the instant, and, with algebraic loops, their
+        residual.
+    ok : ndarray
+        Shape (1,); 0 where a value was not finite or a guard failed.
     """
 
     def __init__(self, flat: FlatDiagram):
         self.flat = flat
-        self.here, self.trial = Vectors(flat), Vectors(flat)
+        self.p = flat.p.copy()
+        self.here, self.trial = Vectors(flat, self.p), Vectors(flat, self.p)
         self.x_next = np.zeros(flat.width)
         self.z = np.zeros(flat.plant_inputs.total)
         self.log = np.zeros(flat.log.total + flat.width + bool(flat.loops.slices))
         self.ok = np.zeros(1)
         self.looped = bool(flat.loops.slices)
+        self._evaluations: dict[frozenset[Clock], Callable[[], None]] = {}
         self._ticks: dict[frozenset[Clock], Callable[[], None]] = {}
         self._kept: list[Bound] = []
-        self._loops: dict[Any, Any] = {}
         self._solved: dict[Any, Callable[[], None]] = {}
 
     def _bind(
         self, function: Any, vectors: Vectors, outputs: list[np.ndarray] | None = None, *more: np.ndarray
     ) -> Bound:
-        arguments = [vectors.t, vectors.x, vectors.w, self.flat.p, *more]
+        arguments = [vectors.t, vectors.x, vectors.w, vectors.p, *more]
         bound = Bound(self.flat.fast(function), arguments, outputs)
         self._kept.append(bound)  # the buffer lives as long as its call
         return bound
 
-    def tick(self, acting: frozenset[Clock]) -> Callable[[], None]:
-        """Return the call that evaluates a tick at ``here``: into x_next, z, log and ok."""
+    # --- an instant, at ``here`` -------------------------------------------------------------------------------------
+
+    def put(self, t: float, x: np.ndarray, w: np.ndarray) -> None:
+        """Put ``here`` to an instant: its time in s, x and w."""
+        self.here.t[0], self.here.x[:], self.here.w[:] = t, x, w
+
+    def restore(self, *, t: float, x: np.ndarray, w: np.ndarray, z: np.ndarray, log: np.ndarray) -> None:
+        """Put ``here`` to an instant that was evaluated before, with what it gave then."""
+        self.put(t, x, w)
+        self.z[:], self.log[:] = z, log
+
+    def evaluate(self, acting: frozenset[Clock] = NONE) -> None:
+        """Evaluate everything at ``here``, where some clocks act: into x_next, z, log and ok."""
+        self._evaluation(acting)()
+
+    def check(self, acting: frozenset[Clock] = NONE) -> None:
+        """Raise the error of the first block that is to blame, if what was evaluated last is not ok.
+
+        Raises
+        ------
+        SimulationError
+            A value that is not finite, or a guard that fails.
+        """
+        if not self.ok[0]:
+            raise failure(self.flat, self.here, self.log, acting).at(t=float(self.here.t[0]))
+
+    def tick(self, acting: frozenset[Clock] = NONE) -> None:
+        """Go through a tick at ``here``: evaluate everything, `check` it, and take over the next states."""
+        self.bind_tick(acting)()
+
+    def bind_tick(self, acting: frozenset[Clock]) -> Callable[[], None]:
+        """Return `tick` for some clocks as a call without arguments, for a loop over many ticks."""
         if acting not in self._ticks:
+            evaluate, ok, x, x_next = self._evaluation(acting), self.ok, self.here.x, self.x_next
+
+            def tick() -> None:
+                evaluate()
+                if not ok[0]:
+                    self.check(acting)
+                x[:] = x_next
+
+            self._ticks[acting] = tick
+        return self._ticks[acting]
+
+    def _evaluation(self, acting: frozenset[Clock]) -> Callable[[], None]:
+        if acting not in self._evaluations:
             results = [self.x_next, self.z, self.log, self.ok]
             call = self._bind(self.flat.at_tick(acting), self.here, results).call
             solve = self.loop_solver(acting, self.here)
-            self._ticks[acting] = call if solve is None else _one_after_the_other(solve, call)
-        return self._ticks[acting]
+            self._evaluations[acting] = call if solve is None else _one_after_the_other(solve, call)
+        return self._evaluations[acting]
 
-    def look(self) -> None:
-        """Evaluate everything at ``here`` between ticks."""
-        self.tick(NONE)()
+    def bind_jump(self) -> Callable[[np.ndarray], None]:
+        """Return the call that lets events fire at ``here`` and takes over the states after them.
+
+        Its argument says which events fire, shape (number of events,).
+        """
+        fired = np.zeros(len(self.flat.events))
+        call = self._bind(self.flat.jump, self.here, [self.x_next], fired).call
+        solve = self.loop_solver(NONE, self.here)
+        evaluate = call if solve is None else _one_after_the_other(solve, call)
+
+        def jump(events: np.ndarray) -> None:
+            fired[:] = events
+            evaluate()
+            self.here.x[:] = self.x_next
+
+        return jump
+
+    def set_parameters(self, path: str, block: Block) -> None:
+        """Let a block go on with the parameters of another one of its kind.
+
+        Raises
+        ------
+        ParameterError
+            If its equations change with them: another class, other options, another number in the place of a zero.
+            If it is a source in continuous time that announces when it is not smooth.
+        """
+        flat = self.flat
+        frame, where = flat.table.frame_of[path], flat.parameters.slices[path]
+        rate = None if flat.table.triggered_around(frame) is not None else flat.table.rate(frame)
+        if not is_traced_by(block, flat.table.blocks[path]):
+            raise ParameterError(
+                "its equations change with these parameters, so that a run can't take them over: it takes numbers of "
+                "the same shape, and none in the place of a zero. Start a run of diagram.replace(…).",
+                block=path,
+            )
+        if not flat.table.is_sampled(frame) and _plans_ahead(block):
+            raise ParameterError(
+                "a solver plans ahead with the times at which it is not smooth, so its parameters can't change in a "
+                "run. Start a run of diagram.replace(…).",
+                block=path,
+            )
+        self.p[where] = flat.checked.traced[path].pack(block, math.nan if rate is None else float(rate))
+
+    # --- what a solver tries -----------------------------------------------------------------------------------------
 
     def flow(self) -> Callable[[float, np.ndarray], np.ndarray]:
         """Return the rates of the continuous states, ``f(t, x)``; w is that of ``trial``."""
@@ -136,13 +232,6 @@ class Machine:
 
         return evaluate
 
-    def jump(self) -> tuple[Callable[[], None], np.ndarray]:
-        """Return the call that makes x_next of ``here``, and the array to fill with the events that fire."""
-        fired = np.zeros(len(self.flat.events))
-        call = self._bind(self.flat.jump, self.here, [self.x_next], fired).call
-        solve = self.loop_solver(NONE, self.here)
-        return (call if solve is None else _one_after_the_other(solve, call)), fired
-
     def plain(self, function: Any, outputs: list[np.ndarray], vectors: Vectors) -> Callable[[], None]:
         """Return the call of another function of (t, x, w, p) between ticks."""
         call: Callable[[], None] = self._bind(function, vectors, outputs).call
@@ -152,7 +241,7 @@ class Machine:
     # --- algebraic loops ---------------------------------------------------------------------------------------------
 
     def loop_solver(self, acting: frozenset[Clock], vectors: Vectors) -> Callable[[], None] | None:
-        """Return the call that solves the algebraic loops at some vectors; None where there are none.
+        """Return the call that solves the algebraic loops at some of its vectors; None where there are none.
 
         Newton's method with the exact derivative, started from the last solution; a step that makes the residual larger
         is halved, and on, as long as that helps.
@@ -211,6 +300,15 @@ class Machine:
         self._solved[key] = solve
         return solve
 
+    def solve_loops(self, acting: frozenset[Clock], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Return x with the algebraic loops solved at an instant; they are sought from the values in x on."""
+        solve = self.loop_solver(acting, self.here)
+        if solve is None:
+            return x
+        self.put(t, x, w)
+        solve()
+        return self.here.x.copy()
+
     def unsolved(self, residual: float, t: float) -> SimulationError:
         """Return the error of a loop that has no solution, or that Newton's method does not find."""
         loops = "\n".join(self.flat.order.loops)
@@ -224,6 +322,11 @@ class Machine:
             port=port,
             t=t,
         )
+
+
+def _plans_ahead(block: Block) -> bool:
+    kind = type(block)
+    return kind.next_instant is not Block.next_instant or kind.time_scale is not Block.time_scale
 
 
 def _one_after_the_other(first: Callable[[], None], second: Callable[[], None]) -> Callable[[], None]:

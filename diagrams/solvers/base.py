@@ -30,8 +30,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -113,6 +114,14 @@ class Solver(ABC):
     @abstractmethod
     def step(self) -> Step:
         """Take one step that the error control accepts, at most to ``stop``."""
+
+    def save(self) -> dict[str, Any]:
+        """Return what it remembers beside the state, such as the step that it would take next."""
+        return {}
+
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Go on as the solver did whose `save` it is; after one of another method, start anew."""
+        return
 
     def rate(self, t: float, x: np.ndarray) -> np.ndarray:
         """Evaluate the rates, never beyond ``stop`` (t + h can be one ulp above it). The array is the caller's own."""

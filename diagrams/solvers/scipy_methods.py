@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,14 @@ class SciPySolver(VariableStep):
         if not self._strange and not np.isfinite(f).all():
             self._strange = True
         return f
+
+    def save(self) -> dict[str, Any]:
+        """Return the step that it would take next; see `Solver.save`."""
+        return {"planned": self.planned}
+
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Plan the step that was saved; see `Solver.restore`."""
+        self.planned = saved.get("planned", self.planned)
 
     def _usable_jacobian(self, t: float, x: np.ndarray) -> np.ndarray:
         """Return the Jacobian, or the last finite one: a predictor may reach beyond the domain of the rates."""
@@ -149,6 +158,7 @@ class SciPySolver(VariableStep):
 
 
 _STABLE = {"RK45": 3.25, "DOP853": 6.1}  # h|λ| at the border of the stable region on the real axis
+_COUNTS = ("_hits", "_misses", "_easy")
 _HITS, _MISSES, _LOOK_EVERY, _EASY = 15, 6, 10, 20
 
 
@@ -171,6 +181,21 @@ class AutoSolver(VariableStep):
         self.statistics.solver = f"auto ({self._explicit.name})"
         self.statistics.rejected = 0
         self._hits = self._misses = self._easy = self._switches = 0
+
+    def save(self) -> dict[str, Any]:
+        """Return which method is at work, what each plans, and how stiff the problem has looked."""
+        counts = {name: getattr(self, name) for name in _COUNTS}
+        methods = {method.name: method.save() for method in (self._explicit, self._implicit)}
+        return {"counts": counts, "active": self._active.name, "methods": methods}
+
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Go on with the method that was at work; see `Solver.restore`."""
+        for name, count in saved.get("counts", {}).items():
+            setattr(self, name, count)
+        for method in (self._explicit, self._implicit):
+            method.restore(saved.get("methods", {}).get(method.name, {}))
+            if method.name == saved.get("active"):
+                self._active = method
 
     def _start(self, t: float, x: np.ndarray) -> None:
         self._active.restart(t, x, self.stop)

@@ -23,7 +23,8 @@ from ...blocks.core.ports import Shape
 from ...blocks.core.units import describe_mismatch, same_unit
 from ...blocks.library.python_control import FixedSampleTime
 from ...blocks.tracing.equations import start_shapes
-from ...blocks.tracing.trace import Traced, trace, traced_parameters
+from ...blocks.tracing.structure import traced_parameters
+from ...blocks.tracing.trace import Traced, trace
 from .structure import Structure, Wire
 
 Unit = str | tuple[str, ...] | None
@@ -264,7 +265,7 @@ def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, 
             block.check_rate(float(rate))
         return trace(block, shapes, sampled=sampled, method=method, cache=shared)
     except LoopwrightError as error:
-        error.block = path
+        error.blame(path)
         raise
 
 

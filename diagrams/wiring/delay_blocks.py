@@ -25,7 +25,7 @@ def add_delay_blocks(table: Structure) -> Structure:
             try:
                 sampled[path] = block.discretize(rate)
             except LoopwrightError as error:
-                error.block = path
+                error.blame(path)
                 raise
     late = [path for path in sorted(table.frames, key=lambda p: (-p.count("."), p)) if table.frames[path].delay]
     if not late and not sampled:

@@ -15,7 +15,8 @@ from ...blocks.core.layout import Layout
 from ...blocks.core.parameters import ParameterSpec
 from ...blocks.core.ports import Port, Shape
 from ...blocks.tracing.numpy_check import GUARDS, NEXT
-from ...blocks.tracing.trace import Traced, trace, traced_parameters
+from ...blocks.tracing.structure import traced_parameters
+from ...blocks.tracing.trace import Traced, trace
 from .build import build_fmu
 from .html_page import block_text
 from .model import Event, Integrator, ModelSpec, Variable

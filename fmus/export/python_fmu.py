@@ -28,8 +28,8 @@ import numpy as np
 from ...blocks.core.block import Block
 from ...blocks.core.errors import DefinitionError, FmuError
 from ...blocks.core.ports import Port
+from ...blocks.tracing.structure import traced_parameters
 from ...blocks.tracing.symbols import bundle
-from ...blocks.tracing.trace import traced_parameters
 from .build import _zip, write_atomically
 from .html_page import block_text
 from .xml_fmi3 import _unit, package_version

@@ -24,7 +24,6 @@ def by_simulation(diagram, t, period, **options):
             after = np.ravel(np.array(flat.at_tick(flat.acting(point.tick))(point.t, x, point.w, flat.p)[0]))
             run.restore(replace(state, x=after))
             run.advance(period)
-            n = flat.log.total
-            return run._machine.log[n : n + flat.width].copy()
+            return run.view.x.copy()
 
         return differences(go, point.x), go(point.x) - point.x

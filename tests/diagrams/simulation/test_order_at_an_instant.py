@@ -40,7 +40,7 @@ from loopwright.blocks import (
     UnitDelay,
 )
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.diagrams.simulation.workspace import Machine
+from loopwright.diagrams.simulation.workspace import Workspace
 from support import TESTS
 from support.hybrid_blocks import TIGHT, Ball, Crossings, Falls, Lag, Takes, Twice, counting, decay
 
@@ -691,6 +691,6 @@ def test_the_derivative_that_implicit_solvers_are_given_is_that_of_the_rates():
     A = rng.normal(size=(3, 3))
     plant = StateSpace(A=A, B=np.zeros(3), C=np.eye(3), D=np.zeros(3), name="plant")
     flat = Diagram("d", plant(Constant(value=0.0)), Lag(name="after", k=7.0)(Constant(value=1.0))).flatten(0.1)
-    machine = Machine(flat)  # its functions write into its vectors
-    slope = machine.jacobian()(0.0, rng.normal(size=4))
+    workspace = Workspace(flat)  # its functions write into its vectors
+    slope = workspace.jacobian()(0.0, rng.normal(size=4))
     assert np.allclose(slope, np.block([[np.array([[-7.0]]), np.zeros((1, 3))], [np.zeros((3, 1)), A]]), rtol=1e-13)

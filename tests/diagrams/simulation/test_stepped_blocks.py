@@ -125,7 +125,7 @@ def test_one_function_lists_it_and_a_drawing_shows_it_as_a_plant():
     def box(u):
         return inner(u=u)
 
-    table = Diagram("d", box(Ramp(slope=1.0)), Gain(gain=1.0, name="tanker")(inner.y))._table
+    table = Diagram("d", box(Ramp(slope=1.0)), Gain(gain=1.0, name="tanker")(inner.y)).structure
     assert list(stepped_blocks(table)) == ["box.tank"] == list(stepped_blocks(table, "box"))
     assert list(stepped_blocks(table, "box.tank")) == ["box.tank"]
     assert stepped_blocks(table, "tanker") == stepped_blocks(table, "bo") == {}

@@ -1,0 +1,52 @@
+"""Structure of a block, which a trace depends on, and its numbers, which a trace takes as symbols."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from ..core.block import Block
+from ..core.values import Value, identity
+
+
+def traced_parameters(block: Value, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted name and value of every parameter that is a symbol in the trace, nested blocks' included."""
+    for name, spec in type(block).parameter_specs.items():
+        value = block.__dict__[name]
+        if isinstance(value, Block):
+            yield from traced_parameters(value, f"{prefix}{name}.")
+        elif isinstance(value, float | np.ndarray) and not spec.structural:
+            yield prefix + name, value
+
+
+def structure(block: Value) -> Any:
+    """Return the key of a trace besides the shapes: class, fixed values, and which numbers are exactly zero."""
+    items: list[Any] = [type(block)]
+    for name, spec in type(block).parameter_specs.items():
+        value = block.__dict__[name]
+        if isinstance(value, Block):
+            items.append((name, structure(value)))
+        elif isinstance(value, float | np.ndarray) and not spec.structural:
+            items.append((name, np.shape(value), (np.asarray(value) == 0).tobytes()))
+        else:
+            items.append((name, identity(value)))
+    return tuple(items)
+
+
+def is_traced_by(block: Value, other: Value) -> bool:
+    """Whether the trace of another block holds for this one, with this one's numbers: what was zero there is here."""
+    if type(block) is not type(other):
+        return False
+    for name, spec in type(block).parameter_specs.items():
+        new, old = block.__dict__[name], other.__dict__[name]
+        if isinstance(old, Block):
+            if not (isinstance(new, Block) and is_traced_by(new, old)):
+                return False
+        elif isinstance(old, float | np.ndarray) and not spec.structural:
+            if np.shape(new) != np.shape(old) or np.any((np.asarray(old) == 0) & (np.asarray(new) != 0)):
+                return False
+        elif identity(new) != identity(old):
+            return False
+    return True

@@ -1,0 +1,169 @@
+"""The engine of a run: everything that goes on in time, without what is recorded of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from types import MappingProxyType
+
+import numpy as np
+
+from ...blocks.core.block import Block
+from ...blocks.core.errors import SimulationError, UnknownNameError, near
+from ..flat.flat_diagram import FlatDiagram
+from ..results.operating_point import OperatingPoint
+from ..results.stored import Occurrence
+from ..solvers.base import solver_name
+from .continuous import Continuous
+from .diagnosis import opaque_failure
+from .initialize import initialize
+from .plants import Plant, bind, loaded
+from .run_options import RunOptions
+from .start_at_point import start_at, take_over
+from .stops import StopConditions
+from .ticks import Progress, Row, run_hybrid, run_ticks, take_tick
+from .view import Position, SimulationView
+from .workspace import Workspace
+
+
+class Engine:
+    """The numbers of a run, its plants, its solver and its events; it goes from tick to tick.
+
+    Parameters
+    ----------
+    flat : FlatDiagram
+        The diagram.
+    name : str
+        Its name.
+    options : RunOptions
+        How it is run.
+    every_tick : bool
+        Visit every tick, not only those at which a box acts.
+    on_event : callable
+        Told every event that fires.
+    """
+
+    def __init__(
+        self,
+        flat: FlatDiagram,
+        name: str,
+        options: RunOptions,
+        *,
+        every_tick: bool,
+        on_event: Callable[[Occurrence], None],
+    ):
+        self.flat, self.name = flat, name
+        self.workspace = Workspace(flat)
+        self.position = Position(flat.base)
+        self.plants: dict[str, Plant] = {}
+        self.view = SimulationView.of(self.workspace, MappingProxyType(self.plants), self.position)
+        self.continuous: Continuous | None = None
+        self._stops = StopConditions(flat, self.workspace.log)
+        self._can_stop = self._stops.exist
+        self._tell = on_event
+        if flat.hybrid:
+            self.continuous = Continuous(
+                self.workspace,
+                name,
+                options.solver,
+                options.rtol,
+                options.atol,
+                options.max_step,
+                self._on_event,
+                self._stops.is_met,
+            )
+        elif options.solver != "auto":
+            solver_name(options.solver)  # an unknown one is an error here, too
+        self.every_tick = every_tick or (self.continuous is not None and self.continuous.fixed)
+
+    def load(self, stack: ExitStack, start_time: float) -> None:
+        """Load the plants for a run from a time in s on; ``stack`` unloads them."""
+        for path, plant in loaded(self.flat, stack, start_time):
+            self.plants[path] = plant
+
+    def initialize(self) -> None:
+        """Find values of everything at t = 0; the plants are then ready to be stepped."""
+        bind(self.workspace, self.plants)
+        initialize(self.workspace, self.plants, None if self.continuous is None else self.continuous.delays)
+        for plant in self.plants.values():
+            plant.begin()
+
+    def take_first_tick(self, point: OperatingPoint | None, row: Row) -> None:
+        """Go through the tick with which the run begins, tick 0 or that of an operating point, and record it."""
+        first = 0 if point is None else start_at(self.workspace, point, self.name)
+        if self.continuous is not None:
+            self.continuous.begin()
+        now = self.position.time_of(first)
+        take_tick(self.workspace, self.continuous, self.plants, now, self.flat.acting(first), first=first == 0)
+        row(now, self.workspace.log)
+        self._arrive(first)
+
+    def go(self, last: int, row: Row, progress: Progress) -> None:
+        """Go on to a tick, or to where a stop condition ends the run.
+
+        Parameters
+        ----------
+        row : callable
+            Records a sample.
+        progress : callable
+            Told the time now and then, and at the end.
+
+        Raises
+        ------
+        SimulationError
+            With the block that is to blame.
+        """
+        workspace, plants, position = self.workspace, self.plants, self.position
+        try:
+            if self.continuous is None:
+                run_ticks(
+                    workspace, [*plants.values()], position.tick, last,
+                    every=self.every_tick, row=row, arrived=self._arrive, progress=progress,
+                )  # fmt: skip
+                return
+            ended = run_hybrid(
+                workspace, self.continuous, plants, position, last,
+                every=self.every_tick, row=row, arrived=self._arrive, progress=progress,
+            )  # fmt: skip
+            if ended is not None:
+                position.stopped = self._stops.met_at(ended)
+        except SimulationError as error:
+            culprit = self.blame(error)
+            raise culprit from culprit.__cause__
+
+    def _arrive(self, k: int) -> bool:
+        """Take note of a tick that has been recorded; return whether it ends the run."""
+        self.position.tick = k
+        return self._can_stop and self._is_over()
+
+    def _is_over(self) -> bool:
+        position = self.position
+        if position.stopped is None and self._stops.is_met():
+            position.stopped = self._stops.met_at(position.t)
+        return position.stopped is not None
+
+    def _on_event(self, event: Occurrence) -> None:
+        self.position.note_event(event)
+        self._tell(event)
+
+    def blame(self, error: SimulationError) -> SimulationError:
+        """Return the error with the full path of a plant that has failed, or the error of an opaque block behind it."""
+        for path, plant in self.plants.items():
+            if plant.failed:
+                error.blame(path)
+        opaque = opaque_failure(self.flat)
+        return error if opaque is None else opaque.at(t=error.t)
+
+    def set_parameters(self, path: str, block: Block) -> None:
+        """Let a block go on with the parameters of a variant; see `Simulation.set_parameters`."""
+        if path not in self.flat.checked.traced:
+            raise UnknownNameError(
+                f"no block there is evaluated in this run. {near(path, self.flat.checked.traced)}", block=path
+            )
+        self.workspace.set_parameters(path, block)
+
+    def take_over(self, x: np.ndarray, of: FlatDiagram) -> None:
+        """Put the blocks to the states of another diagram; see `Simulation.take_over`."""
+        take_over(self.workspace, x, of, self.flat.acting(self.position.tick))
+        if self.continuous is not None:
+            self.continuous.begin()
