@@ -40,7 +40,8 @@ from .frequency.sensitivities import (
 from .linearization.linearize import Linearization
 from .measure.frequency_response import FrequencyResponse
 from .paper import experiments
-from .paper.fig3 import Channel, Rig, fig3
+from .paper.fig3 import Fig3Diagram, fig3
+from .paper.wires import Channel, Rig
 from .report.analyse import analyse
 from .report.model import Plot, Report, Section, Table
 from .results.operating_point import OperatingPoint
@@ -61,6 +62,7 @@ __all__ = [
     "Diagram",
     "DiskMargin",
     "Drawing",
+    "Fig3Diagram",
     "FlatDiagram",
     "Frame",
     "FrequencyResponse",

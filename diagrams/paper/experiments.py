@@ -33,8 +33,9 @@ from ..diagram import Diagram
 from ..results.run import Run
 from ..simulation.run_options import RunKeywords, RunOptions
 from ..simulation.simulation import simulate
-from .fig3 import IMPEDANCE_PAR, IMPEDANCE_PERP, Channel, Rig, check_plant, fig3
+from .fig3 import fig3
 from .options import DEFAULTS, ELLIPSE, merge
+from .wires import IMPEDANCE_PAR, IMPEDANCE_PERP, Channel, Rig, check_plant
 
 __all__ = [
     "DEFAULTS",

@@ -12,7 +12,7 @@ from ...fmus import Fmu, build
 from ...fmus.models.gantry import Gantry
 from ..admittance.compliance_loop import SIDES, AdmittanceLoop
 from ..diagram import Diagram
-from .fig3 import Channel, Rig, fig3
+from .wires import Channel, Rig, wire
 
 INTERNAL_STEP = 1e-4
 
@@ -74,7 +74,7 @@ def moored_diagram(loop: AdmittanceLoop, push: float, **environment: float) -> D
     channels = [Channel(references[side], filters[side]) for side in SIDES]
     rig = Rig(tool_mass=loop.tool_mass, delay=loop.delay, sample_time=loop.sample_time, admittance_method=loop.method)
     plant = Fmu(moored(), name="plant", start=start)
-    made = fig3(plant, loop.path, *channels, model=loop.model, rig=rig, name="moored")
+    made = Diagram("moored", wire(plant, loop.path, *channels, model=loop.model, rig=rig))
     pids: dict[str, Any] = {
         f"controller.pid_{side}": getattr(loop, f"pid_{side}").replace(name=f"pid_{side}") for side in SIDES
     }

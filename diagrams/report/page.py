@@ -8,7 +8,7 @@ from itertools import groupby
 from typing import Any
 
 from ..frequency.number import Number
-from .definitions import LOOP, LOOP_TERMS, definition
+from .definitions import LOOP_TERMS, definition
 from .figures import Picture, embedded
 from .model import Plot, Report, Section
 from .tables import Numbered, TableView, anchor
@@ -86,8 +86,8 @@ class Page:
     reasons: tuple[str, ...]
     """How numbers were confirmed."""
     terms: tuple[TermView, ...]
-    loop: str
-    """The definition of the loop, where terms take it for granted."""
+    defines_loop: bool
+    """Whether terms take the loop for granted, so that it is defined as well."""
 
     @classmethod
     def of(cls, report: Report) -> Page:
@@ -117,7 +117,7 @@ class Page:
             tuple(tuple(line for line in lines if line.path.partition(".")[0] == top) for top in tops),
             tuple(reasons),
             terms,
-            LOOP if LOOP_TERMS & {term.term for term in terms} else "",
+            not LOOP_TERMS.isdisjoint(term.term for term in terms),
         )
 
 

@@ -1,4 +1,4 @@
-"""Figures of a report: Bode, Nyquist, sensitivities, admittances, stability maps; drawn without pyplot."""
+"""Figures of a report: Bode, Nyquist, sensitivities, measured responses; drawn without pyplot."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ import numpy as np
 from ..results.plots import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, new_figure, style
 from .model import Plot
 from .templating import Texts
+from .variant import Implementation
 
 if TYPE_CHECKING:
     from ..frequency.margins import Margins
 
 TEXTS = Texts(__package__, "figures")
 LOOKS: Mapping[str, tuple[str, Any]] = {
-    "continuous": (GREY, "-"),
-    "sampled_d0": (BLUE, "-"),
-    "sampled_d1": (VERMILION, (0, (4, 2))),
+    Implementation.CONTINUOUS: (GREY, "-"),
+    Implementation.SAMPLED: (BLUE, "-"),
+    Implementation.DELAYED: (VERMILION, (0, (4, 2))),
 }
 OTHER = ((GREEN, "-"), (ORANGE, (0, (4, 2))), (PURPLE, (0, (1, 1.5))))
 
 
-def _look(key: str, i: int) -> dict[str, Any]:
+def look_of(key: str, i: int) -> dict[str, Any]:
+    """Return the color and line of a variant, or of the i-th other curve."""
     color, line = LOOKS.get(key, OTHER[i % len(OTHER)])
     return {"color": color, "linestyle": line}
 
@@ -56,7 +58,7 @@ def bode(
         figure = new_figure(4.4)
         top, bottom = figure.subplots(2, 1, sharex=True)
         for i, (name, L) in enumerate(loops.items()):
-            look = _look(name, i)
+            look = look_of(name, i)
             w, value = _response(L, low, high)
             phase = np.degrees(np.unwrap(np.angle(value)))
             phase -= 360 * np.round((phase[0] + 180) / 360)  # the branch that begins nearest to −180°
@@ -95,7 +97,7 @@ def nyquist(
         angle = np.linspace(0, 2 * np.pi, 361)
         ax.plot(np.cos(angle), np.sin(angle), color=GREY, linewidth=0.6)
         for i, (name, L) in enumerate(loops.items()):
-            look = _look(name, i)
+            look = look_of(name, i)
             _, value = _response(L, low, high)
             ax.plot(value.real, value.imag, label=titles[name], **look)
             ax.plot(value.real, -value.imag, color=look["color"], linestyle=look["linestyle"], linewidth=0.5)
@@ -128,12 +130,12 @@ def sensitivities(
         left, right = figure.subplots(1, 2, sharey=True)
         for i, (name, L) in enumerate(loops.items()):
             w, value = _response(L, low, high)
-            left.loglog(w, np.abs(1 / (1 + value)), label=titles[name], **_look(name, i))
-            right.loglog(w, np.abs(value / (1 + value)), **_look(name, i))
+            left.loglog(w, np.abs(1 / (1 + value)), label=titles[name], **look_of(name, i))
+            right.loglog(w, np.abs(value / (1 + value)), **look_of(name, i))
             for ax, x, y in ((left, "ms_frequency", "ms"), (right, "mt_frequency", "mt")):
                 mark = getattr(found[name], x).value, getattr(found[name], y).value
                 if low < mark[0] < high:
-                    ax.plot(*mark, "o", color=_look(name, i)["color"], markersize=3.5)
+                    ax.plot(*mark, "o", color=look_of(name, i)["color"], markersize=3.5)
         for ax, name in ((left, "|S|"), (right, "|T|")):
             ax.axhline(1.0, color=DARK, linewidth=0.6)
             ax.set_title(name)
@@ -141,74 +143,6 @@ def sensitivities(
             ax.set_ylim(bottom=1e-3)
         left.legend(loc="best")
     return Plot(key, TEXTS.line("sensitivities", wire=wire), figure)
-
-
-def admittances(key: str, side: str, w: np.ndarray, curves: Mapping[str, tuple[str, np.ndarray]]) -> Plot:
-    """Draw target and rendered admittances: magnitude, phase, and where the real part is negative."""
-    looks: dict[str, dict[str, Any]] = {
-        "target": {"color": DARK, "linestyle": (0, (1, 1.5)), "linewidth": 1.6},
-        "friction": {"color": GREEN, "linestyle": "-"},
-    }
-    with style():
-        figure = new_figure(4.2)
-        top, bottom = figure.subplots(2, 1, sharex=True)
-        for i, (name, (title, Y)) in enumerate(curves.items()):
-            look = looks.get(name) or _look(name, i)
-            top.loglog(w, np.abs(Y), label=title, **look)
-            bottom.semilogx(w, np.degrees(np.angle(Y)), **look)
-        for y in (-90, 90):
-            bottom.axhline(y, color=DARK, linewidth=0.6)
-        bottom.axhspan(90, 180, color=VERMILION, alpha=0.07, linewidth=0)
-        bottom.axhspan(-180, -90, color=VERMILION, alpha=0.07, linewidth=0)
-        bottom.set_ylim(-180, 180)
-        bottom.set_yticks([-180, -90, 0, 90, 180])
-        top.set_ylabel("|Y| [m/(N s)]")
-        bottom.set_ylabel("phase of Y [°]")
-        bottom.set_xlabel("ω [rad/s]")
-        top.legend(loc="best")
-    name = "along the path" if side == "par" else "across the path"
-    caption = f"Admittance {name}, target and rendered; shaded: Re Y < 0, where the robot feeds energy into a motion."
-    return Plot(key, caption, figure)
-
-
-def stability(key: str, side: str, shown: Any, lines: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Plot:
-    """Draw a stability map: growth rates, and the limits of several variants."""
-    looks: dict[str, dict[str, Any]] = {
-        "sampled d0": {"color": BLUE, "linewidth": 1.6},
-        "sampled d1": {"color": VERMILION, "linestyle": (0, (4, 2))},
-        "sampled d0, friction slope at rest": {"color": GREEN},
-        "rule of thumb, d0": {"color": DARK, "linestyle": (0, (1, 1.5))},
-    }
-    with style():
-        figure = new_figure(3.4)
-        ax = figure.subplots()
-        levels = [-100, -10, -1, -0.1, 0, 0.1, 1, 10, 100, 1000]
-        from matplotlib.colors import SymLogNorm
-
-        k, b, growth = shown
-        growth = np.clip(growth, -99.9, 999.0)
-        filled = ax.contourf(
-            k,
-            b,
-            growth,
-            levels=levels,
-            cmap="RdBu_r",
-            alpha=0.55,
-            norm=SymLogNorm(linthresh=0.1, vmin=-1000, vmax=1000),
-        )
-        for name, (x, y) in lines.items():
-            ax.plot(x, y, label=name, **looks.get(name, {}))
-        ax.set_xscale("log")
-        ax.set_yscale("log")
-        ax.set_xlim(k[0], k[-1])
-        ax.set_ylim(b[0], b[-1])
-        ax.set_xlabel("stiffness k$_e$ of the environment [N/m]")
-        ax.set_ylabel("damping b$_e$ [N s/m]")
-        figure.colorbar(filled, ax=ax, label="growth rate σ, sampled d0 [1/s]", ticks=levels, format="%g")
-        ax.legend(loc="upper left")
-    name = "along the path" if side == "par" else "across the path"
-    caption = f"Stability map {name}: stable left of the line of each variant; colours for sampled d0, red grows."
-    return Plot(key, caption, figure)
 
 
 def response(L: Any, w: np.ndarray) -> np.ndarray:

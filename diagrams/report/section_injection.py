@@ -6,21 +6,20 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks import Constant, Reference, Step
 from ...blocks.core.errors import LoopwrightError
 from ..frequency.number import Number
-from ..measure.frequency_response import frequency_response
+from ..linearization.linearize import Linearization
+from ..measure.frequency_response import FrequencyResponse, frequency_response
 from . import plots as figures
-from .case import FRICTION, Case, Variant, in_s, with_parameters
+from .case import Case
 from .model import Plot, Section, Table
-from .section_loops import wires_on_loops
 from .templating import Texts
+from .variant import Implementation, Variant
 
 TEXTS = Texts(__package__, "injection")
 
-FREQUENCIES = np.geomspace(1.0, 150.0, 9)
-"""In rad/s, for Fig. 3; elsewhere they are spread around the loop's crossover."""
-AMPLITUDE = 1e-4
+WIRES = 2
+"""Wires at most at which is measured."""
 REFUTED = 0.05
 """A relative deviation beyond which a linear model is wrong."""
 CONFIRMED = 1e-3
@@ -32,9 +31,11 @@ def injected(case: Case) -> Section | None:
     rows: list[tuple[Any, ...]] = []
     text: list[str] = []
     plots = []
-    for key, wire in list(wires_on_loops(case).items())[:2]:
+    for key, wire in list(case.loop_wires().items())[:WIRES]:
         measured = {}
-        for v in case.usable("sampled_d0", "sampled_d1", "sampled_d0" + FRICTION):
+        for v in case.usable(Implementation.SAMPLED, Implementation.DELAYED):
+            if v.implementation.delay and not v.is_design:
+                continue
             if not v.rests:
                 text.append(TEXTS.line("moving", variant=v.title, wire=wire, **_moving(v)))
                 continue
@@ -81,37 +82,10 @@ def _moving(v: Variant) -> dict[str, Any]:
     return {"state": v.model.states[most], "change": moves[most], "period": bool(v.model.dt)}
 
 
-def _measured(case: Case, v: Variant, wire: str) -> tuple[Any, Any]:
-    frequencies, amplitude = FREQUENCIES, AMPLITUDE
-    if case.is_fig3:
-        v = _at_rest(v)
-    else:
-        w = np.abs(in_s(v.model.poles, v.model.dt))
-        w = w[(w > 1e-6) & (w < 0.3 * np.pi / v.model.dt)]
-        centre = float(np.median(w)) if len(w) else 0.03 * np.pi / v.model.dt
-        frequencies = np.geomspace(centre / 10, min(centre * 3, 0.5 * np.pi / v.model.dt), 5)
-        value = np.ravel(v.point.values.get(_source(v, wire), 0.0))
-        amplitude = AMPLITUDE * (1.0 + float(np.max(np.abs(value), initial=0.0)))
-    found = frequency_response(v.diagram, wire, frequencies, amplitude=amplitude, at=v.point.t)
-    return found, v.model
-
-
-def _source(v: Variant, wire: str) -> str:
-    source = v.diagram.names.get(wire)
-    return wire if source is None else f"{source.block}.{source.port}"
-
-
-def _at_rest(v: Variant) -> Variant:
-    """Return Fig. 3 with its references held, set-points and desired forces at zero, so that it stays where it is."""
-    changes: dict[str, Any] = {
-        path: Constant(value=0.0, unit=block.unit, name=path)
-        for path, block in v.diagram.blocks.items()
-        if path in ("set_point", "desired_force_par", "desired_force_perp") and isinstance(block, Step)
-    }
-    for name in ("eta_d", "xi_d"):
-        if f"{name}.y" in v.point.values:
-            changes[name] = Reference(float(np.ravel(v.point.values[f"{name}.y"])[0]), unit="m", name=name)
-    return with_parameters(v, changes)
+def _measured(case: Case, v: Variant, wire: str) -> tuple[FrequencyResponse, Linearization]:
+    excited, frequencies, amplitude = case.excitation(v, wire)
+    found = frequency_response(excited.diagram, wire, frequencies, amplitude=amplitude, at=excited.point.t)
+    return found, excited.model
 
 
 def _plot(key: str, wire: str, measured: dict[str, tuple[Any, Any]]) -> Plot:

@@ -1,4 +1,4 @@
-"""Margins of the inner loops: of Fig. 3 at its virtual inputs, of another diagram at every named wire on a loop."""
+"""Margins of the loops at the wires of a case: those with names that lie on loops, where nothing else is said."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core.errors import LoopwrightError
-from ..frequency.disk import mimo_disk_margin
 from ..frequency.margins import Margins, margins
 from ..frequency.number import Number
 from ..frequency.python_control import Comparison, compare_margins
 from ..frequency.realization import Realization
 from . import plots as figures
-from .case import FRICTION, SIDES, Case, in_s
+from .case import Case
+from .disks import several
 from .model import Section, Table
 from .templating import Texts
 from .uncertainty import left_out, widened
+from .variant import in_s
+from .wires import blocks_on_loops
 
 TEXTS = Texts(__package__, "loops")
 ROWS: Mapping[str, str] = {
@@ -36,49 +38,15 @@ ROWS: Mapping[str, str] = {
 }
 
 
-def wires_on_loops(case: Case) -> dict[str, str]:
-    """Return the wires at which loops are looked at, by their key in a report."""
-    if case.is_fig3:
-        return {side: f"controller.{name}" for side, name in SIDES.items()}
-    if case.wires is not None:
-        return {_key(name): name for name in case.wires}
-    diagram = case.diagram
-    inside = _on_cycles(diagram)
-    seen: set[tuple[str, str, Any]] = set()
-    names: dict[str, str] = {}
-    for name, wire in sorted(diagram.names.items(), key=lambda item: (item[0].count("."), item[0])):
-        where = (wire.block, wire.port, str(wire.index))
-        if wire.block in inside and where not in seen:
-            seen.add(where)
-            names[name] = name
-    if not names:  # nothing on a loop has a name: what drives the FMUs, else all outputs on loops
-        table = diagram.structure
-        sources = {f"{w.block}.{w.port}" for w in table.wires.values() if w.block in inside}
-        driving = {
-            f"{w.block}.{w.port}"
-            for (block, _), w in table.wires.items()
-            if w.block in inside and table.blocks[block].stepped
-        }
-        names = {path: path for path in sorted(driving or sources)[:4]}
-    ends = [name.rpartition(".")[2] for name in names]
-    return {(e if ends.count(e) == 1 else _key(n)): n for e, n in zip(ends, names, strict=True)}
-
-
-def _key(name: str) -> str:
-    return name.replace(".", "_")
-
-
 def inner(case: Case) -> Section:
     """Return the section about the loops, one part for each wire."""
     text, parts = [*TEXTS.paragraphs("margins")], []
-    for key, wire in wires_on_loops(case).items():
+    for key, wire in case.loop_wires().items():
         part = _wire(case, key, wire)
         if part is None:
-            text += left_out(case, wire, _on_cycles(case.diagram))
+            text += left_out(case, wire, blocks_on_loops(case.diagram))
         else:
             parts.append(widened(case, wire, part))
-    if case.is_fig3:
-        parts += _motor_forces(case)
     if not parts and len(text) == 1:
         text.append(TEXTS.line("no_loop"))
     return Section("inner", "Inner loops", tuple(text), sections=tuple(parts))
@@ -94,7 +62,7 @@ def _wire(case: Case, key: str, wire: str) -> Section | None:
         try:
             L = v.loop(wire)
             if L.ninputs > 1:
-                return _several(case, key, wire)
+                return several(case, key, wire)
             m = margins(L)
         except LoopwrightError as error:
             notes.append(f"{v.title}: {error.message}")
@@ -106,13 +74,13 @@ def _wire(case: Case, key: str, wire: str) -> Section | None:
             notes.append(TEXTS.line("hidden_unstable", variant=v.title, poles=shown))
         if not m.stable:
             notes.append(TEXTS.line("unstable", variant=v.title))
-        elif not v.key.endswith(FRICTION):
+        elif v.is_design:
             try:
                 with np.errstate(all="ignore"):
                     r = Realization.of(L)
                     rows = compare_margins(r, m, _as_control(r))
             except (LoopwrightError, np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
-                notes.append(TEXTS.line("not_compared", variant=v.title, error=error))
+                notes.append(TEXTS.line("not_compared", variant=v.title, error=str(error)))
                 continue
             for c in rows:
                 numbers[f"{v.key}.control.{c.name}"] = _theirs(m, c)
@@ -140,7 +108,7 @@ def _wire(case: Case, key: str, wire: str) -> Section | None:
     if beside:
         columns = ("variant", "number", "here", "python-control", "its function", "right", "why")
         tables.append(Table("Beside python-control's own values", columns, tuple(beside)))
-    plain = {k: v for k, v in loops.items() if not k.endswith(FRICTION)}
+    plain = {v.key: loops[v.key] for v in case.designs() if v.key in loops}
     plots = (
         figures.bode(f"inner_{key}_bode", wire, plain, found, titles),
         figures.nyquist(f"inner_{key}_nyquist", wire, plain, found, titles),
@@ -205,100 +173,3 @@ def _poles(poles: Iterable[complex], dt: float) -> str:
             shown.append(f"{v.real:.6g} ± {abs(v.imag):.6g}j")
             skip = True
     return ", ".join(shown) or "none"
-
-
-def _several(case: Case, key: str, wire: str) -> Section | None:
-    """Return what is said of a wire with several entries: its MIMO disk margin."""
-    numbers: dict[str, Number] = {}
-    rows, notes = [], []
-    for v in case.usable():
-        try:
-            disk = mimo_disk_margin(v.loop(wire))
-        except LoopwrightError as error:
-            notes.append(f"{v.title}: {error.message}")
-            continue
-        numbers |= _disk(v.key, disk)
-        rows.append((v.title, disk.alpha, disk.frequency, _range(disk)))
-    if not rows:
-        return None
-    table = Table(
-        f"MIMO disk margin at {wire}", ("variant", "α", "at", "gains and phase of all entries at once"), tuple(rows)
-    )
-    return Section(key, f"Loops at {wire}", tuple(notes), (table,), (), numbers)
-
-
-def _disk(start: str, disk: Any) -> dict[str, Number]:
-    how = disk.alpha.confirmed_by
-    return {
-        f"{start}.disk_margin": disk.alpha,
-        f"{start}.frequency": disk.frequency,
-        f"{start}.gain_low": Number(disk.gain_low, "1", disk.alpha.tolerance, how),
-        f"{start}.gain_high": Number(disk.gain_high, "1", disk.alpha.tolerance * disk.gain_high**2, how),
-        f"{start}.phase_deg": Number(disk.phase_deg, "deg", 60 * disk.alpha.tolerance, how),
-    }
-
-
-def _range(disk: Any) -> str:
-    return f"{disk.gain_low:.4g} … {disk.gain_high:.4g}, ± {disk.phase_deg:.4g}°"
-
-
-def _motor_forces(case: Case) -> list[Section]:
-    """Return the 2×2 loop at the motor forces, at several path points, with and without offset."""
-    numbers: dict[str, Number] = {}
-    rows, notes = [], []
-    for v in case.usable():
-        if v.key.endswith(FRICTION) and v.key != "sampled_d0" + FRICTION:
-            continue
-        for place, eta, xi in places(case):
-            at = case.at(v, eta, xi)
-            if at is None:
-                continue
-            try:
-                disk = mimo_disk_margin(at.loop("motor_force"))
-            except LoopwrightError as error:
-                notes.append(f"{v.title} at {place}: {error.message}")
-                continue
-            numbers |= _disk(f"{v.key}.{place}", disk)
-            rows.append((v.title, f"{eta:.3f} m", f"{xi:.3f} m", disk.alpha, disk.frequency, _range(disk)))
-    if not rows:
-        return []
-    text = (
-        (
-            "Both motor forces are cut at once. The MIMO disk margin is α of the largest symmetric disk of factors, a "
-            "different complex one in each motor force, that the closed loop bears; for two channels the "
-            "D-scaled bound is "
-            "exact. It is not that of one loop after the other."
-        ),
-        *notes,
-    )
-    table = Table(
-        "MIMO disk margin at the motor forces", ("variant", "η", "ξ", "α", "at", "gains and phase"), tuple(rows)
-    )
-    return [Section("motor_force", "Loops at the motor forces", text, (table,), (), numbers)]
-
-
-def places(case: Case) -> list[tuple[str, float, float]]:
-    """Return points beside the path, with the names they have in dotted paths."""
-    length = case.path.length
-    made = []
-    for share, xi in ((0.0, 0.0), (0.0, -0.02), (0.15, 0.0), (0.15, 0.02), (0.35, -0.02), (0.35, 0.0)):
-        eta = round(share * length, 3)
-        made.append((f"eta_{1000 * eta:.0f}mm_xi_{1000 * xi:.0f}mm", eta, xi))
-    return made
-
-
-def _on_cycles(diagram: Any) -> set[str]:
-    """Return the blocks that lie on a cycle of wires."""
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    table = diagram.structure
-    index = {path: i for i, path in enumerate(sorted(table.blocks))}
-    edges = [(index[w.block], index[block]) for (block, _), w in table.wires.items()]
-    if not edges:
-        return set()
-    rows, columns = zip(*edges, strict=True)
-    graph = csr_matrix((np.ones(len(edges)), (rows, columns)), shape=(len(index), len(index)))
-    _, labels = connected_components(graph, directed=True, connection="strong")
-    own = {a for a, b in edges if a == b}
-    return {path for path, i in index.items() if np.sum(labels == labels[i]) > 1 or i in own}

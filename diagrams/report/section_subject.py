@@ -9,17 +9,21 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core.block import Block
+from ...fmus.running.fmu import Fmu
 from ..frequency.number import Number
 from ..results.operating_point import PointOrigin
-from .case import AT_REST, Case
+from ..wiring.structure import Wire
+from .case import Case
 from .model import Section, Table
 from .templating import Texts
 from .values import symbol
+from .variant import AT_REST, Variant
 
 TEXTS = Texts(__package__, "subject")
 
 CONFIRMED = {PointOrigin.RUN: "the run's own next tick and rates", PointOrigin.TRIM: "the trim's equations"}
 """How the residual of an operating point is confirmed."""
+TITLE = "What was analysed"
 PACKAGES = ("loopwright", "numpy", "scipy", "casadi", "control", "fmpy", "matplotlib")
 
 
@@ -56,7 +60,7 @@ def subject(case: Case) -> Section:
                 numbers[f"{path}.{name}"] = Number(value, unit or "1", 0.0, "given", given=True)
         if not rows:
             parameters.append((path, type(block).__name__, "", "", ""))
-        if hasattr(block, "description"):
+        if isinstance(block, Fmu):
             plants.append(_plant(path, block))
     tables = [
         Table(
@@ -72,15 +76,14 @@ def subject(case: Case) -> Section:
     tables.append(Table("Versions", ("package", "version"), tuple(versions().items())))
     text = [TEXTS.line("diagram", name=diagram.name, blocks=len(diagram.blocks), wires=len(diagram.names))]
     if case.experiment is not None:
-        text.append(f"Experiment {case.experiment.letter}: {case.experiment.diagram.name.replace('_', ' ')}.")
-    if case.has_friction:
-        text.append(
-            "Where keys end with _friction, the diagram is analysed as it is, with the plant's friction and its "
-            "compensation at the velocity of the operating point. All others are the design itself: exact "
-            "linearization, "
-            "without friction in plant and model."
-        )
-    return Section("subject", "What was analysed", (*text, *case.notes), tuple(tables), (), numbers)
+        name = case.experiment.diagram.name.replace("_", " ")
+        text.append(TEXTS.line("experiment", letter=case.experiment.letter, name=name))
+    return Section("subject", TITLE, tuple(text), tuple(tables), (), numbers)
+
+
+def remarks(case: Case) -> Section | None:
+    """Return the remarks on how the variants were made, None where there are none."""
+    return Section("subject", TITLE, tuple(case.notes)) if case.notes else None
 
 
 def _parameters(block: Block) -> Any:
@@ -103,7 +106,7 @@ def _shown(value: Any) -> str:
     return str(value)
 
 
-def _plant(path: str, block: Any) -> tuple[Any, ...]:
+def _plant(path: str, block: Fmu) -> tuple[Any, ...]:
     d = block.description
     given = [
         name
@@ -133,10 +136,10 @@ def operating_points(case: Case) -> Section:
         rows.append((v.title, numbers[f"{v.key}.t"], point.how, numbers[f"{v.key}.residual"], point.largest, plants))
         if not point.residual < AT_REST:
             notes.append(_moving(v))
-        hidden = [p for p, b in v.diagram.blocks.items() if hasattr(b, "description") and not b.description.states]
+        hidden = [p for p, b in v.diagram.blocks.items() if isinstance(b, Fmu) and not b.description.states]
         if hidden:
             notes.append(TEXTS.line("hidden_states", variant=v.title, plants=sorted(hidden)))
-        notes += [f"{v.title}: {note}" for note in model.notes]
+        notes += [f"{v.title}: {finding}" for finding in model.findings]
     tables = [
         Table("Operating points", ("variant", "t", "how", "residual", "largest of", "derivative of FMUs"), tuple(rows))
     ]
@@ -152,7 +155,7 @@ def operating_points(case: Case) -> Section:
     return Section("operating_points", "Operating points", text, tuple(tables), (), numbers)
 
 
-def _moving(v: Any) -> str:
+def _moving(v: Variant) -> str:
     """Return what is said of an operating point that is no equilibrium."""
     point, model = v.point, v.model
     moving = [i for i, change in enumerate(model.affine) if not abs(change) <= AT_REST]
@@ -162,6 +165,6 @@ def _moving(v: Any) -> str:
     return TEXTS.line("moving", variant=v.title, point=point, alone=names)
 
 
-def _value(v: Any, wire: Any) -> Any:
+def _value(v: Variant, wire: Wire) -> Any:
     value = np.asarray(v.point.values[f"{wire.block}.{wire.port}"])
     return value if wire.index is None else np.asarray(value[wire.index])

@@ -60,7 +60,7 @@ class Texts:
     name: str
 
     def paragraphs(self, macro: str, **facts: Any) -> tuple[str, ...]:
-        """Return the paragraphs of a macro, which blank lines part; a line's end is a space.
+        """Return the paragraphs of a macro, which blank lines part; a line's end is a space, in facts as well.
 
         Parameters
         ----------
@@ -71,12 +71,14 @@ class Texts:
 
         Raises
         ------
+        AttributeError
+            A macro that isn't there.
         jinja2.UndefinedError
-            A macro that isn't there, or a fact that it needs and nobody gave.
+            A fact that it needs, and nobody gave.
         """
+        facts = {name: _one_line(fact) if isinstance(fact, str) else fact for name, fact in facts.items()}
         text = str(getattr(self._template().module, macro)(**facts))
-        parts = (re.sub(r"[ \n]+", " ", part).strip() for part in re.split(r"\n[ \n]*\n", text))
-        return tuple(part for part in parts if part)
+        return tuple(part for part in map(_one_line, re.split(r"\n[ \n]*\n", text)) if part)
 
     def line(self, macro: str, **facts: Any) -> str:
         """Return the one paragraph of a macro; see `paragraphs`."""
@@ -85,3 +87,7 @@ class Texts:
 
     def _template(self) -> Template:
         return environment(self.package).get_template(self.name + TEXTS)
+
+
+def _one_line(text: str) -> str:
+    return re.sub(r"[ \n]+", " ", text).strip()

@@ -15,9 +15,10 @@ from ..frequency.margins import margins
 from ..frequency.number import Number
 from ..linearization.findings import StepsOnly
 from ..linearization.linearize import linearize
-from .case import Case, Variant
+from .case import Case
 from .model import Section, Table
 from .templating import Texts
+from .variant import Variant
 
 LINEAR = 1e-3
 """A difference between an FMU's step and its equations beyond which it is not the solver's: it moves as it steps."""

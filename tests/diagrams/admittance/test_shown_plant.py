@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from loopwright.blocks import Block, Gain, Input, Output, ParameterError, State, UnitDelay
 from loopwright.diagrams import AdmittanceLoop, analyse, experiments, stability_limit
 from loopwright.diagrams.admittance import shown_plant as _shown_plant
-from loopwright.diagrams.report.case import Case
+from loopwright.diagrams.paper.report_case import Fig3Case
 from loopwright.diagrams.report.html import to_html
 from loopwright.fmus import Fmu, build, gantry, gantry_contact, gantry_elastic, gantry_stiction, scara
 from support.plants import hidden
@@ -356,12 +356,12 @@ def test_poles_and_gains_of_the_chain_of_integrators_are_not_told_of_another_loo
 
 
 def test_friction_is_taken_out_of_a_plant_only_where_that_is_shown():
-    assert Case(experiments.compliance(plant=gantry_elastic.build()).diagram).plant_model is None
-    case = Case(diagram(gantry_elastic))
+    assert Fig3Case(experiments.compliance(plant=gantry_elastic.build()).diagram).plant_model is None
+    case = Fig3Case(diagram(gantry_elastic))
     assert list(case.variants) == ["continuous", "sampled_d0", "sampled_d1"]
     assert case.smooth is None
     assert any(note.startswith("The plant is not shown to be the gantry, so that its friction") for note in case.notes)
-    assert Case(diagram()).plant_model == gantry.nominal
+    assert Fig3Case(diagram()).plant_model == gantry.nominal
 
 
 def test_a_report_of_a_heavier_gantry_is_of_that_gantry():

@@ -19,9 +19,9 @@ from loopwright.blocks import (
     TransferFunction,
 )
 from loopwright.diagrams import Diagram, analyse, experiments, subsystem
-from loopwright.diagrams.report.case import Case, delayed_boxes
+from loopwright.diagrams.report.case import delayed_boxes
 from loopwright.diagrams.report.points import point_of
-from loopwright.diagrams.report.section_loops import wires_on_loops
+from loopwright.diagrams.report.wires import wires_on_loops
 from loopwright.fmus import Fmu, dc_motor
 
 DESIGN = ("continuous", "sampled_d0", "sampled_d1")
@@ -246,8 +246,7 @@ def test_only_the_boxes_that_act_on_what_is_continuous_are_delayed():
 
 
 def test_wires_off_all_loops_are_left_out():
-    case = Case(speed_control())
-    assert wires_on_loops(case) == {"speed": "speed", "voltage": "controller.voltage"}
+    assert wires_on_loops(speed_control()) == {"speed": "speed", "voltage": "controller.voltage"}
 
 
 def test_an_unknown_section_is_refused():

@@ -33,7 +33,7 @@ def test_every_text_is_used(package, file, macro):
     assert re.search(rf'\.(line|paragraphs)\(\s*"{macro}"', code)
 
 
-@pytest.mark.parametrize("package", ["report"])
+@pytest.mark.parametrize("package", ["paper", "report"])
 def test_every_text_that_is_asked_for_is_there(package):
     known = {name for of, _, name in macros() if of == package}
     assert set(re.findall(r'TEXTS\.(?:line|paragraphs)\(\s*"(\w+)"', sources(package))) <= known
@@ -67,6 +67,6 @@ def test_blank_lines_part_paragraphs_and_ends_of_lines_are_spaces(tmp_path, monk
     text = Texts("loopwright.diagrams.report", "two")
     made = jinja2.Environment().from_string("{% macro two(x) %}\nOne <b>\nis {{ x }}.\n  \n\nTwo.\n{% endmacro %}")
     monkeypatch.setattr(Texts, "_template", lambda self: made)
-    assert text.paragraphs("two", x="1  <2") == ("One <b> is 1 <2.", "Two.")
+    assert text.paragraphs("two", x="1\n\n<2") == ("One <b> is 1 <2.", "Two.")
     with pytest.raises(ValueError, match="too many values"):
         text.line("two", x=1)

@@ -9,9 +9,9 @@ from scipy.optimize import brentq, minimize_scalar
 
 from loopwright.blocks import PID, Constant, Encoder, FmuError, Integrator, UnknownNameError
 from loopwright.diagrams import Diagram, analyse, subsystem
+from loopwright.diagrams.paper.report_kind import FIG3
 from loopwright.diagrams.report.definitions import definition
 from loopwright.diagrams.report.html import to_html
-from loopwright.diagrams.report.terms import DEFINITIONS
 from loopwright.fmus import Fmu, dc_motor
 
 T, KP, KI = 1e-3, 0.05, 2.0
@@ -131,7 +131,6 @@ def test_a_named_wire_off_all_loops_is_said_to_be_off_them():
 # --- definitions, and other words -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("more", [{}, DEFINITIONS])
 @pytest.mark.parametrize(
     ("path", "term"),
     [
@@ -141,19 +140,22 @@ def test_a_named_wire_off_all_loops_is_said_to_be_off_them():
         ("inner.u.continuous.control.phase_margin_deg", "control"),
         ("inner.control.continuous.phase_margin_deg", "phase_margin_deg"),
         ("inner.u.continuous.gain_crossover_1.frequency", "frequency"),
+        ("inner.u.continuous.gain_crossover_1.phase_margin_deg", "phase_margin_deg"),
         ("poles.par.sampled_d0.pole_1_real", "pole"),
+        ("poles.par.sampled_d0.gain_a1", "gain_a1"),
         ("admittance.par.ke_limit_friction.sampled_d0.be_10", "ke_limit_friction"),
+        ("admittance.par.ke_frequency_friction.sampled_d0.be_10", "ke_frequency"),
     ],
 )
-def test_names_that_users_choose_are_not_taken_for_terms(path, term, more):
-    found = definition(path, more)
+def test_names_that_users_choose_are_not_taken_for_terms(path, term):
+    found = definition(path, FIG3.definitions)
     assert found is not None
     assert found[0] == term
 
 
 @pytest.mark.parametrize("path", ["injection.gain.sampled_d0.nothing", "inner.control.continuous.nothing"])
 def test_a_wires_name_defines_nothing(path):
-    assert definition(path, DEFINITIONS) is None
+    assert definition(path, FIG3.definitions) is None
 
 
 def test_where_python_control_gives_no_value_it_is_not_called_right():

@@ -1,0 +1,125 @@
+"""The reduced loops of a diagram of Fig. 3, and the stiffness limits of their environments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...blocks import Path
+from ...fmus.models.gantry import Gantry
+from ..admittance.compliance_loop import SIDES, AdmittanceLoop
+from ..admittance.stability_limits import StabilityLimit, stability_limit
+from ..flat.wired_diagram import WiredDiagram
+from ..report.variant import Implementation
+from ..results.operating_point import OperatingPoint
+
+FRICTION = "_friction"
+"""End of the keys of what has the plant's friction, where it is told apart from the same without it."""
+NO_FRICTION = {"coulomb_scale": 0.0, "viscous_scale": 0.0}
+OPTIONS: Mapping[Implementation, Mapping[str, Any]] = {
+    Implementation.CONTINUOUS: {"implementation": "continuous", "delay": 0},
+    Implementation.SAMPLED: {"implementation": "sampled", "delay": 0},
+    Implementation.DELAYED: {"implementation": "sampled", "delay": 1},
+}
+"""Parameters of a reduced loop that make it one of an implementation."""
+
+
+class TitledLoop(NamedTuple):
+    """A loop with its title."""
+
+    title: str
+    loop: AdmittanceLoop
+
+
+@dataclass(frozen=True)
+class ReducedLoops:
+    """The reduced loops of a diagram: by direction, with or without friction, impedance control or force tracking.
+
+    Attributes
+    ----------
+    plain : mapping of str to AdmittanceLoop
+        By direction; of the design without friction, where the diagram has some.
+    rough : mapping of str to AdmittanceLoop
+        The same with the slope of the friction at rest, and with its compensation; empty where there is none.
+    """
+
+    plain: Mapping[str, AdmittanceLoop]
+    rough: Mapping[str, AdmittanceLoop]
+    _limits: dict[tuple[str, str, Implementation, float], StabilityLimit] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(
+        cls, base: WiredDiagram, smooth: WiredDiagram | None, plant: Gantry | None, path: Path, point: OperatingPoint
+    ) -> ReducedLoops:
+        """Return the loops of a diagram.
+
+        Parameters
+        ----------
+        base : WiredDiagram
+            The diagram at rest.
+        smooth : WiredDiagram, optional
+            The same without friction, where it has some.
+        plant : Gantry, optional
+            The model that the plant is shown to be, where the controller inverts another one.
+        path : Path
+            The path that is followed.
+        point : OperatingPoint
+            Where.
+
+        Raises
+        ------
+        ParameterError
+            If the plant is not shown to be the reduced model.
+        """
+        coordinates = (point.values[f"controller.transverse_transform.{name}"] for name in ("eta", "xi"))
+        eta, xi = (float(np.ravel(value)[0]) for value in coordinates)
+        period = path.length if path.period is not None else None
+        at: dict[str, Any] = {**OPTIONS[Implementation.SAMPLED], "point": point}
+        at |= {"eta": eta % period if period else eta, "xi": xi}
+        if smooth is None or plant is None:
+            return cls({side: AdmittanceLoop.of(base, side, plant=plant, **at) for side in SIDES}, {})
+        bare = plant.replace(**NO_FRICTION)
+        return cls(
+            {side: AdmittanceLoop.of(smooth, side, plant=bare, **at) for side in SIDES},
+            {side: AdmittanceLoop.of(base, side, plant=plant, **at) for side in SIDES},
+        )
+
+    def suffixed(self, side: str) -> dict[str, AdmittanceLoop]:
+        """Return the loops of a direction by the end of their keys: none, and that of friction."""
+        return {"": self.plain[side]} | ({FRICTION: self.rough[side]} if side in self.rough else {})
+
+    def kinds(self, side: str) -> dict[str, TitledLoop]:
+        """Return the loops of a direction, with impedance control and with force tracking, by the keys of limits."""
+        found: dict[str, TitledLoop] = {}
+        for suffix, loop in self.suffixed(side).items():
+            title = ", friction slope at rest" if suffix else ""
+            kind = "impedance control" if loop.admittance.stiffness > 0 else "force tracking"
+            found[f"ke_limit{suffix}"] = TitledLoop(kind + title, loop)
+            if loop.admittance.stiffness > 0:
+                found[f"force_tracking.ke_limit{suffix}"] = TitledLoop(
+                    "force tracking, k = 0" + title, with_tracking(loop)
+                )
+        return found
+
+    def limit(self, side: str, key: str, implementation: Implementation, damping: float) -> StabilityLimit:
+        """Return the largest stiffness of an environment with a damping in N s/m, computed once."""
+        place = side, key, implementation, damping
+        if place not in self._limits:
+            loop = self.kinds(side)[key].loop.replace(**OPTIONS[implementation])
+            self._limits[place] = stability_limit(loop, damping=damping)
+        return self._limits[place]
+
+
+def each_implementation(loop: AdmittanceLoop) -> dict[Implementation, AdmittanceLoop]:
+    """Return a loop in each implementation."""
+    return {implementation: loop.replace(**options) for implementation, options in OPTIONS.items()}
+
+
+def with_tracking(loop: AdmittanceLoop) -> AdmittanceLoop:
+    """Return the loop with force tracking in its direction: no stiffness, the same damping."""
+    a = loop.admittance
+    free = a.replace(stiffness=0.0, damping=float(a.effective_damping), damping_ratio=None)
+    return loop.replace(**{f"admittance_{loop.side}": free})

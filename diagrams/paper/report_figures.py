@@ -1,0 +1,115 @@
+"""Figures of admittances and stability maps, drawn without pyplot."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..report.model import Plot
+from ..report.plots import look_of
+from ..report.templating import Texts
+from ..report.variant import Implementation
+from ..results.plots import BLUE, DARK, GREEN, VERMILION, new_figure, style
+
+TEXTS = Texts(__package__, "admittance")
+TARGET, WITH_FRICTION, RULE = "target", "friction", "rule_of_thumb"
+"""Curves besides those of implementations."""
+
+
+def draw_admittances(key: str, w: np.ndarray, curves: Mapping[str, tuple[str, np.ndarray]], *, along: bool) -> Plot:
+    """Draw target and rendered admittances: magnitude, phase, and where the real part is negative.
+
+    Parameters
+    ----------
+    key : str
+        Key of the figure.
+    w : ndarray
+        Frequencies in rad/s.
+    curves : mapping of str to (str, ndarray)
+        Title and values of each: of `TARGET`, of implementations, and `WITH_FRICTION`.
+    along : bool
+        Whether it is the direction along the path.
+    """
+    looks: dict[str, dict[str, Any]] = {
+        TARGET: {"color": DARK, "linestyle": (0, (1, 1.5)), "linewidth": 1.6},
+        WITH_FRICTION: {"color": GREEN, "linestyle": "-"},
+    }
+    with style():
+        figure = new_figure(4.2)
+        top, bottom = figure.subplots(2, 1, sharex=True)
+        for i, (name, (title, Y)) in enumerate(curves.items()):
+            look = looks.get(name) or look_of(name, i)
+            top.loglog(w, np.abs(Y), label=title, **look)
+            bottom.semilogx(w, np.degrees(np.angle(Y)), **look)
+        for y in (-90, 90):
+            bottom.axhline(y, color=DARK, linewidth=0.6)
+        bottom.axhspan(90, 180, color=VERMILION, alpha=0.07, linewidth=0)
+        bottom.axhspan(-180, -90, color=VERMILION, alpha=0.07, linewidth=0)
+        bottom.set_ylim(-180, 180)
+        bottom.set_yticks([-180, -90, 0, 90, 180])
+        top.set_ylabel("|Y| [m/(N s)]")
+        bottom.set_ylabel("phase of Y [°]")
+        bottom.set_xlabel("ω [rad/s]")
+        top.legend(loc="best")
+    return Plot(key, TEXTS.line("rendered", along=along), figure)
+
+
+def draw_stability(
+    key: str,
+    k: np.ndarray,
+    b: np.ndarray,
+    growth: np.ndarray,
+    lines: Mapping[str, tuple[str, np.ndarray]],
+    *,
+    along: bool,
+) -> Plot:
+    """Draw a stability map: growth rates, and the limits of several variants.
+
+    Parameters
+    ----------
+    key : str
+        Key of the figure.
+    k, b : ndarray
+        Stiffness in N/m and damping in N s/m of the environment.
+    growth : ndarray
+        Growth rates in 1/s, for each damping and stiffness.
+    lines : mapping of str to (str, ndarray)
+        Title and stiffness of each limit: of implementations, `WITH_FRICTION`, and the `RULE` of thumb.
+    along : bool
+        Whether it is the direction along the path.
+    """
+    looks: dict[str, dict[str, Any]] = {
+        Implementation.SAMPLED: {"color": BLUE, "linewidth": 1.6},
+        Implementation.DELAYED: {"color": VERMILION, "linestyle": (0, (4, 2))},
+        WITH_FRICTION: {"color": GREEN},
+        RULE: {"color": DARK, "linestyle": (0, (1, 1.5))},
+    }
+    with style():
+        figure = new_figure(3.4)
+        ax = figure.subplots()
+        levels = [-100, -10, -1, -0.1, 0, 0.1, 1, 10, 100, 1000]
+        from matplotlib.colors import SymLogNorm
+
+        growth = np.clip(growth, -99.9, 999.0)
+        filled = ax.contourf(
+            k,
+            b,
+            growth,
+            levels=levels,
+            cmap="RdBu_r",
+            alpha=0.55,
+            norm=SymLogNorm(linthresh=0.1, vmin=-1000, vmax=1000),
+        )
+        for name, (title, x) in lines.items():
+            ax.plot(x, b, label=title, **looks.get(name, {}))
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        ax.set_xlim(k[0], k[-1])
+        ax.set_ylim(b[0], b[-1])
+        ax.set_xlabel("stiffness k$_e$ of the environment [N/m]")
+        ax.set_ylabel("damping b$_e$ [N s/m]")
+        figure.colorbar(filled, ax=ax, label="growth rate σ, sampled d0 [1/s]", ticks=levels, format="%g")
+        ax.legend(loc="upper left")
+    return Plot(key, TEXTS.line("map", along=along), figure)

@@ -1,0 +1,71 @@
+"""The report of a diagram of Fig. 3: the parts of any report, and the paper's."""
+
+from __future__ import annotations
+
+from ..report import analyse as general
+from ..report.definitions import DEFINITIONS, read_definitions
+from ..report.model import Section
+from ..report.parts import ReportKind, ReportPart
+from ..report.section_limits import TITLE as LIMITS
+from ..report.section_subject import TITLE as SUBJECT
+from ..report.templating import Texts
+from .reduced_loops import ReducedLoops
+from .report_admittance import admittance, has_admittance
+from .report_case import Fig3Case
+from .report_claims import claims
+from .report_limits_tried import is_tried, limits_tried
+from .report_motor_forces import motor_forces
+from .report_poles import poles_asked
+
+TEXTS = Texts(__package__, "limits")
+SUBJECT_TEXTS = Texts(__package__, "subject")
+
+
+def friction_in_keys(case: Fig3Case) -> Section:
+    """Return the text on keys of variants with friction."""
+    return Section("subject", SUBJECT, SUBJECT_TEXTS.paragraphs("friction"))
+
+
+def has_friction(case: Fig3Case) -> bool:
+    """Return whether variants with and without the plant's friction are told apart."""
+    return case.has_friction
+
+
+def reduced_not_modelled(case: Fig3Case) -> Section:
+    """Return the text on what the reduced loops leave out."""
+    return Section("limits", LIMITS, TEXTS.paragraphs("reduced"))
+
+
+def is_reduced(case: Fig3Case) -> bool:
+    """Return whether the report has numbers of reduced loops."""
+    return not {"admittance", "time_domain"}.isdisjoint(case.keys) and isinstance(case.reduced, ReducedLoops)
+
+
+def friction_not_modelled(case: Fig3Case) -> Section:
+    """Return the text on what the law of friction leaves out."""
+    return Section("limits", LIMITS, TEXTS.paragraphs("friction"))
+
+
+FIG3 = ReportKind(
+    Fig3Case,
+    (
+        general.SUBJECT,
+        ReportPart("subject", friction_in_keys, has_friction),
+        general.REMARKS,
+        general.OPERATING_POINTS,
+        general.CLOSED_LOOPS,
+        ReportPart("poles", poles_asked),
+        general.MEMORY,
+        ReportPart("poles", claims),
+        general.INNER_LOOPS,
+        ReportPart("inner", motor_forces),
+        ReportPart("admittance", admittance, has_admittance),
+        ReportPart("time_domain", limits_tried, is_tried),
+        general.INJECTION,
+        general.LIMITS,
+        ReportPart("limits", reduced_not_modelled, is_reduced),
+        ReportPart("limits", friction_not_modelled, has_friction),
+    ),
+    {**DEFINITIONS, **read_definitions(__package__)},
+)
+"""The report of a diagram of Fig. 3."""

@@ -1,0 +1,141 @@
+"""Variants of a diagram: as it is implemented, and the linear model of each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core.errors import LoopwrightError
+from ..flat.wired_diagram import WiredDiagram
+from ..linearization.linearize import Linearization, linearize
+from ..results.operating_point import OperatingPoint
+from .points import point_of
+
+AT_REST = 1e-6
+"""Largest change of a state, relative to 1 + its size, at which nothing is said to move."""
+
+
+class Implementation(StrEnum):
+    """A way in which a diagram is implemented; its value stands in dotted paths."""
+
+    CONTINUOUS = "continuous"
+    """Everything that is sampled is taken as ideal."""
+    SAMPLED = "sampled_d0"
+    """As it is sampled, without computational delay."""
+    DELAYED = "sampled_d1"
+    """As it is sampled, with a sample of computational delay."""
+
+    @property
+    def words(self) -> str:
+        """The implementation as a title says it."""
+        return _WORDS[self]
+
+    @property
+    def delay(self) -> int:
+        """Samples of computational delay."""
+        return 1 if self is Implementation.DELAYED else 0
+
+
+_WORDS = {
+    Implementation.CONTINUOUS: "continuous",
+    Implementation.SAMPLED: "sampled, no delay",
+    Implementation.DELAYED: "sampled, one sample of delay",
+}
+
+
+@dataclass(eq=False)
+class Variant:
+    """A diagram that is analysed: itself, without sampling, with a delay.
+
+    Attributes
+    ----------
+    key : str
+        Its part of dotted paths, such as ``sampled_d0``.
+    title : str
+        The same in words.
+    diagram : WiredDiagram
+        The diagram.
+    where : OperatingPoint, Snapshot or float, optional
+        The operating point, or where it is looked for; the start without it.
+    implementation : Implementation
+        Whether it is sampled, and delayed.
+    is_design : bool
+        Whether it is the design itself. Other variants show what a real plant adds to it; they get margins, but no
+        figures, and python-control is not asked about them.
+    problem : str
+        Why it can't be analysed; empty where it can.
+    source : WiredDiagram, optional
+        The diagram of an operating point that is taken over.
+    inputs, outputs : tuple of str
+        Inputs and outputs of the linear model.
+    """
+
+    key: str
+    title: str
+    diagram: WiredDiagram
+    where: Any
+    implementation: Implementation
+    is_design: bool = True
+    problem: str = ""
+    source: WiredDiagram | None = None
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    _loops: dict[tuple[str, ...], Any] = field(default_factory=dict, repr=False)
+
+    @cached_property
+    def point(self) -> OperatingPoint:
+        """Its operating point."""
+        return point_of(self.diagram, self.where, self.source)
+
+    @cached_property
+    def model(self) -> Linearization:
+        """Its linear model."""
+        return linearize(self.diagram, self.point, inputs=self.inputs, outputs=self.outputs)
+
+    def loop(self, *wires: str) -> Any:
+        """Return the loop transfer function at wires, computed once."""
+        if wires not in self._loops:
+            self._loops[wires] = self.model.loop(*wires)
+        return self._loops[wires]
+
+    @property
+    def rests(self) -> bool:
+        """Whether nothing moves at its operating point; False where it can't be analysed there."""
+        try:
+            moves = max(self.point.residual, float(np.max(np.abs(self.model.affine), initial=0.0)))
+        except LoopwrightError:
+            return False
+        return moves < AT_REST
+
+    def with_parameters(self, changes: Mapping[str, Any], where: Any = ...) -> Variant:
+        """Return the variant with other parameters, at its own operating point, or at another one.
+
+        Parameters
+        ----------
+        changes : mapping
+            As `WiredDiagram.replace` takes them.
+        where : OperatingPoint, Snapshot or float, optional
+            The other point.
+        """
+        return Variant(
+            self.key,
+            self.title,
+            self.diagram.replace(changes),
+            self.where if where is ... else where,
+            self.implementation,
+            self.is_design,
+            source=self.source,
+            inputs=self.inputs,
+            outputs=self.outputs,
+        )
+
+
+def in_s(poles: Any, dt: float) -> np.ndarray:
+    """Return poles in 1/s; of those of a sampled model, z, without those at z = 0: memory, or a delay."""
+    values = np.asarray(poles, dtype=complex)
+    return np.asarray(np.log(values[np.abs(values) > 1e-12]) / dt if dt else values)

@@ -1,0 +1,65 @@
+"""Wires of a diagram that lie on loops."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..wiring.checked_diagram import CheckedDiagram
+
+MOST = 4
+"""Wires at which loops are looked at where none has a name."""
+
+
+def wires_on_loops(diagram: CheckedDiagram, wires: Sequence[str] | None = None) -> dict[str, str]:
+    """Return the wires at which loops are looked at, by their keys in a report.
+
+    Parameters
+    ----------
+    diagram : CheckedDiagram
+        The diagram.
+    wires : sequence of str, optional
+        The wires, where they were chosen. Without it, all that have names and lie on loops; where none has a name, the
+        inputs of FMUs on loops, or else outputs of blocks on loops.
+    """
+    if wires is not None:
+        return {_key(name): name for name in wires}
+    inside = blocks_on_loops(diagram)
+    seen: set[tuple[str, str, Any]] = set()
+    names: dict[str, str] = {}
+    for name, wire in sorted(diagram.names.items(), key=lambda item: (item[0].count("."), item[0])):
+        where = (wire.block, wire.port, str(wire.index))
+        if wire.block in inside and where not in seen:
+            seen.add(where)
+            names[name] = name
+    if not names:
+        table = diagram.structure
+        on_loops = [(to, wire) for (to, _), wire in table.wires.items() if wire.block in inside]
+        driving = {f"{wire.block}.{wire.port}" for to, wire in on_loops if table.blocks[to].stepped}
+        sources = {f"{wire.block}.{wire.port}" for _, wire in on_loops}
+        names = {path: path for path in sorted(driving or sources)[:MOST]}
+    ends = [name.rpartition(".")[2] for name in names]
+    return {(e if ends.count(e) == 1 else _key(n)): n for e, n in zip(ends, names, strict=True)}
+
+
+def blocks_on_loops(diagram: CheckedDiagram) -> set[str]:
+    """Return the blocks that lie on a cycle of wires."""
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    table = diagram.structure
+    index = {path: i for i, path in enumerate(sorted(table.blocks))}
+    edges = [(index[w.block], index[block]) for (block, _), w in table.wires.items()]
+    if not edges:
+        return set()
+    rows, columns = zip(*edges, strict=True)
+    graph = csr_matrix((np.ones(len(edges)), (rows, columns)), shape=(len(index), len(index)))
+    _, labels = connected_components(graph, directed=True, connection="strong")
+    own = {a for a, b in edges if a == b}
+    return {path for path, i in index.items() if np.sum(labels == labels[i]) > 1 or i in own}
+
+
+def _key(name: str) -> str:
+    return name.replace(".", "_")
