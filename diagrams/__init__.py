@@ -21,6 +21,8 @@ from .admittance.stability_limits import (
 )
 from .contract.check_block import BlockReport, check_block
 from .diagram import Diagram
+from .document.model import Plot, Section, Table
+from .document.report import Report
 from .drawing.svg import Drawing
 from .flat.flat_diagram import FlatDiagram
 from .frequency.disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
@@ -43,7 +45,6 @@ from .paper import experiments
 from .paper.fig3 import Fig3Diagram, fig3
 from .paper.wires import Channel, Rig
 from .report.analyse import analyse
-from .report.model import Plot, Report, Section, Table
 from .results.operating_point import OperatingPoint
 from .results.run import Run, Snapshot
 from .results.saved_state import RunState

@@ -6,13 +6,13 @@ import os
 from collections.abc import Iterable, Mapping
 from typing import Any, Unpack
 
+from .document.report import Report
 from .drawing.svg import Drawing, draw
 from .flat.wired_diagram import WiredDiagram
 from .linearization.linearize import Linearization, batch, linearize
 from .linearization.operating_point import at_time
 from .linearization.trim import given, trim
 from .measure.frequency_response import FrequencyResponse, frequency_response
-from .report.model import Report
 from .results.operating_point import OperatingPoint
 from .results.run import Run
 from .simulation.run_options import RunKeywords, RunOptions
@@ -300,9 +300,9 @@ class Diagram(WiredDiagram):
         ConfirmationError
             A number that its independent confirmation does not bear out.
         """
+        from .document.files import check_files, write_report
         from .report.analyse import analyse
-        from .report.figures import with_drawing
-        from .report.files import check_files, write_report
+        from .report.drawings import with_drawing
 
         check_files(path, pdf=pdf, json=json)
         made = with_drawing(analyse(self, **options), self)

@@ -52,7 +52,7 @@ def add_report(commands: Any) -> None:
 
 def report_command(arguments: argparse.Namespace) -> int:
     """Make the diagram, analyse it, write the files; return the exit status."""
-    from ..report.files import check_files, write_report
+    from ..document.files import check_files, write_report
 
     what = arguments.what or DEFAULT
     with contextlib.ExitStack() as open_file:
@@ -87,7 +87,7 @@ def report_command(arguments: argparse.Namespace) -> int:
 
 def _analyse(diagram: Diagram, experiment: Experiment | None, tell: Callable[[str], None]) -> Any:
     from ..report.analyse import analyse
-    from ..report.figures import with_drawing
+    from ..report.drawings import with_drawing
 
     return with_drawing(analyse(diagram, experiment=experiment, progress=tell), diagram)
 

@@ -12,9 +12,9 @@ from ..admittance.compliance_loop import SIDES, AdmittanceLoop
 from ..admittance.coupled import growth_rate
 from ..admittance.rendered import passivity, rendered_admittance, target_admittance
 from ..admittance.stability_limits import StabilityLimit, stability_limit
+from ..document.model import Plot, Section, Table
+from ..document.templating import Texts
 from ..frequency.number import Number
-from ..report.model import Plot, Section, Table
-from ..report.templating import Texts
 from ..report.variant import Implementation
 from .reduced_loops import ReducedLoops, each_implementation
 from .report_case import Fig3Case

@@ -15,10 +15,10 @@ from ...fmus.models.gantry import Gantry
 from ...fmus.running.fmu import Fmu
 from ..admittance.compliance_loop import control_rate
 from ..admittance.shown_plant import is_discrete, show_plant
+from ..document.templating import Texts
 from ..flat.wired_diagram import WiredDiagram
 from ..report.case import Basis, Case, Excitation
 from ..report.points import point_of
-from ..report.templating import Texts
 from ..report.variant import Implementation, Variant
 from ..results.operating_point import OperatingPoint
 from .reduced_loops import FRICTION, NO_FRICTION, ReducedLoops

@@ -9,11 +9,11 @@ import numpy as np
 from ...blocks import PlanarModel
 from ...blocks.core.errors import LoopwrightError
 from ...fmus.models.gantry import Gantry
+from ..document.model import Section, Table
+from ..document.templating import Texts
 from ..frequency.number import Number
 from ..frequency.pole_placement import relative_difference
-from ..report.model import Section, Table
 from ..report.section_poles import TITLE, scatter, without_memory
-from ..report.templating import Texts
 from ..report.variant import Implementation, Variant, in_s
 from .report_case import COORDINATES, Fig3Case, linearization_of
 

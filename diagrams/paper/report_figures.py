@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ..report.model import Plot
+from ..document.model import Plot
+from ..document.templating import Texts
 from ..report.plots import look_of
-from ..report.templating import Texts
 from ..report.variant import Implementation
 from ..results.plots import BLUE, DARK, GREEN, VERMILION, new_figure, style
 

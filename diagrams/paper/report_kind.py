@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from ..document.definitions import DEFINITIONS, read_definitions
+from ..document.model import Section
+from ..document.templating import Texts
 from ..report import analyse as general
-from ..report.definitions import DEFINITIONS, read_definitions
-from ..report.model import Section
 from ..report.parts import ReportKind, ReportPart
 from ..report.section_limits import TITLE as LIMITS
 from ..report.section_subject import TITLE as SUBJECT
-from ..report.templating import Texts
 from .reduced_loops import ReducedLoops
 from .report_admittance import admittance, has_admittance
 from .report_case import Fig3Case

@@ -9,9 +9,9 @@ from typing import Any
 from ...blocks.core.errors import ConfirmationError, LoopwrightError
 from ..admittance.compliance_loop import AdmittanceLoop
 from ..admittance.coupled import growth_rate
+from ..document.model import Section, Table
+from ..document.templating import Texts
 from ..frequency.number import Number
-from ..report.model import Section, Table
-from ..report.templating import Texts
 from ..report.variant import Implementation
 from .moored_gantry import deviation, measured_growth, moored_diagram
 from .reduced_loops import FRICTION, ReducedLoops, each_implementation

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from ...blocks.core.errors import LoopwrightError
+from ..document.model import Section, Table
+from ..document.templating import Texts
 from ..frequency.disk import mimo_disk_margin
 from ..frequency.number import Number
 from ..report.disks import disk_numbers, disk_range
-from ..report.model import Section, Table
-from ..report.templating import Texts
 from ..report.variant import Implementation
 from .report_case import Fig3Case
 

@@ -9,12 +9,12 @@ import numpy as np
 
 from ...blocks import ErrorDynamics
 from ...blocks.core.errors import LoopwrightError
+from ..document.model import Section, Table
+from ..document.templating import Texts
 from ..frequency.number import Number
 from ..frequency.pole_placement import relative_difference, sampled_gains, sampled_poles
 from ..frequency.realization import Realization
-from ..report.model import Section, Table
 from ..report.section_poles import TITLE
-from ..report.templating import Texts
 from ..report.variant import in_s
 from .report_case import Fig3Case
 

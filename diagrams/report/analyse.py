@@ -7,12 +7,12 @@ from datetime import UTC, datetime
 from typing import Any
 
 from ...fmus.running.fmu import Fmu
+from ..document.definitions import DEFINITIONS
+from ..document.report import Report
 from ..flat.wired_diagram import WiredDiagram
 from ..frequency.one_thread import on_one_thread
 from ..linearization.derivatives import find_signal
 from .case import Case, ReportedExperiment
-from .definitions import DEFINITIONS
-from .model import Report
 from .parts import HasReportKind, MakesSections, ReportKind, ReportPart
 from .points import STEP
 from .section_injection import injected

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ...blocks.core.errors import LoopwrightError
+from ..document.templating import Texts
 from ..flat.wired_diagram import WiredDiagram
 from ..linearization.findings import UnusualStart
-from .templating import Texts
 from .variant import Implementation, Variant, in_s
 from .wires import wires_on_loops
 

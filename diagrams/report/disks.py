@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from ...blocks.core.errors import LoopwrightError
+from ..document.model import Section, Table
 from ..frequency.disk import DiskMargin, mimo_disk_margin
 from ..frequency.number import Number
 from .case import Case
-from .model import Section, Table
 
 
 def several(case: Case, key: str, wire: str) -> Section | None:

@@ -12,9 +12,9 @@ from itertools import chain
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from ...blocks.core.errors import OptionError
+from ..document.model import Section
 from ..flat.wired_diagram import WiredDiagram
 from .case import Case, ReportedExperiment
-from .model import Section
 
 C = TypeVar("C", bound=Case)
 C_contra = TypeVar("C_contra", bound=Case, contravariant=True)

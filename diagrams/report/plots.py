@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..document.model import Plot
+from ..document.templating import Texts
 from ..results.plots import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, new_figure, style
-from .model import Plot
-from .templating import Texts
 from .variant import Implementation
 
 if TYPE_CHECKING:

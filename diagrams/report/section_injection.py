@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core.errors import LoopwrightError
+from ..document.model import Plot, Section, Table
+from ..document.templating import Texts
 from ..frequency.number import Number
 from ..linearization.linearize import Linearization
 from ..measure.frequency_response import FrequencyResponse, frequency_response
 from . import plots as figures
 from .case import Case
-from .model import Plot, Section, Table
-from .templating import Texts
 from .variant import Implementation, Variant
 
 TEXTS = Texts(__package__, "injection")

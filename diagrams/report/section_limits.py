@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from ...blocks import AdmittanceFilter, Backlash, DeadZone, Encoder, Quantizer, RateLimiter, Relay, Saturation
+from ..document.model import Section
+from ..document.templating import Texts
 from .case import Case
-from .model import Section
-from .templating import Texts
 
 TEXTS = Texts(__package__, "limits")
 TITLE = "What is not modelled"

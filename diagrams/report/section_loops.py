@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core.errors import LoopwrightError
+from ..document.model import Section, Table
+from ..document.templating import Texts
 from ..frequency.margins import Margins, margins
 from ..frequency.number import Number
 from ..frequency.python_control import Comparison, compare_margins
@@ -15,8 +17,6 @@ from ..frequency.realization import Realization
 from . import plots as figures
 from .case import Case
 from .disks import several
-from .model import Section, Table
-from .templating import Texts
 from .uncertainty import left_out, widened
 from .variant import in_s
 from .wires import blocks_on_loops

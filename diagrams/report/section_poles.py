@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..document.model import Section, Table
+from ..document.templating import Texts
 from ..frequency.number import Number
 from .case import Case
-from .model import Section, Table
-from .templating import Texts
 from .variant import Variant, in_s
 
 TEXTS = Texts(__package__, "poles")

@@ -10,13 +10,13 @@ import numpy as np
 
 from ...blocks.core.block import Block
 from ...fmus.running.fmu import Fmu
+from ..document.model import Section, Table
+from ..document.templating import Texts
+from ..document.values import symbol
 from ..frequency.number import Number
 from ..results.operating_point import PointOrigin
 from ..wiring.structure import Wire
 from .case import Case
-from .model import Section, Table
-from .templating import Texts
-from .values import symbol
 from .variant import AT_REST, Variant
 
 TEXTS = Texts(__package__, "subject")

@@ -11,13 +11,13 @@ import numpy as np
 
 from ...blocks.core.errors import LoopwrightError
 from ...fmus.running.derivation import DerivativeMethod
+from ..document.model import Section, Table
+from ..document.templating import Texts
 from ..frequency.margins import margins
 from ..frequency.number import Number
 from ..linearization.findings import StepsOnly
 from ..linearization.linearize import linearize
 from .case import Case
-from .model import Section, Table
-from .templating import Texts
 from .variant import Variant
 
 LINEAR = 1e-3

@@ -9,9 +9,10 @@ import pytest
 
 from loopwright.blocks import ConfirmationError
 from loopwright.diagrams.cli.main import _make_parser, main
+from loopwright.diagrams.document.model import Section
+from loopwright.diagrams.document.report import Report
 from loopwright.diagrams.frequency.number import Number
 from loopwright.diagrams.report import analyse as _report_analysis
-from loopwright.diagrams.report.model import Report, Section
 
 LOOP = """
 from loopwright.blocks import Gain, Integrator, Sine, Sum

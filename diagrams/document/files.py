@@ -8,7 +8,7 @@ from pathlib import Path
 from ...blocks.core.errors import OptionError
 from .html import to_html
 from .json import to_json
-from .model import Report
+from .model import Document
 from .pdf import printer, write_pdf
 
 
@@ -41,7 +41,7 @@ def check_files(path: str | os.PathLike[str] | None, *, pdf: bool, json: bool) -
 
 
 def write_report(
-    report: Report, path: str | os.PathLike[str] | None, *, pdf: bool = False, json: bool = False
+    report: Document, path: str | os.PathLike[str] | None, *, pdf: bool = False, json: bool = False
 ) -> list[Path]:
     """Write a report's page and, beside it, its PDF and its numbers; return the files."""
     if path is None:

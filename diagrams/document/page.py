@@ -10,7 +10,7 @@ from typing import Any
 from ..frequency.number import Number
 from .definitions import LOOP_TERMS, definition
 from .figures import Picture, embedded
-from .model import Plot, Report, Section
+from .model import Document, Plot, Section
 from .tables import Numbered, TableView, anchor
 from .values import cell, symbol, tolerance_text, value_text
 
@@ -90,7 +90,7 @@ class Page:
     """Whether terms take the loop for granted, so that it is defined as well."""
 
     @classmethod
-    def of(cls, report: Report) -> Page:
+    def of(cls, report: Document) -> Page:
         """Return the page of a report."""
         numbers = report.numbers()
         more: Mapping[str, str] = report.meta.get("definitions") or {}

@@ -44,8 +44,8 @@ class Section:
 
 
 @dataclass(frozen=True, eq=False)
-class Report:
-    """A design report of a diagram.
+class Document:
+    """Sections with their numbers, and what they are about.
 
     Attributes
     ----------
@@ -72,12 +72,3 @@ class Report:
                 yield from walk(section.sections, here)
 
         return dict(walk(self.sections, ""))
-
-    def _repr_html_(self) -> str:
-        """Show it in a notebook, in a frame of its own: its styles are meant for a whole page."""
-        from html import escape
-
-        from .html import to_html
-
-        page = escape(to_html(self), quote=True)
-        return f'<iframe srcdoc="{page}" style="width:100%;height:45em;border:1px solid #d5dbe1"></iframe>'

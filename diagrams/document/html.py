@@ -6,7 +6,7 @@ import re
 from functools import cache
 from typing import TYPE_CHECKING
 
-from .model import Report
+from .model import Document
 from .page import Page
 from .templating import environment
 from .values import symbol
@@ -22,7 +22,7 @@ _PIECES = re.compile(r"[^/\\._-]{1,16}[/\\._-]?|[/\\._-]")
 """Words that are too long for a column, such as digests and paths of files, and where they may break."""
 
 
-def to_html(report: Report) -> str:
+def to_html(report: Document) -> str:
     """Return the page.
 
     Every number in a table leads to its line in the appendix: dotted path, tolerance, how it was confirmed, and from

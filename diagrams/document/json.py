@@ -10,10 +10,10 @@ from typing import Any
 
 from ...blocks.core.errors import DefinitionError
 from ..frequency.number import Number
-from .model import Report
+from .model import Document
 
 
-def to_json(report: Report) -> str:
+def to_json(report: Document) -> str:
     """Return all numbers, nested by the dots of their paths, with ``meta`` beside them.
 
     Every leaf is ``{"value", "unit", "tolerance", "confirmed_by"}``. JSON has no infinity: it is the text "inf" or

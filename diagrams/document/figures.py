@@ -4,22 +4,11 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
-
-from ..drawing.svg import draw
-from ..flat.wired_diagram import WiredDiagram
-from .model import Plot, Report
-from .templating import Texts
 
 if TYPE_CHECKING:
     from markupsafe import Markup
-
-TEXTS = Texts(__package__, "figures")
-
-ACROSS = 1200.0
-"""Width in pixels up to which a diagram is drawn as one."""
 
 WIDE = 900.0
 """Width in pixels above which a figure is turned by a right angle on paper."""
@@ -82,28 +71,3 @@ def _drawn(figure: Any) -> str:
     with rc_context({"svg.fonttype": "path", "svg.hashsalt": "loopwright"}):
         figure.savefig(buffer, format="svg", metadata={"Date": None}, bbox_inches="tight", pad_inches=0.03)
     return buffer.getvalue()
-
-
-def with_drawing(report: Report, diagram: WiredDiagram) -> Report:
-    """Return a report with the drawing of its diagram in its first section.
-
-    A large one is drawn with closed boxes, and the inside of each box by itself.
-    """
-    if not report.sections:
-        return report
-    first, *others = report.sections
-    plots = (*_drawings(diagram), *first.plots)
-    return replace(report, sections=(replace(first, plots=plots), *others))
-
-
-def _drawings(diagram: WiredDiagram) -> Iterator[Plot]:
-    whole = draw(diagram, closed=False)
-    found = re.search(r'width="([\d.]+)"', whole)
-    boxes = [path for path in diagram.frames if path]
-    if not boxes or (found is not None and float(found[1]) <= ACROSS):
-        yield Plot("diagram", TEXTS.line("diagram", closed=False), whole, ahead=True)
-        return
-    yield Plot("diagram", TEXTS.line("diagram", closed=True), draw(diagram, closed=True), ahead=True)
-    for box in boxes:
-        inside = draw(diagram, box=box, closed=True)
-        yield Plot(f"diagram.{box}", TEXTS.line("inside", subsystem=box), inside, ahead=True)

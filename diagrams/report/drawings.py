@@ -1,0 +1,43 @@
+"""Drawings of the diagram in the first section of its report."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+
+from ..document.model import Plot
+from ..document.report import Report
+from ..document.templating import Texts
+from ..drawing.svg import draw
+from ..flat.wired_diagram import WiredDiagram
+
+TEXTS = Texts(__package__, "figures")
+
+ACROSS = 1200.0
+"""Width in pixels up to which a diagram is drawn as one."""
+
+
+def with_drawing(report: Report, diagram: WiredDiagram) -> Report:
+    """Return a report with the drawing of its diagram in its first section.
+
+    A large one is drawn with closed boxes, and the inside of each box by itself.
+    """
+    if not report.sections:
+        return report
+    first, *others = report.sections
+    plots = (*_drawings(diagram), *first.plots)
+    return replace(report, sections=(replace(first, plots=plots), *others))
+
+
+def _drawings(diagram: WiredDiagram) -> Iterator[Plot]:
+    whole = draw(diagram, closed=False)
+    found = re.search(r'width="([\d.]+)"', whole)
+    boxes = [path for path in diagram.frames if path]
+    if not boxes or (found is not None and float(found[1]) <= ACROSS):
+        yield Plot("diagram", TEXTS.line("diagram", closed=False), whole, ahead=True)
+        return
+    yield Plot("diagram", TEXTS.line("diagram", closed=True), draw(diagram, closed=True), ahead=True)
+    for box in boxes:
+        inside = draw(diagram, box=box, closed=True)
+        yield Plot(f"diagram.{box}", TEXTS.line("inside", subsystem=box), inside, ahead=True)
