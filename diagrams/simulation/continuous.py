@@ -18,7 +18,7 @@ from ..solvers.choose import make_solver
 from .diagnosis import forget_trials, opaque_failure, state_values
 from .events import Domains
 from .solver_setup import absolute_tolerances, remembers, time_scale_of
-from .transport_delays import delays_of, driven_function, step_inputs
+from .transport_delays import delays_of, driven_function, keep_step
 from .workspace import Workspace
 
 NOTHING: frozenset[Any] = frozenset()
@@ -70,7 +70,7 @@ class Continuous:
         self.time_scale = time_scale_of(flat)
         longest = max_step
         if longest is None and remembers(flat):
-            longest = float(flat.base)  # what is remembered is renewed at accepted steps, and must not grow stale
+            longest = float(flat.base)  # memory is renewed at accepted steps, and must not grow stale
         if longest is None and self.time_scale < math.inf:
             longest = 5.0 * self.time_scale  # else a step may fit whole periods of a source
         if self.delays is not None:
@@ -166,8 +166,8 @@ class Continuous:
 
     # --- the instant that is reached ---------------------------------------------------------------------------------
 
-    def at(self, t: float) -> None:
-        """Take an instant from the right: beyond any discontinuity there."""
+    def enter(self, t: float) -> None:
+        """Stand at an instant, beyond any discontinuity there: its values from the right."""
         self._edge = self._left = math.inf
         here = self.workspace.here
         here.t[0] = t
@@ -197,17 +197,17 @@ class Continuous:
 
     def begin(self) -> None:
         """Take the domains of the indicators at the start."""
-        self.at(float(self.workspace.here.t[0]))
+        self.enter(float(self.workspace.here.t[0]))
         if self.domains is not None:
             self.domains.begin(float(self.workspace.here.t[0]), self.workspace.here.x[self.where])
         if self.delays is not None:
-            self.delays.edge(float(self.workspace.here.t[0]))
+            self.delays.note_edge(float(self.workspace.here.t[0]))
 
     def settle(self, t: float) -> bool:
         """Fire what has changed its domain at an instant; return whether anything did."""
         if self.domains is None:
             return False
-        fired = self.domains.changed(t, self.workspace.here.x[self.where])
+        fired = self.domains.update(t, self.workspace.here.x[self.where])
         if not fired.any():
             return False
         self._fire(t, fired)
@@ -224,16 +224,16 @@ class Continuous:
                 self._reset_domains(self.flat.events[int(i)])
             domains.count(t, fired, self.name)
             self._synchronize()
-            fired = domains.changed(t, workspace.here.x[self.where])
+            fired = domains.update(t, workspace.here.x[self.where])
             if not fired.any():
                 if self.delays is not None:
-                    self.delays.edge(t)
+                    self.delays.note_edge(t)
                 self.accept()
                 return
         raise domains.too_many(t, fired)
 
     def _reset_domains(self, event: Any) -> None:
-        """Where a box has just been enabled and its states start anew, so do the domains of its events."""
+        """Let the domains of a subsystem's events start anew where it has just been enabled and its states do so."""
         if not event.box or self.flat.table.frames[event.path].when != "reset":
             return
         if self.workspace.here.x[self.flat.gates.slices[event.path]][0] > 0.5:
@@ -286,7 +286,7 @@ class Continuous:
                         return pending
                     pending = next(times, math.inf)
                 if self.delays is not None and t > step.t_old:
-                    step_inputs(self.delays, step.t_old, t, step.interpolate, self._inputs_of_delays, self._resolution)
+                    keep_step(self.delays, step.t_old, t, step.interpolate, self._inputs_of_delays, self._resolution)
                 self._put(t, step.x if found is None else step.interpolate(t))
                 if found is not None:  # the loops as the indicators saw them, to the last bit
                     workspace.here.x[self._loops] = solved
@@ -295,9 +295,9 @@ class Continuous:
             if found is not None:
                 self._fire(t, found[1])
             if t == edge and self.delays is not None:
-                self.delays.reached(t, from_source=not is_before(t, self._sources_edge))
+                self.delays.note_reached(t, from_source=not is_before(t, self._sources_edge))
             if t == edge < end:  # a discontinuity of a source, or one that comes out of a delay
-                self.at(t)
+                self.enter(t)
                 happened |= self.settle(t)
                 workspace.evaluate()
             if pending == t < end:

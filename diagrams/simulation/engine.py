@@ -17,7 +17,7 @@ from ..solvers.base import solver_name
 from .continuous import Continuous
 from .diagnosis import opaque_failure
 from .initialize import initialize
-from .plants import Plant, bind, loaded
+from .plants import Plant, bind, load_plants
 from .run_options import RunOptions
 from .start_at_point import start_at, take_over
 from .stops import StopConditions
@@ -36,9 +36,9 @@ class Engine:
     name : str
         Its name.
     options : RunOptions
-        How it is run.
+        Options of the run.
     every_tick : bool
-        Visit every tick, not only those at which a box acts.
+        Visit every tick, not only those at which a subsystem acts.
     on_event : callable
         Told every event that fires.
     """
@@ -78,7 +78,7 @@ class Engine:
 
     def load(self, stack: ExitStack, start_time: float) -> None:
         """Load the plants for a run from a time in s on; ``stack`` unloads them."""
-        for path, plant in loaded(self.flat, stack, start_time):
+        for path, plant in load_plants(self.flat, stack, start_time):
             self.plants[path] = plant
 
     def initialize(self) -> None:

@@ -52,23 +52,23 @@ class Domains:
         self._recent = deque[tuple[float, tuple[int, ...]]](maxlen=_CHATTER)
 
     def _domains(self, t: float, x: np.ndarray, before: np.ndarray) -> np.ndarray:
-        return self._taken(self._g(t, x), before)
+        return self._domains_of(self._g(t, x), before)
 
-    def _taken(self, z: np.ndarray, before: np.ndarray) -> np.ndarray:
+    def _domains_of(self, z: np.ndarray, before: np.ndarray) -> np.ndarray:
         """Return the domains at the values z of the indicators that were evaluated last."""
         now = z > np.where(before, -self._hysteresis, self._hysteresis)
-        return np.where(self._open > 0.5, now, before)  # what a closed box holds, this too
+        return np.where(self._open > 0.5, now, before)  # a closed subsystem holds its domains, too
 
     def begin(self, t: float, x: np.ndarray) -> None:
         """Take the domains as they are; nothing fires."""
         self.above = self._first = np.array(self._g(t, x) > 0.0)
 
-    def reset(self, box: str) -> None:
-        """Go back to the domains of the start for the blocks in a box, whose states have done so."""
-        inside = np.array([e.path.startswith(f"{box}.") and not e.box for e in self.events])
+    def reset(self, subsystem: str) -> None:
+        """Go back to the domains of the start for the blocks in a subsystem whose states have done so."""
+        inside = np.array([e.path.startswith(f"{subsystem}.") and not e.box for e in self.events])
         self.above = np.where(inside, self._first, self.above)
 
-    def changed(self, t: float, x: np.ndarray) -> np.ndarray:
+    def update(self, t: float, x: np.ndarray) -> np.ndarray:
         """Take over the domains at one instant, and return which events their changes fire."""
         now = self._domains(t, x, self.above)
         fired = self._fires(self.above, now)
@@ -93,13 +93,13 @@ class Domains:
         seen = [(t_old, self._values(t_old, state), self.above)]  # the last two instants, indicators and domains there
         for b in self._instants(t_old, t_new):
             z = self._values(b, state)
-            now = self._taken(z, self.above)
+            now = self._domains_of(z, self.above)
             fires = self._fires(self.above, now)
             ends = [(int(i), a, b) for i in np.flatnonzero(fires)]
             if len(seen) > 1:
-                ends += self._excursions(seen, b, z, now, state)
+                ends += self._find_excursions(seen, b, z, now, state)
             if ends:
-                t = min(self._root(i, low, high, state) for i, low, high in ends)
+                t = min(self._find_root(i, low, high, state) for i, low, high in ends)
                 before = next(above for at, _, above in reversed([*seen, (math.inf, z, now)]) if at <= t)
                 now = self._domains(t, state(t), before)
                 self.above = now
@@ -110,7 +110,7 @@ class Domains:
         self.fresh = False
         return None
 
-    def _excursions(
+    def _find_excursions(
         self, seen: list[Any], b: float, z: np.ndarray, now: np.ndarray, state: Callable[[float], np.ndarray]
     ) -> list[tuple[int, float, float]]:
         """Return the indicators that go to the other domain and back between three instants, and where to look.
@@ -133,12 +133,12 @@ class Domains:
             lowest = z1[i] - tangent * tangent / (4.0 * bend)
             if (lowest > 0.0) == (z1[i] > 0.0) and abs(lowest) > 0.3 * max(size0[i], size2[i]):
                 continue
-            t = self._closest(int(i), first, b, state)
-            if self._taken(self._values(t, state), above1)[i] != above1[i] and first < t < b:
+            t = self._find_closest(int(i), first, b, state)
+            if self._domains_of(self._values(t, state), above1)[i] != above1[i] and first < t < b:
                 found.append((int(i), first, t))
         return found
 
-    def _closest(self, i: int, low: float, high: float, state: Callable[[float], np.ndarray]) -> float:
+    def _find_closest(self, i: int, low: float, high: float, state: Callable[[float], np.ndarray]) -> float:
         """Return the instant at which an indicator is closest to the other domain."""
         from scipy.optimize import minimize_scalar
 
@@ -167,7 +167,7 @@ class Domains:
             yield b - _CLOSE * h
         yield b
 
-    def _root(self, i: int, a: float, b: float, state: Callable[[float], np.ndarray]) -> float:
+    def _find_root(self, i: int, a: float, b: float, state: Callable[[float], np.ndarray]) -> float:
         """Return the time at which indicator ``i`` has just changed its domain, between a and b."""
         level = -self._hysteresis[i] if self.above[i] else self._hysteresis[i]
         was = bool(self.above[i])
@@ -259,7 +259,7 @@ class Domains:
 
     @property
     def most(self) -> int:
-        """How many rounds of events may follow each other at one instant."""
+        """Most rounds of events that may follow each other at one instant."""
         return _SAME_INSTANT
 
     def save(self) -> Any:

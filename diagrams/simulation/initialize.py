@@ -25,8 +25,8 @@ _SETTLED = 1e-13  # relative change of an input between two passes, a few hundre
 def initialize(workspace: Workspace, plants: Mapping[str, Plant], delays: Delays | None) -> None:
     """Find values of everything at t = 0.
 
-    In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). What they change is given on
-    until it changes no more than by rounding.
+    In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). Outputs are passed on
+    until inputs change by no more than rounding.
     """
     flat = workspace.flat
     acting = flat.acting(0)
@@ -36,8 +36,8 @@ def initialize(workspace: Workspace, plants: Mapping[str, Plant], delays: Delays
     passes, last = 0, np.full(flat.width, np.nan)
     most = _MAX_PASSES * (10 if workspace.looped else 1)
     while True:
-        _states(workspace)
-        _boxes(workspace)
+        _set_initial_states(workspace)
+        _hold_first_outputs(workspace)
         workspace.evaluate(acting)
         workspace.check(acting)
         before = workspace.z.copy()
@@ -55,7 +55,7 @@ def initialize(workspace: Workspace, plants: Mapping[str, Plant], delays: Delays
         last = workspace.here.x.copy()
 
 
-def _states(workspace: Workspace) -> None:
+def _set_initial_states(workspace: Workspace) -> None:
     """Compute the initial states of the blocks that ask for their inputs first."""
     flat, x = workspace.flat, workspace.here.x
     blocks = flat.table.blocks
@@ -93,8 +93,8 @@ def _check_finite(flat: FlatDiagram, path: str, port: str, column: Any) -> None:
         )
 
 
-def _boxes(workspace: Workspace) -> None:
-    """Let every box put out once what it would at the start, and remember what controls it."""
+def _hold_first_outputs(workspace: Workspace) -> None:
+    """Let every subsystem hold its outputs of the start, and keep the signal that enables or triggers it."""
     flat, x = workspace.flat, workspace.here.x
     if not flat.held.slices and not flat.gates.slices:
         return
@@ -102,8 +102,8 @@ def _boxes(workspace: Workspace) -> None:
     for name, column in done.held.items():
         where = flat.held.slices[name]
         x[where] = np.ravel(np.array(column))
-    for box, where in flat.gates.slices.items():
-        x[where] = float(above(done.control(box)))
+    for subsystem, where in flat.gates.slices.items():
+        x[where] = float(above(done.control(subsystem)))
 
 
 def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]]) -> np.ndarray:

@@ -71,7 +71,7 @@ def has_plants(flat: FlatDiagram) -> bool:
     return bool(stepped_blocks(flat.table))
 
 
-def loaded(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) -> Iterator[tuple[str, Plant]]:
+def load_plants(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) -> Iterator[tuple[str, Plant]]:
     """Yield the plants by path, each as soon as it is loaded; ``stack`` unloads them.
 
     They are told no end of the run: it may be gone on from, and an FMU may keep to the end that it was told.

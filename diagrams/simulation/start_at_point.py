@@ -14,7 +14,7 @@ from ..results.operating_point import OperatingPoint
 from .workspace import Workspace
 
 PASSES = 120
-"""How many ticks states without a value, such as those of a delay, are given to take theirs."""
+"""Most ticks that states without a value, such as those of a delay, get to take one."""
 
 
 def apply_point(diagram: WiredDiagram, point: OperatingPoint) -> WiredDiagram:

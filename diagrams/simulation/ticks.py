@@ -36,7 +36,7 @@ def run_ticks(
     Parameters
     ----------
     every : bool
-        Visit every tick, not only those at which a box acts.
+        Visit every tick, not only those at which a subsystem acts.
     row : callable
         Records a sample.
     arrived : callable
@@ -156,13 +156,13 @@ def take_tick(
         workspace.here.t[0] = now
         workspace.tick(acting)
         return
-    continuous.at(now)
+    continuous.enter(now)
     if acting and not first:
-        continuous.settle(now)  # what changes by itself at this instant, boxes see changed
+        continuous.settle(now)  # subsystems see the instant after its own events
     workspace.tick(acting)
-    continuous.at(now)
+    continuous.enter(now)
     if (acting or plants) and continuous.delays is not None:
-        continuous.delays.edge(now)  # what is held has jumped
+        continuous.delays.note_edge(now)  # held signals have jumped
     states = workspace.log[workspace.flat.log.total :]
     before = states.copy()
     if continuous.settle(now):

@@ -1,4 +1,4 @@
-"""Transport delays in continuous time: what went in, kept as polynomials over the solver's steps.
+"""Transport delays in continuous time: their inputs, kept as polynomials over the solver's steps.
 
 The output at t is the input at t − τ. As long as no step of the solver is longer than the shortest τ, that lies in the
 past: it is a known function of time, and the delays cost the solver no states (the method of steps). Each accepted step
@@ -78,23 +78,23 @@ class Delays:
         """Take the side of a discontinuity that is towards a time within the segment that is being solved."""
         self._middle = t
 
-    def times(self, t_old: float, t: float) -> np.ndarray:
+    def sample_times(self, t_old: float, t: float) -> np.ndarray:
         """Return the instants of a step at which `keep` wants the inputs."""
         found = t_old + (t - t_old) * self.nodes
         found[-1] = t
         return np.array(found)
 
     def keep(self, t_old: float, t: float, samples: np.ndarray) -> None:
-        """Keep a step: the vector z at each of `times`."""
+        """Keep a step: the vector z at each of `sample_times`."""
         self._from.append(t_old)
         self._to.append(t)
         self._samples.append(samples)
         old = t - max(self.taus) - 1e-9 * (1.0 + abs(t))
         drop = bisect_right(self._to, old) - 1
-        if drop > 1000:  # what no delay reaches any more
+        if drop > 1000:  # no delay reaches them any more
             del self._from[:drop], self._to[:drop], self._samples[:drop]
 
-    def edge(self, t: float, order: int = 0) -> None:
+    def note_edge(self, t: float, order: int = 0) -> None:
         """Note a discontinuity of the inputs, or of their derivative of some order; one instant is noted once."""
         for tau in sorted(set(self.taus)):
             i = bisect_left(self._edges, (t + tau, -1))
@@ -110,13 +110,13 @@ class Delays:
             self._edges.pop(0)
         return self._edges[0][0] if self._edges else math.inf
 
-    def reached(self, t: float, *, from_source: bool) -> None:
+    def note_reached(self, t: float, *, from_source: bool) -> None:
         """Note that what is not smooth at ``t``, from a source or out of a delay, goes into the delays."""
         order = 0 if from_source else math.inf
         while self._edges and not is_before(t, self._edges[0][0]):
             order = min(order, self._edges.pop(0)[1] + self.smoothed)
         if order < _SMOOTH:
-            self.edge(t, int(order))
+            self.note_edge(t, int(order))
 
     def outputs_at(self, t: float, w: np.ndarray) -> None:
         """Write the outputs at a time into w."""
@@ -140,7 +140,7 @@ class Delays:
         self._from, self._to, self._samples, self._edges, self.starts = (list(part) for part in saved)
 
 
-def step_inputs(
+def keep_step(
     delays: Delays,
     t_old: float,
     t: float,
@@ -154,20 +154,20 @@ def step_inputs(
     def at(times: np.ndarray) -> np.ndarray:
         return np.array([inputs(float(s), state(float(s))).copy() for s in times])
 
-    def piece(a: float, b: float, depth: int) -> None:
-        samples = at(delays.times(a, b))
+    def keep_piece(a: float, b: float, depth: int) -> None:
+        samples = at(delays.sample_times(a, b))
         between = np.array([barycentric(delays, part, samples) for part in _BETWEEN])
         found = at(a + (b - a) * np.array(_BETWEEN))
         size = np.max(np.abs(samples), axis=0)
         allowed = np.maximum(0.1 * (atol + rtol * size), _ROUNDING * size)
         middle = 0.5 * (a + b)
         if depth and a < middle < b and np.any(np.abs(between - found) > allowed):
-            piece(a, middle, depth - 1)
-            piece(middle, b, depth - 1)
+            keep_piece(a, middle, depth - 1)
+            keep_piece(middle, b, depth - 1)
         else:
             delays.keep(a, b, samples)
 
-    piece(t_old, t, _DEEPEST)
+    keep_piece(t_old, t, _DEEPEST)
 
 
 def barycentric(delays: Delays, part: float, samples: np.ndarray) -> np.ndarray:

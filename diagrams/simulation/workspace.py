@@ -211,7 +211,7 @@ class Workspace:
         return through
 
     def indicators(self) -> tuple[Callable[[float, np.ndarray], np.ndarray], np.ndarray]:
-        """Return ``g(t, x)`` of all events at ``trial``, and the array of which boxes are open then."""
+        """Return ``g(t, x)`` of all events at ``trial``, and the array of which subsystems are open then."""
         bound = self._bind(self.flat.indicators, self.trial)
         return self._trial_call(bound), bound.outputs[1]
 

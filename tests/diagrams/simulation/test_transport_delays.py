@@ -107,11 +107,11 @@ def test_discontinuities_are_landed_on_until_states_have_smoothed_them():
     for smoothed in (True, False):
         delays = Delays([0.01, 0.0137], [slice(0, 1), slice(1, 2)], [slice(0, 1), slice(1, 2)], [np.zeros(1)] * 2)
         delays.smoothed = smoothed
-        delays.edge(0.0)
+        delays.note_edge(0.0)
         t, found = 0.0, []
         while (t := delays.next_edge(t)) < 1.0:
             found.append(t)
-            delays.reached(t, from_source=False)
+            delays.note_reached(t, from_source=False)
         sums = ((i, k, 100 * i + 137 * k) for i in range(101) for k in range(74))
         expected = {s for i, k, s in sums if 0 < s < 10_000 and (not smoothed or i + k <= 8)}
         assert [round(1e4 * t) for t in found] == sorted(expected)
