@@ -21,7 +21,7 @@ from ..results.operating_point import OperatingPoint
 from ..simulation.run_options import RunOptions
 from ..simulation.simulation import Simulation
 from ..simulation.start_at_point import copy_states
-from ..wiring.structure import Frame, Structure, Wire
+from ..wiring.structure import Frame, Wire
 
 NEVER = 1e12
 """A time in s that no run reaches."""
@@ -91,7 +91,7 @@ def injected(diagram: WiredDiagram, signal: Signal, lines: int, held: tuple[Frac
         A port that nothing is wired to.
     """
     lowered = diagram.scheduled
-    table = Structure(**{k: dict(v) for k, v in vars(lowered).items()})
+    table = lowered.copy()
     for path, frame in table.frames.items():
         table.frames[path] = replace(frame, delay=0)  # the delays have become blocks
     block, port = signal.port

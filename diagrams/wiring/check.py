@@ -1,4 +1,4 @@
-"""Checks of a diagram's wiring: ports, shapes, units, frames."""
+"""Checks of a diagram's wiring: ports, shapes, units, subsystems."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Port = tuple[str, str]
 
 @dataclass(frozen=True)
 class Checked:
-    """What the checks found out: traces, and shape and unit of every output."""
+    """Results of the checks: traces of the blocks, and shape and unit of every output."""
 
     traced: dict[str, Traced]
     shapes: dict[Port, Shape]
@@ -46,7 +46,7 @@ def check(table: Structure) -> Checked:
     Raises
     ------
     WiringError
-        `UnknownNameError`, `UnwiredInputError`, `ShapeError`, `UnitError`, `SampleTimeError`.
+        One of its kinds: `UnknownNameError`, `UnwiredInputError`, `ShapeError`, `UnitError`, `SampleTimeError`.
     TraceError
         A block whose equations can't be traced.
     """
@@ -63,16 +63,18 @@ def part_shape(shape: Shape, wire: Wire, consumer: str, port: str) -> Shape:
         return shape
     if not shape:
         raise ShapeError(
-            f"{wire} takes a part of a scalar; wire the whole of {wire.block}.{wire.port}.", block=consumer, port=port
+            f"found {wire}, a part of a scalar; wire the whole of {wire.block}.{wire.port}.", block=consumer, port=port
         )
     try:
         return np.empty(shape)[wire.index].shape
     except IndexError:
-        raise ShapeError(f"{wire} is out of range: the port has shape {shape}.", block=consumer, port=port) from None
+        raise ShapeError(
+            f"{wire} is out of range: the port has shape {shape}. Index within it.", block=consumer, port=port
+        ) from None
 
 
 def _check_ports(table: Structure) -> None:
-    inputs = {path: block.inputs for path, block in table.blocks.items()}  # made anew each time they are asked for
+    inputs = {path: block.inputs for path, block in table.blocks.items()}  # each access makes them anew
     for (consumer, port), wire in table.wires.items():
         outputs = table.blocks[wire.block].outputs
         if wire.port not in outputs:
@@ -102,7 +104,7 @@ def _infer_shapes(table: Structure) -> tuple[dict[str, Traced], dict[Port, Shape
         if port.shape is not None
     }
     assumed: dict[Port, Shape] = {}
-    shared: dict[Any, Traced] = {}  # traces of users' classes: what they close over may change between two builds
+    shared: dict[Any, Traced] = {}  # traces of users' classes, for this build alone: their closures may change
     consumers: dict[Port, list[Port]] = {}
     fed: dict[Port, list[str]] = {}
     unknown: dict[str, set[str]] = {path: set() for path in table.blocks}
@@ -179,36 +181,36 @@ def _check_shapes(
 
 
 def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[Port, Shape]) -> None:
-    """Check what controls boxes, and what stands in them."""
-    for box, wire in sorted(table.controls.items()):
-        kind = table.frames[box].control
+    """Check the signals that control subsystems, and the blocks in them."""
+    for gated, wire in sorted(table.controls.items()):
+        kind = table.frames[gated].control
         port = {"enabled": "enable", "triggered": "trigger"}[kind]
-        found = part_shape(shapes[wire.block, wire.port], wire, box, port)
+        found = part_shape(shapes[wire.block, wire.port], wire, gated, port)
         if found != ():
             raise ShapeError(
-                f"{wire} has shape {found}; expected a logic signal, one number. Index it.", block=box, port=port
+                f"{wire} has shape {found}; expected a logic signal, one number. Index it.", block=gated, port=port
             )
     for (path, port), handed in sorted(table.handed.items()):
-        for box, output in handed:
-            frame, clock = table.frames[box], table.clock(table.frame_of[path])
+        for passing, output in handed:
+            frame, clock = table.frames[passing], table.clock(table.frame_of[path])
             same = clock is not None and (clock.sample_time, clock.offset) == (frame.sample_time, frame.offset)
             if not (frame.control or frame.delay) and (frame.sample_time is None or same):
                 continue
-            what = frame.control or ("delayed" if frame.delay else "sampled")
+            kind = frame.control or ("delayed" if frame.delay else "sampled")
             raise WiringError(
-                f"it is wired to {box}.{output}, and that box is {what}, but no block in it makes this output: it "
-                "comes from outside and would be handed on as it is. Put a block between, such as Gain(gain=1.0), or "
-                "wire what is outside.",
+                f"found {passing}.{output}, a signal from outside that the {kind} subsystem only passes through; "
+                "expected the output of a block in it. Put a block between, such as Gain(gain=1.0), or wire the signal "
+                "itself.",
                 block=path,
                 port=port,
             )
     for path in sorted(table.blocks):
         gates = table.gates(table.frame_of[path])
         if gates and path not in traced:
-            what = "a transport delay" if table.blocks[path].transport else "a block that is stepped, such as an FMU,"
+            kind = "a transport delay" if table.blocks[path].transport else "a block that is stepped, such as an FMU,"
             raise WiringError(
-                f"{what} can't stand in a box that is {table.frames[gates[-1]].control} ({gates[-1]}): it goes on in "
-                "time whatever the box does. Put it outside, and wire its outputs in.",
+                f"{kind} can't stand in a subsystem that is {table.frames[gates[-1]].control} ({gates[-1]}): its time "
+                "goes on while the subsystem waits. Put it outside, and wire its outputs in.",
                 block=path,
             )
         triggered = table.triggered_around(table.frame_of[path])
@@ -217,16 +219,16 @@ def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[
         trace = traced[path]
         if trace.advance not in ("none", "update") or _reads_sample_time(table.blocks[path], trace):
             raise SampleTimeError(
-                f"it needs a sample time, and the triggered box {triggered} has none: it acts whenever it is "
-                "triggered. Put it outside the box, or take a block that counts samples.",
+                f"it needs a sample time, and the triggered subsystem {triggered} has none: that acts whenever it is "
+                "triggered. Put the block outside, or take one that counts samples.",
                 block=path,
             )
         inner = table.clock(table.frame_of[path])
         outer = table.clock(triggered)
         if inner is not outer:
             raise SampleTimeError(
-                f"the box {inner.path if inner else ''} has a sample time of its own inside of the triggered box "
-                f"{triggered}; it acts whenever {triggered} is triggered. Leave the sample time out.",
+                f"the subsystem {inner.path if inner else ''} has a sample time of its own inside the triggered "
+                f"subsystem {triggered}; expected none, as it acts whenever {triggered} is triggered. Leave it out.",
                 block=path,
             )
 
@@ -242,8 +244,8 @@ def _check_stops(table: Structure, shapes: dict[Port, Shape]) -> None:
             )
         if shapes[path, block.stops] != ():
             raise ShapeError(
-                f"found shape {shapes[path, block.stops]}; expected one number, as it ends the run where it is above "
-                "0.5. Put out np.max of it, for instance.",
+                f"found shape {shapes[path, block.stops]}; expected one number: the run ends where it is above 0.5. "
+                "Put out np.max of it, for instance.",
                 block=path,
                 port=block.stops,
             )
@@ -270,7 +272,7 @@ def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, 
 
 
 def _known_shapes(table: Structure, shapes: dict[Port, Shape], path: str) -> list[Shape]:
-    """Return the shapes that are known of what is wired to a block."""
+    """Return the known shapes among the signals that are wired to a block."""
     wires = ((port, table.wires.get((path, port))) for port in table.blocks[path].inputs)
     return [
         part_shape(shapes[w.block, w.port], w, path, port)
@@ -280,9 +282,9 @@ def _known_shapes(table: Structure, shapes: dict[Port, Shape], path: str) -> lis
 
 
 def _assume(table: Structure, shapes: dict[Port, Shape], path: str) -> dict[Port, Shape]:
-    """Return an assumption that lets a loop of unknown shapes go on; it is checked once the shapes are known.
+    """Assume the unknown input shapes of a block in a loop; `_check_shapes` compares them with the wires later.
 
-    A block's unknown inputs are assumed to have the shape of a known one beside them, else of its first state.
+    They become the shape of one of its known inputs, else that of its first state.
     """
     block = table.blocks[path]
     shape = next(iter([*_known_shapes(table, shapes, path), *start_shapes(block)]), ())
@@ -296,7 +298,7 @@ def _assume(table: Structure, shapes: dict[Port, Shape], path: str) -> dict[Port
 def _input_shapes(
     table: Structure, shapes: dict[Port, Shape], path: str, assumed: dict[Port, Shape]
 ) -> dict[str, Shape]:
-    """Return the shapes to trace a block with; what a wire brings is compared with them at the end."""
+    """Return the input shapes to trace a block with; `_check_shapes` compares them with the wires later."""
     found: dict[str, Shape] = {}
     for port, spec in table.blocks[path].inputs.items():
         wire = table.wires.get((path, port))
@@ -317,7 +319,7 @@ def _check_units(table: Structure, shapes: dict[Port, Shape]) -> dict[Port, Unit
         for name, port in block.outputs.items():
             if port.unit is not None:
                 units[path, name] = port.unit
-    followers: dict[Port, list[tuple[Port, Wire]]] = {}  # outputs that take over an input's unit
+    followers: dict[Port, list[tuple[Port, Wire]]] = {}  # outputs with the unit of an input
     for path, block in table.blocks.items():
         for name, port in block.outputs.items():
             like = getattr(port, "like", None)
@@ -338,15 +340,15 @@ def _check_units(table: Structure, shapes: dict[Port, Shape]) -> dict[Port, Unit
             unit = None if wire is None else _part_unit(units, wire)
             if wire is None or unit is None:
                 continue
-            expected, what = spec.unit, "expected"
+            expected, relation = spec.unit, "expected"
             if block.same_units:
                 if seen is None:
                     seen = (wire, unit)
-                expected, what = seen[1], f"{seen[0]} beside it is"
+                expected, relation = seen[1], f"{seen[0]} beside it is"
             problem = _unit_mismatch(unit, expected)
             if problem:
                 raise UnitError(
-                    f"{wire} is in {_unit_text(unit)}; {what} in {_unit_text(expected)}: {problem}",
+                    f"{wire} is in {_unit_text(unit)}; {relation} in {_unit_text(expected)}: {problem}",
                     block=path,
                     port=name,
                 )
@@ -368,5 +370,5 @@ def _unit_mismatch(found: Unit, expected: Unit) -> str:
     if found is None or expected is None:
         return ""
     n = max(len(u) if isinstance(u, tuple) else 1 for u in (found, expected))
-    pairs: Any = zip(*(u if isinstance(u, tuple) else (u,) * n for u in (found, expected)), strict=False)
-    return next((describe_mismatch(a, b) for a, b in pairs if not same_unit(a, b)), "")
+    left, right = (u if isinstance(u, tuple) else (u,) * n for u in (found, expected))
+    return next((describe_mismatch(a, b) for a, b in zip(left, right, strict=False) if not same_unit(a, b)), "")

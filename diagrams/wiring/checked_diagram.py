@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace as replace_fields
 from fractions import Fraction
-from typing import Any, Self
+from typing import Self
 
 from ...blocks.core.block import Block
 from ...blocks.core.errors import OptionError, WiringError
@@ -22,7 +22,7 @@ LOOPS = ("error", "solve")
 
 
 class CheckedDiagram:
-    """Blocks and wires as one value; `loopwright.diagrams.Diagram` adds the ways of using it.
+    """Blocks and wires as one value; `loopwright.diagrams.Diagram` adds its uses.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class CheckedDiagram:
     *roots : Call
         The calls that close it.
     loops : {"error", "solve"}
-        Whether algebraic loops are an error or solved.
+        Whether algebraic loops are an error, or solved.
 
     Raises
     ------
@@ -41,7 +41,7 @@ class CheckedDiagram:
         A block whose equations can't be traced.
     """
 
-    def __init__(self, name: str, *roots: Any, loops: str = "error"):
+    def __init__(self, name: str, *roots: object, loops: str = "error"):
         if not isinstance(name, str):
             raise WiringError(
                 f'found {name!r} where the name is expected; write Diagram("name", …), the calls after the name.'
@@ -61,7 +61,7 @@ class CheckedDiagram:
     scheduled: Structure
     """The structure that the scheduler sees: computational delays have become blocks."""
     checked: Checked
-    """Traces of the blocks, and shapes and units of the ports, of what is scheduled."""
+    """Traces of the scheduled blocks, and shapes and units of their ports."""
 
     def _set(self, name: str, table: Structure, loops: str) -> None:
         runs = add_delay_blocks(table)
@@ -70,7 +70,7 @@ class CheckedDiagram:
             evaluation_order(runs, checked.traced, start=start, solve=loops == "solve")
         self.__dict__.update(name=name, loops=loops, structure=table, scheduled=runs, checked=checked)
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"a diagram is a value: {name!r} can't be set. Use replace(…), or build another one.")
 
     @classmethod
@@ -83,12 +83,12 @@ class CheckedDiagram:
         """Return the diagram of another structure, under the same name."""
         return type(self)._of(self.name, structure, self.loops)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         return type(self)._of, (self.name, self.structure, self.loops)
 
     def __repr__(self) -> str:
-        boxes = [path for path in self.structure.frames if path]
-        return f"<diagram {self.name}: {len(self.blocks)} blocks{', in ' + ', '.join(boxes) if boxes else ''}>"
+        paths = [path for path in self.structure.frames if path]
+        return f"<diagram {self.name}: {len(self.blocks)} blocks{', in ' + ', '.join(paths) if paths else ''}>"
 
     @property
     def blocks(self) -> Mapping[str, Block]:
@@ -114,7 +114,7 @@ class CheckedDiagram:
         """Return the block at a path, or at the unique end of one."""
         return self.structure.blocks[find_path(path, self.structure.blocks, "block", self.name)]
 
-    def replace(self, changes: Mapping[str, Any] | None = None, /, **more: Any) -> Self:
+    def replace(self, changes: Mapping[str, object] | None = None, /, **more: object) -> Self:
         """Return a variant: other blocks, parameters or sample times.
 
         Parameters
@@ -122,7 +122,7 @@ class CheckedDiagram:
         changes : mapping, optional
             By dotted path, or its unique end: a block (``"plant"``), a parameter
             (``"controller.admittance_par.stiffness"``), a subsystem's ``sample_time``, ``method``, ``offset`` or
-            ``delay`` (``"controller.sample_time"``; None: that of what surrounds it), a plant's start value
+            ``delay`` (``"controller.sample_time"``; None: that of its surroundings), a plant's start value
             (``"plant.start.position"``).
         **more
             The same, for paths that are identifiers: ``replace(plant=Fmu("other.fmu"))``.
@@ -136,35 +136,35 @@ class CheckedDiagram:
         return self.with_structure(table)
 
     def continuous(self) -> Self:
-        """Return the diagram with every sampled subsystem taken as ideal: continuous, without sampling, hold or delay.
+        """Return the diagram with every sampled subsystem as its ideal: continuous, without sampling, hold or delay.
 
-        A projection then solves its equation at each evaluation, from the foot point of the last accepted step. With an
-        FMU, a run still exchanges signals with it at multiples of ``step`` only, and holds its inputs between; the
-        linear model, of its equations, has no such hold.
+        A projection then solves its equation at each evaluation, from the foot point of the last accepted step. A run
+        with an FMU still exchanges signals with it at multiples of ``step`` only, and holds its inputs between. The
+        linear model comes from the FMU's equations and has no such hold.
 
         Raises
         ------
         SampleTimeError
-            A block that has a meaning at samples only, such as a `UnitDelay`.
+            A block that is defined at samples only, such as a `UnitDelay`.
         """
-        table = Structure(**{k: dict(v) for k, v in vars(self.structure).items()})
+        table = self.structure.copy()
         for path, frame in table.frames.items():
             table.frames[path] = replace_fields(frame, sample_time=None, offset=Fraction(0), delay=0)
         return self.with_structure(table)
 
     def sampled(self, sample_time: float | Fraction, method: str = "exact") -> Self:
-        """Return the diagram with everything that is continuous sampled.
+        """Return the diagram with all its continuous blocks sampled.
 
-        Each block is discretized by itself, and what it reads from others is held over a sample: a plant drawn with
-        `Integrator` blocks becomes forward Euler between them, of first order, whatever the method. To have a method
-        act on a plant as a whole, write it as one block: a `StateSpace`, a `TransferFunction`, a `Block` of one's own.
+        Each block is discretized by itself, with its inputs held over a sample. So a plant drawn with `Integrator`
+        blocks becomes forward Euler between them, of first order, whatever the method. For a method to act on a plant
+        as a whole, write the plant as one block: a `StateSpace`, a `TransferFunction`, or a `Block` of your own.
 
         Parameters
         ----------
         sample_time : float or Fraction
-            Sample time in s. Subsystems that have one of their own keep it.
+            Sample time in s. Subsystems with a sample time of their own keep it.
         method : {"exact", "forward", "semi_implicit", "trapezoidal"}
-            How the blocks are discretized that were continuous; see `loopwright.blocks.hold`. As inputs are held,
+            Discretization of the blocks that were continuous; see `loopwright.blocks.hold`. As inputs are held,
             ``trapezoidal`` is not Tustin's method, python-control's ``c2d(…, "bilinear")``, which averages them too.
 
         Raises
@@ -173,7 +173,7 @@ class CheckedDiagram:
             A sample time that is not positive, or an unknown method.
         """
         check_method(method)
-        table = Structure(**{k: dict(v) for k, v in vars(self.structure).items()})
+        table = self.structure.copy()
         for path, frame in sorted(table.frames.items()):
             if self.structure.clock(path) is None:
                 table.frames[path] = replace_fields(frame, method=method)
@@ -183,13 +183,13 @@ class CheckedDiagram:
 
     @property
     def is_continuous(self) -> bool:
-        """Whether something happens between ticks: continuous states, events, or a transport delay."""
+        """Whether the solver has work between ticks: continuous states, events, or a transport delay."""
         table = self.scheduled
         traces = self.checked.traced
         return (
             any(t.advance == "derivative" or t.indicators is not None for t in traces.values())
             or any(table.blocks[p].transport for p in table.blocks if p not in traces)
-            or any(table.is_event(box) for box in table.controls)
+            or any(table.is_event(path) for path in table.controls)
         )
 
     @property
@@ -199,5 +199,5 @@ class CheckedDiagram:
 
     @property
     def has_fmu(self) -> bool:
-        """Whether an FMU is in it."""
+        """Whether a block in it is stepped from outside, such as an FMU."""
         return bool(stepped_blocks(self.structure))

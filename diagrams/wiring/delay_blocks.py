@@ -1,6 +1,7 @@
-"""From the table that was wired to the one that runs.
+"""Replaces delays by blocks, so that the scheduler sees blocks only.
 
-A computational delay becomes a block of its own; a transport delay in a sampled frame becomes one by whole samples.
+A subsystem's computational delay becomes a `Delay` at each output that leaves it. A transport delay in a sampled
+subsystem becomes a delay by whole samples.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ from .structure import Structure, Wire, join
 
 
 def add_delay_blocks(table: Structure) -> Structure:
-    """Return the table with a delay block for every output that leaves a box with a computational delay.
+    """Return the structure with a delay block for every output that leaves a subsystem with a computational delay.
 
-    It stands inside the box, acts at its ticks, and is called ``delay_`` after the output, numbered where two outputs
-    share a name. What the box itself reads of its own outputs is not delayed.
+    The block stands inside the subsystem, acts at its ticks, and is called ``delay_`` and the output's name, numbered
+    where two outputs share a name. Blocks inside the subsystem still read the output without delay.
     """
     sampled = {}
     for path, block in sorted(table.blocks.items()):
@@ -30,7 +31,7 @@ def add_delay_blocks(table: Structure) -> Structure:
     late = [path for path in sorted(table.frames, key=lambda p: (-p.count("."), p)) if table.frames[path].delay]
     if not late and not sampled:
         return table
-    table = Structure(**{k: dict(v) for k, v in vars(table).items()})
+    table = table.copy()
     table.blocks.update(sampled)
     for frame in late:
         _delay_outputs(table, frame)
@@ -63,9 +64,9 @@ def _delay_outputs(table: Structure, frame: str) -> None:
     for key, wire in sorted(table.wires.items()):
         if leaves(wire, table.frame_of[key[0]]):
             table.wires[key] = delay(wire)
-    for box, wire in sorted(table.controls.items()):
-        if leaves(wire, box.rpartition(".")[0]):
-            table.controls[box] = delay(wire)
+    for path, wire in sorted(table.controls.items()):
+        if leaves(wire, path.rpartition(".")[0]):
+            table.controls[path] = delay(wire)
     for name, wire in sorted(table.names.items()):
         if leaves(wire, name.rpartition(".")[0]):
             table.names[name] = delay(wire)

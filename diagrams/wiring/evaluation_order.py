@@ -1,11 +1,11 @@
 """The order of evaluation, from feedthrough between ports.
 
 A block's outputs, its next state and its guards are ordered one by one: each waits only for the inputs that it
-depends on. So a cycle in the drawing is no algebraic loop as long as no port waits for itself. Blocks are taken by
+depends on. So a cycle in the drawing is an algebraic loop only if a port waits for itself. Blocks are taken by
 path, so the order never depends on how a diagram was written down.
 
-Where a loop is to be solved, some of its ports are *torn*: they are taken as known, and Newton's method finds the
-values at which what comes round is what was taken.
+Where a loop is to be solved, some of its ports are *torn*: their values are taken as known. Newton's method then
+finds the values that the loop gives back unchanged.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from .structure import Structure
 
 Port = tuple[str, str]
 Step = tuple[str, tuple[str, ...]]
-"""A block's path, and what is evaluated of it together."""
+"""A block's path, and its equations that are evaluated together: outputs by name, next state, guards."""
 
 
 def dependencies(table: Structure, traced: Mapping[str, Traced], *, start: bool = False) -> dict[Port, set[Port]]:
     """Return, for every output, next state and guard, the output ports that it waits for.
 
-    With ``start`` it is the graph of initialization, in which a block that computes its initial state from its inputs
+    With ``start`` it is the graph of initialization. There a block that computes its initial state from its inputs
     waits for all of them first.
     """
     waits: dict[Port, set[Port]] = {}
     for path, trace in traced.items():
         all_inputs = start and table.blocks[path].starts_from_inputs
-        controls = [table.controls[box] for box in table.gates(table.frame_of[path])]
+        controls = [table.controls[gate] for gate in table.gates(table.frame_of[path])]
         for name in (*trace.outputs, NEXT, GUARDS):
             inputs = trace.inputs if all_inputs else trace.depends[name]
             wires = (table.wires.get((path, port)) for port in trace.inputs if port in inputs)
@@ -45,18 +45,27 @@ def dependencies(table: Structure, traced: Mapping[str, Traced], *, start: bool 
 
 @dataclass(frozen=True)
 class Order:
-    """What to evaluate, in order, and the output ports that are taken as known."""
+    """The order of evaluation.
+
+    Attributes
+    ----------
+    steps : list of Step
+        Equations to evaluate, block by block.
+    torn : tuple of Port
+        Output ports whose values are taken as known.
+    loops : tuple of str
+        Every algebraic loop, printed port by port.
+    """
 
     steps: list[Step]
     torn: tuple[Port, ...] = ()
     loops: tuple[str, ...] = ()
-    """Every loop, printed port by port."""
 
 
 def evaluation_order(
     table: Structure, traced: Mapping[str, Traced], *, start: bool = False, solve: bool = False
 ) -> Order:
-    """Return what to evaluate, in order; a block is evaluated in one go where its inputs allow it.
+    """Return the order of evaluation; a block is evaluated in one go where its inputs allow it.
 
     Parameters
     ----------
@@ -68,7 +77,7 @@ def evaluation_order(
     Raises
     ------
     AlgebraicLoopError
-        With the loop printed port by port.
+        A loop that is not to be solved, printed port by port.
     """
     waits = dependencies(table, traced, start=start)
     steps, stuck = _sort(traced, waits)
@@ -89,7 +98,7 @@ def evaluation_order(
 def _tear(
     traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]], stuck: set[Port]
 ) -> Iterator[tuple[list[Port], Port]]:
-    """Yield loop after loop among the ports that are stuck, and its port that is to be taken as known."""
+    """Yield loop after loop among the ports that are stuck, each with the port to tear."""
     waits = {port: {s for s in waits[port] if s in stuck} for port in stuck}
     consumers: dict[Port, list[Port]] = defaultdict(list)
     for port, sources in waits.items():
@@ -114,7 +123,7 @@ def _tear(
 
 
 def _sort(traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]]) -> tuple[list[Step], set[Port]]:
-    """Return what can be evaluated, in order, and what is left over."""
+    """Return the steps that can be evaluated, in order, and the ports that are stuck in or behind loops."""
     missing = {port: len(sources) for port, sources in waits.items()}
     consumers: dict[Port, list[Port]] = defaultdict(list)
     for port in sorted(waits):
@@ -146,12 +155,12 @@ def _sort(traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]]) -> tupl
 
 
 def _first_output(ports: Iterable[Port]) -> Port:
-    """Return the first one that is an output."""
+    """Return the first port that is an output."""
     return min(p for p in ports if p[1] not in (NEXT, GUARDS))
 
 
 def _find_loop(waits: Mapping[Port, set[Port]], port: Port) -> list[Port]:
-    """Return the ports of one loop, found from a port that is stuck, each waiting for the next."""
+    """Follow the waiting from a stuck port until it closes, and return that loop's ports, each waiting for the next."""
     seen: dict[Port, int] = {}
     while port not in seen:
         seen[port] = len(seen)
@@ -177,20 +186,20 @@ def _write_loop(table: Structure, traced: Mapping[str, Traced], loop: list[Port]
             lines.append(f"  {path}.{name} is wired to {consumer_path}.{through[0]}")
             lines.append(f"  {consumer_path}.{through[0]} feeds through to {consumer_path}.{source[1]}")
             continue
-        boxes = table.gates(table.frame_of[consumer_path])
-        box = next((b for b in boxes if (table.controls[b].block, table.controls[b].port) == (path, name)), "?")
-        lines.append(f"  {path}.{name} is wired to what controls {box}")
-        lines.append(f"  {box} acts on {consumer_path}.{source[1]}")
+        gates = table.gates(table.frame_of[consumer_path])
+        gate = next((g for g in gates if (table.controls[g].block, table.controls[g].port) == (path, name)), "?")
+        lines.append(f"  {path}.{name} controls the subsystem {gate}")
+        lines.append(f"  {gate} acts on {consumer_path}.{source[1]}")
     return lines
 
 
 def _loop_error(table: Structure, traced: Mapping[str, Traced], loop: list[Port], start: bool) -> AlgebraicLoopError:
     advice = ", or have it solved at every instant: Diagram(…, loops='solve')"
-    what, delay = "these ports depend on each other within one instant", "UnitDelay"
+    found, delay = "these ports depend on each other within one instant", "UnitDelay"
     if start:
-        what, delay = "initial values depend on each other", "UnitDelay(initial_value=…)"
+        found, delay = "initial values depend on each other", "UnitDelay(initial_value=…)"
     return AlgebraicLoopError(
-        f"{what}:\n" + "\n".join(_write_loop(table, traced, loop)) + f"\nBreak the loop where a delay is real: put a "
+        f"{found}:\n" + "\n".join(_write_loop(table, traced, loop)) + f"\nBreak the loop where a delay is real: put a "
         f"{delay} on one of these wires{'' if start else advice}.",
         block=min(loop)[0],
     )

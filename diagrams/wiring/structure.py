@@ -1,6 +1,7 @@
-"""From calls to a table: every block with its path, every input with its source.
+"""The structure of a diagram: every block with its path, every input with its source.
 
-A diagram distinguishes blocks by identity. Subsystem borders are dissolved here: wires go from block to block.
+`Collector` makes it from the calls that close a diagram. It tells blocks apart by identity. Wires lead from block to
+block, across the borders of subsystems.
 """
 
 from __future__ import annotations
@@ -8,32 +9,31 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any, cast
 
 from ...blocks.core.block import Block
 from ...blocks.core.errors import DoubleDriveError, DuplicateNameError, UnwiredInputError, WiringError
 from ...blocks.core.signals import Call, Signal, Wireable
-from .subsystem import FrameInput, SubsystemCall
+from .subsystem import SubsystemCall, SubsystemInput
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A box: the diagram itself (path "") or a subsystem.
+    """Settings of a subsystem, or of the diagram itself (path "").
 
     Attributes
     ----------
     sample_time : Fraction or None
-        Its own, in s; None where it has the rate of what surrounds it.
+        Its own sample time in s; None where that of its surroundings holds.
     method : str or None
-        How continuous blocks in it are discretized; None: as in what surrounds it, see `Structure.method`.
+        Discretization of continuous blocks in it; None: as in its surroundings, see `Structure.method`.
     offset : Fraction
-        Time of its first tick in s, of a box with a sample time.
+        Time of its first tick in s, where it has a sample time.
     delay : int
         Computational delay of its outputs in samples.
     control : str
-        "enabled" or "triggered" for a box that acts on a condition, else "".
+        "enabled" or "triggered" for a subsystem that acts on a condition, else "".
     when : str
-        "held" or "reset" for an enabled box: what its states do when it is enabled again. For a triggered box the edge:
+        For an enabled subsystem "held" or "reset": its states when it is enabled again. For a triggered one the edge:
         "rising", "falling" or "both".
     """
 
@@ -64,7 +64,25 @@ class Wire:
 
 @dataclass
 class Structure:
-    """The table of a diagram."""
+    """Blocks, subsystems and wires of a diagram, by path.
+
+    Attributes
+    ----------
+    blocks : dict
+        Every block by its path.
+    frame_of : dict
+        Path of the subsystem that a block stands in, by the block's path.
+    frames : dict
+        Settings of every subsystem by its path, the diagram's own under "".
+    wires : dict
+        The source of every wired input, by (block path, input).
+    names : dict
+        The source of every named wire.
+    controls : dict
+        The source of the signal that enables or triggers a subsystem, by the subsystem's path.
+    handed : dict
+        For an input, by (block path, input): the subsystems, each with its output, that only pass its signal through.
+    """
 
     blocks: dict[str, Block] = field(default_factory=dict)
     frame_of: dict[str, str] = field(default_factory=dict)
@@ -72,52 +90,62 @@ class Structure:
     wires: dict[tuple[str, str], Wire] = field(default_factory=dict)
     names: dict[str, Wire] = field(default_factory=dict)
     controls: dict[str, Wire] = field(default_factory=dict)
-    """The source of what enables or triggers a subsystem, by the subsystem's path."""
     handed: dict[tuple[str, str], tuple[tuple[str, str], ...]] = field(default_factory=dict)
-    """For an input: the boxes, with their outputs, that its signal comes out of though nothing in them makes it."""
+
+    def copy(self) -> Structure:
+        """Return a structure with dictionaries of its own."""
+        return Structure(
+            dict(self.blocks),
+            dict(self.frame_of),
+            dict(self.frames),
+            dict(self.wires),
+            dict(self.names),
+            dict(self.controls),
+            dict(self.handed),
+        )
 
     def clock(self, frame: str) -> Frame | None:
-        """Return the frame whose sample time holds in a frame: itself, or the nearest one around it."""
+        """Return the subsystem whose sample time holds in one: itself, or the nearest around it; None without any."""
         while frame and self.frames[frame].sample_time is None:
             frame = frame.rpartition(".")[0]
         found = self.frames[frame]
         return None if found.sample_time is None else found
 
     def method(self, frame: str) -> str:
-        """Return how continuous blocks in a frame are discretized: by its own method, or the nearest one around it."""
+        """Return the discretization of continuous blocks in a subsystem: its own, or that of the nearest around it."""
         while frame and self.frames[frame].method is None:
             frame = frame.rpartition(".")[0]
         return self.frames[frame].method or "exact"
 
     def rate(self, frame: str) -> Fraction | None:
-        """Return the sample time that holds in a frame, None where it is continuous."""
+        """Return the sample time that holds in a subsystem, None where it is continuous."""
         found = self.clock(frame)
         return None if found is None else found.sample_time
 
     def subsystems_around(self, frame: str) -> list[Frame]:
-        """Return the frames around a block in ``frame``, from the outermost one that is not the diagram to it."""
+        """Return a subsystem and all those around it, from outside in; the diagram itself is none."""
         parts = frame.split(".") if frame else []
         return [self.frames[".".join(parts[: i + 1])] for i in range(len(parts))]
 
     def gates(self, frame: str) -> tuple[str, ...]:
-        """Return the enabled and triggered boxes around a block in ``frame``, from outside in."""
+        """Return the paths of the enabled and triggered subsystems around a block in ``frame``, from outside in."""
         return tuple(f.path for f in self.subsystems_around(frame) if f.control)
 
     def triggered_around(self, frame: str) -> str | None:
-        """Return the innermost triggered box around a block in ``frame``."""
+        """Return the path of the innermost triggered subsystem around a block in ``frame``; None without any."""
         return next((f.path for f in reversed(self.subsystems_around(frame)) if f.control == "triggered"), None)
 
-    def is_event(self, box: str) -> bool:
-        """Whether a box is enabled or triggered in continuous time, by an event, and not at ticks."""
-        return box in self.controls and self.rate(box) is None and not self.is_sampled(box.rpartition(".")[0])
+    def is_event(self, path: str) -> bool:
+        """Whether a subsystem is enabled or triggered in continuous time, by an event, and not at ticks."""
+        return path in self.controls and self.rate(path) is None and not self.is_sampled(path.rpartition(".")[0])
 
     def is_traced(self, path: str) -> bool:
-        """Whether a run evaluates a block's equations: it is not stepped, and no transport delay in continuous time."""
+        """Whether a run evaluates a block's equations: a stepped block and a continuous transport delay have none."""
         block = self.blocks[path]
         return not block.stepped and (not block.transport or self.is_sampled(self.frame_of[path]))
 
     def is_sampled(self, frame: str) -> bool:
-        """Whether blocks in a frame act at instants only: ticks, or those of a trigger."""
+        """Whether blocks in a subsystem act at instants only: at ticks, or when it is triggered."""
         return self.rate(frame) is not None or self.triggered_around(frame) is not None
 
 
@@ -127,9 +155,9 @@ def stepped_blocks(table: Structure, inside: str = "") -> dict[str, Block]:
     Parameters
     ----------
     table : Structure
-        The diagram's table.
+        The diagram's structure.
     inside : str
-        Path of a block or a subsystem: only what it is, or holds; all without it.
+        Path of a block or a subsystem, to which the search is limited; the whole diagram without it.
     """
     paths = [p for p, b in table.blocks.items() if b.stepped and (not inside or f"{p}.".startswith(f"{inside}."))]
     return {path: table.blocks[path] for path in sorted(paths)}
@@ -137,58 +165,62 @@ def stepped_blocks(table: Structure, inside: str = "") -> dict[str, Block]:
 
 @dataclass(frozen=True, eq=False)
 class _Inside:
-    """The inside of a box, as the place where what it returns is used."""
+    """The inside of a subsystem, as the place where its results are used."""
 
-    box: SubsystemCall
+    call: SubsystemCall
 
 
-_ROOT: Any = object()  # the diagram itself, as the place where its roots are used
+class _Root:
+    """The diagram itself, as the place where its roots are used."""
+
+
+_Consumer = Call | SubsystemCall | _Inside | _Root | None
+"""User of a signal: a call, a subsystem, or a place; None for a reference that says nothing about the place."""
 
 
 def join(frame: str, name: str) -> str:
-    """Return the dotted path of ``name`` in a frame."""
+    """Return the dotted path of ``name`` in a subsystem."""
     return f"{frame}.{name}" if frame else name
 
 
 class Collector:
     """Walks from the roots against the wires, then gives every block its path."""
 
-    def __init__(self, roots: Iterable[Any]):
+    def __init__(self, roots: Iterable[object]):
         self.calls: dict[int, Call] = {}  # block identity → its call
         self.blocks: dict[int, Block] = {}  # every block met, in order
-        self.boxes: dict[int, SubsystemCall] = {}
-        self.named: list[tuple[str, Signal, Any]] = []  # wire name, signal, consumer (a call, a box, or None)
-        self.consumers: dict[int, list[Any]] = {}
+        self.subsystems: dict[int, SubsystemCall] = {}
+        self.named: list[tuple[str, Signal, _Consumer]] = []  # wire name, signal, consumer
+        self.consumers: dict[int, list[_Consumer]] = {}
         self.seen: set[int] = set()
-        self.stack: list[Any] = []
+        self.stack: list[tuple[Wireable, _Consumer]] = []
         for root in roots:
             if not isinstance(root, Wireable):
                 raise WiringError(f"found {root!r}; expected calls of blocks or subsystems, such as plant(force=u).")
-            self._follow(root._signal() if isinstance(root, Signal) else root, _ROOT)
+            self._follow(root, _Root())
             while self.stack:
                 self._follow(*self.stack.pop())
 
-    def _follow(self, item: Any, consumer: Any) -> None:
+    def _follow(self, item: Wireable, consumer: _Consumer) -> None:
         if isinstance(item, Signal):
             if item.wire:
                 self.named.append((item.wire, item, consumer))
             source = item.source
-            if isinstance(source, FrameInput):
-                self._follow(source.frame, None)
+            if isinstance(source, SubsystemInput):
+                self._follow(source.call, None)
             elif isinstance(source, SubsystemCall):
                 self._follow(source, None)
             elif isinstance(item.call, Call):
                 self._follow(item.call, consumer)
-            else:
+            elif isinstance(source, Block):
                 self._add_block(source, consumer)
-        elif isinstance(item, Call):
-            self._add_block(cast(Block, item.block), consumer)  # signals know blocks by their face only
+        elif isinstance(item, Call) and isinstance(item.block, Block):  # always: signals know blocks by a protocol
+            self._add_block(item.block, consumer)
             known = self.calls.setdefault(id(item.block), item.origin)
             if known is not item.origin:
                 raise DoubleDriveError(
                     "this block is called twice in one diagram, so its inputs would be driven twice. Make a second "
-                    "block: "
-                    f"{item.block.label}.replace().",
+                    f"block: {item.block.label}.replace().",
                     block=item.block.label,
                 )
             for port, name in zip(item.primary, item.names, strict=False):
@@ -200,23 +232,23 @@ class Collector:
         elif isinstance(item, SubsystemCall):
             if id(item) not in self.seen:
                 self.seen.add(id(item))
-                self.boxes[id(item)] = item
+                self.subsystems[id(item)] = item
                 self.stack.extend((s, _Inside(item)) for s in reversed(list(item.results.values())))
                 self.stack.extend((c, None) for c in reversed(item.calls))
                 self.stack.extend((s, item) for s in reversed(list(item.wires.values())))
-        else:
+        elif isinstance(item, Block):
             self._add_block(item, consumer)
 
-    def _add_block(self, block: Block, consumer: Any) -> None:
+    def _add_block(self, block: Block, consumer: _Consumer) -> None:
         self.blocks.setdefault(id(block), block)
         self.consumers.setdefault(id(block), []).append(consumer)
 
     def structure(self) -> Structure:
-        """Return the table."""
+        """Return the structure."""
         table = Structure(frames={"": Frame("", None, "exact")})
-        inner = {id(c): box for box in self.boxes.values() for c in box.calls}
-        path_of_box: dict[int, str] = {}
-        taken: dict[str, Any] = {}
+        around = {id(c): outer for outer in self.subsystems.values() for c in outer.calls}
+        subsystem_paths: dict[int, str] = {}
+        taken: set[str] = set()
 
         def place(frame: str, given: str | None, label: str) -> str:
             path = join(frame, given or label)
@@ -228,58 +260,58 @@ class Collector:
             count = 2
             while path in taken or (not given and path in fixed):
                 path, count = join(frame, f"{label}_{count}"), count + 1
-            taken[path] = True
+            taken.add(path)
             return path
 
         fixed: set[str] = set()
 
-        def subsystem_path(box: SubsystemCall) -> str:
-            if id(box) not in path_of_box:
-                outer = inner.get(id(box))
+        def subsystem_path(call: SubsystemCall) -> str:
+            if id(call) not in subsystem_paths:
+                outer = around.get(id(call))
                 frame = "" if outer is None else subsystem_path(outer)
-                path_of_box[id(box)] = place(frame, box.label, box.label)
-            return path_of_box[id(box)]
+                subsystem_paths[id(call)] = place(frame, call.label, call.label)
+            return subsystem_paths[id(call)]
 
-        def subsystem_of_item(item: Any) -> str | None:
-            if item is None:
+        def place_of(consumer: _Consumer) -> str | None:
+            if consumer is None:
                 return None
-            if item is _ROOT:
+            if isinstance(consumer, _Root):
                 return ""
-            if isinstance(item, _Inside):
-                return subsystem_path(item.box)
-            outer = inner.get(id(item))
+            if isinstance(consumer, _Inside):
+                return subsystem_path(consumer.call)
+            outer = around.get(id(consumer))
             return "" if outer is None else subsystem_path(outer)
 
-        for box in sorted(self.boxes.values(), key=lambda b: (subsystem_path(b).count("."), subsystem_path(b))):
-            path, made = subsystem_path(box), box.subsystem
+        for inner in sorted(self.subsystems.values(), key=lambda s: (subsystem_path(s).count("."), subsystem_path(s))):
+            path, made = subsystem_path(inner), inner.subsystem
             table.frames[path] = Frame(
                 path,
                 made.sample_time,
                 made.method,
-                tuple(box.wires),
-                tuple(box.outputs),
+                tuple(inner.wires),
+                tuple(inner.outputs),
                 made.offset,
                 made.delay,
                 made.control,
                 made.when,
             )
-        # frames of all blocks, then the given names, then the numbered ones
+        # the place of every block, then the given names, then the numbered ones
         frames: dict[int, str] = {}
         for key, block in self.blocks.items():
             call = self.calls.get(key)
             if call is not None:
-                frames[key] = subsystem_of_item(call) or ""
+                frames[key] = place_of(call) or ""
             else:
                 if any(port.default is None for port in block.inputs.values()):
                     needed = [n for n, port in block.inputs.items() if port.default is None]
                     raise UnwiredInputError(
                         f"an output of this block is used, but the block is never called, so nothing is wired to "
-                        f"{', '.join(map(repr, needed))}. Call it, and give the call (or what it drives) to the "
+                        f"{', '.join(map(repr, needed))}. Call it, and give the call (or one that it drives) to the "
                         f"Diagram.",
                         block=block.label,
                         port=needed[0],
                     )
-                users = [subsystem_of_item(c) for c in self.consumers[key]]
+                users = [place_of(c) for c in self.consumers[key]]
                 frames[key] = _common_subsystem([u for u in users if u is not None])
             if block.name:
                 fixed.add(join(frames[key], block.name))
@@ -296,16 +328,16 @@ class Collector:
                 crossed: list[tuple[SubsystemCall, str]] = []
                 wire = table.wires[paths[key], port] = _resolve(signal, paths, crossed)
                 maker = f"{table.frame_of[wire.block]}."
-                outputs = [(subsystem_path(box), output) for box, output in crossed]
-                handed = tuple((box, output) for box, output in outputs if not maker.startswith(f"{box}."))
+                outputs = [(subsystem_path(passing), output) for passing, output in crossed]
+                handed = tuple((path_, output) for path_, output in outputs if not maker.startswith(f"{path_}."))
                 if handed:
                     table.handed[paths[key], port] = handed
-        for box in self.boxes.values():
-            if box.subsystem.control:
-                table.controls[subsystem_path(box)] = _resolve(box.wires[box.subsystem.control_input], paths)
+        for inner in self.subsystems.values():
+            if inner.subsystem.control:
+                table.controls[subsystem_path(inner)] = _resolve(inner.wires[inner.subsystem.control_input], paths)
         for name, signal, consumer in self.named:
             wire = _resolve(signal, paths)
-            frame = subsystem_of_item(consumer)
+            frame = place_of(consumer)
             frame = table.frame_of[wire.block] if frame is None else frame
             if table.names.setdefault(join(frame, name), wire) != wire:
                 raise DuplicateNameError(
@@ -317,7 +349,7 @@ class Collector:
 
 
 def _common_subsystem(frames: list[str]) -> str:
-    """Return the innermost frame that holds all the given ones."""
+    """Return the innermost subsystem that holds all the given ones."""
     if not frames:
         return ""
     parts = [f.split(".") if f else [] for f in frames]
@@ -330,11 +362,11 @@ def _common_subsystem(frames: list[str]) -> str:
 
 
 def _resolve(signal: Signal, paths: dict[int, str], crossed: list[tuple[SubsystemCall, str]] | None = None) -> Wire:
-    """Follow a signal through subsystem borders to its block; ``crossed`` takes the outputs of boxes on the way."""
+    """Follow a signal across borders to its block; ``crossed`` collects the outputs of subsystems on the way."""
     index = signal.index
     while True:
-        if isinstance(signal.source, FrameInput):
-            inner = signal.source.frame.wires[signal.source.port]
+        if isinstance(signal.source, SubsystemInput):
+            inner = signal.source.call.wires[signal.source.port]
         elif isinstance(signal.source, SubsystemCall):
             inner = signal.source.results[signal.port]
             if crossed is not None:

@@ -1,11 +1,11 @@
-"""Subsystems: a function of signals is one box of a diagram."""
+"""Subsystems: functions of signals that stand in a diagram like blocks."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
 from fractions import Fraction
-from typing import Any, overload
+from typing import SupportsFloat, TypedDict, Unpack, overload
 
 from ...blocks.core.errors import (
     DoubleDriveError,
@@ -22,7 +22,7 @@ FINEST = Fraction(1, 10**9)
 ENABLED, TRIGGERED = ("held", "reset"), ("rising", "falling", "both")
 
 
-def exact_time(value: Any, *, block: str = "") -> Fraction:
+def exact_time(value: SupportsFloat | str, *, block: str = "") -> Fraction:
     """Return a sample time as an exact fraction of a second: a float is read as its shortest decimal.
 
     Raises
@@ -47,13 +47,13 @@ def exact_time(value: Any, *, block: str = "") -> Fraction:
     return time
 
 
-def exact_offset(value: Any, sample_time: Fraction | None, *, block: str) -> Fraction:
+def exact_offset(value: SupportsFloat | str, sample_time: Fraction | None, *, block: str) -> Fraction:
     """Return an offset as an exact fraction of a second.
 
     Raises
     ------
     SampleTimeError
-        If it is negative, not less than the sample time, or there is none.
+        If it is negative, not less than the sample time, or there is no sample time.
     """
     if isinstance(value, int | float | Fraction) and not isinstance(value, bool) and value == 0:
         return Fraction(0)
@@ -68,8 +68,8 @@ def exact_offset(value: Any, sample_time: Fraction | None, *, block: str) -> Fra
     return offset
 
 
-def check_delay(value: Any, sample_time: Fraction | None, *, block: str) -> int:
-    """Return a computational delay in samples.
+def check_delay(value: object, sample_time: Fraction | None, *, block: str) -> int:
+    """Return a computational delay in samples, checked.
 
     Raises
     ------
@@ -83,25 +83,37 @@ def check_delay(value: Any, sample_time: Fraction | None, *, block: str) -> int:
     return value
 
 
-class FrameInput:
+class SubsystemInput:
     """The inside of a subsystem's input: stands for the signal that is wired to it outside."""
 
-    def __init__(self, frame: SubsystemCall, port: str):
-        self.frame, self.port = frame, port
+    def __init__(self, call: SubsystemCall, port: str):
+        self.call, self.port = call, port
         self.label, self.outputs = port, (port,)
 
 
+class SubsystemKeywords(TypedDict, total=False):
+    """Keywords of `subsystem`."""
+
+    sample_time: float | Fraction | None
+    method: str | None
+    name: str | None
+    offset: float | Fraction
+    delay: int
+    enabled: str | None
+    triggered: str | None
+
+
 class Subsystem:
-    """A function of signals as a box; made by `subsystem`, called like a block."""
+    """A function of signals that stands in a diagram like a block; made by `subsystem`, called like a block."""
 
     def __init__(
         self,
-        function: Callable[..., Any],
+        function: Callable[..., object],
         *,
-        sample_time: Any = None,
+        sample_time: float | Fraction | None = None,
         method: str | None = None,
         name: str | None = None,
-        offset: Any = 0,
+        offset: float | Fraction = 0,
         delay: int = 0,
         enabled: str | None = None,
         triggered: str | None = None,
@@ -109,7 +121,7 @@ class Subsystem:
         if method is not None:
             check_method(method)
         self.function, self.method = function, method
-        own = getattr(function, "__name__", "")  # a functools.partial has none, a lambda no identifier
+        own = str(getattr(function, "__name__", ""))  # a functools.partial has none, a lambda no identifier
         own = own if own.isidentifier() else "subsystem"
         self.name = check_name(name or own)
         self.sample_time = None if sample_time is None else exact_time(sample_time, block=self.name)
@@ -117,7 +129,10 @@ class Subsystem:
         self.delay = check_delay(delay, self.sample_time, block=self.name)
         self.enabled, self.triggered = enabled, triggered
         if enabled is not None and triggered is not None:
-            raise WiringError("it is both enabled and triggered; put one box into the other.", block=self.name)
+            raise WiringError(
+                "it is both enabled and triggered; put an enabled subsystem into a triggered one, or the reverse.",
+                block=self.name,
+            )
         for value, key, allowed in ((enabled, "enabled", ENABLED), (triggered, "triggered", TRIGGERED)):
             if value is not None and value not in allowed:
                 raise WiringError(
@@ -131,7 +146,7 @@ class Subsystem:
         self.open_ended = len(self.parameters) < len(every)
         self.__doc__, self.__name__ = function.__doc__, self.name
 
-    def replace(self, **changes: Any) -> Subsystem:
+    def replace(self, **changes: Unpack[SubsystemKeywords]) -> Subsystem:
         """Return a variant; the keywords are those of `subsystem`.
 
         Raises
@@ -139,7 +154,7 @@ class Subsystem:
         UnknownNameError
             For any other name.
         """
-        known = {
+        known: SubsystemKeywords = {
             "sample_time": self.sample_time,
             "method": self.method,
             "name": self.name,
@@ -151,10 +166,11 @@ class Subsystem:
         for key in changes:
             if key not in known:
                 raise UnknownNameError(f"a subsystem has no {key!r}. {near(key, known)}", block=self.name)
-        return Subsystem(self.function, **{**known, **changes})
+        options: SubsystemKeywords = {**known, **changes}
+        return Subsystem(self.function, **options)
 
-    def __call__(self, *args: Any, **kwargs: Any) -> SubsystemCall:
-        """Wire the box: run the function on signals that stand for its inputs."""
+    def __call__(self, *args: object, **kwargs: object) -> SubsystemCall:
+        """Wire the subsystem: run the function on signals that stand for its inputs."""
         names = [p.name for p in self.parameters]
         if self.control_input and self.control_input not in names:
             names.append(self.control_input)
@@ -187,12 +203,12 @@ class SubsystemCall(Wireable):
 
     def __init__(self, subsystem: Subsystem, wires: dict[str, Signal]):
         self.subsystem, self.wires, self.label = subsystem, wires, subsystem.name
-        calls: list[Any] = []
+        calls: list[Call | SubsystemCall] = []
         token = recorder.set(calls)
         try:
             own = {p.name for p in subsystem.parameters}
             inside = [k for k in wires if k in own or k != subsystem.control_input]
-            result = subsystem.function(**{k: Signal(FrameInput(self, k), k) for k in inside})
+            result = subsystem.function(**{k: Signal(SubsystemInput(self, k), k) for k in inside})
         finally:
             recorder.reset(token)
         self.calls = calls
@@ -202,7 +218,7 @@ class SubsystemCall(Wireable):
         if outer is not None:
             outer.append(self)
 
-    def _name_results(self, result: Any) -> dict[str, Signal]:
+    def _name_results(self, result: object) -> dict[str, Signal]:
         if result is None:
             return {}
         if isinstance(result, dict):
@@ -248,7 +264,7 @@ class SubsystemCall(Wireable):
 
 
 @overload
-def subsystem(function: Callable[..., Any], /) -> Subsystem: ...
+def subsystem(function: Callable[..., object], /) -> Subsystem: ...
 @overload
 def subsystem(
     *,
@@ -259,9 +275,9 @@ def subsystem(
     delay: int = 0,
     enabled: str | None = None,
     triggered: str | None = None,
-) -> Callable[[Callable[..., Any]], Subsystem]: ...
+) -> Callable[[Callable[..., object]], Subsystem]: ...
 def subsystem(
-    function: Callable[..., Any] | None = None,
+    function: Callable[..., object] | None = None,
     /,
     *,
     sample_time: float | Fraction | None = None,
@@ -271,42 +287,43 @@ def subsystem(
     delay: int = 0,
     enabled: str | None = None,
     triggered: str | None = None,
-) -> Any:
-    """Make a function of signals a box of a diagram.
+) -> Subsystem | Callable[[Callable[..., object]], Subsystem]:
+    """Make a subsystem of a function of signals.
 
     Parameters
     ----------
     sample_time : float or Fraction, optional
         Sample time in s. Inputs are sampled at its ticks, outputs held between them, continuous blocks inside
-        discretized. A float is read as its shortest decimal. Without one the box has the rate of what surrounds it.
+        discretized. A float is read as its shortest decimal. Without one, the sample time of the surroundings holds.
     method : {"exact", "forward", "semi_implicit", "trapezoidal"}
-        How continuous blocks inside are discretized: ``exact`` is the zero-order hold for blocks that are linear in
-        their states, forward Euler for others; ``trapezoidal`` is of second order, solved by Newton's method where a
-        block is not linear, and the run stops at a step that it does not solve; see `loopwright.blocks.hold`.
-        Without one it is that of the box around, or ``exact``. Each block is discretized by itself, with its inputs
-        held over the sample: several `Integrator` blocks in a row are forward Euler between them whatever the method
-        (put them into one block, such as a `StateSpace`, for it to act on the whole), and ``trapezoidal`` is not
-        Tustin's method, ``c2d(…, "bilinear")``, which averages the inputs too.
+        Discretization of continuous blocks inside. ``exact`` is the zero-order hold for blocks that are linear in
+        their states, forward Euler for others. ``trapezoidal`` is of second order; where a block is not linear,
+        Newton's method solves each step, and the run stops at a step that it does not solve. See
+        `loopwright.blocks.hold`. Without one, the method of the surroundings holds, or ``exact``. Each block is
+        discretized by itself, with its inputs held over the sample. So several `Integrator` blocks in a row are
+        forward Euler between them whatever the method; put them into one block, such as a `StateSpace`, for the method
+        to act on the whole. For the same reason ``trapezoidal`` is not Tustin's method, ``c2d(…, "bilinear")``, which
+        averages the inputs too.
     name : str, optional
-        Name of the box; without one, the function's.
+        Name of the subsystem; without one, the function's.
     offset : float or Fraction
-        Time of the first tick in s, less than the sample time. Until then the outputs are what the box gives at t = 0,
-        and are held.
+        Time of the first tick in s, less than the sample time. Until then the outputs have their values of t = 0.
     delay : int
-        Computational delay in samples: what leaves the box at a tick was computed that many ticks before, from the
-        inputs then. In the first ticks it is what was computed first.
+        Computational delay in samples: an output leaves the subsystem that many ticks after it was computed. In the
+        first ticks the first computed value leaves it.
     enabled : {"held", "reset"}, optional
-        The box is called with one more input, ``enable``, and acts only while that is true (above 0.5). Else its
-        outputs and states are held; with "reset" the states start anew when it is enabled again. With a sample time it
-        looks at its own ticks, and boxes of other rates in it go by the last one.
+        Gives the subsystem one more input, ``enable``. It acts only while that is true (above 0.5), and holds its
+        outputs and states else; with "reset" the states start anew when it is enabled again. With a sample time the
+        input counts at its own ticks, and subsystems of other rates inside go by the last of them.
     triggered : {"rising", "falling", "both"}, optional
-        The box is called with one more input, ``trigger``, and acts only at the instants at which that becomes true
-        (rising), false (falling), or either. Between them its outputs are held. Blocks inside have no sample time.
+        Gives the subsystem one more input, ``trigger``. It acts only at the instants at which that becomes true
+        (rising), false (falling), or either, and holds its outputs between. Blocks inside have no sample time.
 
     Raises
     ------
     SampleTimeError
-        Not positive, or no multiple of 1 ns; an unknown method; an offset or a delay without a sample time.
+        A sample time that is not positive, or no multiple of 1 ns; an unknown method; an offset or a delay without a
+        sample time.
     WiringError
         Another word for ``enabled`` or ``triggered``, or both.
 
@@ -324,7 +341,7 @@ def subsystem(
             f"found {function!r}; expected a function, or keywords: @subsystem(sample_time={function!r})."
         )
 
-    def decorate(f: Callable[..., Any]) -> Subsystem:
+    def decorate(f: Callable[..., object]) -> Subsystem:
         return Subsystem(
             f,
             sample_time=sample_time,

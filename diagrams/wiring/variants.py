@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace as replace_fields
-from typing import Any
+from typing import Any, TypeVar
 
 from ...blocks.core.block import Block
 from ...blocks.core.errors import UnknownNameError, WiringError, near
@@ -13,32 +13,34 @@ from ...blocks.tracing.discretization import check_method
 from .structure import Frame, Structure
 from .subsystem import check_delay, exact_offset, exact_time
 
-_OF_A_BOX = ("sample_time", "method", "offset", "delay")
+V = TypeVar("V", bound=Value)
+
+_OF_A_SUBSYSTEM = ("sample_time", "method", "offset", "delay")
 
 
-def apply_changes(table: Structure, changes: Mapping[str, Any], diagram: str) -> Structure:
+def apply_changes(table: Structure, changes: Mapping[str, object], diagram: str) -> Structure:
     """Return the structure of a variant; see `Diagram.replace`."""
-    table = Structure(**{k: dict(v) for k, v in vars(table).items()})
+    table = table.copy()
     for path, value in changes.items():
         _change(table, path, value, diagram)
     return table
 
 
 def _find_owner(table: Structure, path: str) -> str:
-    """Return the block that a path is, or is the unique end of; "" if there is none."""
+    """Return the path of the block that a path, or the unique end of one, names; "" if there is none."""
     if path in table.blocks:
         return path
     found = [p for p in table.blocks if p.endswith("." + path)]
     return found[0] if len(found) == 1 else ""
 
 
-def _change(table: Structure, path: str, value: Any, diagram: str) -> None:
+def _change(table: Structure, path: str, value: object, diagram: str) -> None:
     head, _, last = path.rpartition(".")
     owner = table.blocks.get(_find_owner(table, head)) if head else None
     if isinstance(value, Block) and not (owner is not None and last in type(owner).parameter_specs):
         full = find_path(path, table.blocks, "block", diagram)
         table.blocks[full] = value.replace(name=full.rpartition(".")[2])
-    elif last in _OF_A_BOX and (frame := _find_subsystem(table, head, last, diagram)) is not None:
+    elif last in _OF_A_SUBSYSTEM and (frame := _find_subsystem(table, head, last, diagram)) is not None:
         table.frames[frame] = _change_subsystem(table.frames[frame], last, value)
     elif path in table.blocks:
         raise WiringError(
@@ -52,19 +54,20 @@ def _change(table: Structure, path: str, value: Any, diagram: str) -> None:
 
 
 def _find_subsystem(table: Structure, path: str, key: str, diagram: str) -> str | None:
-    """Return the subsystem that a path means; None where it means none, but perhaps a block."""
-    boxes = {frame: None for frame in table.frames if frame}
+    """Return the path of the subsystem whose ``key`` is meant; None where it may be a block's parameter."""
+    known = {frame: None for frame in table.frames if frame}
     if path:
-        found = [f for f in boxes if f == path or f.endswith("." + path)]
-        return find_path(path, boxes, "subsystem", diagram) if found else None
+        found = [f for f in known if f == path or f.endswith("." + path)]
+        return find_path(path, known, "subsystem", diagram) if found else None
     if any(key in type(block).parameter_specs for block in table.blocks.values()):
-        return None  # a block's parameter of that name
-    offered = ", ".join(f"{frame}.{key}" for frame in boxes) or "none: this diagram has no subsystem"
-    raise UnknownNameError(f"a diagram has no {key!r} of its own; its subsystems have: {offered}.")
+        return None
+    offered = ", ".join(f"{frame}.{key}" for frame in known)
+    step = f"its subsystems have: {offered}" if offered else "leave it out: this diagram has no subsystem"
+    raise UnknownNameError(f"a diagram has no {key!r} of its own; {step}.")
 
 
 def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str]]:
-    """Return the block and the parameter path that a dotted path means."""
+    """Split a dotted path into the path of a block and the names of a parameter in it."""
     parts = path.split(".")
     for cut in range(len(parts) - 1, 0, -1):
         try:
@@ -83,7 +86,7 @@ def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str
 
 
 def _change_subsystem(frame: Frame, key: str, value: Any) -> Frame:
-    """Return a box with another sample time, method, offset or delay."""
+    """Return a subsystem's settings with another sample time, method, offset or delay."""
     new, path = value, frame.path
     if key == "sample_time" and value is not None:
         new = exact_time(value, block=path)
@@ -100,8 +103,8 @@ def _change_subsystem(frame: Frame, key: str, value: Any) -> Frame:
     return replace_fields(frame, **changed)
 
 
-def find_path(path: str, known: Mapping[str, Any], kind: str, diagram: str) -> str:
-    """Return the full path that ``path`` is, or is the unique end of."""
+def find_path(path: str, known: Mapping[str, object], kind: str, diagram: str) -> str:
+    """Return the full path that ``path``, or the unique end of one, names."""
     if not isinstance(path, str):
         raise UnknownNameError(f"found {path!r}; expected the path of a {kind}, such as {next(iter(known), '')!r}.")
     if path in known:
@@ -114,7 +117,7 @@ def find_path(path: str, known: Mapping[str, Any], kind: str, diagram: str) -> s
     raise UnknownNameError(f"no {kind} {path!r} in diagram {diagram!r}. {near(path, known)}")
 
 
-def change_parameter(block: Value, keys: list[str], value: Any) -> Any:
+def change_parameter(block: V, keys: list[str], value: object) -> V:
     """Return ``block`` with the parameter at a path of attribute names or mapping keys changed."""
     name = keys[0]
     if len(keys) == 1:

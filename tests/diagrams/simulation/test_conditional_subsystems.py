@@ -305,7 +305,7 @@ def test_an_fmu_in_an_enabled_box_is_refused():
 
     with pytest.raises(
         WiringError,
-        match=r"box\.ball: a block that is stepped, such as an FMU, can't stand in a box that is enabled \(box\)",
+        match=r"box\.ball: a block that is stepped, such as an FMU, can't stand in a subsystem that is enabled \(box\)",
     ):
         Diagram("d", box(enable=Constant(value=1.0)))
 
@@ -315,7 +315,7 @@ def test_a_transport_delay_in_an_enabled_box_is_refused():
     def box(u):
         return TransportDelay(delay=0.1, name="late")(u)
 
-    with pytest.raises(WiringError, match=r"box\.late: a transport delay can't stand in a box that is enabled"):
+    with pytest.raises(WiringError, match=r"box\.late: a transport delay can't stand in a subsystem that is enabled"):
         Diagram("d", box(Clock(), enable=Constant(value=1.0)))
 
 
@@ -328,7 +328,9 @@ def test_a_box_with_a_rate_of_its_own_in_a_triggered_box_is_refused():
 
         return inner(u)
 
-    with pytest.raises(SampleTimeError, match=r"inner has a sample time of its own inside of the triggered box outer"):
+    with pytest.raises(
+        SampleTimeError, match=r"inner has a sample time of its own inside the triggered subsystem outer"
+    ):
         Diagram("d", outer(Clock(), trigger=Sine(frequency=1.0)))
 
 
@@ -338,7 +340,9 @@ def test_what_needs_a_sample_time_is_refused_in_a_triggered_box(block):
     def box(u):
         return block()(u)
 
-    with pytest.raises(SampleTimeError, match=r"box\.i: it needs a sample time, and the triggered box box has none"):
+    with pytest.raises(
+        SampleTimeError, match=r"box\.i: it needs a sample time, and the triggered subsystem box has none"
+    ):
         Diagram("d", box(Clock(), trigger=Sine(frequency=1.0)))
 
 
