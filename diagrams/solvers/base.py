@@ -1,6 +1,6 @@
 """Solvers of ordinary differential equations behind one interface: x' = f(t, x) between two discontinuities.
 
-How to choose (`rtol`, `atol` bound the error of one step; the error of a run is usually 1 to 100 times that):
+`rtol` and `atol` bound the error of one step; the error of a run is usually 1 to 100 times that. The choice:
 
 ============== ======================== ====================================================================
 name           method                   choose it for
@@ -21,9 +21,8 @@ euler          Runge-Kutta 1, fixed     to see what a controller's forward Euler
 
 The multistep methods start again at order 1 after every discontinuity, so that a sampled controller costs them most.
 
-A solver never evaluates the rates beyond the `stop` it was given and lands on it exactly: discontinuities in time are
-put there. The state at times inside a step comes from the method's own dense output (from a shorter step if the step is
-fixed).
+A solver never evaluates the rates beyond its `stop`, and lands on it exactly: discontinuities in time are put there.
+The state at times inside a step comes from the method's own dense output, with a fixed step from a shorter step.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ _HOPELESS = 1e7  # steps to go, at which a run is given up
 
 @dataclass(frozen=True)
 class Problem:
-    """What is integrated: x' = rate(t, x).
+    """The differential equation x' = rate(t, x).
 
     Parameters
     ----------
@@ -57,7 +56,7 @@ class Problem:
     jacobian : callable
         ``jacobian(t, x)``: ∂rate/∂x, size × size.
     names : sequence of str
-        What each entry of x is, for messages: ``"block.state[i]"``.
+        Name of each entry of x, for messages: ``"block.state[i]"``.
     """
 
     size: int
@@ -68,7 +67,7 @@ class Problem:
 
 @dataclass
 class Statistics:
-    """What a solver did. ``rejected`` is None where the method does not tell."""
+    """Counts of a solver's work, and its messages; ``rejected`` is None where the method does not count them."""
 
     solver: str
     steps: int = 0
@@ -88,7 +87,7 @@ class Step:
         self._dense: Dense | None = None
 
     def interpolate(self, t: float) -> np.ndarray:
-        """Return the state at ``t`` in [t_old, t]. Only until the solver's next step or restart."""
+        """Return the state at ``t`` in [t_old, t]; valid until the solver's next step or restart."""
         if t == self.t:
             return self.x.copy()
         if self._dense is None:
@@ -100,7 +99,7 @@ class Solver(ABC):
     """The interface of all solvers: `restart`, then `step` until ``t == stop``."""
 
     fixed = False
-    stiff = False  # is it made for stiff problems?
+    stiff = False  # made for stiff problems
 
     def __init__(self, name: str, problem: Problem, rtol: float, atol: float | np.ndarray, max_step: float):
         self.name, self.problem, self.rtol, self.atol, self.max_step = name, problem, rtol, atol, max_step
@@ -116,11 +115,11 @@ class Solver(ABC):
         """Take one step that the error control accepts, at most to ``stop``."""
 
     def save(self) -> dict[str, Any]:
-        """Return what it remembers beside the state, such as the step that it would take next."""
+        """Return the solver's memory beside the state, such as the step that it would take next."""
         return {}
 
     def restore(self, saved: Mapping[str, Any]) -> None:
-        """Go on as the solver did whose `save` it is; after one of another method, start anew."""
+        """Take over the memory that `save` returned; of another method's memory nothing is used."""
         return
 
     def rate(self, t: float, x: np.ndarray) -> np.ndarray:
@@ -133,23 +132,23 @@ class Solver(ABC):
         self.statistics.jacobian_evaluations += 1
         return np.array(self.problem.jacobian(min(t, self.stop), x), dtype=float)
 
-    def check_finite(self, t: float, values: np.ndarray, what: str) -> None:
-        """Raise if an entry is not finite; ``what`` is "state" or "rate"."""
+    def check_finite(self, t: float, values: np.ndarray, quantity: str) -> None:
+        """Raise a `NonFiniteError` if an entry is not finite; ``quantity`` is "state" or "rate"."""
         if not np.isfinite(values).all():
             i = int(np.flatnonzero(~np.isfinite(values))[0])
             growth = "a step too long for a fast mode (try a tenth of it)" if self.fixed else "unbounded growth"
             error = NonFiniteError(
-                f"The {what} of {self.problem.names[i]} is {values[i]:g} with solver={self.name!r}; expected a finite "
-                f"number. Look for a division by zero, a root or a logarithm of a negative number, or {growth}.",
+                f"The {quantity} of {self.problem.names[i]} is {values[i]:g} with solver={self.name!r}; expected a "
+                f"finite number. Look for a division by zero, a root or a logarithm of a negative number, or {growth}.",
                 t=t,
             )
             error.state = self.problem.names[i]
             raise error
 
     def failure(self, t: float, x: np.ndarray, h: float, found: str = "") -> SimulationError:
-        """Return the error of a step that can't be made small enough, at the accepted point (t, x).
+        """Return the error for a step that can't be made small enough, at the accepted point (t, x).
 
-        The entry that it names has the largest weighted error there in a step of Euler's method.
+        It names the entry with the largest weighted error there in a step of Euler's method.
         """
         f = self.rate(t, x)
         try:
@@ -176,7 +175,7 @@ class Solver(ABC):
 
 
 class VariableStep(Solver):
-    """The base of the variable-step solvers: an interval of a few ulps is crossed by one step of Heun's method."""
+    """Base of the variable-step solvers: one step of Heun's method crosses an interval of a few ulps."""
 
     _sliver: tuple[float, np.ndarray] | None = None
     _count, _mark = 0, 0.0
@@ -205,7 +204,7 @@ class VariableStep(Solver):
         return Step(t, self.stop, _heun(self.rate, t, x, f, self.stop), lambda: lambda time: x + (time - t) * f)
 
     def _check_progress(self, step: Step) -> None:
-        """Raise if the last steps were so small that the run would never end: at a jump that is no event, say."""
+        """Raise if the last steps were so small that the run would never end, as at a jump that is no event."""
         h, self._mark = (step.t - self._mark) / _STRETCH, step.t
         if self.stop - step.t > _HOPELESS * h:
             found = f"got no further than {h:.2g} s per step in {_STRETCH} steps, with {self.stop - step.t:.3g} s to go"
@@ -223,7 +222,7 @@ class VariableStep(Solver):
 class FixedStep(Solver):
     """Explicit Runge-Kutta methods of fixed step.
 
-    Stops that are further away than ``step`` are reached in equal steps of at most ``step``.
+    A stop that is further away than ``step`` is reached in equal steps of at most ``step``.
     """
 
     fixed = True
@@ -261,7 +260,7 @@ class FixedStep(Solver):
 def euler(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray, t_new: float) -> np.ndarray:
     """Forward Euler, order 1, one stage: x + h f(t, x). Stable for |1 + hλ| < 1: h < 2/|λ| for a real pole.
 
-    The step below is Hairer, Nørsett, Wanner, Solving Ordinary Differential Equations I, II.1, for all three methods.
+    Reference for all three methods: Hairer, Nørsett, Wanner, Solving Ordinary Differential Equations I, II.1.
     """
     return x + (t_new - t) * f
 
@@ -292,13 +291,19 @@ SOLVERS: tuple[str, ...] = ("auto", *FIXED, *_SCIPY, *SUNDIALS)
 
 
 class NoStates(FixedStep):
-    """Without states there is nothing to integrate: one step to ``stop``, or several of ``max_step``."""
+    """Solver of a diagram without continuous states: one step to ``stop``, or several of ``max_step``."""
 
     fixed = False
 
 
 def solver_name(name: str) -> str:
-    """Return the name as `SOLVERS` spells it; an unknown one is an `OptionError`."""
+    """Return the name as `SOLVERS` spells it; capitals don't matter.
+
+    Raises
+    ------
+    OptionError
+        If it is none of them.
+    """
     spelled = {known.lower(): known for known in SOLVERS} | {"cvode": "CVODE_BDF"}
     if not isinstance(name, str) or name.lower() not in spelled:
         hint = near(str(name).lower(), spelled)

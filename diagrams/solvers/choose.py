@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -22,16 +21,16 @@ def make_solver(
     step: float | None = None,
     max_step: float | None = None,
 ) -> Solver:
-    """Return the solver of this name (capitals don't matter).
+    """Return the solver of a name; capitals don't matter.
 
     Parameters
     ----------
     name : str
         One of `SOLVERS`.
     problem : Problem
-        What is integrated.
+        The differential equation.
     rtol, atol : float, float or ndarray
-        Each step's error in entry i is held below about atol[i] + rtol·|x[i]|.
+        They hold each step's error in entry i below about atol[i] + rtol·|x[i]|.
     step : float, optional
         Step of a fixed-step method, s; the others take none.
     max_step : float, optional
@@ -46,7 +45,7 @@ def make_solver(
     size = problem.size
     for option, value in (("step", step), ("max_step", max_step)):
         if value is not None and not (isinstance(value, int | float | np.number) and value > 0):
-            raise OptionError(f"{option} is {value!r}; expected a positive number of seconds.")
+            raise OptionError(f"{option} is {value!r}; expected a positive number of seconds, such as 1e-3.")
     if name in FIXED:
         if step is None:
             raise OptionError(f"solver={name!r} has a fixed step and step is None; give step=1e-3 or so, in s.")
@@ -59,10 +58,12 @@ def make_solver(
     except (TypeError, ValueError):
         absolute = np.full((), -1.0)
     if absolute.shape not in ((), (size,)) or not (absolute >= 0).all():
-        raise OptionError(f"atol is {atol!r}; expected a number or an array of shape ({size},), not negative.")
+        raise OptionError(
+            f"atol is {atol!r}; expected a number, such as 1e-9, or an array of shape ({size},), not negative."
+        )
     if not size:
         return NoStates(name, problem, bound, euler)
-    tolerance: Any = absolute if absolute.ndim else float(absolute)
+    tolerance = absolute if absolute.ndim else float(absolute)
     if name in SUNDIALS:
         return Cvode(name, problem, rtol, tolerance, bound)
     return (AutoSolver if name == "auto" else SciPySolver)(name, problem, rtol, tolerance, bound)

@@ -1,8 +1,8 @@
 """CVODE, the multistep solver of SUNDIALS, in compiled code.
 
-FMPy, which is needed anyway, brings SUNDIALS for Linux and Windows (x86_64) and macOS (arm64); it is called through
-ctypes, so that nothing else is to be installed, and with everything that is needed here: one step at a time up to a
-stop time, the method's own dense output, the exact Jacobian, and a cheap start after each discontinuity.
+FMPy, which Loopwright needs anyway, brings SUNDIALS for Linux and Windows (x86_64) and macOS (arm64), so nothing else
+is to be installed. The calls go through ctypes: one step at a time up to a stop time, the method's own dense output,
+the exact Jacobian, and a cheap start after each discontinuity.
 
 ============  ================  ======================================  ================================================
 name          order             each step is solved by                  choose it for
@@ -20,6 +20,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import weakref
+from collections.abc import Callable
 from ctypes import CFUNCTYPE, POINTER, byref, c_char_p, c_double, c_int, c_int64, c_long, c_void_p
 from typing import Any
 
@@ -29,7 +30,7 @@ from ...blocks.core.errors import NonFiniteError, OptionError
 from .base import Dense, Problem, Statistics, Step, VariableStep
 
 _ADAMS, _BDF, _ONE_STEP = 1, 2, 2
-_MEMORY = -20  # codes from here down are misuse or lack of memory, not mathematics
+_MEMORY = -20  # this code and those below are misuse or lack of memory, not mathematics
 _RATE = CFUNCTYPE(c_int, c_double, c_void_p, c_void_p, c_void_p)
 _JACOBIAN = CFUNCTYPE(c_int, c_double, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p, c_void_p)
 _MESSAGE = CFUNCTYPE(None, c_int, c_char_p, c_char_p, c_char_p, c_int, c_void_p, c_void_p)
@@ -86,7 +87,7 @@ class _Library:
                 function.restype, function.argtypes = result, arguments
                 setattr(self, name, function)
 
-    def __getattr__(self, name: str) -> Any:  # for type checkers: all attributes are set above
+    def __getattr__(self, name: str) -> Callable[..., int]:  # for type checkers: all attributes are set above
         raise AttributeError(name)
 
 
@@ -105,13 +106,13 @@ def _load_library() -> _Library:
     library.SUNDIALSGetVersionNumber(byref(major), byref(c_int()), byref(c_int()), ctypes.create_string_buffer(8), 8)
     if major.value != 7:
         raise OptionError(
-            f"FMPy brings SUNDIALS {major.value}; expected 7. Install another version of FMPy, or take solver='BDF'."
+            f"found SUNDIALS {major.value} in FMPy; expected 7. Install another version of FMPy, or take solver='BDF'."
         )
     return library
 
 
 class _Calls:
-    """What CVODE calls back. Python's exceptions can't pass through it: they are kept and raised afterwards."""
+    """Callbacks for CVODE. Python's exceptions can't pass through C: they are kept, and raised afterwards."""
 
     def __init__(self, problem: Problem, statistics: Statistics, library: _Library):
         self.problem, self.statistics, self.library = problem, statistics, library
@@ -130,7 +131,7 @@ class _Calls:
         """Return the memory of a vector as an array."""
         return self.view(self.library.N_VGetArrayPointer(handle), self.problem.size)
 
-    def _rate(self, t: float, x: int, f: int, _: Any) -> int:
+    def _rate(self, t: float, x: int, f: int, _: object) -> int:
         try:
             self.statistics.rate_evaluations += 1
             rates = self.vector(f)
@@ -140,7 +141,7 @@ class _Calls:
             self.error = error
             return -1
 
-    def _jacobian(self, t: float, x: int, f: int, matrix: int, *_: Any) -> int:
+    def _jacobian(self, t: float, x: int, f: int, matrix: int, *_: object) -> int:
         try:
             self.statistics.jacobian_evaluations += 1
             n = self.problem.size
@@ -151,14 +152,14 @@ class _Calls:
             self.error = error
             return -1
 
-    def _say(self, line: int, function: bytes, file: bytes, message: bytes, code: int, *_: Any) -> None:
+    def _say(self, line: int, function: bytes, file: bytes, message: bytes, code: int, *_: object) -> None:
         self.message = message.decode("utf-8", "replace")
 
 
 class Cvode(VariableStep):
     """CVODE with variable-order BDF (stiff) or Adams (not stiff). It selects its first step anew at each restart."""
 
-    def __init__(self, name: str, problem: Problem, rtol: float, atol: Any, max_step: float):
+    def __init__(self, name: str, problem: Problem, rtol: float, atol: float | np.ndarray, max_step: float):
         super().__init__(name, problem, rtol, atol, max_step)
         self._library = library = _load_library()
         self._calls = calls = _Calls(problem, self.statistics, library)
@@ -234,7 +235,9 @@ class Cvode(VariableStep):
         raise failure
 
 
-def _free(calls: _Calls, memory: int, solvers: tuple[Any, ...], vectors: tuple[int, ...], context: c_void_p) -> None:
+def _free(
+    calls: _Calls, memory: int, solvers: tuple[int | None, ...], vectors: tuple[int, ...], context: c_void_p
+) -> None:
     library = calls.library  # the callbacks live until CVODE is gone
     library.CVodeFree(byref(c_void_p(memory)))
     for handle, free in zip(solvers, ("SUNMatDestroy", "SUNLinSolFree", "SUNNonlinSolFree"), strict=True):

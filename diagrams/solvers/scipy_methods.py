@@ -18,8 +18,8 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -28,29 +28,57 @@ from .base import Dense, Problem, Step, VariableStep
 
 _ATTEMPT = {"RK23": 3, "RK45": 6, "DOP853": 12}  # evaluations of the rates per attempted step
 _MULTISTEP = ("BDF", "LSODA")
-_RETRIES = 30  # of one step, or of every third step: then the border of the rates' domain is reached
+_RETRIES = 30  # of one step; of steps in a row each counts 3, and a step at once gives 1 back
+
+
+class _Method(Protocol):
+    """The part of SciPy's solver objects that is used here."""
+
+    t: float
+    t_old: float | None
+    t_bound: float
+    y: np.ndarray
+    y_old: np.ndarray | None
+    h_abs: float
+    status: str
+    f: np.ndarray
+    """Rates at (t, y), of the one-step methods."""
+    K: np.ndarray
+    """Rates of the last step's stages, of the explicit methods."""
+    A: np.ndarray
+    n_stages: int
+    J: np.ndarray
+    """Jacobian, of the implicit methods."""
+
+    def step(self) -> str | None:
+        """Take a step."""
+
+    def dense_output(self) -> Dense:
+        """Return the interpolant of the last step."""
 
 
 class SciPySolver(VariableStep):
     """One of `scipy.integrate`'s solvers, given the exact Jacobian if it is implicit.
 
-    A one-step method goes on with the step that it would have taken next; a multistep method starts again at order 1,
-    and selects its first step anew.
+    After a restart a one-step method goes on with the step that it would have taken next. A multistep method starts
+    again at order 1, and selects its first step anew.
     """
 
-    def __init__(self, name: str, problem: Problem, rtol: float, atol: Any, max_step: float):
+    _inner: _Method
+
+    def __init__(self, name: str, problem: Problem, rtol: float, atol: float | np.ndarray, max_step: float):
         import scipy.integrate
 
         super().__init__(name, problem, rtol, atol, max_step)
-        self._method: Any = getattr(scipy.integrate, name)
+        self._method: Callable[..., _Method] = getattr(scipy.integrate, name)
         self._attempt, self.stiff = _ATTEMPT.get(name), name not in _ATTEMPT
-        self._options: dict[str, Any] = {"rtol": rtol, "atol": atol, "max_step": max_step}
+        self._options: dict[str, object] = {"rtol": rtol, "atol": atol, "max_step": max_step}
         if not self._attempt:
             self._options["jac"] = self._usable_jacobian
         self.statistics.rejected = 0 if self._attempt else None
         self.planned: float | None = None  # the step that the method would take next
         self._last_jacobian: np.ndarray | None = None
-        self._inner: Any = None
+        self._started = False  # whether there is an object of SciPy's
         self.stuck: tuple[float, np.ndarray] | None = None  # where no step was small enough
         self._retried = 0  # grows if many steps have to be taken again
         self._strange = False  # a rate was not finite since the flag was cleared
@@ -85,7 +113,7 @@ class SciPySolver(VariableStep):
     def _start(self, t: float, x: np.ndarray) -> None:
         first = None if self.planned is None else min(self.planned, self.stop - t)
         self._strange = False
-        if self._attempt and self._inner is not None and first is not None:  # a new object would cost a third of a step
+        if self._attempt and self._started and first is not None:  # a new object would cost a third of a step
             inner = self._inner
             inner.t, inner.y, inner.t_bound, inner.t_old = t, x, self.stop, None
             inner.h_abs, inner.status = first, "running"
@@ -99,24 +127,25 @@ class SciPySolver(VariableStep):
             if self.name != "LSODA" and not math.isfinite(self._inner.h_abs):  # the trial of a first step went astray
                 first = 1e-6 * (self.stop - t)
                 self._inner = self._method(self.rate, t, x, self.stop, first_step=first, **self._options)
+        self._started = True
 
     def _advance(self) -> Step:
         inner = self._inner
         before = self.statistics.rate_evaluations
         planned = 0.0 if self.name == "LSODA" else inner.h_abs
-        if self._strange and inner.t_old is None:  # perhaps it is the very start
+        if self._strange and inner.t_old is None:  # the first step: perhaps the start itself is the cause
             self.check_finite(inner.t, super().rate(inner.t, inner.y), "rate")
-        self._attempt_step()
+        t_old = self._attempt_step()
         inner = self._inner
         if self._attempt and self.statistics.rejected is not None:
             self.statistics.rejected += (self.statistics.rate_evaluations - before) // self._attempt - 1
         if self.name not in _MULTISTEP:  # a step that was cut at the stop says little about the next
             self.planned = max(planned, inner.h_abs) if inner.t == self.stop else inner.h_abs
         self.statistics.steps += 1
-        return Step(float(inner.t_old), float(inner.t), inner.y.copy(), self._prepare_dense)
+        return Step(float(t_old), float(inner.t), inner.y.copy(), self._prepare_dense)
 
-    def _attempt_step(self) -> None:
-        """Take a step; go back and take a shorter one if it ended where the rates are not finite."""
+    def _attempt_step(self) -> float:
+        """Take a step, a shorter one where it ends at rates that are not finite, and return the time of its start."""
         first = self._inner
         for _ in range(_RETRIES if self._retried < _RETRIES else 1):
             inner = self._inner
@@ -124,7 +153,7 @@ class SciPySolver(VariableStep):
             self._strange = False
             with np.errstate(all="ignore"):
                 if self.name == "LSODA":
-                    with warnings.catch_warnings():  # it says by a warning why it fails
+                    with warnings.catch_warnings():  # LSODA warns where it fails; the status says so, too
                         warnings.simplefilter("ignore")
                         inner.step()
                 else:
@@ -133,7 +162,7 @@ class SciPySolver(VariableStep):
                 break
             if self._is_sound(inner):
                 self._retried = max(0, self._retried - 1) if inner is first else self._retried + 3
-                return
+                return t
             h = 0.25 * (inner.t - t)
             if h < 10 * math.ulp(t):
                 break
@@ -144,9 +173,9 @@ class SciPySolver(VariableStep):
         self.stuck = (t, x)
         raise self.failure(t, x, 10 * math.ulp(t))
 
-    def _is_sound(self, inner: Any) -> bool:
-        """Tell whether an accepted step is: a method may have met a NaN and shortened its step, which is well."""
-        if self.name == "LSODA":  # which accepts a NaN
+    def _is_sound(self, inner: _Method) -> bool:
+        """Return whether an accepted step is finite: a method may have met a NaN on the way and shortened its step."""
+        if self.name == "LSODA":  # it accepts a NaN
             return not self._strange
         if self._attempt and not self._strange:
             return True
@@ -154,7 +183,7 @@ class SciPySolver(VariableStep):
         return bool(finite and not math.isnan(inner.h_abs))
 
     def _prepare_dense(self) -> Dense:
-        return self._inner.dense_output()  # type: ignore[no-any-return]
+        return self._inner.dense_output()
 
 
 _STABLE = {"RK45": 3.25, "DOP853": 6.1}  # h|λ| at the border of the stable region on the real axis
@@ -165,14 +194,14 @@ _HITS, _MISSES, _LOOK_EVERY, _EASY = 15, 6, 10, 20
 class AutoSolver(VariableStep):
     """The default: RK45 (DOP853 for rtol < 1e-8) as long as the problem is not stiff, Radau where it is.
 
-    Stiff means that the step is held down by stability, not by accuracy. Two evaluations at the end of each explicit
-    step give an estimate of the dominant eigenvalue (E. Hairer, G. Wanner, Solving Ordinary Differential Equations II,
-    IV.2); if h|λ| stays beyond the border of the stable region for 15 looks, and the spectral abscissa of the exact
-    Jacobian agrees, Radau goes on. It hands back when h‖J‖ < 1 for 20 steps: an explicit method would take them too.
-    What was used is in `Statistics.messages`.
+    Stiff means that stability bounds the step, not accuracy. Two evaluations at the end of each explicit step give an
+    estimate of the dominant eigenvalue (E. Hairer, G. Wanner, Solving Ordinary Differential Equations II, IV.2). If
+    h|λ| stays beyond the border of the stable region for 15 looks, and the leftmost eigenvalue of the exact Jacobian
+    agrees, Radau goes on. It hands back when h‖J‖ < 1 for 20 steps: an explicit method would take them too. Each change
+    is told in `Statistics.messages`.
     """
 
-    def __init__(self, name: str, problem: Problem, rtol: float, atol: Any, max_step: float):
+    def __init__(self, name: str, problem: Problem, rtol: float, atol: float | np.ndarray, max_step: float):
         super().__init__(name, problem, rtol, atol, max_step)
         self._explicit = SciPySolver("RK45" if rtol >= 1e-8 else "DOP853", problem, rtol, atol, max_step)
         self._implicit = SciPySolver("Radau", problem, rtol, atol, max_step)
@@ -183,13 +212,13 @@ class AutoSolver(VariableStep):
         self._hits = self._misses = self._easy = self._switches = 0
 
     def save(self) -> dict[str, Any]:
-        """Return which method is at work, what each plans, and how stiff the problem has looked."""
+        """Return the name of the active method, the steps that both plan, and the counts of signs of stiffness."""
         counts = {name: getattr(self, name) for name in _COUNTS}
         methods = {method.name: method.save() for method in (self._explicit, self._implicit)}
         return {"counts": counts, "active": self._active.name, "methods": methods}
 
     def restore(self, saved: Mapping[str, Any]) -> None:
-        """Go on with the method that was at work; see `Solver.restore`."""
+        """Go on with the method that was active; see `Solver.restore`."""
         for name, count in saved.get("counts", {}).items():
             setattr(self, name, count)
         for method in (self._explicit, self._implicit):
@@ -253,7 +282,7 @@ class AutoSolver(VariableStep):
         return -h * self._leftmost_eigenvalue(step.t, step.x) > 0.5 * border
 
     def _leftmost_eigenvalue(self, t: float, x: np.ndarray) -> float:
-        """Return the real part of the fastest decaying mode."""
+        """Return the real part of the leftmost eigenvalue: that of the fastest decaying mode."""
         jacobian = self.jacobian(t, x)
         if self.problem.size > 300:  # the eigenvalues would cost more than many steps; trust the estimate
             return -math.inf
