@@ -1,17 +1,21 @@
-"""Runs for other tools: CSV, pandas, xarray, Parquet, MATLAB."""
+"""Export of runs to other tools: CSV, pandas, xarray, Parquet, MATLAB."""
 
 from __future__ import annotations
 
 import importlib
 import re
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...blocks.core.errors import OptionError
+from .stored import PathLike
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+    from xarray import Dataset
+
     from .recorded_signals import RecordedSignals
 
 _GROUP = 2**24  # bytes of a row group
@@ -24,25 +28,25 @@ _TAKEN = {
 }
 
 
-def to_csv(run: RecordedSignals, path: Any, names: Sequence[str]) -> None:
-    """See `Run.to_csv`."""
+def to_csv(run: RecordedSignals, path: PathLike | IO[str], names: Sequence[str]) -> None:
+    """Write signals as comma-separated values; see `Run.to_csv`."""
     table = dict(columns(run, names))
     header = ",".join(["t", *table])
     rows = np.column_stack([run.t, *table.values()])
     np.savetxt(path, rows, "%.17g", ",", header=header, comments="", encoding="utf-8")
 
 
-def to_pandas(run: RecordedSignals, names: Sequence[str]) -> Any:
-    """See `Run.to_pandas`."""
+def to_pandas(run: RecordedSignals, names: Sequence[str]) -> DataFrame:
+    """Return signals as a DataFrame; see `Run.to_pandas`."""
     pandas = import_library("pandas")
     table = dict(columns(run, names))
-    frame = pandas.DataFrame(table, index=pandas.Index(np.array(run.t), name="t"))
+    frame: DataFrame = pandas.DataFrame(table, index=pandas.Index(np.array(run.t), name="t"))
     frame.attrs["units"] = {"t": "s", **units_of_columns(run, names)}
     return frame
 
 
-def to_xarray(run: RecordedSignals, names: Sequence[str]) -> Any:
-    """See `Run.to_xarray`."""
+def to_xarray(run: RecordedSignals, names: Sequence[str]) -> Dataset:
+    """Return signals as a Dataset; see `Run.to_xarray`."""
     xarray = import_library("xarray")
     variables, coordinates = {}, {"t": ("t", np.array(run.t), {"units": "s"})}
     for name in select_signals(run, names):
@@ -53,11 +57,12 @@ def to_xarray(run: RecordedSignals, names: Sequence[str]) -> Any:
         text = units[0] if len(set(units)) == 1 else ", ".join(units)
         variables[name] = (("t", *dims), values, {"units": text} if any(units) else {})
         coordinates |= {dim: (dim, np.arange(1, n + 1), {}) for dim, n in zip(dims, axes, strict=True)}
-    return xarray.Dataset(variables, coordinates, attrs={"title": run.diagram_name})
+    dataset: Dataset = xarray.Dataset(variables, coordinates, attrs={"title": run.diagram_name})
+    return dataset
 
 
-def to_parquet(run: RecordedSignals, path: Any, names: Sequence[str]) -> None:
-    """See `Run.to_parquet`."""
+def to_parquet(run: RecordedSignals, path: PathLike, names: Sequence[str]) -> None:
+    """Write signals as a Parquet file; see `Run.to_parquet`."""
     arrow, parquet = import_library("pyarrow"), import_library("pyarrow.parquet")
     units = {"t": "s", **units_of_columns(run, names)}
     fields = [arrow.field(n, arrow.float64(), metadata={"unit": u} if u else None) for n, u in units.items()]
@@ -70,8 +75,8 @@ def to_parquet(run: RecordedSignals, path: Any, names: Sequence[str]) -> None:
             writer.write_table(arrow.Table.from_arrays([arrow.array(a) for a in arrays], schema=schema))
 
 
-def to_mat(run: RecordedSignals, path: Any, names: Sequence[str]) -> None:
-    """See `Run.to_mat`."""
+def to_mat(run: RecordedSignals, path: PathLike, names: Sequence[str]) -> None:
+    """Write signals as a MATLAB file; see `Run.to_mat`."""
     from scipy.io import savemat
 
     signals = select_signals(run, names)
@@ -80,8 +85,8 @@ def to_mat(run: RecordedSignals, path: Any, names: Sequence[str]) -> None:
     for name, variable in variables.items():
         if values[variable].nbytes > _LARGEST:
             raise OptionError(
-                f"the signal {name!r} takes {values[variable].nbytes / 2**30:.1f} GiB; a MATLAB file of version 5 "
-                "holds less than 2 a variable. Write it with to_parquet, which MATLAB reads with parquetread."
+                f"the signal {name!r} takes {values[variable].nbytes / 2**30:.1f} GiB; expected less than 2 GiB a "
+                "variable in a MATLAB file of version 5. Write it with to_parquet, which MATLAB reads with parquetread."
             )
     units = [", ".join(unit_list(run, n, values[v].shape[1])) if run.unit(n) else "" for n, v in variables.items()]
     info = {
@@ -95,7 +100,7 @@ def to_mat(run: RecordedSignals, path: Any, names: Sequence[str]) -> None:
 
 
 def matlab_names(names: Sequence[str]) -> dict[str, str]:
-    """Return a valid MATLAB name for each signal; the rules stand at `Run.to_mat`."""
+    """Return a valid MATLAB name for each signal, by the rules of `Run.to_mat`."""
     made: dict[str, str] = {}
     for name in names:
         plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
@@ -112,7 +117,7 @@ def matlab_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def select_signals(run: RecordedSignals, names: Sequence[str]) -> list[str]:
-    """Return the signals to export: those given, else all named wires, else all ports; each once."""
+    """Return the signals to export, each once: those given, else all named wires, else all ports."""
     every = run.names
     wires = [n for n in every if n in run.wires]
     return list(dict.fromkeys(names or wires or every))
@@ -147,14 +152,14 @@ def units_of_columns(run: RecordedSignals, names: Sequence[str]) -> dict[str, st
 
 def unit_list(run: RecordedSignals, name: str, size: int) -> list[str]:
     """Return the unit of each entry of a signal, "" where it is not declared."""
-    unit: Any = run.unit(name)
+    unit = run.unit(name)
     if not isinstance(unit, tuple):
         return [unit or ""] * size
-    return [u or "" for u in unit] if len(unit) == size else [", ".join(u or "" for u in unit)] * size
+    return list(unit) if len(unit) == size else [", ".join(unit)] * size
 
 
 def import_library(name: str) -> Any:
-    """Return a library of the extra ``export``.
+    """Import a library of the extra ``export``.
 
     Raises
     ------

@@ -6,7 +6,6 @@ import os
 import shutil
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 from ...blocks.core.errors import OptionError
 
@@ -19,7 +18,9 @@ def memory() -> int:
         return 16 * 2**30
 
 
-def check_memory(samples: int, width: int, base: Fraction, name: str, *, every: int = 1, to: Any = None) -> None:
+def check_memory(
+    samples: int, width: int, base: Fraction, name: str, *, every: int = 1, to: str | os.PathLike[str] | None = None
+) -> None:
     """Refuse a run whose samples can't fit, before it takes the machine down.
 
     Parameters
@@ -27,20 +28,20 @@ def check_memory(samples: int, width: int, base: Fraction, name: str, *, every: 
     samples : int
         Samples of the run, one more than its ticks.
     width : int
-        Numbers that are recorded of each, without the time.
+        Numbers that are recorded of each sample, without the time.
     base : Fraction
         Seconds between two ticks.
     name : str
         The diagram's name.
     every : int
-        Of so many samples one is recorded.
+        One of so many samples is recorded.
     to : path, optional
-        Folder on disk that they go to.
+        Folder on disk for the samples; without it they stay in memory.
 
     Raises
     ------
     OptionError
-        If more than 80 % of the memory were needed, or more than is free on the disk.
+        If they need more than 80 % of the memory, or more than is free on the disk.
     """
     needed = -(-samples // every) * 8 * (width + 1)
     if to is None:

@@ -12,11 +12,11 @@ import numpy as np
 
 from ...blocks.core.errors import OptionError
 from ..flat.flat_diagram import FlatDiagram
-from .saved_state import layout_of
+from .saved_state import StateLayout, layout_of
 
 
 class PointOrigin(StrEnum):
-    """The way in which an operating point was made."""
+    """The origin of an operating point."""
 
     RUN = "run"
     """A run has reached it."""
@@ -30,7 +30,8 @@ class PointOrigin(StrEnum):
 class OperatingPoint:
     """An instant of a diagram: everything that its linear model depends on.
 
-    Made by `Diagram.operating_point` (from a run), `Diagram.trim`, or from a recorded instant, ``run.at(t)``.
+    `Diagram.operating_point` makes one by a run, `Diagram.trim` by solving for it. ``diagram.linearize(run.at(t))``
+    makes one of a recorded instant.
 
     Attributes
     ----------
@@ -39,20 +40,20 @@ class OperatingPoint:
     tick : int
         Its tick, on the base ``base`` (seconds, exact).
     x : ndarray
-        The vector x of the flattened diagram, as it is before the tick.
+        The vector x of the flattened diagram just before the tick.
     w, z : ndarray
-        Outputs of the FMUs then, and their inputs from then on.
+        Outputs of the FMUs at the tick, and their inputs from then on.
     plants : mapping
         Time, states and inputs of each FMU by path, as `Fmu.linear_model` takes them.
     residual : float
-        How far it is from an equilibrium: the largest change of a state over the next tick, and of a continuous state
-        in one second, relative to 1 + its size. States of FMUs count: by their rates, or by their change over a step
-        where the rates are not to be had. It means the same however the point was found; what a trim has left of its
-        equations is in ``residuals``.
+        Distance from an equilibrium: the largest change of a state over the next tick, and of a continuous state in
+        one second, relative to 1 + its size. States of FMUs count by their rates, or by their change over a step where
+        an FMU doesn't give its rates. It means the same for points of all origins; ``residuals`` holds the remainders
+        of a trim's equations.
     largest : str
         The block with that residual, of an FMU its state; empty where nothing moves.
     how : PointOrigin
-        The way in which it was made: "run", "trim" or "given".
+        Its origin: "run", "trim" or "given".
     """
 
     t: float
@@ -66,9 +67,9 @@ class OperatingPoint:
     largest: str = ""
     how: PointOrigin = PointOrigin.RUN
     values: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    """Every signal by its path, then."""
-    layout: tuple[Any, ...] = field(default=(), repr=False)
-    """What its vectors mean: two diagrams with one of these can exchange operating points."""
+    """Every signal at the tick by its path."""
+    layout: StateLayout = field(default=(), repr=False)
+    """Names and shapes of the entries of its vectors: diagrams with equal layouts can exchange operating points."""
 
     def check_fits(self, flat: FlatDiagram, name: str) -> None:
         """Refuse the operating point of a diagram with other blocks, states or ports.
@@ -83,14 +84,13 @@ class OperatingPoint:
         if sizes == needed and (not self.layout or self.layout == layout_of(flat)):
             return
         raise OptionError(
-            "it is the operating point of a diagram with other blocks or wires. Make one of this diagram: "
-            "diagram.operating_point(t), or linearize(t).",
+            "found the operating point of a diagram with other blocks or wires; expected one of this diagram. Make it "
+            "with diagram.operating_point(t), or linearize(t).",
             block=name,
             port="operating point",
         )
 
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    """Parameters that belong to it, where a trim has found them, by path, as `Diagram.replace` takes them."""
+    """Parameters that a trim has found with it, by path, as `Diagram.replace` takes them."""
     residuals: Mapping[str, float] = field(default_factory=dict, repr=False)
-    """What a trim has left of each of its equations, by name, largest first, relative to 1 + the size of what they
-    belong to."""
+    """Remainder of each equation of a trim by name, largest first, relative to 1 + the size of its quantity."""

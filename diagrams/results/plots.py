@@ -1,4 +1,4 @@
-"""Plots of a run's signals over time, and the look of all figures; drawn without pyplot and its global state."""
+"""Plots of a run's signals over time, and the style of all figures; drawn without pyplot and its global state."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ _OWN = {
 
 @cache
 def _figure_class() -> type[Figure]:
-    """Return a figure that a notebook shows, whether or not pyplot was imported."""
+    """Return a class of figures that notebooks show, whether or not pyplot was imported."""
     from io import BytesIO
 
     from matplotlib.figure import Figure
@@ -131,13 +131,13 @@ def save(figure: Figure, stem: Path) -> tuple[Path, Path]:
     return files
 
 
-def plot_signals(run: RecordedSignals, names: Sequence[str], axes: Any = None) -> Figure:
+def plot_signals(run: RecordedSignals, names: Sequence[str], axes: Sequence[Axes] | None = None) -> Figure:
     """Draw signals over time, one below the other; a vector's entries share an axis.
 
     Parameters
     ----------
     run : Run
-        What was recorded.
+        The run.
     names : sequence of str
         Signals, by the names that ``run[name]`` takes.
     axes : sequence of matplotlib axes, optional
@@ -150,7 +150,7 @@ def plot_signals(run: RecordedSignals, names: Sequence[str], axes: Any = None) -
     Raises
     ------
     OptionError
-        Without a name, or with another number of axes.
+        If there is no name, or another number of axes.
     UnknownNameError
         For a name that was not recorded.
     """
@@ -162,11 +162,13 @@ def plot_signals(run: RecordedSignals, names: Sequence[str], axes: Any = None) -
     with style():
         if axes is None:
             figure = new_figure(0.5 + 1.35 * len(names))
-            axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
-        axes = np.ravel(axes)
-        if len(axes) != len(names):
-            raise OptionError(f"found {len(axes)} axes for {len(names)} signals; expected one for each.")
-        for ax, (name, values, vector, units) in zip(axes, signals, strict=True):
+            axes = list(figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0])
+        rows: list[Axes] = list(np.ravel(np.asarray(axes, dtype=object)))
+        if len(rows) != len(names):
+            raise OptionError(
+                f"found {len(rows)} axes for {len(names)} signals; expected one for each. Make as many, or give none."
+            )
+        for ax, (name, values, vector, units) in zip(rows, signals, strict=True):
             for i, column in enumerate(values.T):
                 unit = f" [{units[i]}]" if vector and len(set(units)) > 1 and units[i] else ""
                 ax.plot(run.t, column, marker=marker_of(run), label=f"{name}[{i + 1}]{unit}" if vector else name)
@@ -174,10 +176,11 @@ def plot_signals(run: RecordedSignals, names: Sequence[str], axes: Any = None) -
             ax.set_ylabel(f"{name} [{common}]" if common else name)
             if vector:
                 ax.legend(loc="best", ncols=min(values.shape[1], 3))
-        axes[-1].set_xlabel("t [s]")
-        for ax in axes:
+        rows[-1].set_xlabel("t [s]")
+        for ax in rows:
             limit_time(ax, run)
-        result: Figure = axes[0].figure
+        top: Any = rows[0].figure  # a figure, or a part of one
+        result: Figure = top
         result.align_ylabels()
     return result
 
@@ -188,9 +191,9 @@ def _size(run: RecordedSignals, name: str) -> int:
 
 
 def _units(run: RecordedSignals, name: str) -> list[str]:
-    """Return the unit of every entry, as it is to be read."""
+    """Return the unit of every entry, as readers see it."""
     unit = run.unit(name)
-    units = [u or "" for u in unit] if isinstance(unit, tuple) else [unit or ""] * _size(run, name)
+    units = unit if isinstance(unit, tuple) else [unit or ""] * _size(run, name)
     return [_unit_text(u) for u in units]
 
 
@@ -210,5 +213,5 @@ def limit_time(ax: Axes, run: RecordedSignals) -> None:
 
     ax.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10]))
     if len(run.t) > 1:
-        margin = 0.015 * float(run.t[-1] - run.t[0])  # what happens at the first tick is not hidden by the frame
+        margin = 0.015 * float(run.t[-1] - run.t[0])  # the frame must not hide the first tick
         ax.set_xlim(float(run.t[0]) - margin, float(run.t[-1]) + margin)

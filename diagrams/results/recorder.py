@@ -1,12 +1,13 @@
-"""Recording: samples into memory, or to disk as the run goes."""
+"""The recorder: takes samples into memory, or to disk while the run goes on."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from io import FileIO
 from pathlib import Path
 from time import monotonic
-from typing import Any
+from typing import TextIO
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from ...blocks.core.layout import Layout
 from ..wiring.structure import Wire
 from .memory import memory
 from .signal_names import entries, resolve
-from .stored import END, Occurrence, create, event_line, prepare, read, split, write_json
+from .stored import END, Occurrence, PathLike, create, event_line, prepare, read, split, write_json
 
 _FIRST, _LARGEST = 1024, 2**26  # rows of the first chunk in memory, bytes of the largest
 _ROWS, _BYTES = 1024, 2**18  # of a chunk on its way to disk, whichever is less
@@ -25,14 +26,14 @@ _LATEST = 1.0  # seconds after which a row is written at the latest when the nex
 class Recorder:
     """Takes a run's samples.
 
-    In memory, samples go into chunks that double until they hold 64 MiB; `finish` puts them together chunk by chunk, so
-    that little more than the samples themselves is ever held. With ``to`` they go to disk in chunks of at most 1024
-    rows and about 256 KiB, and no more than one chunk is held. Nothing is allocated or written before the first sample.
+    In memory, samples go into chunks that double until they hold 64 MiB. `finish` joins them chunk by chunk, so it
+    never holds much more than the samples themselves. With ``to`` they go to disk in chunks of at most 1024 rows and
+    about 256 KiB, and memory holds one chunk. Nothing is allocated or written before the first sample.
 
-    What holds after a kill of the process (``kill -9``, a crash): all that was flushed can be read. Rows and events are
+    After a kill of the process (``kill -9``, a crash) everything that was flushed can be read. Rows and events are
     flushed when the chunk is full, when a row comes a second or more after the last flush, and by `flush`. So a kill
-    loses at most the last 1024 rows, and of these only what came in the second before the newest one. A row that was
-    cut in the middle is left out. After a power failure the same holds for what the operating system had written by
+    loses at most the last 1024 rows, and of these only those of the second before the newest one. A row that was cut in
+    the middle is left out. After a power failure the same holds for the data that the operating system had written by
     then, and for everything once `finish` has returned.
 
     Parameters
@@ -42,16 +43,16 @@ class Recorder:
     columns : sequence of int, optional
         Entries that are kept, ascending; None for all.
     every : int
-        Of so many calls of `row` one is kept, beginning with the first.
+        One of so many calls of `row` is kept, beginning with the first.
     rows : int, optional
-        Calls that are to come, if that is known: memory is then taken once.
+        Calls to come, if that is known: memory is then taken once.
     residual : bool
-        Whether the vector has one more entry at its end: the residual of the algebraic loops. It is always kept, and
-        stands apart from the data.
+        Whether the vector has one more entry at its end: the residual of the algebraic loops. It is always kept, apart
+        from the data.
     to : path, optional
         Folder for a run on disk; see `loopwright.diagrams.Run.open`.
     header : mapping, optional
-        Its header (`_stored.header`); needed with ``to``.
+        Header of the run on disk (`stored.header`); needed with ``to``.
     overwrite : bool
         Whether a stored run at ``to`` may be replaced.
 
@@ -72,8 +73,8 @@ class Recorder:
         every: int = 1,
         rows: int | None = None,
         residual: bool = False,
-        to: Any = None,
-        header: Mapping[str, Any] | None = None,
+        to: PathLike | None = None,
+        header: Mapping[str, object] | None = None,
         overwrite: bool = False,
     ):
         check_every(every)
@@ -88,8 +89,9 @@ class Recorder:
         if self.to is not None:
             prepare(self.to, overwrite)
         self._header, self._written = header, 0
-        self._files: tuple[Any, Any] | None = None
-        self.events: Any = []
+        self._files: tuple[FileIO, TextIO] | None = None
+        self._fired: list[Occurrence] = []
+        self.events: Sequence[Occurrence] = self._fired
         self._done: list[np.ndarray] = []
         self._chunk = self._times = self._values = np.empty((0, 0))
         self._k = self._limit = self._skip = 0
@@ -129,7 +131,7 @@ class Recorder:
             self._keep(t, vector)
 
     def last(self, t: float, vector: np.ndarray) -> None:
-        """Append the final sample, whatever ``every`` is; one that `row` has just kept is not kept twice."""
+        """Append the final sample, whatever ``every`` is, unless `row` has just kept it."""
         newest = self._chunk[self._k - 1] if self._k else self._tail
         values = vector if self._pick is None else vector[self._pick]
         if newest is None or newest[0] != t or not np.array_equal(newest[1:], values, equal_nan=True):
@@ -138,7 +140,7 @@ class Recorder:
     def event(self, occurrence: Occurrence) -> None:
         """Append an event that fired."""
         if self.to is None:
-            self.events.append(occurrence)
+            self._fired.append(occurrence)
         else:
             self._start()[1].write(event_line(occurrence))
 
@@ -157,7 +159,7 @@ class Recorder:
         rows = min(2 * self._limit, max(_LARGEST // row, 1)) if self._limit else (self._expected or _FIRST)
         held = sum(chunk.nbytes for chunk in self._done)
         if self._done and held + rows * row > 0.8 * memory():
-            self._chunk, self._k, self._limit = self._chunk[:0], 0, 0  # what is full is among the chunks done
+            self._chunk, self._k, self._limit = self._chunk[:0], 0, 0  # the full one is among the chunks done
             raise SimulationError(
                 f"the samples fill {held / 2**30:.1f} GiB, and this machine has {memory() / 2**30:.0f}. Record less "
                 "with record=[…] or every=…, or stream to disk with to=path.",
@@ -165,8 +167,8 @@ class Recorder:
             )
         self._begin_chunk(rows)
 
-    def _start(self) -> Any:
-        """Create the folder, if that has not been done."""
+    def _start(self) -> tuple[FileIO, TextIO]:
+        """Return the open files for rows and events; the first time, create the folder and open them."""
         if self._files is None:
             assert self.to is not None
             try:
@@ -183,7 +185,7 @@ class Recorder:
         return self._files is not None
 
     def flush(self) -> None:
-        """Write what is held to disk; in memory, nothing is to be done."""
+        """Write the rows of the chunk to disk; without ``to`` this does nothing."""
         if self._files is None:
             return
         rows, events = self._files
@@ -195,7 +197,7 @@ class Recorder:
                 left = left[rows.write(left) :]
             events.flush()
         except OSError as error:
-            rows.truncate(self._written * 8 * self._width)  # whole rows only: later ones must not be shifted
+            rows.truncate(self._written * 8 * self._width)  # whole rows only, or later ones would be shifted
             self._k = 0
             raise self._write_error(error) from error
         self._written += self._k
@@ -204,17 +206,17 @@ class Recorder:
     def _write_error(self, error: OSError) -> SimulationError:
         self._broken = True
         return SimulationError(
-            f"the run can't be written to {os.fspath(self.to or '')!r}: {error.strerror or error}. What was written "
-            "before is kept; make room, or choose another path."
+            f"the run can't be written to {os.fspath(self.to or '')!r}: {error.strerror or error}. The samples written "
+            "before are kept; make room, or choose another path."
         )
 
-    def finish(self, **end: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return times, shape (n,), and samples, shape (n, entries kept).
+    def finish(self, **end: object) -> tuple[np.ndarray, np.ndarray]:
+        """Close the files, and return times, shape (n,), and samples, shape (n, entries kept).
 
         Parameters
         ----------
         **end
-            How the run ended (``elapsed``, ``messages``, ``stopped``), for the run on disk.
+            Facts about the run's end (``elapsed``, ``messages``, ``stopped``), for the run on disk.
         """
         if self.to is not None:
             return self._close(end)
@@ -222,20 +224,20 @@ class Recorder:
             self._done.append(self._chunk[: self._k])
         self._chunk, self._k, self._limit = np.empty((0, 0)), 0, 0
         rows = self._done.pop() if len(self._done) == 1 else self._join_chunks()
-        self.events = tuple(self.events)
+        self.events = tuple(self._fired)
         t, data, self.residual = split(rows, self.has_residual)
         return np.ascontiguousarray(t), data
 
     def _join_chunks(self) -> np.ndarray:
         rows, n = np.empty((sum(map(len, self._done)), self._width)), 0
         self._done.reverse()
-        while self._done:  # each is freed as soon as it is copied: the pages of `rows` come only with what is written
+        while self._done:  # each is freed once it is copied: memory for `rows` is taken page by page, on writing
             chunk = self._done.pop()
             rows[n : n + len(chunk)] = chunk
             n += len(chunk)
         return rows
 
-    def _close(self, end: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    def _close(self, end: Mapping[str, object]) -> tuple[np.ndarray, np.ndarray]:
         assert self.to is not None
         files = self._start()
         try:
@@ -245,7 +247,7 @@ class Recorder:
                 os.fsync(file.fileno())
             write_json(self.to / END, end)
         except OSError as error:
-            if not self._broken:  # else that was said already
+            if not self._broken:  # else the error was raised before
                 raise self._write_error(error) from error
         finally:
             for file in files:
@@ -256,7 +258,7 @@ class Recorder:
         return stored.t, stored.data
 
 
-def check_every(every: Any) -> None:
+def check_every(every: object) -> None:
     """Refuse an ``every`` that is no positive integer.
 
     Raises
@@ -265,7 +267,7 @@ def check_every(every: Any) -> None:
         If it is none.
     """
     if isinstance(every, bool) or not isinstance(every, int | np.integer) or every < 1:
-        raise OptionError(f"found every={every!r}; expected a positive integer: one of so many samples is kept.")
+        raise OptionError(f"found every={every!r}; expected a positive integer, such as 10 to keep one sample of 10.")
 
 
 def select(
@@ -281,9 +283,10 @@ def select(
     Parameters
     ----------
     record : iterable of str, optional
-        Signals, by the names that ``run[name]`` takes, and subsystems or blocks, for all that is in them; None for all.
+        Signals, by the names that ``run[name]`` takes; a subsystem or a block stands for all its signals. None for
+        all.
     layout : Layout
-        Where each port stands in the vector; from ``layout.total`` to ``width`` it holds the states.
+        Entries of each port in the vector; from ``layout.total`` to ``width`` it holds the states.
     wires : mapping
         The named wires.
     states : bool

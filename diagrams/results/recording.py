@@ -1,4 +1,4 @@
-"""What a run records, and where to."""
+"""The choices of a recording: signals and states, how often, into memory or to disk."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from ...blocks.core.errors import OptionError
+from ...blocks.core.ports import PortUnit
 from ..flat.flat_diagram import FlatDiagram
 from ..wiring.structure import join
 from .memory import check_memory
 from .recorder import Recorder, check_every, select
-from .stored import header
+from .stored import PathLike, header
 
 
 @dataclass
 class Recording:
-    """What a run records, and where to: the choices of `Diagram.simulate`."""
+    """The choices of a recording: `Diagram.simulate` takes them as ``record``, ``every``, ``states`` and ``to``."""
 
     flat: FlatDiagram
     name: str
     record: Iterable[str] | None
     every: int
     states: bool
-    to: Any
+    to: PathLike | None
     overwrite: bool
 
     def __post_init__(self) -> None:
@@ -58,7 +58,7 @@ class Recording:
         return select(self.record, self.flat.log, self.flat.table.names, self.width, states=self.states)
 
     @cached_property
-    def units(self) -> dict[str, Any]:
+    def units(self) -> dict[str, PortUnit]:
         """The units of the ports by path."""
         return {join(*port): unit for port, unit in self.flat.checked.units.items()}
 
@@ -70,7 +70,7 @@ class Recording:
         ticks : int
             Ticks of the run.
         every_tick : bool
-            Whether each is visited, not only those at which a box acts.
+            Whether each tick is a sample, not only those at which a subsystem acts.
         """
         width = self.width if self.columns is None else len(self.columns)
         clocks = self.flat.distinct
@@ -85,7 +85,7 @@ class Recording:
         Parameters
         ----------
         rows : int, optional
-            Samples that are to come, if that is known.
+            Samples to come, if that is known.
         """
         flat, head = self.flat, None
         residual = bool(flat.loops.slices)

@@ -1,4 +1,4 @@
-"""What a run recorded."""
+"""The record of a run: signals, states, events, and the final state."""
 
 from __future__ import annotations
 
@@ -6,17 +6,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...blocks.core.errors import OptionError, UnknownNameError
 from ...blocks.core.layout import Layout
+from ...blocks.core.ports import PortUnit
+from ..wiring.checked_diagram import CheckedDiagram
 from ..wiring.structure import Wire
 from .signal_names import entries, resolve
-from .stored import Occurrence, Stopped, read, write
+from .stored import Occurrence, PathLike, Stopped, header, prepare, read, write
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from pandas import DataFrame
     from xarray import Dataset
@@ -30,13 +33,13 @@ class Snapshot:
 
     t: float
     tick: int
-    """The sample's number in the run, from 0; the tick, where every tick was recorded."""
+    """The sample's number in the run, from 0: the tick, where every tick was recorded."""
     values: dict[str, Any]
     state: np.ndarray
     """The state vector x of the flattened diagram."""
     names: dict[str, Wire]
-    """The named wires: two of one short name are told apart by what they carry."""
-    run: Any = field(default=None, repr=False, compare=False)
+    """The named wires: two of one short name are told apart by their source."""
+    run: Run | None = field(default=None, repr=False, compare=False)
     """The run that it comes from."""
 
     def __getitem__(self, name: str) -> Any:
@@ -47,28 +50,26 @@ class Snapshot:
 class Run:
     """A run: the outputs of the blocks, and the states, at the instants that were recorded.
 
-    ``run.t`` are the times in s, ``run["xi"]`` is an array with one row per sample, reached by a wire's name, by a
-    port's dotted path (``"controller.pid_par.v"``), or by any end of such a path that is unique. Steps need not be
-    equal; at an event there may be two samples of one time, before and after it.
+    ``run.t`` holds the times in s. ``run["xi"]`` is an array with one row per sample, by a wire's name, by a port's
+    dotted path (``"controller.pid_par.v"``), or by any unique end of such a path. Steps need not be equal. At an event
+    there may be two samples of one time, before and after it.
 
     Attributes
     ----------
     t : (N,) ndarray
         Times in s, ascending, up to and including the end.
     messages : tuple of str
-        What the FMUs said, and whether the run was cut off.
+        Messages of the FMUs, and whether the run was cut off.
     events : sequence of Occurrence
         The events that fired, in their order.
     stopped : Stopped or None
-        The stop condition that ended the run before its time.
+        The end by a stop condition, before the duration was over.
     residual : (N,) ndarray or None
-        Largest residual of the algebraic loops that were solved, by sample; None where there were none.
+        Largest residual of the solved algebraic loops, by sample; None where there were none.
     has_states : bool
         Whether the states were recorded, which `at` needs.
     elapsed : float
         Elapsed time of the loop in s.
-    real_time_factor : float
-        Simulated time over elapsed time of the loop.
 
     Examples
     --------
@@ -80,41 +81,39 @@ class Run:
     array([0. , 0.2, 0.4])
     >>> run["y"]
     array([0., 6., 6.])
-    >>> "gain.y" in run
-    True
     """
 
     t: np.ndarray
     data: np.ndarray = field(repr=False)
     layout: Layout = field(repr=False)
     wires: dict[str, Wire] = field(repr=False)
-    units: dict[str, Any] = field(repr=False)
-    diagram: Any = field(repr=False)
+    units: dict[str, PortUnit] = field(repr=False)
+    diagram: CheckedDiagram | None = field(repr=False)
     elapsed: float = float("nan")
     messages: tuple[str, ...] = ()
     events: Sequence[Occurrence] = field(default=(), repr=False)
     stopped: Stopped | None = None
     residual: np.ndarray | None = field(default=None, repr=False)
     columns: np.ndarray | None = field(default=None, repr=False)
-    """Which entries of a sample's vector (outputs as in ``layout``, then states) are in ``data``; None for all."""
+    """Entries of a sample's vector (outputs as in ``layout``, then states) that ``data`` holds; None for all."""
     has_states: bool = field(default=True, repr=False)
     diagram_name: str = ""
     final_state: RunState | None = field(default=None, repr=False)
-    """The complete state at the end, to go on from with ``simulate(…, start=)``; None where an FMU can't save its."""
+    """The complete state at the end, for ``simulate(…, start=)``; None where an FMU can't save its state."""
 
     recipe: Mapping[str, Any] = field(default_factory=dict, repr=False)
-    """How it was run (step, solver, tolerances, start), so that an instant of it can be found again."""
+    """Options of the run (step, solver, tolerances, start), with which an instant of it can be found again."""
 
     def __post_init__(self) -> None:
         if not self.diagram_name:
             object.__setattr__(self, "diagram_name", getattr(self.diagram, "name", ""))
 
     @classmethod
-    def open(cls, path: Any) -> Run:
+    def open(cls, path: PathLike) -> Run:
         """Open a run on disk, as `save` and ``simulate(…, to=path)`` write it; its diagram is not needed.
 
-        The samples stay on disk and are read when a signal is asked for. A run that was killed, or that still runs,
-        opens with what was written until then; its messages say so.
+        The samples stay on disk; ``run[name]`` reads those of one signal. A run that was killed, or that still runs,
+        opens with the samples written until then; its messages say so.
 
         Parameters
         ----------
@@ -131,7 +130,7 @@ class Run:
         if end is None:
             until = f", until t = {stored.t[-1]:g} s" if n else ""
             end = {"messages": [f"This run did not end: it was killed, or still runs. It holds {n} samples{until}."]}
-        vector = stored.head["vector"]
+        stopped, vector = end.get("stopped"), stored.head["vector"]
         return cls(
             t=stored.t,
             data=stored.data,
@@ -142,21 +141,20 @@ class Run:
             elapsed=end.get("elapsed", float("nan")),
             messages=tuple(end.get("messages", ())),
             events=stored.events,
-            stopped=Stopped(**end["stopped"]) if end.get("stopped") else None,
+            stopped=None if stopped is None else Stopped(**stopped),
             residual=stored.residual,
             columns=stored.columns,
             has_states=vector["has_states"],
             diagram_name=stored.head["diagram"],
         )
 
-    def save(self, path: Any, *, overwrite: bool = False) -> None:
+    def save(self, path: PathLike, *, overwrite: bool = False) -> None:
         """Write the run to a folder, from which `Run.open` reads it, exact to the last bit.
 
         Parameters
         ----------
         path : path
-            Folder to make: ``header.json``, ``rows.f64`` (little-endian 64-bit floats, t first), ``events.jsonl`` and
-            ``end.json``.
+            Folder to make; its files are those of ``simulate(…, to=path)``.
         overwrite : bool
             Whether a run that stands there may be replaced.
 
@@ -165,7 +163,21 @@ class Run:
         OptionError
             If something is in the way.
         """
-        write(Path(path), self, overwrite)
+        folder = Path(path)
+        prepare(folder, overwrite)
+        total, columns = self.layout.total, self.columns
+        head = header(
+            diagram=self.diagram_name,
+            layout=self.layout,
+            wires=self.wires,
+            units=self.units,
+            width=self.data.shape[1] if columns is None else total + int(np.sum(columns >= total)),
+            columns=columns,
+            has_states=self.has_states,
+            residual=self.residual is not None,
+        )
+        parts = [self.t[:, None], self.data, *([] if self.residual is None else [self.residual[:, None]])]
+        write(folder, head, parts, self.events, elapsed=self.elapsed, messages=self.messages, stopped=self.stopped)
 
     @property
     def real_time_factor(self) -> float:
@@ -174,12 +186,12 @@ class Run:
 
     @property
     def names(self) -> list[str]:
-        """Every name under which a signal was recorded: the wires' names, then the ports' paths."""
+        """Names of all recorded signals: the wires' names, then the ports' paths."""
         return [n for n in (*sorted(self.wires), *self.layout.slices) if self._find_columns(n) is not None]
 
     @cached_property
     def _position(self) -> np.ndarray | None:
-        """For every entry of a sample's vector, its column in ``data``; -1 where it has none."""
+        """Column in ``data`` of every entry of a sample's vector; -1 where it has none."""
         if self.columns is None:
             return None
         position = np.full(max([self.layout.total, *(self.columns + 1)]), -1)
@@ -200,7 +212,7 @@ class Run:
         Raises
         ------
         UnknownNameError
-            If there is none of that name, or several, or if it was not recorded.
+            If no signal or several have that name, or if it was not recorded.
         """
         return self.part(name, slice(None))
 
@@ -212,12 +224,12 @@ class Run:
         name : str
             The signal, by a name that ``run[name]`` takes.
         samples : slice
-            Which samples, by number.
+            Numbers of the samples.
 
         Raises
         ------
         UnknownNameError
-            If there is none of that name, or several, or if it was not recorded.
+            If no signal or several have that name, or if it was not recorded.
         """
         full = resolve(name, self.wires, self.layout.slices)
         where = self._find_columns(full)
@@ -274,7 +286,7 @@ class Run:
         first = self.layout.total if self.columns is None else int(np.searchsorted(self.columns, self.layout.total))
         return Snapshot(float(self.t[k]), k, values, row[first:].copy(), dict(self.wires), self)
 
-    def plot(self, *names: str, axes: Any = None) -> Figure:
+    def plot(self, *names: str, axes: Sequence[Axes] | None = None) -> Figure:
         """Draw signals over time, one below the other, and return the figure.
 
         Parameters
@@ -295,10 +307,10 @@ class Run:
 
     # --- for other tools: all named wires (where none has a name, all ports) if no signal is given -------------------
 
-    def to_csv(self, path: Any, *names: str) -> None:
+    def to_csv(self, path: PathLike | IO[str], *names: str) -> None:
         """Write ``t`` (s) and signals as comma-separated values, 17 significant digits.
 
-        A column is called as its signal; those of a vector are ``name[1]``, ``name[2]``, ….
+        A column is named after its signal; those of a vector are ``name[1]``, ``name[2]``, ….
 
         Parameters
         ----------
@@ -317,7 +329,7 @@ class Run:
         to_csv(self, path, names)
 
     def to_pandas(self, *names: str) -> DataFrame:
-        """Return signals as a pandas DataFrame with the times (s) as index ``t``; columns are called as in `to_csv`.
+        """Return signals as a pandas DataFrame with the times (s) as index ``t``; columns are named as in `to_csv`.
 
         Units are in its ``attrs["units"]``, by column. At an event an index repeats: before and after.
 
@@ -348,11 +360,10 @@ class Run:
         """
         from .exports import to_xarray
 
-        dataset: Dataset = to_xarray(self, names)
-        return dataset
+        return to_xarray(self, names)
 
-    def to_parquet(self, path: Any, *names: str) -> None:
-        """Write ``t`` (s) and signals as a Parquet file; columns are called as in `to_csv`.
+    def to_parquet(self, path: PathLike, *names: str) -> None:
+        """Write ``t`` (s) and signals as a Parquet file; columns are named as in `to_csv`.
 
         A field's metadata holds its unit. Rows are written in groups, so a run on disk need not fit into memory.
 
@@ -367,14 +378,14 @@ class Run:
 
         to_parquet(self, path, names)
 
-    def to_mat(self, path: Any, *names: str) -> None:
+    def to_mat(self, path: PathLike, *names: str) -> None:
         """Write ``t`` (s) and signals as a MATLAB file (version 5), a column vector or an N-by-n matrix each.
 
-        A variable is called as its signal, with what MATLAB allows in a name: every character other than a letter of
-        ASCII, a digit or ``_`` becomes ``_``; ``s_`` is put in front of what does not begin with a letter, and of
-        MATLAB's keywords, ``t`` and ``info``; of a name longer than 63 characters the end is kept; what is then taken
-        already gets ``_2``, ``_3``, …. The struct ``info`` lists ``variables``, the ``names`` they stand for, and their
-        ``units``. Of a matrix each row holds its entries row by row.
+        A variable is named after its signal, as MATLAB allows. Every character other than an ASCII letter, a digit or
+        ``_`` becomes ``_``. A name that doesn't begin with a letter gets ``s_`` in front, as do MATLAB's keywords,
+        ``t`` and ``info``. Of a name longer than 63 characters the end is kept. A name that is taken already gets
+        ``_2``, ``_3``, …. The struct ``info`` lists ``variables``, the ``names`` they stand for, and their ``units``.
+        Of a matrix each row holds its entries row by row.
 
         Raises
         ------

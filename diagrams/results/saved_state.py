@@ -1,4 +1,4 @@
-"""The complete state of a run at a tick: saved, kept, and continued from, in another process too."""
+"""The complete state of a run at a tick, from which a run can go on, in another process too."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ from .stored import Stopped, own_version
 VERSION = 2
 """Version of a state's vectors and their layout."""
 
+StateLayout = tuple[tuple[tuple[str, object], ...], ...]
+"""Names and shapes of a state's entries, kind by kind."""
+
 
 @dataclass(frozen=True, eq=False)
 class RunState:
-    """The complete state of a run at a tick: states of all blocks, what boxes hold, the solver's memory, the FMUs.
+    """The complete state of a run at a tick: of all blocks and FMUs, of outputs that are held, and of the solver.
 
-    It can be pickled. `Diagram.simulate` goes on from it with ``start=``: the diagram that it comes from, or a variant
-    with other parameters (a branch), but the same blocks and states.
+    It can be pickled. `Diagram.simulate` goes on from it with ``start=``. The diagram may be a variant with other
+    parameters (a branch), with the same blocks and states.
 
     Attributes
     ----------
@@ -33,7 +36,7 @@ class RunState:
     fmus : mapping
         State of each FMU, as bytes, by path.
     version : int
-        Version of what is saved; another version of loopwright may not read it.
+        Version of the saved data; another version of loopwright may not read it.
     made_by : str
         Version of loopwright that made it.
     """
@@ -46,7 +49,7 @@ class RunState:
     w: np.ndarray = field(repr=False)
     z: np.ndarray = field(repr=False)
     log: np.ndarray = field(repr=False)
-    layout: tuple[Any, ...] = field(repr=False)
+    layout: StateLayout = field(repr=False)
     continuous: Mapping[str, Any] | None = field(default=None, repr=False)
     fmus: Mapping[str, bytes] = field(default_factory=dict, repr=False)
     stopped: Stopped | None = None
@@ -54,8 +57,8 @@ class RunState:
     made_by: str = field(default_factory=own_version)
 
 
-def layout_of(flat: FlatDiagram) -> tuple[Any, ...]:
-    """Return what a state's vectors mean: two diagrams with one of these can exchange states."""
+def layout_of(flat: FlatDiagram) -> StateLayout:
+    """Return the layout of a saved state: two diagrams with equal layouts can exchange states."""
     layouts = (flat.states, flat.held, flat.gates, flat.starts, flat.loops, flat.log, flat.plant_inputs)
     names = tuple(tuple((n, layout.shapes[n]) for n in layout.slices) for layout in layouts)
     return (*names, tuple((e.path, e.name) for e in flat.events))
@@ -71,7 +74,7 @@ def check_fits(state: RunState, flat: FlatDiagram, name: str) -> None:
     """
     if not isinstance(state, RunState):
         raise OptionError(
-            f"found {state!r}; expected a state, as run.final_state or Simulation.save() give it.",
+            f"found {state!r}; expected a saved state. Give run.final_state, or the result of Simulation.save().",
             block=name,
             port="start",
         )
@@ -92,14 +95,14 @@ def check_fits(state: RunState, flat: FlatDiagram, name: str) -> None:
     here = layout_of(flat)
     if state.layout == here:
         return
-    kinds = ("state", "held output", "box", "reset state", "solved loop", "signal", "input of an FMU", "event")
+    kinds = ("state", "held output", "subsystem", "reset state", "solved loop", "signal", "input of an FMU", "event")
     for kind, mine, theirs in zip(kinds, here, state.layout, strict=True):
         for missing, whose in ((set(theirs) - set(mine), "it has"), (set(mine) - set(theirs), "it lacks")):
             if missing:
                 first = min(map(str, (m[0] for m in missing)))
                 raise OptionError(
-                    f"it is the state of a run of {state.diagram!r} with other blocks: {whose} the {kind} of "
-                    f"{first!r}. A branch may change parameters, not blocks or wires.",
+                    f"found the state of a run of {state.diagram!r} with other blocks: {whose} the {kind} of "
+                    f"{first!r}. Go on with the same blocks and wires; a branch may change parameters.",
                     block=name,
                     port="start",
                 )

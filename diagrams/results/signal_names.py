@@ -1,16 +1,17 @@
-"""The names under which a run's signals are found."""
+"""Names of a run's signals: full names, and the entries that they stand for."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
 from ...blocks.core.errors import UnknownNameError, near
 from ...blocks.core.layout import Layout
+from ..wiring.structure import Wire
 
 
-def resolve(name: str, wires: Any, ports: Any) -> str:
+def resolve(name: str, wires: Mapping[str, Wire], ports: Collection[str]) -> str:
     """Return the full name that ``name`` stands for: a wire's or port's path, or a unique end of one; wires go first.
 
     Raises
@@ -23,7 +24,7 @@ def resolve(name: str, wires: Any, ports: Any) -> str:
     for group in (wires, ports):
         found = sorted(n for n in group if n.endswith("." + name))
         if found and (len(found) == 1 or (group is wires and len({wires[n] for n in found}) == 1)):
-            return str(found[0])
+            return found[0]
         if found:
             error = UnknownNameError(
                 f"{name!r} stands for several signals: {', '.join(found)}. Write more of the path."
@@ -34,8 +35,8 @@ def resolve(name: str, wires: Any, ports: Any) -> str:
     raise UnknownNameError(f"no signal {name!r} was recorded. {near(name, short | set(wires) | set(ports))}")
 
 
-def entries(full: str, layout: Layout, wires: Any) -> np.ndarray:
-    """Return where a signal stands in the vector of a sample, in the signal's shape."""
+def entries(full: str, layout: Layout, wires: Mapping[str, Wire]) -> np.ndarray:
+    """Return the numbers of a signal's entries in the vector of a sample, in the signal's shape."""
     wire = wires.get(full)
     port = full if wire is None else f"{wire.block}.{wire.port}"
     whole = layout.index(port)

@@ -3,13 +3,13 @@
 ::
 
     run/
-    ├── header.json    what the columns are: names, shapes, units, wires, versions; written before the first row
+    ├── header.json    the columns: names, shapes, units, wires, versions; written before the first row
     ├── rows.f64       the samples: little-endian 64-bit floats, one row after the other, t first
     ├── events.jsonl   one event a line
-    └── end.json       how the run ended; missing where it was killed, or still runs
+    └── end.json       the run's end; missing where it was killed, or still runs
 
-``np.fromfile("rows.f64", "<f8").reshape(-1, n)`` is all it takes, n being the number of names in ``columns`` of the
-header. Rows are only ever appended, so what was once written stays readable; a row that was cut off is left out.
+``np.fromfile("rows.f64", "<f8").reshape(-1, n)`` reads the samples, n being the number of names in ``columns`` of the
+header. Rows are only ever appended, so they stay readable once written. A row that was cut off is left out.
 """
 
 from __future__ import annotations
@@ -17,28 +17,32 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import PackageNotFoundError, version
+from io import FileIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO, TypedDict, overload
 
 import numpy as np
 
 from ...blocks.core.errors import OptionError
 from ...blocks.core.layout import Layout
+from ...blocks.core.ports import PortUnit
 from ..wiring.structure import Wire
 
 FORMAT, VERSION = "loopwright run", 1
 HEADER, ROWS, EVENTS, END = "header.json", "rows.f64", "events.jsonl", "end.json"
 _BLOCK = 2**24  # bytes written at once
 
+PathLike = str | os.PathLike[str]
+
 
 @dataclass(frozen=True)
 class Occurrence:
-    """An event that fired: when (s), which block by its path, which of its events, and its states around the jump."""
+    """An event that fired: its time in s, the block's path, the event's name, and the states around the jump."""
 
     t: float
     block: str
@@ -49,10 +53,65 @@ class Occurrence:
 
 @dataclass(frozen=True)
 class Stopped:
-    """What ended a run before its duration was over: when (s), and the path of the stop condition's block."""
+    """The end of a run by a stop condition before its duration was over: time in s, and the path of the block."""
 
     t: float
     block: str
+
+
+class SignalEntry(TypedDict):
+    """A port in a header: ``first`` is its first entry in the vector of a sample."""
+
+    name: str
+    shape: list[int]
+    first: int
+    unit: str | Sequence[str] | None
+
+
+class WireEntry(TypedDict):
+    """A named wire in a header; a slice stands as ``{"slice": [start, stop, step]}``."""
+
+    block: str
+    port: str
+    index: int | dict[str, list[int | None]] | None
+
+
+class VectorEntry(TypedDict):
+    """The vector of a sample in a header."""
+
+    width: int
+    columns: list[int] | None
+    has_states: bool
+    residual: bool
+
+
+class Header(TypedDict):
+    """The header of a stored run."""
+
+    format: str
+    version: int
+    diagram: str
+    created: str
+    versions: dict[str, str]
+    columns: list[str]
+    signals: list[SignalEntry]
+    wires: dict[str, WireEntry]
+    vector: VectorEntry
+
+
+class StoppedEntry(TypedDict):
+    """A `Stopped` in a file."""
+
+    t: float
+    block: str
+
+
+class End(TypedDict, total=False):
+    """The end of a stored run."""
+
+    elapsed: float
+    messages: list[str]
+    stopped: StoppedEntry | None
 
 
 def header(
@@ -60,12 +119,12 @@ def header(
     diagram: str,
     layout: Layout,
     wires: Mapping[str, Wire],
-    units: Mapping[str, Any],
+    units: Mapping[str, PortUnit],
     width: int,
-    columns: Any = None,
+    columns: Iterable[int] | None = None,
     has_states: bool = True,
     residual: bool = False,
-) -> dict[str, Any]:
+) -> Header:
     """Return the header of a stored run.
 
     Parameters
@@ -73,7 +132,7 @@ def header(
     diagram : str
         The diagram's name.
     layout : Layout
-        Where each port's entries stand in the vector of a sample; the states follow them.
+        Entries of each port in the vector of a sample; the states follow them.
     wires, units : mapping
         Named wires, and units of ports.
     width : int
@@ -116,7 +175,7 @@ def header(
 
 
 def prepare(folder: Path, overwrite: bool) -> None:
-    """Check that a run may be written to a folder; nothing is written yet.
+    """Check that a run may be written to a folder, without writing.
 
     Raises
     ------
@@ -137,22 +196,22 @@ def prepare(folder: Path, overwrite: bool) -> None:
         )
 
 
-def create(folder: Path, head: Mapping[str, Any]) -> tuple[Any, Any]:
+def create(folder: Path, head: Mapping[str, object]) -> tuple[FileIO, TextIO]:
     """Write the header, and return the open files for rows and events.
 
-    Files of an earlier run are removed, not emptied: whoever still has them open goes on reading what was there.
+    Files of an earlier run are removed, not emptied, so a reader that has them open goes on reading the earlier run.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name in (HEADER, END, EVENTS, ROWS):
         (folder / name).unlink(missing_ok=True)
-    rows = open(folder / ROWS, "xb", buffering=0)  # noqa: SIM115 - they stay open for the run
+    rows = open(folder / ROWS, "xb", buffering=0)  # noqa: SIM115 - both stay open for the run
     events = open(folder / EVENTS, "x", encoding="utf-8")  # noqa: SIM115
     write_json(folder / HEADER, head)
     return rows, events
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write a file as a whole: whoever reads it finds all of it, or no file."""
+def write_json(path: Path, value: Mapping[str, object]) -> None:
+    """Write a file as a whole: a reader finds all of it, or no file."""
     part = path.with_name(path.name + ".part")
     with open(part, "w", encoding="utf-8") as file:
         json.dump(value, file, ensure_ascii=False, indent=1, default=_to_json)
@@ -167,38 +226,38 @@ def event_line(event: Occurrence) -> str:
     return json.dumps(asdict(event), ensure_ascii=False, default=_to_json) + "\n"
 
 
-def write(folder: Path, run: Any, overwrite: bool) -> None:
-    """Write a run that is at hand; see `Run.save`."""
-    prepare(folder, overwrite)
-    beyond = run.data.shape[1] if run.columns is None else int(np.sum(run.columns >= run.layout.total))
-    head = header(
-        diagram=run.diagram_name,
-        layout=run.layout,
-        wires=run.wires,
-        units=run.units,
-        width=beyond if run.columns is None else run.layout.total + beyond,
-        columns=run.columns,
-        has_states=run.has_states,
-        residual=run.residual is not None,
-    )
-    events, n = list(run.events), _BLOCK // (8 * len(head["columns"])) + 1
+def write(folder: Path, head: Header, parts: Sequence[np.ndarray], events: Iterable[Occurrence], **end: object) -> None:
+    """Write a run that is complete; see `Run.save`.
+
+    Parameters
+    ----------
+    folder : Path
+        The run's folder.
+    head : Header
+        Its header.
+    parts : sequence of ndarray
+        Times, shape (n, 1), samples, shape (n, columns), and residuals, shape (n, 1), where there are any.
+    events : iterable of Occurrence
+        The events that fired.
+    **end
+        Facts about its end; see `End`.
+    """
+    events, n = list(events), _BLOCK // (8 * len(head["columns"])) + 1
     rows, lines = create(folder, head)
     with rows, lines:
-        for k in range(0, len(run.t), n):
-            some = slice(k, k + n)
-            parts = [run.t[some, None], run.data[some], *([] if run.residual is None else [run.residual[some, None]])]
-            left = np.ascontiguousarray(np.hstack(parts), "<f8").data.cast("B")
+        for k in range(0, len(parts[0]), n):
+            left = np.ascontiguousarray(np.hstack([part[k : k + n] for part in parts]), "<f8").data.cast("B")
             while left:
                 left = left[rows.write(left) :]
         lines.writelines(map(event_line, events))
         lines.flush()
         for file in (rows, lines):
             os.fsync(file.fileno())
-    write_json(folder / END, {"elapsed": run.elapsed, "messages": run.messages, "stopped": run.stopped})
+    write_json(folder / END, end)
 
 
 class StoredEvents(Sequence[Occurrence]):
-    """The events of a stored run, read when they are first asked for."""
+    """The events of a stored run, read at first use."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -213,7 +272,11 @@ class StoredEvents(Sequence[Occurrence]):
     def __len__(self) -> int:
         return len(self._all)
 
-    def __getitem__(self, k: Any) -> Any:
+    @overload
+    def __getitem__(self, k: int) -> Occurrence: ...
+    @overload
+    def __getitem__(self, k: slice) -> tuple[Occurrence, ...]: ...
+    def __getitem__(self, k: int | slice) -> Occurrence | tuple[Occurrence, ...]:
         return self._all[k]
 
     def __iter__(self) -> Iterator[Occurrence]:
@@ -227,9 +290,9 @@ class StoredEvents(Sequence[Occurrence]):
 class Stored:
     """A stored run as it is read; the samples stay on disk until they are used."""
 
-    head: dict[str, Any]
-    end: dict[str, Any] | None
-    """How the run ended; None where it was killed, or still runs."""
+    head: Header
+    end: End | None
+    """The run's end; None where it was killed, or still runs."""
     t: np.ndarray
     data: np.ndarray
     residual: np.ndarray | None
@@ -237,13 +300,13 @@ class Stored:
 
     @property
     def columns(self) -> np.ndarray | None:
-        """Which entries of a sample's vector were recorded, None for all."""
+        """Entries of a sample's vector that were recorded, None for all."""
         chosen = self.head["vector"]["columns"]
         return None if chosen is None else np.array(chosen, dtype=int)
 
     @property
     def layout(self) -> Layout:
-        """Where each port's entries stand in that vector."""
+        """Entries of each port in that vector."""
         shapes = {s["name"]: tuple(s["shape"]) for s in self.head["signals"]}
         first = {s["name"]: s["first"] for s in self.head["signals"]}
         return Layout({n: slice(k, k + int(np.prod(shapes[n], dtype=int))) for n, k in first.items()}, shapes)
@@ -255,9 +318,10 @@ class Stored:
         return {name: Wire(w["block"], w["port"], _index_from_json(w["index"])) for name, w in found}
 
     @property
-    def units(self) -> dict[str, Any]:
+    def units(self) -> dict[str, PortUnit]:
         """The units of ports."""
-        return {s["name"]: _to_tuples(s["unit"]) for s in self.head["signals"] if s["unit"] is not None}
+        units = ((s["name"], s["unit"]) for s in self.head["signals"])
+        return {name: unit if isinstance(unit, str) else tuple(unit) for name, unit in units if unit is not None}
 
 
 def read(folder: Path) -> Stored:
@@ -270,7 +334,7 @@ def read(folder: Path) -> Stored:
     """
     place = os.fspath(folder)
     try:
-        head = json.loads((folder / HEADER).read_text(encoding="utf-8"))
+        head: Header = json.loads((folder / HEADER).read_text(encoding="utf-8"))
         if head["format"] != FORMAT:
             raise KeyError("format")
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -301,7 +365,7 @@ def _read_rows(path: Path, width: int) -> np.ndarray:
     return np.asarray(np.memmap(path, "<f8", mode="r", shape=(n, width)))
 
 
-def _to_json(value: Any) -> Any:
+def _to_json(value: object) -> object:
     if isinstance(value, Mapping):
         return dict(value)
     if isinstance(value, np.ndarray | np.generic):
@@ -311,15 +375,11 @@ def _to_json(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} can't be stored")
 
 
-def _to_tuples(value: Any) -> Any:
-    return tuple(_to_tuples(v) for v in value) if isinstance(value, list) else value
-
-
-def _index_to_json(index: Any) -> Any:
+def _index_to_json(index: int | slice | None) -> int | dict[str, list[int | None]] | None:
     return {"slice": [index.start, index.stop, index.step]} if isinstance(index, slice) else index
 
 
-def _index_from_json(index: Any) -> Any:
+def _index_from_json(index: int | dict[str, list[int | None]] | None) -> int | slice | None:
     return slice(*index["slice"]) if isinstance(index, dict) else index
 
 

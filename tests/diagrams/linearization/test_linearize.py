@@ -542,7 +542,7 @@ def test_a_transport_delay_in_continuous_time_is_refused():
 
 def test_the_point_of_another_diagram_is_refused():
     point = hybrid().operating_point()
-    with pytest.raises(OptionError, match="it is the operating point of a diagram with other blocks or wires"):
+    with pytest.raises(OptionError, match="found the operating point of a diagram with other blocks or wires"):
         pendulum().linearize(point)
     with pytest.raises(OptionError, match=r"found an instant of a run of the diagram 'hybrid', which has other blocks"):
         pendulum().linearize(hybrid().simulate(T, progress=False).at(T))

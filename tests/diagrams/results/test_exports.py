@@ -174,7 +174,7 @@ def test_a_signal_that_the_format_cannot_hold_is_refused(run, tmp_path, monkeypa
     monkeypatch.setattr(_exports, "_LARGEST", 8 * 300)
     run.to_mat(tmp_path / "run.mat", "v")
     with pytest.raises(
-        OptionError, match=r"the signal 'both' takes .* holds less than 2 a variable\. Write it with to_parquet"
+        OptionError, match=r"the signal 'both' takes .* less than 2 GiB a variable .*\. Write it with to_parquet"
     ):
         run.to_mat(tmp_path / "run.mat", "v", "both")
 

@@ -234,7 +234,7 @@ def test_a_state_of_other_blocks_is_refused_and_says_what_differs():
     state = Diagram("one", Lag(name="lag")(Constant(value=1.0))).simulate(1.0, step=0.1, progress=False).final_state
     other = Diagram("two", Lag(name="leg")(Constant(value=1.0)))
     with pytest.raises(
-        OptionError, match=r"two\.start: it is the state of a run of 'one' with other blocks: it has the state of 'lag'"
+        OptionError, match=r"two\.start: found the state of a run of 'one' with other blocks: it has the state of 'lag'"
     ):
         other.simulate(1.0, step=0.1, start=state, progress=False)
 
@@ -255,7 +255,7 @@ def test_a_state_on_other_ticks_is_refused():
 
 
 def test_what_is_no_state_is_refused():
-    with pytest.raises(OptionError, match=r"found 3; expected a state, as run\.final_state"):
+    with pytest.raises(OptionError, match=r"found 3; expected a saved state\. Give run\.final_state"):
         thermostat().simulate(1.0, start=3, progress=False)
 
 
