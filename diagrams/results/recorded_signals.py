@@ -1,4 +1,4 @@
-"""The signals of a run, as plots and exports read them."""
+"""The part of a run that plots and exports read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..wiring.structure import Wire
 
 
 class RecordedSignals(Protocol):
-    """A run, as far as its plots and exports need it: `loopwright.diagrams.Run` is one."""
+    """The members of a run that plots and exports need; `loopwright.diagrams.Run` has them."""
 
     @property
     def t(self) -> np.ndarray:
