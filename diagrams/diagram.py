@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Mapping
 from typing import Any, Unpack
 
+from .document.files import check_files, write_report
 from .document.report import Report
 from .drawing.svg import Drawing, draw
 from .flat.wired_diagram import WiredDiagram
@@ -13,6 +14,8 @@ from .linearization.linearize import Linearization, batch, linearize
 from .linearization.operating_point import at_time
 from .linearization.trim import given, trim
 from .measure.frequency_response import FrequencyResponse, frequency_response
+from .report.analyse import analyse
+from .report.drawings import with_drawing
 from .results.operating_point import OperatingPoint
 from .results.run import Run
 from .simulation.run_options import RunKeywords, RunOptions
@@ -300,10 +303,6 @@ class Diagram(WiredDiagram):
         ConfirmationError
             A number that its independent confirmation does not bear out.
         """
-        from .document.files import check_files, write_report
-        from .report.analyse import analyse
-        from .report.drawings import with_drawing
-
         check_files(path, pdf=pdf, json=json)
         made = with_drawing(analyse(self, **options), self)
         write_report(made, path, pdf=pdf, json=json)
