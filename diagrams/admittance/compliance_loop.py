@@ -1,41 +1,41 @@
 """The compliance loop of one direction against an environment, reduced to a linear model.
 
-At rest on (or beside) the path, Fig. 3 is linear for small motions, and what an environment feels is this. Let p be the
-displacement in m along the frame of the path, first the tangent t, then the normal n; then η = p∥/q and ξ = p⊥ with
-q = 1 − κ ξ₁ (E22), or w = Q⁻¹ p, Q = diag(q, 1). With E = [t n] and the model (2) of the plant, the mobility is
-G = Eᵀ G_v E, the inertia M = G⁻¹, and the slope of its friction C = −M Eᵀ (∂f_v/∂x_v) E, which at rest holds the slope
-F_c/w of the Coulomb friction. Robot and environment are one continuous system:
+Fig. 3 is linear for small motions around rest on, or beside, the path. Let p be the displacement in m in the frame of
+the path, first along the tangent t, then along the normal n. Then η = p∥/q and ξ = p⊥ with q = 1 − κ ξ₁ (E22), or
+w = Q⁻¹ p, Q = diag(q, 1). With E = [t n] and the model (2) of the plant, the mobility is G = Eᵀ G_v E, the inertia
+M = G⁻¹, and the slope of the friction C = −M Eᵀ (∂f_v/∂x_v) E. At rest C contains the slope F_c/w of the Coulomb
+friction. Robot and environment are one continuous system:
 
     (M + m_e) p̈ = u − (C + b_e) ṗ − k_e p + F                                          plant
     F_meas = F − k_e p − b_e ṗ − (m_e + m_tool) p̈                                      force sensor
 
-u is the motor force, F what else pushes, and a tool beyond the sensor is a part of M. The controller inverts its own
-model M̂, Ĉ, with the gains (a₂, a₁, a₀) of the error dynamics and (m, d, k) of the admittance in its direction:
+u is the motor force and F any other force; M contains the mass of a tool beyond the sensor. The controller inverts its
+own model M̂, Ĉ, with the gains (a₂, a₁, a₀) of the error dynamics and (m, d, k) of the admittance in its direction:
 
     m ë = F_meas − d ė − k e                                                           admittance (15)
     v = φ ë − a₂ (ẇ − ė) − a₁ (w − e) − a₀ ∫(w − e) dt                                 error dynamics (12)
     u = M̂ Q v + Ĉ ṗ − β F_meas                                                         linearization (10)
 
-φ = 1 is the acceleration feed-forward by its point value, φ = 0 none; β = 1 cancels the measured force. Three
-implementations are told apart:
+φ = 1 feeds the acceleration forward by its point value, φ = 0 does not; β = 1 cancels the measured force. There are
+three implementations:
 
 ``ideal``
     The inner loop is perfect, w = e: (m + q (m_e + m_tool)) ë + (d + q b_e) ė + (k + q k_e) e = 0.
 ``continuous``
-    The equations as they stand. F_meas contains p̈ and p̈ contains F_meas: solved, as if nothing took time, so that this
-    model hides the limits on the masses.
+    The equations above. F_meas contains p̈ and p̈ contains F_meas: this algebraic loop is solved as if nothing took
+    time, so that the model hides the limits on the masses.
 ``sampled``
-    The plant with its environment in continuous time under a held motor force, by the matrix exponential; p̈ in F_meas
-    is that at the end of the last step, under the last motor force. The controller is what the blocks compute in a
-    tick: the admittance by the discretization of `AdmittanceFilter`, the integral by Euler, and ``delay`` samples
-    before u acts.
+    The plant with its environment runs in continuous time under a held motor force, by the matrix exponential. p̈ in
+    F_meas is that at the end of the last step, under the last motor force. The controller computes once a tick what
+    its blocks compute: the admittance by the discretization of `AdmittanceFilter`, the integral by Euler's method. u
+    acts ``delay`` samples later.
 
-Where M, C, M̂ and Ĉ are diagonal in the frame of the path, at rest on a path along an axis, say, one direction stands
-alone. Elsewhere unequal axes couple the two; both are then in the model, and the environment acts in one.
+One direction stands alone where M, C, M̂ and Ĉ are diagonal in the frame of the path, such as at rest on a path along an
+axis. Elsewhere unequal axes couple the two directions: the model then has both, and the environment acts in one.
 
-The reduction is exact for small motions where no static force acts, or the path is straight. On a curved path the frame
-turns under a static force F₀: for each metre along it F∥ changes by κ F₀⊥ and F⊥ by −κ F₀∥, which is not modelled. Nor
-are the limits of an `AdmittanceFilter`, which small motions don't reach.
+The reduction is exact for small motions if no static force acts or the path is straight. On a curved path the frame
+turns under a static force F₀: for each metre along it F∥ changes by κ F₀⊥ and F⊥ by −κ F₀∥. The model leaves this out,
+and the limits of an `AdmittanceFilter`, which small motions don't reach.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from typing import Any, NamedTuple, Self, cast
 
 import numpy as np
 
-from ...blocks import AdmittanceFilter, ErrorDynamics, Path, PlanarModel
+from ...blocks import AdmittanceFilter, ErrorDynamics, FeedbackLinearization, ForceSensor, Frame, Path, PlanarModel
 from ...blocks.core.errors import ParameterError, UnknownNameError
 from ...blocks.core.values import Array, Value, parameter
 from ...blocks.path_following.transverse import expect_model, expect_path
@@ -53,55 +53,56 @@ from ...blocks.tracing.discretization import check_method
 from ..flat.wired_diagram import WiredDiagram
 from ..results.operating_point import OperatingPoint
 from .fig3_parts import check_wires, delay_of, plant_path
-from .planar import slopes
-from .shown_plant import show_plant
+from .planar import compute_slopes
+from .shown_plant import check_plant
 
 SIDES = ("par", "perp")
 IMPLEMENTATIONS = ("ideal", "continuous", "sampled")
-_DECOUPLED = 1e-12  # off the diagonal, relative to it: what a rounded tangent leaves
+_DECOUPLED = 1e-12
+"""Size off the diagonal, relative to it, that a rounded tangent leaves."""
 
 
-class Linear(NamedTuple):
-    """State-space matrices; leading axes are those of a batch."""
+class StateMatrices(NamedTuple):
+    """State-space matrices; axes in front of the last two are those of a batch."""
 
-    A: Array
-    B: Array
-    C: Array
-    D: Array
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
 
 
 class Motion(NamedTuple):
     """Inertia M in kg and friction slope C in N s/m, in the frame of the path."""
 
-    mass: Array
-    damping: Array
+    mass: np.ndarray
+    damping: np.ndarray
 
 
 class AdmittanceLoop(Value):
-    """One direction of Fig. 3's compliance loop at rest, as its environment feels it; the module derives it.
+    """One direction of Fig. 3's compliance loop at rest, as its environment feels it; this module derives the model.
 
     Raises
     ------
     ParameterError
-        A side, implementation or method that isn't one, an offset at which the path has no coordinates, or a plant or
-        model that is not Cartesian: its output is not its position, or it changes with the position.
+        If a side, implementation or method is unknown, the path has no coordinates at the offset, or a plant or model
+        is not Cartesian: its output is not its position, or it changes with the position.
     """
 
     path: Path = parameter(kw_only=False, description="the path")
-    model: PlanarModel = parameter(kw_only=False, description="what the feedback linearization inverts: M̂, Ĉ")
-    plant: PlanarModel | None = parameter(default=None, description="the robot as it is: M, C; None: the model itself")
+    model: PlanarModel = parameter(kw_only=False, description="model that the feedback linearization inverts: M̂, Ĉ")
+    plant: PlanarModel | None = parameter(default=None, description="true robot: M, C; None for the model itself")
     admittance_par: AdmittanceFilter = parameter(description="admittance along the path")
     admittance_perp: AdmittanceFilter = parameter(description="admittance across the path")
     pid_par: ErrorDynamics = parameter(description="error dynamics along the path")
     pid_perp: ErrorDynamics = parameter(description="error dynamics across the path")
     side: str = parameter(default="perp", description="direction of the environment, par or perp")
     eta: float = parameter(default=0.0, unit="m", description="arc length η₁ of the point on the path")
-    xi: float = parameter(default=0.0, unit="m", description="offset ξ₁ from the path")
+    xi: float = parameter(default=0.0, unit="m", description="offset ξ₁ of the point from the path")
     velocity: Array = parameter(
         default=(0.0, 0.0),
         shape=(2,),
         unit="m/s",
-        description="velocity at which the friction's slope is taken; other than zero only along a straight path",
+        description="velocity at which the friction's slope is taken; zero unless the path is straight",
     )
     implementation: str = parameter(default="sampled", description="ideal, continuous or sampled")
     sample_time: float = parameter(default=1e-3, unit="s", above=0.0, description="sample time T")
@@ -115,10 +116,10 @@ class AdmittanceLoop(Value):
     def of(
         cls, diagram: WiredDiagram, side: str = "perp", *, point: OperatingPoint | None = None, **changes: Any
     ) -> Self:
-        """Return the loop of a diagram that `fig3` made, with its parameters.
+        """Return the loop of a diagram that `fig3` has made, with the diagram's parameters.
 
-        The diagram's plant is compared with the reduced model: its own linear model, at the point and velocity of the
-        loop, with M and C. A plant that is not shown to be the reduced model has no such loop.
+        The linear model of the diagram's own plant, at the point and velocity of the loop, is compared with M and C. A
+        plant that disagrees is refused.
 
         Parameters
         ----------
@@ -127,27 +128,28 @@ class AdmittanceLoop(Value):
         side : str, optional
             ``"par"`` or ``"perp"``.
         point : OperatingPoint, optional
-            An instant of the diagram. From it come the states of the plant that its position doesn't tell, such as
-            contact; without it they are those of the start.
+            Instant of the diagram that gives the plant's states beside position and velocity, such as contact; the
+            start without it.
         **changes
-            Parameters that the diagram does not hold (``eta``, ``xi``; ``plant``, a model with which the diagram's
-            plant agrees, where the controller inverts another one), or that are to differ.
+            Parameters that the diagram does not hold, or other values for those it holds. ``eta`` and ``xi`` give the
+            point on the path. ``plant`` gives the true robot where the controller inverts another model.
 
         Raises
         ------
         UnknownNameError
             If a block of Fig. 3 is missing.
         ParameterError
-            If there is more in the loop than in Fig. 3 (an encoder, a filter), or if the plant has no linear model,
-            hidden states, a stiffness, or another mass or friction slope than the model. A loop of parameters that no
-            diagram holds is made by hand: ``AdmittanceLoop(path, model, …)``.
+            If the loop contains more than Fig. 3 (an encoder, a filter), or if the plant has no linear model, hidden
+            states, a stiffness, or another mass or friction slope than the model. ``AdmittanceLoop(path, model, …)``
+            makes a loop of parameters without a diagram.
         """
         names = (*(f"{kind}_{s}" for kind in ("admittance", "pid") for s in SIDES),)
-        linearization, frame = diagram["controller.feedback_linearization"], diagram.frames["controller"]
+        linearization = cast(FeedbackLinearization, diagram["controller.feedback_linearization"])
+        sensor, frame = cast(ForceSensor, diagram["sensors.force_sensor"]), diagram.frames["controller"]
         found: dict[str, Any] = {name: diagram[f"controller.{name}"] for name in names}
         if frame.sample_time is None:
             raise UnknownNameError(
-                "its controller has no sample time; make the diagram with fig3().", block="controller"
+                "found no sample time; expected that of Fig. 3. Make the diagram with fig3().", block="controller"
             )
         found |= {
             "path": linearization.path,
@@ -155,11 +157,11 @@ class AdmittanceLoop(Value):
             "sample_time": float(frame.sample_time),
             "method": frame.method,
             "delay": delay_of(diagram),
-            "tool_mass": diagram["sensors.force_sensor"].tool_mass,
+            "tool_mass": sensor.tool_mass,
         }
         check_wires(diagram)
         loop = cls(**{**found, "side": side, **changes})
-        show_plant(
+        check_plant(
             diagram,
             plant_path(diagram),
             loop.true_plant,
@@ -172,34 +174,32 @@ class AdmittanceLoop(Value):
         return loop
 
     def check(self) -> None:
-        """Refuse what can't be reduced."""
-        who = type(self).__name__
+        """Refuse parameters that don't make a loop."""
         expect_path(cast(Any, self))
-        kinds: dict[str, Any] = {"par": self.admittance_par, "perp": self.admittance_perp}
-        for side, block in kinds.items():
+        for side, block in self.filters.items():
             if not isinstance(block, AdmittanceFilter):
-                raise _wrong(f"admittance_{side}", block, "an AdmittanceFilter(…)")
-        for side, pid in {"par": self.pid_par, "perp": self.pid_perp}.items():
+                raise _make_error(f"admittance_{side}", block, "an AdmittanceFilter(…)")
+        for side, pid in self.pids.items():
             if not isinstance(pid, ErrorDynamics):
-                raise _wrong(f"pid_{side}", pid, "an ErrorDynamics(…)")
+                raise _make_error(f"pid_{side}", pid, "an ErrorDynamics(…)")
         if self.side not in SIDES:
-            raise _wrong("side", self.side, "'par' or 'perp'")
+            raise _make_error("side", self.side, "'par' or 'perp'")
         if self.implementation not in IMPLEMENTATIONS:
-            raise _wrong("implementation", self.implementation, "'ideal', 'continuous' or 'sampled'")
+            raise _make_error("implementation", self.implementation, "'ideal', 'continuous' or 'sampled'")
         check_method(self.method)
         left, right = self.path.reach(self.path.parameter_at(self.eta))
         if not -float(right) < self.xi < float(left) or self.q <= 0.0:
             raise ParameterError(
                 f"found {self.xi:g} m; expected an offset within the reach of the path there, from {-float(right):.6g} "
                 f"to {float(left):.6g} m. Choose one nearer to the path.",
-                block=who,
+                block=type(self).__name__,
                 port="xi",
             )
-        if np.any(self.velocity) and float(self._at.curvature) != 0.0:
+        if np.any(self.velocity) and float(self._path_frame.curvature) != 0.0:
             raise ParameterError(
-                f"found {self.velocity.tolist()} m/s where the path is curved; expected zero there: it is a model "
-                "at rest. Choose a straight path, or linearize the diagram along a run.",
-                block=who,
+                f"found {self.velocity.tolist()} m/s where the path is curved; expected zero: the model is one at "
+                "rest. Choose a straight path, or linearize the diagram along a run.",
+                block=type(self).__name__,
                 port="velocity",
             )
         for model in (self.model, self.true_plant):
@@ -207,28 +207,38 @@ class AdmittanceLoop(Value):
         _ = self.motions
 
     @property
-    def _at(self) -> Any:
+    def _path_frame(self) -> Frame:
         return self.path.frame(self.path.parameter_at(self.eta))
 
     @property
     def true_plant(self) -> PlanarModel:
-        """The robot as it is."""
+        """The true robot: ``plant``, or the model where none is given."""
         return self.model if self.plant is None else self.plant
+
+    @property
+    def filters(self) -> dict[str, AdmittanceFilter]:
+        """The admittances of both directions, by side."""
+        return {"par": self.admittance_par, "perp": self.admittance_perp}
+
+    @property
+    def pids(self) -> dict[str, ErrorDynamics]:
+        """The error dynamics of both directions, by side."""
+        return {"par": self.pid_par, "perp": self.pid_perp}
 
     @property
     def admittance(self) -> AdmittanceFilter:
         """The admittance in the direction of the environment."""
-        return self.admittance_par if self.side == "par" else self.admittance_perp
+        return self.filters[self.side]
 
     @property
     def pid(self) -> ErrorDynamics:
         """The error dynamics in the direction of the environment."""
-        return self.pid_par if self.side == "par" else self.pid_perp
+        return self.pids[self.side]
 
     @property
     def q(self) -> float:
         """1 − κ ξ₁."""
-        return 1.0 - float(self._at.curvature) * self.xi
+        return 1.0 - float(self._path_frame.curvature) * self.xi
 
     @property
     def scale(self) -> float:
@@ -237,8 +247,8 @@ class AdmittanceLoop(Value):
 
     @property
     def rate(self) -> float:
-        """Rate of the slower error dynamics in 1/s, beside which an error of a slope is small or not."""
-        return min(control_rate(pid) for pid in (self.pid_par, self.pid_perp))
+        """Rate of the slower error dynamics in 1/s, the measure for errors of a slope."""
+        return min(control_rate(pid) for pid in self.pids.values())
 
     @property
     def label(self) -> str:
@@ -247,64 +257,65 @@ class AdmittanceLoop(Value):
 
     @property
     def frame(self) -> np.ndarray:
-        """E = [t n] at the point on the path."""
-        return np.stack([self._at.tangent, self._at.normal], axis=-1)
+        """Frame E = [t n] at the point on the path."""
+        return np.stack([self._path_frame.tangent, self._path_frame.normal], axis=-1)
 
     @cached_property
     def motions(self) -> tuple[Motion, Motion]:
-        """Inertia and friction slope of the plant and of the model, of one direction where it stands alone."""
-        both = tuple(_motion(self, m) for m in (self.true_plant, self.model))
+        """Inertia and friction slope of the plant and of the model; of one direction if it stands alone."""
+        both = _reduce_to_motion(self, self.true_plant), _reduce_to_motion(self, self.model)
         diagonal = all(abs(X[0, 1]) + abs(X[1, 0]) <= _DECOUPLED * np.abs(X).max() for m in both for X in m)
         if diagonal or self.implementation == "ideal":
             i = SIDES.index(self.side)
-            both = tuple(Motion(*(X[i : i + 1, i : i + 1] for X in m)) for m in both)
-        return both[0], both[1]
+            plant, model = (Motion(*(X[i : i + 1, i : i + 1] for X in m)) for m in both)
+            return plant, model
+        return both
 
     @property
     def directions(self) -> tuple[str, ...]:
-        """The directions in the model: one, or both where they are coupled."""
+        """The directions in the model: one, or both if they are coupled."""
         return (self.side,) if len(self.motions[0].mass) == 1 else SIDES
 
     @property
-    def drifting(self) -> int:
+    def drift_count(self) -> int:
         """Number of coupled directions without environment and without stiffness: each has one pole of pure drift."""
-        filters = {"par": self.admittance_par, "perp": self.admittance_perp}
-        return sum(filters[s].stiffness == 0.0 for s in self.directions if s != self.side)
+        return sum(self.filters[s].stiffness == 0.0 for s in self.directions if s != self.side)
 
     def plant_matrices(
         self, stiffness: Array = 0.0, damping: Array = 0.0, mass: Array = 0.0, tool_mass: Array | None = None
-    ) -> Linear:
-        """Return robot and environment as (p, ṗ) driven by (u, F), with the outputs (p, ṗ, F_meas).
+    ) -> StateMatrices:
+        """Return the matrices of robot and environment, from (u, F) to (p, ṗ, F_meas) with the states (p, ṗ).
 
-        Each argument may be an array: the matrices then have its axes in front.
+        Stiffness in N/m, damping in N s/m and masses in kg may be arrays; the matrices then have their axes in front.
         """
         check_environment(stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
         n = len(self.directions)
         M, C = self.motions[0]
-        there = np.diag([float(s == self.side) for s in self.directions])  # where the environment acts
+        there = np.diag([float(s == self.side) for s in self.directions])  # the environment acts in one direction
         tool = self.tool_mass if tool_mass is None else tool_mass
         k, b, m, tool = (
-            v[..., None, None] for v in np.broadcast_arrays(*map(_float, (stiffness, damping, mass, tool)))
+            v[..., None, None] for v in np.broadcast_arrays(*map(_as_floats, (stiffness, damping, mass, tool)))
         )
         eye, zero = np.eye(n), np.zeros((*k.shape[:-2], n, n))
         W = np.linalg.inv(M + m * there)
         on_p, on_v = -W @ (k * there), -W @ (C + b * there)  # p̈ = on_p p + on_v ṗ + W (u + F)
         felt = m * there + tool * eye
-        A = _blocks([[zero, zero + eye], [on_p, on_v]])
-        B = _blocks([[zero, zero], [W, W]])
-        C_ = _blocks([[zero + eye, zero], [zero, zero + eye], [-k * there - felt @ on_p, -b * there - felt @ on_v]])
-        D = _blocks([[zero, zero], [zero, zero], [-felt @ W, eye - felt @ W]])
-        return Linear(A, B, C_, D)
+        A = _join_blocks([[zero, zero + eye], [on_p, on_v]])
+        B = _join_blocks([[zero, zero], [W, W]])
+        C_ = _join_blocks(
+            [[zero + eye, zero], [zero, zero + eye], [-k * there - felt @ on_p, -b * there - felt @ on_v]]
+        )
+        D = _join_blocks([[zero, zero], [zero, zero], [-felt @ W, eye - felt @ W]])
+        return StateMatrices(A, B, C_, D)
 
     @cached_property
-    def controller_matrices(self) -> Linear:
-        """The controller from (p, ṗ, F_meas) to u: its states are the integrals, e, ė, and what the delay holds."""
+    def controller_matrices(self) -> StateMatrices:
+        """Matrices of the controller from (p, ṗ, F_meas) to u; its states are ∫(w − e) dt, e, ė, and the delayed u."""
         n, T = len(self.directions), self.sample_time
         eye, zero = np.eye(n), np.zeros((n, n))
         Q_inv = np.diag([1.0 / self.q if s == "par" else 1.0 for s in self.directions])
-        pids = [getattr(self, f"pid_{s}") for s in self.directions]
-        filters = [getattr(self, f"admittance_{s}") for s in self.directions]
-        a2, a1, a0 = (np.diag([getattr(pid, a) for pid in pids]) for a in ("a2", "a1", "a0"))
+        pids, filters = ([parts[s] for s in self.directions] for parts in (self.pids, self.filters))
+        a2, a1, a0 = np.diag([p.a2 for p in pids]), np.diag([p.a1 for p in pids]), np.diag([p.a0 for p in pids])
         m_inv, k = np.diag([1.0 / a.mass for a in filters]), np.diag([a.stiffness for a in filters])
         d = np.diag([a.effective_damping for a in filters])
         M, C = self.motions[1]
@@ -315,7 +326,7 @@ class AdmittanceLoop(Value):
         if self.implementation != "sampled":
             A = np.block([[zero, -eye, zero], [zero, zero, eye], [zero, -m_inv @ k, -m_inv @ d]])
             B = np.block([[Q_inv, zero, zero], [zero, zero, zero], [zero, zero, m_inv]])
-            return Linear(A, B, C_, D)
+            return StateMatrices(A, B, C_, D)
         made = [a.constants(T, self.method) for a in filters]
         step = [[np.diag([c["transition"][i, j] for c in made]) for j in range(2)] for i in range(2)]
         push = [np.diag([c["forcing"][i, 1] for c in made]) @ m_inv for i in range(2)]
@@ -325,7 +336,7 @@ class AdmittanceLoop(Value):
             A = np.block([[A, np.zeros((len(A), n))], [C_, np.zeros((n, n))]])
             B, C_ = np.vstack([B, D]), np.hstack([np.zeros((n, len(A) - n)), eye])
             D = np.zeros((n, 3 * n))
-        return Linear(A, B, C_, D)
+        return StateMatrices(A, B, C_, D)
 
 
 def control_rate(pid: ErrorDynamics) -> float:
@@ -333,50 +344,55 @@ def control_rate(pid: ErrorDynamics) -> float:
     return float(max(abs(pid.a2), np.sqrt(abs(pid.a1)), np.cbrt(abs(pid.a0))))
 
 
-def check_environment(**values: Any) -> None:
-    """Refuse an environment that is not one: NaN, infinite or negative."""
+def check_environment(**values: Array | None) -> None:
+    """Refuse a property of the environment that is NaN, infinite or negative."""
     for name, value in values.items():
-        if value is not None and not np.all((_float(value) >= 0.0) & np.isfinite(_float(value))):
+        if value is not None and not np.all((_as_floats(value) >= 0.0) & np.isfinite(_as_floats(value))):
             raise ParameterError(
-                f"found {value!r}; expected finite numbers that are not negative.", block="environment", port=name
+                f"found {value!r}; expected finite numbers that are not negative. Correct it.",
+                block="environment",
+                port=name,
             )
 
 
-def held(plant: Linear, T: float, n: int) -> Linear:
-    """Return the plant under a motor force that is held over T, its last value a state: it made the last p̈."""
+def hold_force(plant: StateMatrices, T: float, n: int) -> StateMatrices:
+    """Return the plant under a motor force that is held over T; the last force is a state, since it gave the last p̈."""
     from scipy.linalg import expm
 
     A, B = plant.A, plant.B[..., :n]
     batch, x = A.shape[:-2], A.shape[-1]
     whole = np.zeros((*batch, x + n, x + n))
     whole[..., :x, :x], whole[..., :x, x:] = A, B
-    whole = expm(whole * T)
+    whole = np.asarray(expm(whole * T))
     none = np.zeros((*batch, n, n))
-    A = _blocks([[whole[..., :x, :x], np.zeros((*batch, x, n))], [np.zeros((*batch, n, x)), none]])
-    B = _blocks([[whole[..., :x, x:]], [none + np.eye(n)]])
-    return Linear(A, B, _blocks([[plant.C, plant.D[..., :n]]]), np.zeros((*batch, 3 * n, n)))
+    A = _join_blocks([[whole[..., :x, :x], np.zeros((*batch, x, n))], [np.zeros((*batch, n, x)), none]])
+    B = _join_blocks([[whole[..., :x, x:]], [none + np.eye(n)]])
+    return StateMatrices(A, B, _join_blocks([[plant.C, plant.D[..., :n]]]), np.zeros((*batch, 3 * n, n)))
 
 
-def _blocks(rows: list[list[Array]]) -> Array:
+def _join_blocks(rows: list[list[np.ndarray]]) -> np.ndarray:
+    """Return the matrix of these blocks; axes in front of the last two are those of a batch."""
     return np.concatenate([np.concatenate(row, axis=-1) for row in rows], axis=-2)
 
 
-def _float(value: Any) -> np.ndarray:
+def _as_floats(value: Array) -> np.ndarray:
     return np.asarray(value, dtype=float)
 
 
-def _wrong(port: str, found: Any, expected: str) -> ParameterError:
-    return ParameterError(f"found {found!r}; expected {expected}.", block=AdmittanceLoop.__name__, port=port)
+def _make_error(port: str, found: object, expected: str) -> ParameterError:
+    return ParameterError(
+        f"found {found!r}; expected {expected}. Correct it.", block=AdmittanceLoop.__name__, port=port
+    )
 
 
-def _motion(loop: AdmittanceLoop, model: PlanarModel) -> Motion:
-    """Return M and C in the frame of the path, after refusing a model that is not Cartesian."""
+def _reduce_to_motion(loop: AdmittanceLoop, model: PlanarModel) -> Motion:
+    """Return M and C in the frame of the path; refuse a model that is not Cartesian."""
     E = loop.frame
-    made = slopes(model, loop.path.to_plane(loop.eta, loop.xi), loop.velocity)
-    if type(model).h is not PlanarModel.h or np.any(made.moved):
+    made = compute_slopes(model, loop.path.to_plane(loop.eta, loop.xi), loop.velocity)
+    if type(model).h is not PlanarModel.h or np.any(made.by_position):
         raise ParameterError(
-            f"found {type(model).__name__}, which is not Cartesian; expected a model whose output is its position, and "
-            "whose f_v and G_v don't change with it, such as gantry.nominal. Linearize the diagram instead.",
+            f"found {type(model).__name__}, which is not Cartesian; expected a model whose output is its position and "
+            "whose f_v and G_v don't depend on it, such as gantry.nominal. Linearize the diagram instead.",
             block=type(loop).__name__,
             port="model",
         )

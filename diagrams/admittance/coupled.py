@@ -1,33 +1,31 @@
-"""The compliance loop coupled to an environment: poles and growth rate (`compliance_loop` derives the model).
+"""Poles and growth rate of the compliance loop coupled to an environment; `compliance_loop` derives the model.
 
-The robot and its environment, a mass m_e, a damper b_e and a spring k_e, make one closed loop. Its growth rate σ is the
-largest real part of its poles, ln|z|/T for those of a sampled loop; it is stable where σ < 0.
+Robot and environment, a mass m_e, a damper b_e and a spring k_e, make one closed loop. Its growth rate σ is the largest
+real part of its poles, ln|z|/T in a sampled loop. It is stable if σ < 0.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ...blocks.core.values import Array
-from .compliance_loop import AdmittanceLoop, Linear, check_environment, held
+from .compliance_loop import AdmittanceLoop, StateMatrices, check_environment, hold_force
 
 
-def closed_loop(loop: AdmittanceLoop, **environment: Any) -> Array:
+def close_loop(loop: AdmittanceLoop, **environment: Array) -> np.ndarray:
     """Return the system matrix of the coupled loop, continuous or over one sample.
 
-    ``environment`` as in `poles`. Where the continuous equations have no solution, because the force that is fed back
-    through the acceleration would turn its sign, the matrix is NaN.
+    ``environment`` is that of `poles`. The matrix is NaN if the continuous equations have no solution: the force that
+    is fed back through the acceleration would change its sign.
     """
     if loop.implementation == "ideal":
-        return _ideal(loop, **environment)
+        return _close_ideal_loop(loop, **environment)
     n = len(loop.directions)
     plant, K = loop.plant_matrices(**environment), loop.controller_matrices
     if loop.implementation == "sampled":
-        P = held(plant, loop.sample_time, n)
+        P = hold_force(plant, loop.sample_time, n)
     else:
-        P = Linear(plant.A, plant.B[..., :n], plant.C, plant.D[..., :n])
+        P = StateMatrices(plant.A, plant.B[..., :n], plant.C, plant.D[..., :n])
     F = np.eye(n) - K.D @ P.D
     bad = np.linalg.det(F) <= 0.0
     F_inv = np.linalg.inv(np.where(bad[..., None, None], np.eye(n), F))
@@ -42,9 +40,13 @@ def closed_loop(loop: AdmittanceLoop, **environment: Any) -> Array:
     return np.where(bad[..., None, None], np.nan, A)
 
 
-def _ideal(
-    loop: AdmittanceLoop, stiffness: Array = 0.0, damping: Array = 0.0, mass: Array = 0.0, tool_mass: Any = None
-) -> Array:
+def _close_ideal_loop(
+    loop: AdmittanceLoop,
+    stiffness: Array = 0.0,
+    damping: Array = 0.0,
+    mass: Array = 0.0,
+    tool_mass: Array | None = None,
+) -> np.ndarray:
     check_environment(stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
     a, q = loop.admittance, loop.scale
     tool = loop.tool_mass if tool_mass is None else tool_mass
@@ -71,21 +73,21 @@ def poles(
     loop : AdmittanceLoop
         Robot and controller.
     stiffness, damping, mass : float or array
-        The environment: k_e in N/m, b_e in N s/m, m_e in kg. Arrays are broadcast.
+        Environment: k_e in N/m, b_e in N s/m, m_e in kg. Arrays are broadcast.
     tool_mass : float or array, optional
-        Instead of the loop's own, kg.
+        Mass of the tool in kg, in place of the loop's own.
 
     Returns
     -------
     ndarray
-        The poles along the last axis. The pure drift of a coupled direction that has neither environment nor stiffness
-        is left out.
+        Poles along the last axis, without the pure drift of a coupled direction that has neither environment nor
+        stiffness.
     """
-    A = closed_loop(loop, stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
+    A = close_loop(loop, stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
     solvable = np.isfinite(A).all(axis=(-1, -2))
-    values: Any = np.linalg.eigvals(np.where(solvable[..., None, None], A, 0.0))
-    values = np.where(solvable[..., None], values, np.nan)
-    drift = 0 if loop.implementation == "ideal" else loop.drifting
+    eigenvalues = np.linalg.eigvals(np.where(solvable[..., None, None], A, 0.0))
+    values: np.ndarray = np.where(solvable[..., None], eigenvalues, np.nan)
+    drift = 0 if loop.implementation == "ideal" else loop.drift_count
     if drift:
         rest = 1.0 if loop.implementation == "sampled" else 0.0
         order = np.argsort(np.abs(values - rest), axis=-1)
@@ -93,41 +95,41 @@ def poles(
     return values
 
 
-def growth_rate(loop: AdmittanceLoop, **environment: Any) -> Array:
-    """Return σ in 1/s: the coupled loop grows like exp(σ t), and is stable where σ < 0.
+def growth_rate(loop: AdmittanceLoop, **environment: Array) -> Array:
+    """Return σ in 1/s: the coupled loop grows like exp(σ t), and is stable if σ < 0.
 
     Parameters
     ----------
     loop : AdmittanceLoop
         Robot and controller.
     **environment
-        As `poles` takes it; arrays are broadcast.
+        Environment, as `poles` takes it.
 
     Returns
     -------
     float or ndarray
-        Infinite where the continuous equations have no solution.
+        σ; infinite where the continuous equations have no solution.
     """
-    values = rates(loop, poles(loop, **environment))
+    values = to_rates(loop, poles(loop, **environment))
     sigma = np.where(np.isnan(values).any(axis=-1), np.inf, np.max(values.real, axis=-1))
     return float(sigma) if np.ndim(sigma) == 0 else sigma
 
 
-def rates(loop: AdmittanceLoop, values: Array) -> Array:
-    """Return poles in 1/s; those of a sampled loop by s = ln z/T."""
+def to_rates(loop: AdmittanceLoop, values: np.ndarray) -> np.ndarray:
+    """Return poles in 1/s: as they are, or s = ln z/T in a sampled loop."""
     if loop.implementation != "sampled":
         return values
-    return np.log(np.where(np.abs(values) < 1e-300, 1e-300, values)) / loop.sample_time
+    return np.asarray(np.log(np.where(np.abs(values) < 1e-300, 1e-300, values)) / loop.sample_time)
 
 
-def crossing_frequency(loop: AdmittanceLoop, **environment: Any) -> float:
-    """Return the frequency of the fastest growing pole, rad/s."""
-    values = rates(loop, poles(loop, **environment))
+def crossing_frequency(loop: AdmittanceLoop, **environment: Array) -> float:
+    """Return the frequency of the pole that grows fastest, rad/s."""
+    values = to_rates(loop, poles(loop, **environment))
     return float(abs(values[np.argmax(values.real)].imag))
 
 
 def growth_rate_by_control(loop: AdmittanceLoop, **environment: float) -> float:
-    """Return the growth rate from python-control's discretization and feedback of plant and controller."""
+    """Return σ in 1/s from python-control's discretization and feedback of plant and controller."""
     import control
 
     n = len(loop.directions)
@@ -136,13 +138,13 @@ def growth_rate_by_control(loop: AdmittanceLoop, **environment: float) -> float:
         if np.linalg.det(np.eye(n) - K.D @ P.D[:, :n]) <= 0.0:
             return float("inf")
         plant = control.ss(P.A, P.B[:, :n], P.C, P.D[:, :n])
-        values = control.feedback(plant, control.ss(*K), sign=1).poles()
+        values = np.asarray(control.feedback(plant, control.ss(*K), sign=1).poles())
     else:
         T = loop.sample_time
         sampled = control.sample_system(control.ss(P.A, P.B[:, :n], P.C, np.zeros((3 * n, n))), T, method="zoh")
         last = control.ss(np.zeros((n, n)), np.eye(n), P.D[:, :n], np.zeros((3 * n, n)), T)
-        values = control.feedback(sampled + last, control.ss(*K, T), sign=1).poles()
-    if loop.drifting:
+        values = np.asarray(control.feedback(sampled + last, control.ss(*K, T), sign=1).poles())
+    if loop.drift_count:
         rest = 0.0 if loop.implementation == "continuous" else 1.0
-        values = values[np.argsort(np.abs(values - rest))][loop.drifting :]
-    return float(np.max(rates(loop, values).real))
+        values = values[np.argsort(np.abs(values - rest))][loop.drift_count :]
+    return float(np.max(to_rates(loop, values).real))

@@ -1,8 +1,8 @@
-"""The parts of a diagram of Fig. 3 that a reduced loop is made of, and the wires between them."""
+"""Blocks of a diagram of Fig. 3 that a reduced loop is made from, and the wires between them."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,45 +17,45 @@ _BOX = "controller"
 
 
 def plant_path(diagram: WiredDiagram) -> str:
-    """Return the path of the plant: the block whose acceleration the force sensor gets.
+    """Return the path of the plant: the block whose acceleration is wired to the force sensor.
 
     Raises
     ------
     UnknownNameError
-        If there is no force sensor, or nothing is wired to it.
+        If there is no force sensor, or no acceleration is wired to it.
     """
     wire = diagram.structure.wires.get((SENSOR, "acceleration"))
     if wire is None:
         raise UnknownNameError(
-            "found no acceleration of a plant; expected the wires of Fig. 3. Make the diagram with fig3().",
+            "found no wire to its acceleration; expected that of Fig. 3. Make the diagram with fig3().",
             block=SENSOR,
         )
     return wire.block
 
 
 def check_wires(diagram: WiredDiagram) -> None:
-    """Refuse a diagram with anything between the parts that the reduced loop is made of.
+    """Refuse a diagram with other blocks between those that the reduced loop is made from.
 
     Raises
     ------
     ParameterError
-        If an input has another source than in Fig. 3: an encoder, a filter, an actuator's own dynamics.
+        If an input has another source than in Fig. 3, such as an encoder, a filter or an actuator.
     """
     plant, wires = plant_path(diagram), diagram.structure.wires
-    for (block, port), expected in _wires(diagram, plant).items():
+    for (block, port), expected in _expected_wires(diagram, plant).items():
         wire = wires.get((block, port))
         found = "nothing" if wire is None else str(wire)
         if found != expected:
             raise ParameterError(
-                f"found {found}; expected {expected}, as the reduced loop has nothing else between them. Take it out, "
-                "or linearize the diagram itself.",
+                f"found {found}; expected {expected}: the reduced loop has nothing between them. Take it out, or "
+                "linearize the diagram itself.",
                 block=block,
                 port=port,
             )
 
 
-def _wires(diagram: WiredDiagram, plant: str) -> dict[tuple[str, str], str]:
-    """Return the source of each input, as Fig. 3 has it."""
+def _expected_wires(diagram: WiredDiagram, plant: str) -> dict[tuple[str, str], str]:
+    """Return the source of each input in Fig. 3."""
     position, velocity, theta = f"{plant}.position", f"{plant}.velocity", f"{_BOX}.path_projection.theta"
     transform, linearization = f"{_BOX}.transverse_transform", f"{_BOX}.feedback_linearization"
     found: dict[tuple[str, str], str] = {(f"{_BOX}.path_projection", "position"): position}
@@ -77,19 +77,19 @@ def _wires(diagram: WiredDiagram, plant: str) -> dict[tuple[str, str], str]:
     found[plant, "motor_force"] = last
     outside = diagram.structure.wires.get((plant, "external_force"))
     found[SENSOR, "force"] = "nothing" if outside is None else str(outside)
-    outputs: Any = diagram.blocks[plant].outputs
-    if "contact_force" in outputs:
+    if "contact_force" in diagram.blocks[plant].outputs:
         found[SENSOR, "contact_force"] = f"{plant}.contact_force"
     return found
 
 
 def delay_of(diagram: WiredDiagram) -> int:
-    """Return the samples by which the motor force is late: the box's own delay, and that of ``computation`` in it.
+    """Return the samples of delay of the motor force: the controller's own, and that of the block ``computation``.
 
     Raises
     ------
     ParameterError
-        If the sensors have another sample time, offset or delay, or ``computation`` is more than a delay.
+        If the sensors have another sample time or offset than the controller, or a delay, or if ``computation`` is
+        more than a delay.
     """
     frames = diagram.frames
     box, sensors = frames[_BOX], frames["sensors"]
@@ -98,10 +98,10 @@ def delay_of(diagram: WiredDiagram) -> int:
         told = " s, ".join(str(v) for v in found)
         raise ParameterError(
             f"found the sample time, offset and delay {told}; expected {box.sample_time} s, {box.offset} s, 0: the "
-            "sensors' signals are taken at the controller's ticks. Linearize the diagram itself.",
+            "reduced loop reads the sensors at the controller's ticks. Linearize the diagram itself.",
             block="sensors",
         )
-    last: Any = diagram.blocks.get(f"{_BOX}.computation")
+    last = diagram.blocks.get(f"{_BOX}.computation")
     late = isinstance(last, UnitDelay)
     if last is not None and not late and not (isinstance(last, Gain) and bool(np.all(last.gain == 1.0))):
         raise ParameterError(

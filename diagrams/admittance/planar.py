@@ -1,28 +1,29 @@
-"""Slopes of a planar model, equation (2)."""
+"""Derivatives of a planar model, equation (2)."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ...blocks import PlanarModel
+from ...blocks.core.values import Array
 from ...blocks.tracing.symbols import flat_column, wrap
 
 
 class Slopes(NamedTuple):
-    """A planar model at a position and a velocity."""
+    """Input matrix and derivatives of a planar model at a position and a velocity."""
 
     G_v: np.ndarray
     """Input matrix G_v."""
     slope: np.ndarray
     """Derivative of f_v by the velocity."""
-    moved: np.ndarray
+    by_position: np.ndarray
     """Derivatives of f_v and G_v by the position, one after the other."""
 
 
-def slopes(model: PlanarModel, position: Any, velocity: Any) -> Slopes:
-    """Return G_v, ∂f_v/∂x_v, and the derivatives by the position; traced, so that slopes are exact."""
+def compute_slopes(model: PlanarModel, position: Array, velocity: Array) -> Slopes:
+    """Return G_v, ∂f_v/∂x_v and the derivatives by the position, by algorithmic differentiation."""
     import casadi as ca
 
     x_c, x_v = ca.MX.sym("x_c", 2), ca.MX.sym("x_v", 2)

@@ -1,28 +1,33 @@
-"""Target and rendered admittance of one direction, and what its real part says about passivity.
+"""Target and rendered admittance of one direction, and passivity by its real part.
 
-An admittance is velocity over force, Y(jω) = V/F in m/(N s), with the velocity in m/s: off the path, that along it is q
-times the rate of η (E22). The target is that of the admittance filter,
+An admittance is velocity over force, Y(jω) = V/F in m/(N s), with the velocity in m/s. Off the path, the velocity along
+it is q times the rate of η (E22). The target is the admittance of the admittance filter,
 
     Y(s) = q s/(m s² + d s + k),
 
-the rendered one that of the whole loop of `compliance_loop`, from a force F on the tool to the velocity ṗ. In a
-sampled loop F(t) = e^{jωt} acts in continuous time; the motor force is a staircase, and Y is the fundamental of the
-velocity, the part at ω itself: the mean of ṗ(t) e^{−jωt} over one sample, from the steady state of the sampled loop and
-the exact motion of the plant under the held motor force and F in between. The aliases of ω are not in Y.
+the rendered admittance is that of the whole loop of `compliance_loop`, from a force F on the tool to the velocity ṗ.
+
+In a sampled loop F(t) = e^{jωt} acts in continuous time, and the motor force is a staircase. Y is then the fundamental
+of the velocity, its part at ω itself: the mean of ṗ(t) e^{−jωt} over one sample. It follows from the steady state of
+the sampled loop and the exact motion of the plant between the ticks. Y does not contain the aliases of ω.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...blocks.core.errors import OptionError
 from ...blocks.core.values import Array
-from .compliance_loop import AdmittanceLoop, held
-from .coupled import closed_loop
+from ..frequency.state_space import read_matrices
+from .compliance_loop import AdmittanceLoop, hold_force
+from .coupled import close_loop
+
+if TYPE_CHECKING:
+    from control import FrequencyResponseData, StateSpace
 
 CONTINUOUS = "Re Y(jω) ≥ 0 at all frequencies and no unstable pole is passivity of this linear model, and of it alone."
 SAMPLED = (
@@ -33,27 +38,28 @@ OFF_PATH = (
     " Off the path the force that is conjugate to the rate of η is q F∥ (E22): driven by F∥, the admittance is not "
     "passive in motions that change q, whatever Re Y says at one point."
 )
-_LOWEST = 1e-2  # rad/s, from where is scanned
-_HIGHEST = 1e5
-_ROUNDED = 1e-10  # of |Y|: smaller real parts are rounding
+_LOWEST, _HIGHEST = 1e-2, 1e5
+"""Ends of a scan, rad/s."""
+_ROUNDED = 1e-10
+"""Real part relative to |Y| below which it is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class Passivity:
-    """The sign of the real part of a rendered admittance.
+    """Sign of the real part of a rendered admittance.
 
     Attributes
     ----------
     frequency : float
-        First frequency in rad/s at which Re Y changes to negative; infinite where it doesn't on the scan.
+        First frequency in rad/s at which Re Y becomes negative; infinite if it doesn't on the scan.
     intervals : tuple of pairs of float
-        Frequencies from where to where Re Y is negative, rad/s; the last may end with the scan.
+        Ends of the intervals of frequencies with negative Re Y, rad/s; the last may end with the scan.
     scanned : tuple of float
-        From where to where was scanned; up to the Nyquist frequency π/T where the loop is sampled.
+        Ends of the scan in rad/s; the upper one is at most the Nyquist frequency π/T of a sampled loop.
     stable : bool
         Whether the loop alone, without environment, has no pole that grows.
     caveat : str
-        What the sign means here, and what it doesn't.
+        Meaning of the sign for this loop, and its limits.
     tolerance : float
         Relative error of the frequencies.
     """
@@ -67,7 +73,7 @@ class Passivity:
 
 
 def target_admittance(loop: AdmittanceLoop, omega: Array) -> Array:
-    """Return the admittance that is asked for, m/(N s), at frequencies in rad/s."""
+    """Return the admittance of the admittance filter, m/(N s), at frequencies in rad/s."""
     s, a = 1j * np.asarray(omega, dtype=float), loop.admittance
     return loop.scale * s / (a.mass * s * s + a.effective_damping * s + a.stiffness)
 
@@ -80,31 +86,31 @@ def rendered_admittance(loop: AdmittanceLoop, omega: Array) -> Array:
     loop : AdmittanceLoop
         Robot and controller.
     omega : float or array
-        Frequencies in rad/s, below the Nyquist frequency π/T where the loop is sampled.
+        Frequencies in rad/s; those of a sampled loop lie below the Nyquist frequency π/T.
 
     Raises
     ------
     OptionError
-        A frequency that is not positive, or not below the Nyquist frequency.
+        If a frequency is not positive, or not below the Nyquist frequency.
     """
     w = np.asarray(omega, dtype=float)
     top = math.pi / loop.sample_time if loop.implementation == "sampled" else math.inf
     if not np.all((w > 0.0) & (w < top)):
         raise OptionError(
             f"found frequencies from {np.min(w):g} to {np.max(w):g} rad/s; expected them positive"
-            f"{f', below the Nyquist frequency {top:.6g} rad/s' if top < math.inf else ''}.",
+            f"{f', below the Nyquist frequency {top:.6g} rad/s' if top < math.inf else ''}. Leave the others out.",
             port="omega",
         )
     if loop.implementation == "ideal":
-        return _ideal(loop, w)
-    return _continuous(loop, w) if loop.implementation == "continuous" else _sampled(loop, w)
+        return _ideal_admittance(loop, w)
+    return _continuous_admittance(loop, w) if loop.implementation == "continuous" else _sampled_admittance(loop, w)
 
 
-def rendered_system(loop: AdmittanceLoop) -> Any:
+def rendered_system(loop: AdmittanceLoop) -> StateSpace:
     """Return the rendered admittance as a `control.StateSpace`, from the force F to the velocity ṗ.
 
-    A sampled loop gives the discrete system from a force that is held over each sample to the velocity at the ticks,
-    which contains the aliases; `rendered_response` gives the fundamental.
+    A sampled loop gives the discrete system from a force that is held over each sample to the velocity at the ticks.
+    Its response contains the aliases; `rendered_response` gives the fundamental.
     """
     import control
 
@@ -112,7 +118,7 @@ def rendered_system(loop: AdmittanceLoop) -> Any:
     if loop.implementation == "ideal":
         a, q, tool = loop.admittance, loop.scale, loop.tool_mass
         return control.ss(
-            closed_loop(loop), [[0.0], [1.0 / (a.mass + q * tool)]], [[0.0, q]], 0.0, states=["e", "e_rate"], **names
+            close_loop(loop), [[0.0], [1.0 / (a.mass + q * tool)]], [[0.0, q]], 0.0, states=["e", "e_rate"], **names
         )
     n, i = len(loop.directions), _index(loop)
     plant, K = loop.plant_matrices(), loop.controller_matrices
@@ -122,22 +128,24 @@ def rendered_system(loop: AdmittanceLoop) -> Any:
         F_inv = np.linalg.inv(np.eye(n) - K.D @ D_u)
         u = F_inv @ K.D @ D_F
         B_all = np.vstack([B + plant.B[:, :n] @ u, K.B @ (D_F + D_u @ u)])
-        A, dt, states = closed_loop(loop), 0.0, _state_names(loop)
+        A, dt, states = close_loop(loop), 0.0, _state_names(loop)
     else:
         dt = loop.sample_time
-        push = control.sample_system(control.ss(plant.A, B, np.eye(2 * n), np.zeros((2 * n, 1))), dt, method="zoh").B
+        held = control.sample_system(control.ss(plant.A, B, np.eye(2 * n), np.zeros((2 * n, 1))), dt, method="zoh")
+        push = read_matrices(held).B
         at_once = np.zeros((3 * n, 1))
         at_once[2 * n + i] = 1.0
-        # what the tool's acceleration shows of F is that of the last sample: F is kept as a state
-        later = _driven(loop, np.zeros((2 * n, 1)), plant.D[:, [n + i]] - at_once)
-        A = np.block([[closed_loop(loop), later], [np.zeros((1, len(later) + 1))]])
-        B_all, states = np.vstack([_driven(loop, push, at_once), [[1.0]]]), [*_state_names(loop), f"F_{loop.side}_last"]
+        # the tool's acceleration in F_meas is due to the last sample's F, which therefore is a state
+        later = _drive_states(loop, np.zeros((2 * n, 1)), plant.D[:, [n + i]] - at_once)
+        A = np.block([[close_loop(loop), later], [np.zeros((1, len(later) + 1))]])
+        B_all = np.vstack([_drive_states(loop, push, at_once), [[1.0]]])
+        states = [*_state_names(loop), f"F_{loop.side}_last"]
     C = np.zeros((1, len(A)))
     C[0, n + i] = 1.0
     return control.ss(A, B_all, C, 0.0, dt, states=states, **names)
 
 
-def rendered_response(loop: AdmittanceLoop, omega: Array) -> Any:
+def rendered_response(loop: AdmittanceLoop, omega: Array) -> FrequencyResponseData:
     """Return the rendered admittance as `control.FrequencyResponseData`; see `rendered_admittance`."""
     import control
 
@@ -148,21 +156,21 @@ def rendered_response(loop: AdmittanceLoop, omega: Array) -> Any:
 def passivity(
     loop: AdmittanceLoop, *, low: float = _LOWEST, high: float | None = None, per_decade: int = 200
 ) -> Passivity:
-    """Return where the real part of the rendered admittance is negative.
+    """Return the frequencies at which the real part of the rendered admittance is negative.
 
     Parameters
     ----------
     loop : AdmittanceLoop
         Robot and controller.
     low, high : float, optional
-        From where to where to scan, rad/s; the second by default the Nyquist frequency, or 1e5 rad/s.
+        Ends of the scan, rad/s; by default 0.01 rad/s and the Nyquist frequency, or 1e5 rad/s in a continuous loop.
     per_decade : int, optional
-        Points of the scan.
+        Points of the scan in a decade.
 
     Raises
     ------
     OptionError
-        As `rendered_admittance`.
+        If an end of the scan is not positive, or not below the Nyquist frequency.
     """
     from scipy.optimize import brentq
 
@@ -170,19 +178,19 @@ def passivity(
     top = (math.pi / loop.sample_time * (1.0 - 1e-9) if sampled else _HIGHEST) if high is None else high
     grid = np.geomspace(low, top, max(8, math.ceil(per_decade * math.log10(top / low)) + 1))
 
-    def sine(w: Array) -> Array:
-        Y = rendered_admittance(loop, w)
-        return Y.real / np.abs(Y) + _ROUNDED
+    def sine(w: np.ndarray | float) -> np.ndarray:
+        Y: np.ndarray = rendered_admittance(loop, w)
+        return np.asarray(Y.real / np.abs(Y) + _ROUNDED)
 
     positive = sine(grid) >= 0.0
 
-    def edge(i: int) -> float:
+    def find_edge(i: int) -> float:
         return math.exp(brentq(lambda y: float(sine(math.exp(y))), *np.log(grid[i : i + 2]), xtol=1e-13))
 
-    edges = ([] if positive[0] else [low]) + [edge(int(i)) for i in np.flatnonzero(positive[1:] != positive[:-1])]
+    edges = ([] if positive[0] else [low]) + [find_edge(int(i)) for i in np.flatnonzero(positive[1:] != positive[:-1])]
     if len(edges) % 2:
         edges.append(top)
-    poles = np.linalg.eigvals(closed_loop(loop))
+    poles = np.linalg.eigvals(close_loop(loop))
     stable = bool(np.all(np.abs(poles) <= 1.0 + 1e-9) if sampled else np.all(poles.real <= 1e-6))
     return Passivity(
         frequency=edges[0] if edges else math.inf,
@@ -197,35 +205,38 @@ def _index(loop: AdmittanceLoop) -> int:
     return loop.directions.index(loop.side)
 
 
-def _ideal(loop: AdmittanceLoop, w: Array) -> Array:
+def _ideal_admittance(loop: AdmittanceLoop, w: np.ndarray) -> np.ndarray:
     s, a, q = 1j * w, loop.admittance, loop.scale
-    return q * s / ((a.mass + q * loop.tool_mass) * s * s + a.effective_damping * s + a.stiffness)
+    return np.asarray(q * s / ((a.mass + q * loop.tool_mass) * s * s + a.effective_damping * s + a.stiffness))
 
 
-def _continuous(loop: AdmittanceLoop, w: Array) -> Array:
-    system = rendered_system(loop)
+def _continuous_admittance(loop: AdmittanceLoop, w: np.ndarray) -> np.ndarray:
+    system = read_matrices(rendered_system(loop))
     eye = np.eye(len(system.A))
     x = np.linalg.solve(1j * w[..., None, None] * eye - system.A, system.B.astype(complex))
-    return (system.C @ x)[..., 0, 0]
+    return np.asarray((system.C @ x)[..., 0, 0])
 
 
-def _driven(loop: AdmittanceLoop, push: Array, force: Array) -> Array:
-    """Return how the sampled loop's states take what F moves in one sample, and what the sensor shows of it at once."""
+def _drive_states(loop: AdmittanceLoop, push: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Return the input matrix of the sampled loop for F.
+
+    ``push`` moves the plant within one sample; ``force`` is the part of F that the sensor shows at once.
+    """
     n, K = len(loop.directions), loop.controller_matrices
-    P = held(loop.plant_matrices(), loop.sample_time, n)
+    P = hold_force(loop.plant_matrices(), loop.sample_time, n)
     u = K.D @ force
-    moved = np.concatenate([push, np.zeros((*push.shape[:-2], n, 1))], axis=-2)
+    on_plant = np.concatenate([push, np.zeros((*push.shape[:-2], n, 1))], axis=-2)
     on_k = np.broadcast_to(K.B @ force, (*push.shape[:-2], len(K.A), 1))
-    return np.concatenate([moved + P.B @ u, on_k], axis=-2)
+    return np.concatenate([on_plant + P.B @ u, on_k], axis=-2)
 
 
-def _sampled(loop: AdmittanceLoop, w: Array) -> Array:
+def _sampled_admittance(loop: AdmittanceLoop, w: np.ndarray) -> np.ndarray:
     from scipy.linalg import expm
 
     n, i, T = len(loop.directions), _index(loop), loop.sample_time
     plant, K = loop.plant_matrices(), loop.controller_matrices
     x, every = 2 * n, 3 * n + 1
-    # (p, ṗ), the held u and F = e^{jωt} as one system, seen from a frame that turns with F, and its mean over a sample
+    # (p, ṗ), the held u and F = e^{jωt} as one system, times e^{−jωt}, and its mean over a sample
     turning = np.zeros((*w.shape, 2 * every, 2 * every), dtype=complex)
     turning[..., :x, :x] = plant.A
     turning[..., :x, x : x + n] = plant.B[:, :n]
@@ -233,16 +244,16 @@ def _sampled(loop: AdmittanceLoop, w: Array) -> Array:
     turning[..., every - 1, every - 1] = 1j * w
     turning[..., :every, :every] -= 1j * w[..., None, None] * np.eye(every)
     turning[..., :every, every:] = np.eye(every) / T
-    turned = expm(turning * T)
+    turned = np.asarray(expm(turning * T))
     z = np.exp(1j * w * T)[..., None, None]
     push, mean = z * turned[..., :x, every - 1 : every], turned[..., :every, every:]
     shown = plant.D[:, [n + i]]
-    A = closed_loop(loop)
-    states = np.linalg.solve(z * np.eye(len(A)) - A, _driven(loop, push, shown))
-    y = held(plant, T, n).C @ states[..., : 3 * n, :] + shown
+    A = close_loop(loop)
+    states = np.linalg.solve(z * np.eye(len(A)) - A, _drive_states(loop, push, shown))
+    y = hold_force(plant, T, n).C @ states[..., : 3 * n, :] + shown
     u = K.C @ states[..., 3 * n :, :] + K.D @ y
     now = np.concatenate([states[..., :x, :], u, np.ones((*w.shape, 1, 1))], axis=-2)
-    return (mean @ now)[..., n + i, 0]
+    return np.asarray((mean @ now)[..., n + i, 0])
 
 
 def _state_names(loop: AdmittanceLoop) -> list[str]:

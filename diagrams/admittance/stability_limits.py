@@ -1,13 +1,13 @@
-"""Limits of coupled stability: which environments the compliance loop can touch.
+"""Limits of coupled stability: the environments that the compliance loop can touch.
 
-A limit is the first value, on a scan from below, at which the growth rate of the coupled loop changes its sign. Regions
-that become stable again beyond it follow, and are listed: bisection between two ends would miss them.
+A limit is the first value, on a scan from below, at which the growth rate of the coupled loop changes its sign. The
+scan also finds regions beyond it that are stable again; bisection between two ends would miss them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,42 +21,50 @@ from .compliance_loop import AdmittanceLoop
 from .coupled import crossing_frequency, growth_rate, growth_rate_by_control
 
 SCANNED = {"stiffness": (1e-2, 1e8), "damping": (1e-3, 1e6), "mass": (1e-4, 1e4), "tool_mass": (1e-4, 1e4)}
-"""What can be limited, and from where to where it is scanned by default."""
+"""Ends of the scan for each property, by default."""
 UNITS = {"stiffness": "N/m", "damping": "N.s/m", "mass": "kg", "tool_mass": "kg"}
-_SIDES = 0.01  # a limit is confirmed at 0.99 and 1.01 of it
-_GROWTH = 0.03  # its growth rate is told at 0.97 and 1.03
-_FLAT = 20.0  # an extremum that is so many times its own depth away from zero does not reach it
-_ROUNDING = 1e-12  # relative, of Brent's method
+"""Unit of each property."""
+PER_DECADE = 40
+"""Points of a scan in a decade, by default."""
+_SIDES = 0.01
+"""Relative distance from a limit at which it is confirmed: 0.99 and 1.01."""
+_GROWTH = 0.03
+"""Relative distance from a limit at which growth rates are given: 0.97 and 1.03."""
+_FLAT = 20.0
+"""Ratio of distance from zero and depth beyond which an extremum does not reach zero."""
+_ROUNDING = 1e-12
+"""Relative rounding error of Brent's method."""
+Growth = Callable[[float], float]
 
 
 @dataclass(frozen=True)
 class StabilityLimit:
-    """The first value of one property of the environment at which the coupled loop is no longer stable.
+    """First value of one property of the environment at which the coupled loop loses its stability.
 
     Attributes
     ----------
     over : str
-        The property: ``"stiffness"``, ``"damping"``, ``"mass"`` or ``"tool_mass"``.
+        Property: ``"stiffness"``, ``"damping"``, ``"mass"`` or ``"tool_mass"``.
     value : float
-        The limit; infinite where the loop is stable over the whole scan, 0 where it never is at its start.
+        Limit; infinite if the loop is stable over the whole scan, 0 if it is unstable at its start.
     unit : str
-        Its unit.
+        Unit of the limit.
     frequency : float
-        Frequency in rad/s at which the loop then oscillates; NaN without a limit.
+        Frequency in rad/s at which the loop oscillates at the limit; NaN without a limit.
     restabilizes : tuple of float
-        Where it becomes stable again beyond the limit, and unstable once more, in turn.
+        Values beyond the limit at which the loop becomes stable again, then unstable, in turn.
     growth_below, growth_above : float
         Growth rate σ in 1/s at 0.97 and at 1.03 of the limit.
     rule_of_thumb : float
-        (d + b_e)/T_d for a stiffness, NaN else; see `rule_of_thumb`.
+        (d + b_e)/T_d for a stiffness, NaN for another property; see `rule_of_thumb`.
     scanned : tuple of float
-        From where to where was scanned.
+        Ends of the scan.
     tolerance : float
-        Numerical error of the value, in its unit: what the confirming computation is off there, tenfold.
+        Bound of the value's numerical error, in its unit: ten times the deviation of the confirming computation.
     confirmed_by : str
-        The independent computation that agrees.
+        Independent computation that agrees.
     environment : dict
-        The properties that were held.
+        Properties that were held.
     """
 
     over: str
@@ -85,13 +93,13 @@ class StabilityMap:
     Attributes
     ----------
     x, y : str
-        The properties.
+        Properties.
     x_values, y_values : ndarray
-        Their values.
+        Values of the properties.
     growth : ndarray, shape (len(y_values), len(x_values))
         σ in 1/s, negative where the loop is stable.
     limits : tuple of StabilityLimit
-        The limit of x at each value of y.
+        Limit of x at each value of y.
     """
 
     x: str
@@ -105,8 +113,8 @@ class StabilityMap:
 def rule_of_thumb(loop: AdmittanceLoop, damping: float = 0.0) -> float:
     """Return the rule of thumb for the largest stiffness, k_e ≈ (d + b_e)/T_d, in N/m.
 
-    A held force comes late by T_d = T/2, and by T more for each sample of delay. d is that in metres, d/q along the
-    path. Infinite where nothing is sampled.
+    A held force comes late by T_d = T/2, and by T more for each sample of delay. d is the admittance's damping for
+    velocities in m/s, divided by q along the path. The rule gives infinity for a loop that is not sampled.
     """
     if loop.implementation != "sampled":
         return math.inf
@@ -121,33 +129,33 @@ def stability_limit(
     *,
     low: float | None = None,
     high: float | None = None,
-    per_decade: int = 40,
+    per_decade: int = PER_DECADE,
     **environment: float,
 ) -> StabilityLimit:
     """Return the first value of ``over`` at which the coupled loop loses its stability.
 
-    The growth rate is scanned from ``low`` to ``high``; its extrema between points of the scan are looked at too; each
-    change of its sign is refined by Brent's method.
+    The growth rate is scanned from ``low`` to ``high``, extrema between the points included. Brent's method refines
+    each change of its sign.
 
     Parameters
     ----------
     loop : AdmittanceLoop
         Robot and controller.
     over : str, optional
-        ``"stiffness"``, ``"damping"``, ``"mass"`` (of the environment) or ``"tool_mass"``.
+        ``"stiffness"``, ``"damping"`` or ``"mass"`` of the environment, or ``"tool_mass"``.
     low, high : float, optional
-        From where to where to scan; by default `SCANNED`.
+        Ends of the scan; by default those of `SCANNED`.
     per_decade : int, optional
-        Points of the scan.
+        Points of the scan in a decade.
     **environment
-        The other properties, as `poles` takes them.
+        Other properties, as `poles` takes them.
 
     Raises
     ------
     OptionError
-        An unknown property, one that is given besides, or a scan that doesn't rise.
+        If a property is unknown, ``over`` is among the held ones, or the scan does not rise.
     ParameterError
-        A property that is NaN, infinite or negative.
+        If a property is NaN, infinite or negative.
     ConfirmationError
         If python-control's interconnection of the same parts is not stable below the limit and unstable above it.
     """
@@ -155,17 +163,19 @@ def stability_limit(
     first, last = SCANNED[over]
     first, last = first if low is None else low, last if high is None else high
     if not 0.0 < first < last < math.inf:
-        raise OptionError(f"found a scan from {first!r} to {last!r}; expected 0 < low < high.", port=over)
+        raise OptionError(
+            f"found a scan from {first!r} to {last!r}; expected 0 < low < high. Give other ends.", port=over
+        )
     grid = np.geomspace(first, last, max(8, math.ceil(per_decade * math.log10(last / first)) + 1))
-    sigma = growth_rate(loop, **{over: grid}, **environment)
+    sigma: np.ndarray = growth_rate(loop, **{over: grid}, **environment)
     rule = rule_of_thumb(loop, environment.get("damping", 0.0)) if over == "stiffness" else math.nan
     common: dict[str, Any] = {"over": over, "unit": UNITS[over], "rule_of_thumb": rule, "scanned": (first, last)}
     common["environment"] = dict(environment)
 
-    def at(x: float) -> float:
+    def growth_at(x: float) -> float:
         return float(growth_rate(loop, **{over: x}, **environment))
 
-    changes = [_refined(at, a, b) for a, b in _brackets(at, grid, sigma)]
+    changes = [_refine(growth_at, a, b) for a, b in _find_brackets(growth_at, grid, sigma)]
     if sigma[0] > 0.0:
         changes.insert(0, 0.0)
     if not changes:
@@ -181,14 +191,14 @@ def stability_limit(
         )
     step = min(_SIDES, 0.5 * (later[0] / value - 1.0)) if later else _SIDES
     confirmed = _confirm(loop, over, value, step, environment)
-    slope = (at((1.0 + step) * value) - at((1.0 - step) * value)) / (2.0 * step)  # of σ over ln value
+    slope = (growth_at((1.0 + step) * value) - growth_at((1.0 - step) * value)) / (2.0 * step)  # of σ over ln value
     error = abs(growth_rate_by_control(loop, **{over: value}, **environment) / slope)
     return StabilityLimit(
         value=value,
         frequency=crossing_frequency(loop, **{over: value}, **environment),
         restabilizes=tuple(later),
-        growth_below=at((1.0 - _GROWTH) * value),
-        growth_above=at((1.0 + _GROWTH) * value),
+        growth_below=growth_at((1.0 - _GROWTH) * value),
+        growth_above=growth_at((1.0 + _GROWTH) * value),
         tolerance=value * (10.0 * error + _ROUNDING),
         confirmed_by=confirmed,
         **common,
@@ -196,22 +206,22 @@ def stability_limit(
 
 
 def stiffness_limits(loop: AdmittanceLoop, dampings: Sequence[float] = (0.0, 10.0, 100.0)) -> dict[str, StabilityLimit]:
-    """Return the limits of the environment's stiffness side by side: continuous, and sampled without and with a delay.
+    """Return the limits of the environment's stiffness: of the continuous loop, and sampled without and with a delay.
 
-    They are the loop's as it is: with `AdmittanceLoop.of` and a diagram with friction, those that a report calls
-    ``ke_limit_friction``. A report's ``ke_limit`` is that of the design without friction.
+    The loop keeps its friction. For a diagram with friction, `AdmittanceLoop.of` therefore gives the numbers that a
+    report calls ``ke_limit_friction``; its ``ke_limit`` is that of the design without friction.
 
     Parameters
     ----------
     loop : AdmittanceLoop
-        Robot and controller; its own implementation and delay are replaced.
+        Robot and controller; the implementation and delay are replaced.
     dampings : sequence of float, optional
         Dampings b_e of the environment, N s/m.
 
     Returns
     -------
     dict
-        By the names that they have in a report, such as ``admittance.perp.ke_limit.sampled_d0.be_10``.
+        Limits by their names in a report, such as ``admittance.perp.ke_limit.sampled_d0.be_10``.
     """
     variants = {"continuous": loop.replace(implementation="continuous", delay=0)}
     variants |= {f"sampled_d{n}": loop.replace(implementation="sampled", delay=n) for n in (0, 1)}
@@ -232,49 +242,59 @@ def stability_map(
     y: str = "damping",
     **environment: float,
 ) -> StabilityMap:
-    """Return the growth rate over two properties of the environment, with the limit of the first at each of the second.
+    """Return the growth rate over two properties of the environment, and the limit of x at each value of y.
 
     Parameters
     ----------
     loop : AdmittanceLoop
         Robot and controller.
     x_values, y_values : array
-        Values of the two properties, x positive and rising.
+        Values of the two properties; those of x positive and rising.
     x, y : str, optional
-        The properties.
+        Properties.
     **environment
-        The others, as `poles` takes them.
+        Other properties, as `poles` takes them.
 
     Raises
     ------
-    OptionError, ConfirmationError
-        As in `stability_limit`.
+    OptionError
+        If a property is unknown or given twice, or values are not a row.
+    ConfirmationError
+        If python-control's interconnection of the same parts disagrees with a limit.
     """
     _check(x, environment)
     _check(y, environment)
     across, up = np.asarray(x_values, dtype=float), np.asarray(y_values, dtype=float)
     if x == y or across.ndim != 1 or up.ndim != 1:
         raise OptionError(
-            f"found {x!r} and {y!r}; expected two different properties, each with a row of values.", port=x
+            f"found {x!r} and {y!r} with values of {across.ndim} and {up.ndim} axes; expected two different "
+            "properties, each with a row of values. Give x=…, y=….",
+            port=x,
         )
-    growth = growth_rate(loop, **{x: across[None, :], y: up[:, None]}, **environment)
-    span = {"low": float(across[0]), "high": float(across[-1])}
-    limits = tuple(stability_limit(loop, x, **span, **{y: float(v)}, **environment) for v in up)  # type: ignore[arg-type]
+    growth: np.ndarray = growth_rate(loop, **{x: across[None, :], y: up[:, None]}, **environment)
+    low, high = float(across[0]), float(across[-1])
+    held = [{y: float(v), **environment} for v in up]
+    limits = tuple(stability_limit(loop, x, low=low, high=high, per_decade=PER_DECADE, **h) for h in held)
     return StabilityMap(x, y, across, up, growth, limits)
 
 
 def _check(name: str, environment: dict[str, float]) -> None:
+    """Refuse properties that are unknown, and one that is held and scanned."""
     if name not in UNITS:
         raise OptionError(f"an environment has no {name!r}. {near(name, UNITS)}", port=str(name))
     if name in environment:
-        raise OptionError(f"found it given as {environment[name]!r}, too; expected it free. Leave it out.", port=name)
+        raise OptionError(
+            f"found it among the held properties, as {environment[name]!r}; expected it only as the scanned one. Leave "
+            "it out.",
+            port=name,
+        )
     for other in environment:
         if other not in UNITS:
             raise OptionError(f"an environment has no {other!r}. {near(other, UNITS)}", port=other)
 
 
-def _brackets(at: Any, grid: np.ndarray, sigma: np.ndarray) -> Iterator[tuple[float, float]]:
-    """Yield intervals in which the sign changes: between points of the scan, and around extrema between them."""
+def _find_brackets(growth_at: Growth, grid: np.ndarray, sigma: np.ndarray) -> Iterator[tuple[float, float]]:
+    """Yield intervals in which the growth rate changes its sign: between points, and around extrema between them."""
     from scipy.optimize import minimize_scalar
 
     positive = sigma > 0.0
@@ -282,37 +302,39 @@ def _brackets(at: Any, grid: np.ndarray, sigma: np.ndarray) -> Iterator[tuple[fl
         if positive[i] != positive[i + 1]:
             yield float(grid[i]), float(grid[i + 1])
         elif 0 < i + 1 < len(grid) - 1 and positive[i + 1] == positive[i + 2] and np.isfinite(sigma[i : i + 3]).all():
-            towards = 1.0 if positive[i] else -1.0  # the sign of σ that a touching extremum would leave
+            towards = 1.0 if positive[i] else -1.0  # sign of σ that the extremum points away from
             here = towards * sigma[i : i + 3]
             if here[1] > min(here[0], here[2]) or here[1] > _FLAT * float(np.ptp(here)):
                 continue
             found = minimize_scalar(
-                lambda y, towards=towards: towards * at(math.exp(y)),
+                lambda y, towards=towards: towards * growth_at(math.exp(y)),
                 bounds=(math.log(grid[i]), math.log(grid[i + 2])),
                 method="bounded",
                 options={"xatol": 1e-10},
             )
-            if found.fun < 0.0:
-                top = math.exp(found.x)
+            if float(found.fun) < 0.0:
+                top = math.exp(float(found.x))
                 yield float(grid[i]), top
                 yield top, float(grid[i + 2])
 
 
-def _refined(at: Any, low: float, high: float) -> float:
-    """Return where the growth rate changes its sign, by Brent's method."""
+def _refine(growth_at: Growth, low: float, high: float) -> float:
+    """Return the value at which the growth rate changes its sign, by Brent's method."""
     from scipy.optimize import brentq
 
-    sign = lambda y: min(max(at(math.exp(y)), -1e6), 1e6)  # noqa: E731 - infinite where there is no solution
-    return math.exp(brentq(sign, math.log(low), math.log(high), xtol=1e-13, rtol=1e-13, maxiter=200))
+    def bounded(y: float) -> float:
+        return min(max(growth_at(math.exp(y)), -1e6), 1e6)  # infinite where the equations have no solution
+
+    return math.exp(float(brentq(bounded, math.log(low), math.log(high), xtol=1e-13, rtol=1e-13, maxiter=200)))
 
 
 def _confirm(loop: AdmittanceLoop, over: str, value: float, step: float, environment: dict[str, float]) -> str:
-    """Compare with poles of an interconnection that python-control makes, below and above the limit."""
+    """Confirm a limit by the poles of python-control's interconnection below and above it; return the computation."""
     below, above = (growth_rate_by_control(loop, **{over: x * value}, **environment) for x in (1.0 - step, 1.0 + step))
     if not below < 0.0 < above:
         raise ConfirmationError(
             f"{over} {value:.6g} {UNITS[over]} is no limit: python-control's interconnection has the growth rates "
             f"{below:.4g} and {above:.4g} 1/s at {1.0 - step:.4g} and {1.0 + step:.4g} of it; expected the first "
-            "negative, the second positive. Scan more finely (per_decade=…), or look at poles(…) there."
+            "negative, the second positive. Scan more finely with per_decade=…."
         )
     return f"closed-loop eigenvalues of python-control's interconnection at {1.0 - step:.4g} and {1.0 + step:.4g}"

@@ -14,7 +14,7 @@ from ...blocks.core.errors import LoopwrightError
 from ...fmus.models.gantry import Gantry
 from ...fmus.running.fmu import Fmu
 from ..admittance.compliance_loop import control_rate
-from ..admittance.shown_plant import is_discrete, show_plant
+from ..admittance.shown_plant import check_plant, is_discrete
 from ..document.templating import Texts
 from ..flat.wired_diagram import WiredDiagram
 from ..report.case import Basis, Case, Excitation
@@ -161,7 +161,7 @@ class Fig3Case(Case):
         """Return whether the plant of a variant is shown to be a model, where and as fast as it is."""
         pids = [cast(ErrorDynamics, self.diagram.blocks[f"controller.pid_{side}"]) for side in SIDES]
         try:
-            show_plant(diagram, PLANT, model, rate=min(map(control_rate, pids)), point=point)
+            check_plant(diagram, PLANT, model, rate=min(map(control_rate, pids)), point=point)
         except LoopwrightError:
             return False
         return True

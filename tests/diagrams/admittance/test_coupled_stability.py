@@ -13,9 +13,9 @@ from loopwright.blocks.core.errors import UnknownNameError
 from loopwright.diagrams import experiments
 from loopwright.diagrams.admittance import stability_limits as _stability_limits
 from loopwright.diagrams.admittance.compliance_loop import AdmittanceLoop
-from loopwright.diagrams.admittance.coupled import closed_loop, growth_rate, growth_rate_by_control, poles
+from loopwright.diagrams.admittance.coupled import close_loop, growth_rate, growth_rate_by_control, poles
 from loopwright.diagrams.admittance.stability_limits import (
-    _brackets,
+    _find_brackets,
     rule_of_thumb,
     stability_limit,
     stability_map,
@@ -117,7 +117,7 @@ def from_the_start(model, push, ticks, **environment):
     if model.delay:  # u₀ acts in the first two ticks
         at_once = model.replace(delay=0).controller_matrices.D
         parts.append(at_once @ np.concatenate([p, v, -b * there @ v - k * there @ p]))
-    x, A = np.concatenate(parts), closed_loop(model, **environment)
+    x, A = np.concatenate(parts), close_loop(model, **environment)
     found = []
     for _ in range(ticks):
         found.append(x[n + i])
@@ -326,7 +326,7 @@ def test_an_island_between_two_points_of_the_scan_is_found(sign):
         return sign * (1e-4 - (math.log(x) - 1.03) ** 2)
 
     grid = np.geomspace(0.5, 20.0, 9)  # 0.46 apart in ln x, the island is 0.02 wide
-    edges = [x for pair in _brackets(at, grid, np.array([at(x) for x in grid])) for x in pair]
+    edges = [x for pair in _find_brackets(at, grid, np.array([at(x) for x in grid])) for x in pair]
     assert edges[0] < math.exp(1.02) < edges[1] == edges[2] < math.exp(1.04) < edges[3]
 
 
@@ -406,7 +406,7 @@ def test_what_can_not_be_reduced_is_refused(change, text):
     [
         ({"over": "stifness"}, "an environment has no 'stifness'. Did you mean 'stiffness'?"),
         ({"damper": 1.0}, "an environment has no 'damper'. Did you mean"),
-        ({"over": "mass", "mass": 1.0}, "mass: found it given as 1.0, too"),
+        ({"over": "mass", "mass": 1.0}, "mass: found it among the held properties, as 1.0"),
         ({"low": 10.0, "high": 1.0}, "found a scan from 10.0 to 1.0; expected 0 < low < high"),
     ],
 )

@@ -179,8 +179,8 @@ def test_the_matrices_of_these_tests_are_those_of_the_plants(kind):
 # --- plants that are, and that are not -------------------------------------------------------------------------------
 
 ELASTIC = (
-    "plant: found 8 states (position, velocity, deflection, deflection_rate); expected 4, position and velocity in two "
-    "axes, as the reduced model has. Linearize the diagram itself in place of the reduced loop."
+    "plant: found 8 states (position, velocity, deflection, deflection_rate); expected 4, position and velocity of two "
+    "axes, as in the reduced model. Linearize the diagram itself in place of the reduced loop."
 )
 
 
@@ -204,8 +204,10 @@ def test_a_wall_is_seen_in_contact_and_not_away_from_it():
         touching
     )
     found = refusal(diagram(gantry_contact), eta=0.3)  # contact there is not known
-    assert found.startswith("plant.position: found the position [0.8, 0.5] m, and discrete states that hold there;")
-    assert found.endswith("Start the diagram there, or give the point of the path at which it is: eta=…, xi=….")
+    assert found.startswith(
+        "plant.position: found the position [0.8, 0.5] m, with discrete states that hold only there;"
+    )
+    assert found.endswith("Start the diagram there, or give its point of the path: eta=…, xi=….")
 
 
 def test_contact_is_taken_from_the_point_that_is_given():
@@ -222,7 +224,7 @@ def test_another_mass_than_the_models_is_refused_until_it_is_given():
     made = experiments.compliance(plant=Fmu(gantry.build(), start=HEAVY)).diagram
     assert refusal(made) == (
         "plant.motor_force: found the mass 21.2 kg along and 39.26 kg across the path; expected 21.2 kg along and "
-        "36.87 kg across the path, as the reduced model has. Give the plant as it is, with plant=…, or its parameters "
+        "36.87 kg across the path, as in the reduced model. Give the plant as it is, with plant=…, or its parameters "
         "to the FMU."
     )
     loop = AdmittanceLoop.of(made, plant=gantry.nominal.replace(**HEAVY))
@@ -276,8 +278,8 @@ def undirected(file, folder):
 def test_a_plant_without_a_linear_model_has_no_reduced_loop(tmp_path):
     made = experiments.compliance(plant=hidden(gantry.build(), tmp_path)).diagram
     found = refusal(made)
-    assert found.startswith("plant: found no linear model of it (its model structure lists no derivatives")
-    assert found.endswith("Build the AdmittanceLoop by hand, if the plant is known to be rigid.")
+    assert found.startswith("plant: found no linear model (its model structure lists no derivatives")
+    assert found.endswith("Build the AdmittanceLoop by hand if the plant is known to be rigid.")
 
 
 def test_a_block_as_plant_is_differentiated():
@@ -292,7 +294,7 @@ def test_a_block_as_plant_is_differentiated():
 def test_an_arm_is_no_gantry():
     arm = Fmu(scara.build(), rename={"motor_torque": "motor_force"}, name="plant")
     with pytest.raises(ParameterError, match=r"^plant"):
-        _shown_plant.show_plant(Robots({"plant": arm}), "plant", gantry.nominal, rate=60.0, position=(0.7, 0.5))
+        _shown_plant.check_plant(Robots({"plant": arm}), "plant", gantry.nominal, rate=60.0, position=(0.7, 0.5))
 
 
 class Robots:
@@ -307,8 +309,8 @@ class Robots:
 
 def test_an_encoder_is_not_in_the_reduced_loop():
     assert refusal(experiments.compliance(encoder=1e-6).diagram) == (
-        "controller.path_projection.position: found sensors.encoder.measured_position; expected plant.position, as the "
-        "reduced loop has nothing else between them. Take it out, or linearize the diagram itself."
+        "controller.path_projection.position: found sensors.encoder.measured_position; expected plant.position: the "
+        "reduced loop has nothing between them. Take it out, or linearize the diagram itself."
     )
 
 
