@@ -1,7 +1,8 @@
-"""Where the blocks and wires of a drawing stand: layers from left to right, wires in the channels between them.
+"""Layout of a drawing: blocks in layers from left to right, wires in the channels between them.
 
-Signals run from left to right. What closes a loop runs back below everything else: behind a plant, or else ahead of the
-block at which the loop is entered. All coordinates are in pixels; the same diagram always gives the same drawing.
+Signals run from left to right. A wire that closes a loop runs back below everything else: behind a plant, or else ahead
+of the block at which the loop is entered. All coordinates are in pixels. The same diagram always gives the same
+drawing.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ class Net:
     Attributes
     ----------
     label : float
-        Width of the name that is written at its source.
+        Width of the name at its source.
     below : float
         Height at which it runs back, where it closes a loop.
     runs : list of list of (x, y)
         Its polylines.
     dots : list of (x, y)
-        Where it branches.
+        Its branching points.
     """
 
     key: str
@@ -48,7 +49,7 @@ End = tuple[Node, float]
 
 @dataclass(eq=False)
 class _Part:
-    """A net within a channel: from a node on the left to some on the right, and down to its way back."""
+    """The part of a net in a channel: from a node on the left to some on the right, and down to its way back."""
 
     net: Net
     start: End | None
@@ -71,14 +72,14 @@ class _Part:
 
 
 def arrange(nodes: Sequence[Node], nets: Sequence[Net]) -> tuple[float, float]:
-    """Place nodes and route nets, in place; return the width and height of it all.
+    """Place nodes and route nets, in place, and return the width and height of the drawing.
 
     Parameters
     ----------
     nodes : list of Node
-        In the order in which they stand where nothing else decides.
+        The nodes; their order decides where nothing else does.
     nets : list of Net
-        Their ends are pins of the nodes.
+        The nets between pins of the nodes.
     """
     by_key = {node.key: node for node in nodes}
     pairs = [(net.source[0], sink[0]) for net in nets for sink in net.sinks]
@@ -109,7 +110,7 @@ def arrange(nodes: Sequence[Node], nets: Sequence[Net]) -> tuple[float, float]:
 
 
 def _assign_layers(nodes: Sequence[Node], pairs: Sequence[tuple[str, str]]) -> None:
-    """Give every node its layer: behind all that it takes signals from, but for what closes a loop."""
+    """Give every node its layer, behind the nodes that drive it; wires that close loops don't count."""
     forward = cut_loops([n.key for n in nodes], pairs, {n.key for n in nodes if n.plant})
     before: dict[str, list[str]] = {n.key: [] for n in nodes}
     after: dict[str, list[str]] = {n.key: [] for n in nodes}
@@ -160,7 +161,7 @@ def _sinks_in(net: Net, by_key: dict[str, Node], layer: int) -> Iterable[tuple[N
 def _find_links(
     nets: Sequence[Net], by_key: dict[str, Node], lanes: dict[tuple[str, int], Node]
 ) -> list[tuple[Node, float, Node, float]]:
-    """Return what is to be straight between neighbouring layers: node, height of its pin, node, height."""
+    """Return the wires between neighbouring layers, to be drawn straight: node, pin's height, node, pin's height."""
     links = []
     for net in nets:
         node, pin = by_key[net.source[0]], net.source[1]
@@ -197,12 +198,12 @@ def _find_parts(
 
 
 def _assign_tracks(parts: list[_Part], x: float, floor: float, *, outside: bool) -> float:
-    """Give the upright pieces of a channel their places; return where the channel ends."""
+    """Give the upright pieces of a channel their places; return the x at which the channel ends."""
     placed: list[_Part] = []
     waiting = sorted((p for p in parts if _is_upright(p, floor)), key=lambda p: _preference(p, floor))
     while waiting:
         free = [p for p in waiting if not any(_turns_first(b, p) for b in waiting)]
-        if not free:  # they wait for one another in a circle: one of them changes its height on the way
+        if not free:  # they wait for one another in a circle, so one of them changes its height on the way
             rest = _split_part(waiting[0], parts)
             parts.append(rest)
             waiting.append(rest)
@@ -232,7 +233,7 @@ def _is_upright(part: _Part, floor: float) -> bool:
 
 
 def _turns_first(a: _Part, b: _Part) -> bool:
-    """Return whether a part must turn ahead of another: where it enters the channel the other one leaves it."""
+    """Return whether a part must turn ahead of another: it enters the channel at a height at which the other leaves."""
     if any(node.layer < 0 and a.start == (node, dy) for node, dy in b.ends):
         return False
     if b.start is not None and any(node.layer < 0 and b.start == (node, dy) for node, dy in a.ends):
@@ -241,7 +242,7 @@ def _turns_first(a: _Part, b: _Part) -> bool:
 
 
 def _split_part(part: _Part, parts: list[_Part]) -> _Part:
-    """Split a part at a height at which no other one enters or leaves; return what comes behind."""
+    """Split a part at a height at which no other one enters or leaves; return the piece behind."""
     taken = [y for p in parts for y in (*p.rights, *([] if p.left is None else [p.left]))]
     begin = part.rights[0] if part.left is None else part.left
     steps = (begin + sign * 4.0 * k for k in range(1, 500) for sign in (1, -1))
@@ -253,7 +254,7 @@ def _split_part(part: _Part, parts: list[_Part]) -> _Part:
 
 
 def _preference(part: _Part, floor: float) -> tuple[float, ...]:
-    """Return a key that keeps crossings few: what rises goes first from above, what falls first from below."""
+    """Return a sorting key that keeps crossings few: rising pieces first, from above, then falling ones, from below."""
     low, high = part.span(floor)
     if part.left is None:
         return (2.0, -low)
@@ -262,7 +263,7 @@ def _preference(part: _Part, floor: float) -> tuple[float, ...]:
 
 
 def _route_back(nets: Sequence[Net], channels: dict[int, list[_Part]], floor: float) -> float:
-    """Route what runs back below everything, short ways above long ones; return the lower edge."""
+    """Route the wires that run back below everything, short ways above long ones; return the lower edge."""
     ways = []
     for net in nets:
         xs = [p.x for parts in channels.values() for p in parts if p.net is net and p.back]
@@ -293,7 +294,7 @@ def _draw(channels: dict[int, list[_Part]]) -> None:
         if part.start is not None and part.left is not None:
             ys.append(part.left)
             node = part.start[0]
-            begin = node.x if node.lane else node.x + node.width  # a lane is drawn along with what follows
+            begin = node.x if node.lane else node.x + node.width  # a lane is drawn along with the piece behind it
             net.runs.append([(begin, part.left), (part.x, part.left)])
         if max(ys) > min(ys):
             net.runs.append([(part.x, min(ys)), (part.x, max(ys))])

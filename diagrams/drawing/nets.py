@@ -1,4 +1,4 @@
-"""Wires of every frame for a drawing, led from their blocks through the borders of boxes to their consumers."""
+"""Wires of a drawing, subsystem by subsystem: each leads from its block across borders to its consumers."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from .order import Pin
 
 
 class Border(Enum):
-    """The inner side of a box's border, where its wires begin and end."""
+    """The inner side of a subsystem's border, where its wires begin and end."""
 
     INPUTS = "inputs"
-    """Signals come into the box there."""
+    """Signals enter the subsystem there."""
     OUTPUTS = "outputs"
-    """Signals leave the box there."""
+    """Signals leave the subsystem there."""
 
 
 class Place(NamedTuple):
-    """An end of a wire within a frame: a block or box, or the border of the frame's own box.
+    """An end of a wire inside a subsystem: at a block, at an inner subsystem, or at the subsystem's own border.
 
     Attributes
     ----------
     path : str
-        Path of the block or box.
+        Path of the block or subsystem.
     border : Border, optional
-        The side of the border; None where the wire ends at the block or box itself.
+        The side of the border; None where the wire ends at a block or an inner subsystem.
     """
 
     path: str
@@ -41,16 +41,16 @@ PlacedPin = tuple[Place, Pin]
 
 
 class Nets:
-    """All wires of a diagram by frame.
+    """All wires of a diagram by subsystem.
 
     Attributes
     ----------
     of : dict
-        For each frame the sources, with all their sinks there.
+        For each subsystem the sources inside, each with all its sinks there.
     parts : dict
         The index of a wire that leads a part of its signal, by the path and pin at which it ends.
     ins, outs : dict
-        Pins of every block and box.
+        Pins of every block and subsystem.
     names : dict
         Names of the wires that begin at a block's port.
     """
@@ -68,19 +68,19 @@ class Nets:
                 self.names[wire.block, wire.port].append(short)
         for (path, port), wire in table.wires.items():
             self._thread(wire, table.frame_of[path], path, Pin(port))
-        for box, wire in table.controls.items():
-            self._thread(wire, box.rpartition(".")[0], box, Pin(wire.port, wire.block, control=True))
+        for path, wire in table.controls.items():
+            self._thread(wire, path.rpartition(".")[0], path, Pin(wire.port, wire.block, control=True))
         for block, port in self.names:
             self.of[table.frame_of[block]].setdefault((Place(block), Pin(port)), [])
             _add(self.outs, block, Pin(port))
 
     def name_of(self, path: str, pin: Pin) -> str:
-        """Return the names of the wire that begins at a pin of a block or a box."""
+        """Return the names of the wire that begins at a pin of a block or a subsystem."""
         block = path if path in self.table.blocks else pin.maker
         return ", ".join(self.names.get((block, pin.port), []))
 
     def label_at(self, place: Place, pin: Pin, sinks: list[PlacedPin]) -> str:
-        """Return the name that is written at a wire; one that only leaves the box is named outside."""
+        """Return the text at a wire's source: its name; empty where the wire only leaves the subsystem."""
         if place.border is Border.INPUTS or (sinks and all(end.border is Border.OUTPUTS for end, _ in sinks)):
             return ""
         return self.name_of(place.path, pin)
@@ -89,33 +89,33 @@ class Nets:
         """Whether only a part of the wire's signal goes into this end."""
         return place.border is None and (place.path, pin) in self.parts
 
-    def _thread(self, wire: Wire, frame: str, item: str, pin: Pin) -> None:
-        """Lead a wire from its block through the borders of boxes to a consumer in a frame."""
+    def _thread(self, wire: Wire, subsystem: str, item: str, pin: Pin) -> None:
+        """Lead a wire from its block across borders to a consumer in a subsystem."""
         crossing = Pin(wire.port, wire.block)
         here = self.table.frame_of[wire.block]
         end = (Place(wire.block), Pin(wire.port))
         _add(self.outs, wire.block, end[1])
-        while not (here == frame or not here or frame.startswith(here + ".")):
+        while not (here == subsystem or not here or subsystem.startswith(here + ".")):
             self._join(here, end, (Place(here, Border.OUTPUTS), crossing))
             _add(self.outs, here, crossing)
             end, here = (Place(here), crossing), here.rpartition(".")[0]
-        for box in _subsystems_between(here, frame):
-            self._join(here, end, (Place(box), crossing))
-            _add(self.ins, box, crossing)
-            end, here = (Place(box, Border.INPUTS), crossing), box
+        for inner in _subsystems_between(here, subsystem):
+            self._join(here, end, (Place(inner), crossing))
+            _add(self.ins, inner, crossing)
+            end, here = (Place(inner, Border.INPUTS), crossing), inner
         self._join(here, end, (Place(item), pin))
         _add(self.ins, item, pin)
         if wire.index is not None:
             self.parts[item, pin] = wire.index
 
-    def _join(self, frame: str, source: PlacedPin, sink: PlacedPin) -> None:
-        sinks = self.of[frame].setdefault(source, [])
+    def _join(self, subsystem: str, source: PlacedPin, sink: PlacedPin) -> None:
+        sinks = self.of[subsystem].setdefault(source, [])
         if sink not in sinks:
             sinks.append(sink)
 
 
 def _subsystems_between(outer: str, inner: str) -> list[str]:
-    """Return the boxes from a frame down to one inside it."""
+    """Return the paths of the subsystems from one down to another inside it, without the outer one."""
     parts = inner.split(".") if inner else []
     start = len(outer.split(".")) if outer else 0
     return [".".join(parts[: i + 1]) for i in range(start, len(parts))]

@@ -1,4 +1,4 @@
-"""Order for a drawing: which wires close loops, who stands above whom in a layer, and at what height."""
+"""Order of a drawing: wires that close loops, positions in a layer, and heights."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from typing import NamedTuple
 
 
 class Pin(NamedTuple):
-    """A pin of a block, by its port, or of a box, by the output that makes the signal.
+    """A pin of a block, by its port, or of a subsystem, by the output that makes the signal.
 
     Attributes
     ----------
     port : str
-        The block's port; at a box, the output's.
+        The block's port; at a subsystem, the port of the maker.
     maker : str
-        Path of the block that makes the signal, at a box; empty at a block.
+        At a subsystem, the path of the block that makes the signal; empty at a block.
     control : bool
-        Whether it enables or triggers the box.
+        Whether it enables or triggers the subsystem.
     """
 
     port: str
@@ -27,18 +27,20 @@ class Pin(NamedTuple):
 
 @dataclass(eq=False)
 class Node:
-    """A block, a box, a pin on a box's border, or a wire on its way through a layer.
+    """A block, a subsystem, a pin on a subsystem's border, or a wire on its way through a layer.
 
     Attributes
     ----------
     ins, outs : dict
         Height of every pin below the upper edge.
     side : int
-        -1 for an input pin of the box that is laid out, 1 for an output pin, else 0.
+        -1 for an input pin of the subsystem whose inside is laid out, 1 for an output pin, else 0.
     plant : bool
         Whether loops are closed behind it.
-    lane, loose : bool
-        A wire on its way through a layer; what nothing drives, and a wire that comes from there.
+    lane : bool
+        Whether it is a wire on its way through a layer.
+    loose : bool
+        Whether it has no inputs, or is a wire from such a node.
     """
 
     key: str
@@ -62,7 +64,7 @@ Link = tuple[Node, float, Node, float]
 
 
 def cut_loops(keys: Sequence[str], pairs: Iterable[tuple[str, str]], plants: set[str]) -> list[tuple[str, str]]:
-    """Return the wires without those that close loops.
+    """Return the wires that close no loop.
 
     Parameters
     ----------
@@ -71,7 +73,7 @@ def cut_loops(keys: Sequence[str], pairs: Iterable[tuple[str, str]], plants: set
     pairs : list of pairs
         The wires.
     plants : set of str
-        Nodes behind which loops are closed; other loops are closed ahead of the node where they are entered.
+        Nodes behind which loops are closed; other loops are closed ahead of the node at which they are entered.
     """
     left = [pair for pair in dict.fromkeys(pairs) if pair[0] != pair[1]]
     place = {key: i for i, key in enumerate(keys)}
@@ -125,11 +127,11 @@ def _find_knots(keys: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[s
     return found
 
 
-# --- who stands above whom ------------------------------------------------------------------------------------------
+# --- positions in a layer -------------------------------------------------------------------------------------------
 
 
 def order_layers(layers: list[list[Node]], links: Sequence[Link]) -> list[list[Node]]:
-    """Sort every layer so that few wires cross: sweeps to the barycentres of the neighbours, the best one is kept."""
+    """Sort every layer so that few wires cross: sweep to the barycentres of the neighbours, and keep the best order."""
     left, right = _neighbours(links)
     best, least = layers, _count_crossings(layers, links)
     now = [list(layer) for layer in layers]
@@ -238,7 +240,7 @@ def place_layers(layers: list[list[Node]], links: Sequence[Link], *, gap: Callab
 
 
 def _stiffness(a: Node, b: Node) -> float:
-    """Return how much it matters that a wire between two nodes is straight."""
+    """Return the weight of a straight wire between two nodes."""
     if a.lane and b.lane:
         return 4.0
     if a.loose or b.loose:  # a source can stand anywhere
@@ -257,7 +259,7 @@ def _median(values: Sequence[tuple[float, float]]) -> float:
 
 
 def _settle(layer: list[Node], wanted: list[tuple[float, float]], gap: Callable[[Node, Node], float]) -> None:
-    """Move the nodes of a layer as near as they can come to where they are wanted, in order and apart."""
+    """Move the nodes of a layer as near to their wanted heights as they can come, in order and apart."""
     offsets, total = [], 0.0
     for i, node in enumerate(layer):
         total += layer[i - 1].height + gap(layer[i - 1], node) if i else 0.0

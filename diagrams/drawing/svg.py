@@ -17,11 +17,11 @@ from .order import Node, Pin
 from .shapes import BORDER, GREY, INK, NAME, PLANT, WIRE, line, rect, seconds, text_at, width
 
 MANY = 40
-"""Blocks above which boxes are drawn closed unless told otherwise."""
+"""Blocks above which subsystems are drawn closed by default."""
 
 HEADER, MARGIN, PIN, STUB = 24.0, 14.0, 18.0, 14.0
 TINTS = ("#eaf2fb", "#e6f5ec", "#f3ecfa", "#fdebec", "#e8f4f6", "#f6f2e2")
-"""Of sampled boxes, one for each sample time."""
+"""Colours of sampled subsystems, one for each sample time."""
 
 
 class Drawing:
@@ -43,42 +43,59 @@ class Drawing:
         return f"<drawing, {len(self.svg)} characters of SVG>"
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write it to a file, ``.svg``."""
+        """Write the drawing to a file, ``.svg``, and return the file.
+
+        Raises
+        ------
+        OptionError
+            If the file has another ending.
+        """
         file = Path(path)
         if file.suffix.lower() != ".svg":
-            raise OptionError(f"found {str(path)!r}; a drawing is written as SVG: name it {file.stem}.svg.")
+            raise OptionError(f"found {str(path)!r}; expected a file for SVG. Name it {file.stem}.svg.")
         file.write_text(self.svg, encoding="utf-8")
         return file
 
 
 def draw(diagram: CheckedDiagram, *, box: str = "", closed: bool | Iterable[str] | None = None) -> str:
-    """Return the drawing of a diagram, or of the inside of one of its boxes, as SVG.
+    """Return the drawing of a diagram, or of the inside of one of its subsystems, as SVG.
 
     Parameters
     ----------
+    diagram : CheckedDiagram
+        The diagram.
     box : str
         Path of the subsystem whose inside is drawn; the whole diagram without it.
     closed : bool or list of str, optional
-        Boxes that are drawn closed, all or some; without it all of them in a diagram of more than 40 blocks.
+        Subsystems that are drawn closed, all or some; by default all of them in a diagram of more than 40 blocks.
+
+    Raises
+    ------
+    OptionError
+        If a path stands for no subsystem.
     """
     table = diagram.structure
-    boxes = [path for path in table.frames if path]
+    paths = [path for path in table.frames if path]
     shut = _find_closed(table, box, closed, diagram=diagram.name)
     if box not in table.frames:
-        raise OptionError(f"there is no subsystem {box!r}. {near(box, boxes)}", block=diagram.name, port="box")
+        raise OptionError(f"there is no subsystem {box!r}. {near(box, paths)}", block=diagram.name, port="box")
     return _Picture(table, shut - {box}).page(box, box or diagram.name)
 
 
 def _find_closed(table: Structure, box: str, closed: bool | Iterable[str] | None, *, diagram: str) -> set[str]:
-    boxes = {path for path in table.frames if path}
+    known = {path for path in table.frames if path}
     if closed is None:
-        inside = [p for p, frame in table.frame_of.items() if not box or frame == box or frame.startswith(box + ".")]
+        inside = [
+            p
+            for p, subsystem in table.frame_of.items()
+            if not box or subsystem == box or subsystem.startswith(box + ".")
+        ]
         closed = len(inside) > MANY
     if isinstance(closed, bool):
-        return boxes if closed else set()
+        return known if closed else set()
     shut = {closed} if isinstance(closed, str) else set(closed)
-    for path in sorted(shut - boxes):
-        raise OptionError(f"there is no subsystem {path!r}. {near(path, boxes)}", block=diagram, port="closed")
+    for path in sorted(shut - known):
+        raise OptionError(f"there is no subsystem {path!r}. {near(path, known)}", block=diagram, port="closed")
     return shut
 
 
@@ -94,15 +111,17 @@ class _Picture:
 
     # --- layout -----------------------------------------------------------------------------------------------------
 
-    def page(self, frame: str, title: str) -> str:
+    def page(self, subsystem: str, title: str) -> str:
         """Return the whole SVG."""
-        body, w, h, pins = self._lay_out(frame)
+        body, w, h, pins = self._lay_out(subsystem)
         left, right, top, border = MARGIN, MARGIN, MARGIN, ""
-        if frame:  # its border, and the names of the pins on it
-            texts = {name: (side, text) for side, names in enumerate(self._pin_texts(frame)) for name, text in names}
+        if subsystem:  # its border, and the names of the pins on it
+            texts = {
+                name: (side, text) for side, names in enumerate(self._pin_texts(subsystem)) for name, text in names
+            }
             wide = [max((width(text, 9) for side, text in texts.values() if side == i), default=0.0) for i in (0, 1)]
             left, right, top = left + wide[0] + 16 + MARGIN, right + wide[1] + 16 + MARGIN, top + HEADER
-            border = self._border(frame, -MARGIN, -HEADER, w + 2 * MARGIN, h + HEADER + MARGIN)
+            border = self._border(subsystem, -MARGIN, -HEADER, w + 2 * MARGIN, h + HEADER + MARGIN)
             for pin in pins:
                 (name,) = (*pin.ins, *pin.outs)
                 start, end = (-MARGIN - 14, 0.0) if pin.side < 0 else (pin.x, w + MARGIN + 14)
@@ -118,14 +137,14 @@ class _Picture:
             f'<g transform="translate({left:g} {top:g})">\n{border}{body}</g>\n</svg>\n'
         )
 
-    def _lay_out(self, frame: str) -> tuple[str, float, float, list[Node]]:
-        """Lay a frame out; return its drawing, its size, and the pins on its border."""
+    def _lay_out(self, subsystem: str) -> tuple[str, float, float, list[Node]]:
+        """Lay out the inside of a subsystem; return its drawing, its width and height, and the pins on its border."""
         table = self.table
-        items = [p for p, f in table.frame_of.items() if f == frame]
-        boxes = [p for p in table.frames if p and p.rpartition(".")[0] == frame]
+        items = [p for p, f in table.frame_of.items() if f == subsystem]
+        inner = [p for p in table.frames if p and p.rpartition(".")[0] == subsystem]
         drawn: dict[str, tuple[str, list[Node]]] = {}
         nodes = []
-        for path in [*items, *boxes]:
+        for path in [*items, *inner]:
             if path in table.blocks:
                 nodes.append(self._block_node(path))
             elif path in self.closed:
@@ -140,14 +159,14 @@ class _Picture:
                 nodes.append(node)
             nodes[-1].plant = self._has_plant(path)
         borders = []
-        if frame:
-            entering, leaving = Place(frame, Border.INPUTS), Place(frame, Border.OUTPUTS)
+        if subsystem:
+            entering, leaving = Place(subsystem, Border.INPUTS), Place(subsystem, Border.OUTPUTS)
             borders = [
-                Node(entering.key(n), 0, 0, {}, {n: 0.0}, -1) for n in self.nets.ins.get(frame, []) if not n.control
+                Node(entering.key(n), 0, 0, {}, {n: 0.0}, -1) for n in self.nets.ins.get(subsystem, []) if not n.control
             ]
-            borders += [Node(leaving.key(n), 0, 0, {n: 0.0}, {}, 1) for n in self.nets.outs.get(frame, [])]
+            borders += [Node(leaving.key(n), 0, 0, {n: 0.0}, {}, 1) for n in self.nets.outs.get(subsystem, [])]
         nets, names = [], []
-        for (place, pin), sinks in self.nets.of[frame].items():
+        for (place, pin), sinks in self.nets.of[subsystem].items():
             name = self.nets.label_at(place, pin, sinks)
             part = any(self.nets.is_part(*sink) for sink in sinks)
             label = (width(name, 9) + 10 if name else 0.0) + (14.0 if part else 0.0)
@@ -227,17 +246,17 @@ class _Picture:
         return " · ".join(self._headings(path))
 
     def _headings(self, path: str) -> list[str]:
-        """Return the texts at a box's upper edge: its name, its rate, its conditions."""
-        frame = self.table.frames[path]
+        """Return the texts at a subsystem's upper edge: its name, its rate, its conditions."""
+        settings = self.table.frames[path]
         texts = [path.rpartition(".")[2]]
-        if frame.sample_time is not None:
-            texts.append(f"every {seconds(frame.sample_time)}")
-        if frame.offset:
-            texts.append(f"from {seconds(frame.offset)}")
-        if frame.delay:
-            texts.append(f"delay {frame.delay} sample{'s' if frame.delay > 1 else ''}")
-        if frame.control:
-            texts.append(f"{frame.control}, {frame.when}")
+        if settings.sample_time is not None:
+            texts.append(f"every {seconds(settings.sample_time)}")
+        if settings.offset:
+            texts.append(f"from {seconds(settings.offset)}")
+        if settings.delay:
+            texts.append(f"delay {settings.delay} sample{'s' if settings.delay > 1 else ''}")
+        if settings.control:
+            texts.append(f"{settings.control}, {settings.when}")
         return texts
 
     # --- drawing ----------------------------------------------------------------------------------------------------
@@ -252,14 +271,14 @@ class _Picture:
             return "".join(out)
         body, pins = inner
         out.append(f'<g transform="translate({x + MARGIN:g} {y + HEADER:g})">\n{body}</g>\n')
-        for pin in pins:  # from the border to where the inside begins
+        for pin in pins:  # from the border to the drawing of the inside
             at = y + HEADER + pin.y
             a, b = (x, x + MARGIN) if pin.side < 0 else (x + MARGIN + pin.x, x + w)
             out.append(line([(a, at), (b, at)]))
         return "".join(out)
 
     def _border(self, path: str, x: float, y: float, w: float, h: float) -> str:
-        """Return a box without what is in it."""
+        """Return the border of a subsystem, with its texts."""
         rate = self.table.rate(path)
         tint = self.tints[rate] if rate is not None else "#f5f6f7"
         name, *rest = self._headings(path)
@@ -308,7 +327,7 @@ class _Picture:
         return "".join(out)
 
     def _label(self, net: Net, name: str, nodes: list[Node]) -> str:
-        """Write a wire's name behind its source, arrows and parts ahead of its sinks."""
+        """Return a wire's name behind its source, and arrows and indices ahead of its sinks."""
         out = []
         by_key = {node.key: node for node in nodes}
         source = by_key.get(net.source[0])

@@ -192,11 +192,11 @@ def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[
             )
     for (path, port), handed in sorted(table.handed.items()):
         for passing, output in handed:
-            frame, clock = table.frames[passing], table.clock(table.frame_of[path])
-            same = clock is not None and (clock.sample_time, clock.offset) == (frame.sample_time, frame.offset)
-            if not (frame.control or frame.delay) and (frame.sample_time is None or same):
+            settings, clock = table.frames[passing], table.clock(table.frame_of[path])
+            same = clock is not None and (clock.sample_time, clock.offset) == (settings.sample_time, settings.offset)
+            if not (settings.control or settings.delay) and (settings.sample_time is None or same):
                 continue
-            kind = frame.control or ("delayed" if frame.delay else "sampled")
+            kind = settings.control or ("delayed" if settings.delay else "sampled")
             raise WiringError(
                 f"found {passing}.{output}, a signal from outside that the {kind} subsystem only passes through; "
                 "expected the output of a block in it. Put a block between, such as Gain(gain=1.0), or wire the signal "
@@ -260,8 +260,8 @@ def _reads_sample_time(block: Block, trace: Traced) -> bool:
 
 
 def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, shared: dict[Any, Traced]) -> Traced:
-    frame = table.frame_of[path]
-    sampled, method, rate = table.is_sampled(frame), table.method(frame), table.rate(frame)
+    subsystem = table.frame_of[path]
+    sampled, method, rate = table.is_sampled(subsystem), table.method(subsystem), table.rate(subsystem)
     try:
         if rate is not None and isinstance(block, FixedSampleTime):
             block.check_rate(float(rate))

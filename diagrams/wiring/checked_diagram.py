@@ -148,8 +148,8 @@ class CheckedDiagram:
             A block that is defined at samples only, such as a `UnitDelay`.
         """
         table = self.structure.copy()
-        for path, frame in table.frames.items():
-            table.frames[path] = replace_fields(frame, sample_time=None, offset=Fraction(0), delay=0)
+        for path, settings in table.frames.items():
+            table.frames[path] = replace_fields(settings, sample_time=None, offset=Fraction(0), delay=0)
         return self.with_structure(table)
 
     def sampled(self, sample_time: float | Fraction, method: str = "exact") -> Self:
@@ -174,9 +174,9 @@ class CheckedDiagram:
         """
         check_method(method)
         table = self.structure.copy()
-        for path, frame in sorted(table.frames.items()):
+        for path, settings in sorted(table.frames.items()):
             if self.structure.clock(path) is None:
-                table.frames[path] = replace_fields(frame, method=method)
+                table.frames[path] = replace_fields(settings, method=method)
         top = replace_fields(table.frames[""], sample_time=exact_time(sample_time, block=self.name))
         table.frames[""] = top
         return self.with_structure(table)
@@ -195,7 +195,7 @@ class CheckedDiagram:
     @property
     def has_clock(self) -> bool:
         """Whether a subsystem, or the diagram itself, has a sample time."""
-        return any(frame.sample_time is not None for frame in self.scheduled.frames.values())
+        return any(settings.sample_time is not None for settings in self.scheduled.frames.values())
 
     @property
     def has_fmu(self) -> bool:

@@ -33,33 +33,33 @@ def add_delay_blocks(table: Structure) -> Structure:
         return table
     table = table.copy()
     table.blocks.update(sampled)
-    for frame in late:
-        _delay_outputs(table, frame)
+    for subsystem in late:
+        _delay_outputs(table, subsystem)
     return table
 
 
-def _is_inside(frame: str, path: str) -> bool:
-    return path == frame or path.startswith(f"{frame}.")
+def _is_inside(subsystem: str, path: str) -> bool:
+    return path == subsystem or path.startswith(f"{subsystem}.")
 
 
-def _delay_outputs(table: Structure, frame: str) -> None:
+def _delay_outputs(table: Structure, subsystem: str) -> None:
     made: dict[tuple[str, str], str] = {}
 
     def delay(wire: Wire) -> Wire:
         key = (wire.block, wire.port)
         if key not in made:
-            base = path = join(frame, f"delay_{wire.port if wire.port.isidentifier() else 'output'}")
+            base = path = join(subsystem, f"delay_{wire.port if wire.port.isidentifier() else 'output'}")
             count = 2
             while path in table.blocks:
                 path, count = f"{base}_{count}", count + 1
             made[key] = path
-            table.blocks[path] = Delay(steps=table.frames[frame].delay, name=path.rpartition(".")[2])
-            table.frame_of[path] = frame
+            table.blocks[path] = Delay(steps=table.frames[subsystem].delay, name=path.rpartition(".")[2])
+            table.frame_of[path] = subsystem
             table.wires[path, "u"] = replace(wire, index=None)
         return Wire(made[key], "y", wire.index)
 
-    def leaves(wire: Wire, consumer_frame: str) -> bool:
-        return _is_inside(frame, table.frame_of[wire.block]) and not _is_inside(frame, consumer_frame)
+    def leaves(wire: Wire, consumer_subsystem: str) -> bool:
+        return _is_inside(subsystem, table.frame_of[wire.block]) and not _is_inside(subsystem, consumer_subsystem)
 
     for key, wire in sorted(table.wires.items()):
         if leaves(wire, table.frame_of[key[0]]):

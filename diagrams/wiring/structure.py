@@ -104,36 +104,36 @@ class Structure:
             dict(self.handed),
         )
 
-    def clock(self, frame: str) -> Frame | None:
+    def clock(self, subsystem: str) -> Frame | None:
         """Return the subsystem whose sample time holds in one: itself, or the nearest around it; None without any."""
-        while frame and self.frames[frame].sample_time is None:
-            frame = frame.rpartition(".")[0]
-        found = self.frames[frame]
+        while subsystem and self.frames[subsystem].sample_time is None:
+            subsystem = subsystem.rpartition(".")[0]
+        found = self.frames[subsystem]
         return None if found.sample_time is None else found
 
-    def method(self, frame: str) -> str:
+    def method(self, subsystem: str) -> str:
         """Return the discretization of continuous blocks in a subsystem: its own, or that of the nearest around it."""
-        while frame and self.frames[frame].method is None:
-            frame = frame.rpartition(".")[0]
-        return self.frames[frame].method or "exact"
+        while subsystem and self.frames[subsystem].method is None:
+            subsystem = subsystem.rpartition(".")[0]
+        return self.frames[subsystem].method or "exact"
 
-    def rate(self, frame: str) -> Fraction | None:
+    def rate(self, subsystem: str) -> Fraction | None:
         """Return the sample time that holds in a subsystem, None where it is continuous."""
-        found = self.clock(frame)
+        found = self.clock(subsystem)
         return None if found is None else found.sample_time
 
-    def subsystems_around(self, frame: str) -> list[Frame]:
+    def subsystems_around(self, subsystem: str) -> list[Frame]:
         """Return a subsystem and all those around it, from outside in; the diagram itself is none."""
-        parts = frame.split(".") if frame else []
+        parts = subsystem.split(".") if subsystem else []
         return [self.frames[".".join(parts[: i + 1])] for i in range(len(parts))]
 
-    def gates(self, frame: str) -> tuple[str, ...]:
-        """Return the paths of the enabled and triggered subsystems around a block in ``frame``, from outside in."""
-        return tuple(f.path for f in self.subsystems_around(frame) if f.control)
+    def gates(self, subsystem: str) -> tuple[str, ...]:
+        """Return the paths of the enabled and triggered subsystems around a block in ``subsystem``, from outside in."""
+        return tuple(f.path for f in self.subsystems_around(subsystem) if f.control)
 
-    def triggered_around(self, frame: str) -> str | None:
-        """Return the path of the innermost triggered subsystem around a block in ``frame``; None without any."""
-        return next((f.path for f in reversed(self.subsystems_around(frame)) if f.control == "triggered"), None)
+    def triggered_around(self, subsystem: str) -> str | None:
+        """Return the path of the innermost triggered subsystem around a block in ``subsystem``; None without any."""
+        return next((f.path for f in reversed(self.subsystems_around(subsystem)) if f.control == "triggered"), None)
 
     def is_event(self, path: str) -> bool:
         """Whether a subsystem is enabled or triggered in continuous time, by an event, and not at ticks."""
@@ -144,9 +144,9 @@ class Structure:
         block = self.blocks[path]
         return not block.stepped and (not block.transport or self.is_sampled(self.frame_of[path]))
 
-    def is_sampled(self, frame: str) -> bool:
+    def is_sampled(self, subsystem: str) -> bool:
         """Whether blocks in a subsystem act at instants only: at ticks, or when it is triggered."""
-        return self.rate(frame) is not None or self.triggered_around(frame) is not None
+        return self.rate(subsystem) is not None or self.triggered_around(subsystem) is not None
 
 
 def stepped_blocks(table: Structure, inside: str = "") -> dict[str, Block]:
@@ -178,9 +178,9 @@ _Consumer = Call | SubsystemCall | _Inside | _Root | None
 """User of a signal: a call, a subsystem, or a place; None for a reference that says nothing about the place."""
 
 
-def join(frame: str, name: str) -> str:
+def join(subsystem: str, name: str) -> str:
     """Return the dotted path of ``name`` in a subsystem."""
-    return f"{frame}.{name}" if frame else name
+    return f"{subsystem}.{name}" if subsystem else name
 
 
 class Collector:
@@ -250,8 +250,8 @@ class Collector:
         subsystem_paths: dict[int, str] = {}
         taken: set[str] = set()
 
-        def place(frame: str, given: str | None, label: str) -> str:
-            path = join(frame, given or label)
+        def place(subsystem: str, given: str | None, label: str) -> str:
+            path = join(subsystem, given or label)
             if given and path in taken:
                 raise DuplicateNameError(
                     f"two blocks or subsystems are called {given!r} here. Rename one with name=… or .replace(name=…).",
@@ -259,7 +259,7 @@ class Collector:
                 )
             count = 2
             while path in taken or (not given and path in fixed):
-                path, count = join(frame, f"{label}_{count}"), count + 1
+                path, count = join(subsystem, f"{label}_{count}"), count + 1
             taken.add(path)
             return path
 
@@ -268,8 +268,8 @@ class Collector:
         def subsystem_path(call: SubsystemCall) -> str:
             if id(call) not in subsystem_paths:
                 outer = around.get(id(call))
-                frame = "" if outer is None else subsystem_path(outer)
-                subsystem_paths[id(call)] = place(frame, call.label, call.label)
+                subsystem = "" if outer is None else subsystem_path(outer)
+                subsystem_paths[id(call)] = place(subsystem, call.label, call.label)
             return subsystem_paths[id(call)]
 
         def place_of(consumer: _Consumer) -> str | None:
@@ -337,12 +337,12 @@ class Collector:
                 table.controls[subsystem_path(inner)] = _resolve(inner.wires[inner.subsystem.control_input], paths)
         for name, signal, consumer in self.named:
             wire = _resolve(signal, paths)
-            frame = place_of(consumer)
-            frame = table.frame_of[wire.block] if frame is None else frame
-            if table.names.setdefault(join(frame, name), wire) != wire:
+            subsystem = place_of(consumer)
+            subsystem = table.frame_of[wire.block] if subsystem is None else subsystem
+            if table.names.setdefault(join(subsystem, name), wire) != wire:
                 raise DuplicateNameError(
-                    f"two wires are called {name!r} here: {table.names[join(frame, name)]} and {wire}. Rename one.",
-                    block=frame or None,
+                    f"two wires are called {name!r} here: {table.names[join(subsystem, name)]} and {wire}. Rename one.",
+                    block=subsystem or None,
                     port=name,
                 )
         return table

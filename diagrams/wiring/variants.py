@@ -40,8 +40,8 @@ def _change(table: Structure, path: str, value: object, diagram: str) -> None:
     if isinstance(value, Block) and not (owner is not None and last in type(owner).parameter_specs):
         full = find_path(path, table.blocks, "block", diagram)
         table.blocks[full] = value.replace(name=full.rpartition(".")[2])
-    elif last in _OF_A_SUBSYSTEM and (frame := _find_subsystem(table, head, last, diagram)) is not None:
-        table.frames[frame] = _change_subsystem(table.frames[frame], last, value)
+    elif last in _OF_A_SUBSYSTEM and (subsystem := _find_subsystem(table, head, last, diagram)) is not None:
+        table.frames[subsystem] = _change_subsystem(table.frames[subsystem], last, value)
     elif path in table.blocks:
         raise WiringError(
             f"found {value!r}; expected a block in its place, such as Fmu('other.fmu'), or the name of a parameter "
@@ -55,13 +55,13 @@ def _change(table: Structure, path: str, value: object, diagram: str) -> None:
 
 def _find_subsystem(table: Structure, path: str, key: str, diagram: str) -> str | None:
     """Return the path of the subsystem whose ``key`` is meant; None where it may be a block's parameter."""
-    known = {frame: None for frame in table.frames if frame}
+    known = {subsystem: None for subsystem in table.frames if subsystem}
     if path:
         found = [f for f in known if f == path or f.endswith("." + path)]
         return find_path(path, known, "subsystem", diagram) if found else None
     if any(key in type(block).parameter_specs for block in table.blocks.values()):
         return None
-    offered = ", ".join(f"{frame}.{key}" for frame in known)
+    offered = ", ".join(f"{subsystem}.{key}" for subsystem in known)
     step = f"its subsystems have: {offered}" if offered else "leave it out: this diagram has no subsystem"
     raise UnknownNameError(f"a diagram has no {key!r} of its own; {step}.")
 
@@ -85,22 +85,22 @@ def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str
     raise UnknownNameError(f"nothing is called {path!r} in diagram {diagram!r}. {near(path, known)}")
 
 
-def _change_subsystem(frame: Frame, key: str, value: Any) -> Frame:
+def _change_subsystem(settings: Frame, key: str, value: Any) -> Frame:
     """Return a subsystem's settings with another sample time, method, offset or delay."""
-    new, path = value, frame.path
+    new, path = value, settings.path
     if key == "sample_time" and value is not None:
         new = exact_time(value, block=path)
     elif key == "method" and value is not None:
         check_method(value)
     elif key == "offset":
-        new = exact_offset(value, frame.sample_time, block=path)
+        new = exact_offset(value, settings.sample_time, block=path)
     elif key == "delay":
-        new = check_delay(value, frame.sample_time, block=path)
+        new = check_delay(value, settings.sample_time, block=path)
     changed: dict[str, Any] = {key: new}
     if key == "sample_time":
-        exact_offset(frame.offset, new, block=path)
-        check_delay(frame.delay, new, block=path)
-    return replace_fields(frame, **changed)
+        exact_offset(settings.offset, new, block=path)
+        check_delay(settings.delay, new, block=path)
+    return replace_fields(settings, **changed)
 
 
 def find_path(path: str, known: Mapping[str, object], kind: str, diagram: str) -> str:
