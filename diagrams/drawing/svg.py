@@ -52,7 +52,7 @@ class Drawing:
         """
         file = Path(path)
         if file.suffix.lower() != ".svg":
-            raise OptionError(f"found {str(path)!r}; expected a file for SVG. Name it {file.stem}.svg.")
+            raise OptionError(f"found {str(path)!r}; expected a file for SVG; name it {file.stem}.svg.")
         file.write_text(self.svg, encoding="utf-8")
         return file
 
