@@ -1,4 +1,4 @@
-"""FMUs: plants written as Python equations and exported, and FMUs of anyone's as blocks."""
+"""FMUs: plants that are written as Python equations and exported, and FMUs of any tool as blocks."""
 
 from .archive.description import FmuDescription, FmuVariable, read_description
 from .calls.instance import FmuInstance, FmuState

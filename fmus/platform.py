@@ -1,4 +1,4 @@
-"""Platform of this machine, and the folder of what can be built again."""
+"""Platform of this machine, and the cache folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..blocks.core.errors import FmuError
 
 
 def native_platform() -> str:
-    """Name this machine's platform as FMI 3.0 does (2.5.1.4), such as ``x86_64-linux``."""
+    """Return this machine's platform as FMI 3.0 names it (2.5.1.4), such as ``x86_64-linux``."""
     machine = platform.machine().lower()
     arch = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64"}.get(machine, machine)
     system = {"linux": "linux", "windows": "windows", "darwin": "darwin"}.get(platform.system().lower(), sys.platform)
@@ -22,13 +22,13 @@ def native_platform() -> str:
 
 
 def cache_folder() -> Path:
-    """Folder of everything that can be built again: LOOPWRIGHT_CACHE, else the user's cache folder."""
+    """Return the folder of files that can be built again: LOOPWRIGHT_CACHE, else the user's cache folder."""
     given = os.environ.get("LOOPWRIGHT_CACHE")
     return Path(given).expanduser() if given else Path(platformdirs.user_cache_dir("loopwright", appauthor=False))
 
 
 def check_cache() -> Path:
-    """Return the cache folder, after making it and writing to it.
+    """Return the cache folder, after creating it and writing to it.
 
     Raises
     ------

@@ -72,12 +72,12 @@ class LoopwrightError(Exception):
         return self
 
     def blame(self, block: str) -> Self:
-        """Name another block as the one concerned, such as the full path of one that knew only its name."""
+        """Set the block concerned, such as the full path where only a name was known, and return self."""
         self.block = block
         return self
 
     def add(self, text: str) -> Self:
-        """Add to the message, and return self."""
+        """Add text to the message, and return self."""
         self.message += text
         return self
 
@@ -172,7 +172,7 @@ class SimulationError(LoopwrightError, RuntimeError):
     state: str | None = None
 
     def keep(self, run: Any) -> Self:
-        """Keep what was recorded until the run stopped, and return self."""
+        """Keep the run as it was recorded until it stopped, and return self."""
         self.run = run
         return self
 

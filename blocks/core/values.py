@@ -165,7 +165,7 @@ def shorten(value: Any) -> str:
     return repr(value)
 
 
-def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
+def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
     """Bring one parameter value into its stored form and check it against its declaration.
 
     Numbers become float, sequences of numbers read-only float64 arrays, integers stay integers where the declaration
@@ -180,7 +180,7 @@ def convert(value: Any, spec: ParameterSpec, who: str, name: str) -> Any:
     def error(found: str, expected: str) -> ParameterError:
         unit = f" in {spec.unit}" if spec.unit else ""
         return ParameterError(
-            f"found {found}; expected {expected}{unit}. {spec.description}".rstrip(), block=who, port=name
+            f"found {found}; expected {expected}{unit}. {spec.description}".rstrip(), block=owner, port=name
         )
 
     kinds = _kinds(spec.annotation)

@@ -51,7 +51,7 @@ class CubicSpline(Path):
             raise self._error(
                 f"points {i} and {j} are both {points[i].tolist()}; expected consecutive points to differ. {step}"
             )
-        slowest, theta = self._slowest()
+        slowest, theta = self._find_slowest()
         if slowest < 1e-6:  # chord length makes the speed about 1
             raise self._error(
                 f"the spline's speed falls to {slowest:.3g} at theta = {theta:.6g} m, where it has a cusp or turns "
@@ -86,7 +86,7 @@ class CubicSpline(Path):
             coefficients = np.concatenate([ends[:1], coefficients, ends[1:]])
         return breaks, coefficients
 
-    def _slowest(self) -> tuple[float, float]:
+    def _find_slowest(self) -> tuple[float, float]:
         """Return the least speed and its parameter, from the roots of the derivative of its square in every piece."""
         breaks, coefficients = self._cubics
         least, where = np.inf, 0.0

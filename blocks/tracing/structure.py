@@ -36,7 +36,7 @@ def structure(block: Value) -> Any:
 
 
 def is_traced_by(block: Value, other: Value) -> bool:
-    """Whether the trace of another block holds for this one, with this one's numbers: what was zero there is here."""
+    """Whether another block's trace holds for this block: equal structure, with its exact zeros among this one's."""
     if type(block) is not type(other):
         return False
     for name, spec in type(block).parameter_specs.items():

@@ -1,1 +1,1 @@
-"""An FMU file: its description, read and checked."""
+"""FMU files: their description, read and checked."""

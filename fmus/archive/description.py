@@ -1,4 +1,4 @@
-"""Reading an FMU's description: what a diagram needs to know before anything is loaded."""
+"""Description of an FMU: it is read and checked before the FMU's library is loaded."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..platform import native_platform
 
 @dataclass(frozen=True, eq=False)
 class FmuVariable:
-    """A Float64 variable of an FMU."""
+    """Float64 variable of an FMU."""
 
     name: str
     reference: int
@@ -34,7 +34,7 @@ class FmuVariable:
     nominal: float | None = None
     variability: str = "continuous"
     initial: str = "exact"
-    """FMI's initial: exact where the start value is the value (FMI 3.0, 2.4.7.4)."""
+    """FMI's ``initial``; "exact" means that the variable starts at its start value (FMI 3.0, 2.4.7.4)."""
 
     @property
     def size(self) -> int:
@@ -44,7 +44,7 @@ class FmuVariable:
 
 @dataclass(frozen=True, eq=False)
 class FmuDescription:
-    """What is read from ``modelDescription.xml``."""
+    """Content of ``modelDescription.xml``, as far as a diagram needs it."""
 
     file: Path
     digest: str
@@ -54,23 +54,23 @@ class FmuDescription:
     token: str
     variables: dict[str, FmuVariable]
     other: dict[str, str]
-    """Variables of other types, with their type."""
+    """Type of each variable that is no Float64, by name."""
     can_save: bool = False
     """Whether the state of an instance can be saved and restored (canGetAndSetFMUState)."""
     can_serialize: bool = False
     """Whether a saved state can be turned into bytes, for another process (canSerializeFMUState)."""
     has_derivatives: bool = False
-    """Whether it gives directional derivatives in co-simulation (providesDirectionalDerivatives)."""
+    """Whether the FMU computes directional derivatives in co-simulation (providesDirectionalDerivatives)."""
     variable_step: bool = False
     """Whether communication steps may differ in length (canHandleVariableCommunicationStepSize)."""
     fixed_internal_step: float | None = None
-    """The step in s that it computes with inside, where it is fixed (fixedInternalStepSize): take multiples of it."""
+    """Fixed step of the FMU's own integrator in s (fixedInternalStepSize), or None; steps must be multiples of it."""
     states: dict[str, str] = field(default_factory=dict)
     """Continuous states that are variables, with their derivatives' names, in the order of the model structure."""
     model_exchange: str | None = None
-    """Model identifier of the model-exchange interface, None without one."""
+    """Model identifier of the model-exchange interface; None without that interface."""
     model_exchange_has_derivatives: bool = False
-    """Whether it gives directional derivatives in model exchange."""
+    """Whether the FMU computes directional derivatives in model exchange."""
 
     def of(self, causality: str) -> dict[str, FmuVariable]:
         """Return the variables of a causality, in the file's order."""
@@ -78,7 +78,7 @@ class FmuDescription:
 
     @property
     def discrete_states(self) -> tuple[str, ...]:
-        """Names of the variables that hold discrete states: given at the start, changed at events."""
+        """Names of the discrete states: they are set at the start and change at events."""
         return tuple(
             v.name
             for v in self.variables.values()
@@ -92,7 +92,7 @@ def read_description(file: str | os.PathLike[str]) -> FmuDescription:
     Raises
     ------
     FmuFileError
-        No such file, no FMU, not FMI 3.0 co-simulation, no binary for this platform.
+        If the file is missing, is no FMU, or has no FMI 3.0 co-simulation or no binary for this platform.
     """
     path = Path(file).expanduser()
     if not path.is_file():
@@ -132,9 +132,8 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
     if not any(e.startswith(f"binaries/{platform}/{identifier}.") for e in entries):
         found = sorted({e.split("/")[1] for e in entries if e.startswith("binaries/") and e.count("/") > 1})
         raise FmuFileError(
-            f"{str(path)!r} has no binary for this platform, {platform} (it has: {', '.join(found) or 'none'}). "
-            f"Export or build "
-            "it for this platform."
+            f"{str(path)!r} has no binary for this platform, {platform} (it has: {', '.join(found) or 'none'}). Export "
+            "or build it for this platform."
         )
     variables, other = {}, {}
     for v in model.modelVariables:
@@ -157,7 +156,7 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
 
 
 def _capabilities(text: bytes) -> dict[str, Any]:
-    """Return what the interfaces claim (FMI 3.0, 3.4 and 4.4); FMPy drops providesDirectionalDerivatives of 3.0."""
+    """Return the interfaces' flags (FMI 3.0, 3.4 and 4.4); FMPy drops providesDirectionalDerivatives of FMI 3.0."""
     root = ET.fromstring(text)
     steps, exchange = root.find("CoSimulation"), root.find("ModelExchange")
     fixed = None if steps is None else steps.get("fixedInternalStepSize")
@@ -177,7 +176,7 @@ def _flag(interface: ET.Element | None, name: str) -> bool:
 
 
 def _states(model: Any, variables: dict[str, FmuVariable]) -> dict[str, str]:
-    """Return the states behind the listed derivatives (FMI 3.0, 2.4.8); none where one is missing or no Float64."""
+    """Return derivatives and their states (FMI 3.0, 2.4.8); none if one is missing or no Float64."""
     pairs = {
         u.variable.derivative.name: u.variable.name for u in model.derivatives if u.variable.derivative is not None
     }
@@ -207,7 +206,7 @@ def _start(text: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _unit(text: str | None) -> str | None:
-    """Return a unit that can be checked, None for one that this library can't read."""
+    """Return a unit that this library can read, else None."""
     if text is None:
         return None
     try:

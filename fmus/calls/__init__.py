@@ -1,1 +1,1 @@
-"""FMI calls of a library that is loaded in this process."""
+"""FMI calls into a library that is loaded in this process."""

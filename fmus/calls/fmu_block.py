@@ -1,4 +1,4 @@
-"""The part of the block `Fmu` that a loaded library needs."""
+"""Members of the block `Fmu` that a loaded library needs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..archive.description import FmuDescription
 
 
 class FmuBlock(Protocol):
-    """A block that stands for an FMU: its file, its start values and the names of its ports."""
+    """A block of an FMU: its file, its start values and the names of its ports."""
 
     @property
     def label(self) -> str:
@@ -25,8 +25,8 @@ class FmuBlock(Protocol):
 
     @property
     def rename(self) -> Mapping[str, str]:
-        """The name of a port by the FMU's name."""
+        """Names of ports by the FMU's names."""
 
     @property
     def variable_step(self) -> bool:
-        """Whether the FMU takes steps of different lengths."""
+        """Whether communication steps may differ in length."""

@@ -1,4 +1,4 @@
-"""An FMU in a run: communication steps, its saved states."""
+"""Instance of an FMU in a run: communication steps and saved states."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from ..platform import native_platform
 from .fmu_block import FmuBlock
 from .loaded_library import LoadedFmu, status_of
 
-_HEADER = struct.Struct("<8s32s24sd?")  # of a serialized state: what it is, whose, made where, when, in a run?
+_HEADER = struct.Struct("<8s32s24sd?")  # of a serialized state: magic, FMU's digest, platform, time, running
 _MAGIC = b"lw-fmu-1"
 _DISCARD = 2
 
 
 class FmuState:
-    """The saved state of an `FmuInstance`: everything that it knows at one time, and that time.
+    """Saved state of an `FmuInstance`: all of its memory at one time, and that time.
 
-    It belongs to the instance that has made it, and is freed with it, or when nothing refers to it any more.
+    It belongs to the instance that made it, and is freed with it, or when nothing refers to it any more.
     """
 
     def __init__(self, instance: FmuInstance, handle: Any, t: float, running: bool):
         self.instance, self.t, self.running = instance, t, running
         self._handle = handle
         self._free = weakref.finalize(self, instance._release, handle)
-        self._free.atexit = False  # the process gives back its memory itself
+        self._free.atexit = False  # the end of the process frees the memory anyway
 
     @property
     def is_free(self) -> bool:
-        """Whether it has been given back, so that nothing can be restored from it any more."""
+        """Whether the state has been freed, so that it can't be restored any more."""
         return not self._free.alive
 
     def free(self) -> None:
-        """Give its memory back to the FMU."""
+        """Free the state's memory in the FMU."""
         self._free()
 
     def __repr__(self) -> str:
@@ -47,13 +47,13 @@ class FmuState:
 
 
 class FmuInstance(LoadedFmu):
-    """A loaded FMU: one step at a time, through vectors that are shared with the scheduler.
+    """Loaded FMU that takes one step at a time, through vectors that are shared with the scheduler.
 
-    What it can do at a communication point beyond a step depends on the FMU: `can_save`, `can_serialize`.
+    Saving and serializing its state depend on the FMU: `can_save`, `can_serialize`.
     """
 
     step: Callable[[float, float], None]
-    """Set the inputs, step from a time over a length, both in s, and get the outputs (after `bind`)."""
+    """Set the inputs, take a step from a time over a length, both in s, and get the outputs (after `bind`)."""
     exchange: Callable[[], None]
     """In Initialization Mode: set the inputs and get the outputs (after `bind`)."""
 
@@ -69,27 +69,27 @@ class FmuInstance(LoadedFmu):
 
     @property
     def t(self) -> float:
-        """Time that the instance has reached in s."""
+        """Time of the instance in s."""
         return self._now.value + self._width.value if self._running else self._began
 
     def begin(self) -> None:
-        """Leave Initialization Mode and read the outputs with which the run begins."""
+        """Leave Initialization Mode and read the outputs at the start of the run."""
         super().begin()
         self._now.value, self._width.value = self._began, 0.0
         self._read(self._began)
 
     def bind(self, inputs: np.ndarray, outputs: np.ndarray) -> None:
-        """Take the vectors that hold the inputs to set and the outputs to get, and get the outputs once."""
+        """Bind the vectors of the inputs to set and of the outputs to get, and get the outputs once."""
         lib, component = self._fmu.dll, ctypes.c_void_p(self._fmu.component)
         set_values, get_values, do_step = lib["fmi3SetFloat64"], lib["fmi3GetFloat64"], lib["fmi3DoStep"]
         for function in (set_values, get_values, do_step):
-            function.restype = ctypes.c_int  # arguments are made once, so their types need no checks at each call
-        flags = (ctypes.c_bool * 4)()  # event, terminate, early return, and one that nobody sets
+            function.restype = ctypes.c_int  # arguments are made once, so that no call checks their types
+        flags = (ctypes.c_bool * 4)()  # event, terminate, early return, and one that is never set
         any_flag = ctypes.c_uint32.from_buffer(flags)
         reached = ctypes.c_double()
         ins = (ctypes.c_uint * max(1, len(self._inputs)))(*[v.reference for v in self._inputs])
         outs = (ctypes.c_uint * max(1, len(self._outputs)))(*[v.reference for v in self._outputs])
-        self._kept = (ins, outs, flags, reached, inputs, outputs)  # alive as long as their addresses are used
+        self._kept = (ins, outs, flags, reached, inputs, outputs)  # kept alive as long as their addresses are used
         address, size, now, width = ctypes.c_void_p, ctypes.c_size_t, self._now, self._width
         set_arguments = (component, ins, size(len(self._inputs)), address(inputs.ctypes.data), size(inputs.size))
         get_arguments = (component, outs, size(len(self._outputs)), address(outputs.ctypes.data), size(outputs.size))
@@ -107,7 +107,7 @@ class FmuInstance(LoadedFmu):
             if (status := do_step(*step_arguments)) > 1:
                 raise self._step_error(status, t, h)
             if any_flag.value:
-                self._look_at(flags, reached.value, t, h)
+                self._check_flags(flags, reached.value, t, h)
             if has_outputs and (status := get_values(*get_arguments)) > 1:
                 raise self._error("reading the outputs", status, t)
 
@@ -123,50 +123,50 @@ class FmuInstance(LoadedFmu):
         self.step, self.exchange, self._read = step, exchange, read
         read(self._began)
 
-    # ---- what a step may end with (FMI 3.0, 2.2.3 and 4.2.1) ----
+    # ---- failures of a step (FMI 3.0, 2.2.3 and 4.2.1) ----
 
-    def _fails(self, status: int) -> None:
-        self.failed = status > _DISCARD  # what discards a call is as it was before
+    def _mark_failure(self, status: int) -> None:
+        self.failed = status > _DISCARD  # a call that is discarded changes nothing
         self.fatal = status > _DISCARD + 1
 
-    def _error(self, what: str, status: int, t: float, advice: str = "") -> FmuRuntimeError:
-        self._fails(status)
+    def _error(self, action: str, status: int, t: float, advice: str = "") -> FmuRuntimeError:
+        self._mark_failure(status)
         inputs = ", ".join(f"{v.name}" for v in self._inputs)
         values = self._kept[4].tolist()
         return FmuRuntimeError(
-            f"{what} failed with {status_of(status)}{self._quoted()} The inputs ({inputs}) were {values}. "
+            f"{action} failed with {status_of(status)}{self._quote_messages()} The inputs ({inputs}) were {values}. "
             f"{advice or 'Look at the last samples of error.run, or take a smaller step.'}",
             block=self.block.label,
             t=t,
         )
 
     def _step_error(self, status: int, t: float, h: float) -> FmuRuntimeError:
-        self._width.value = 0.0  # it stays where it was
-        what = f"the step from t = {t:.9g} s by {h:g} s"
+        self._width.value = 0.0  # the instance stays where it was
+        action = f"the step from t = {t:.9g} s by {h:g} s"
         if status != _DISCARD:
-            return self._error(what, status, t)
-        steps = "" if self.block.variable_step else " from the start: this FMU takes steps of one length alone"
+            return self._error(action, status, t)
+        steps = "" if self.block.variable_step else " from the start: this FMU takes steps of one length only"
         return self._error(
-            f"{what} was discarded, as the FMU can't compute it: it",
+            f"{action} was discarded, as the FMU can't compute it: it",
             status,
             t,
-            f"Take a smaller step{steps}, or look at what drives the FMU there.",
+            f"Take a smaller step{steps}, or check the FMU's inputs there.",
         )
 
-    def _look_at(self, flags: Any, reached: float, t: float, h: float) -> None:
+    def _check_flags(self, flags: Any, reached: float, t: float, h: float) -> None:
         _, terminate, early, _ = flags
         if terminate:
             raise FmuRuntimeError(
                 f"the FMU asks to end the simulation (terminateSimulation) in the step from t = {t:.9g} s by {h:g} s"
-                f"{self._quoted()} End the run there, or look in the FMU's documentation for what makes it stop.",
+                f"{self._quote_messages()} End the run there, or look up the reason in the FMU's documentation.",
                 block=self.block.label,
                 t=t,
             )
         if early:
             raise FmuRuntimeError(
                 f"the step from t = {t:.9g} s by {h:g} s returned early, at {reached:.9g} s (earlyReturn), though the "
-                f"FMU was told that it must not (earlyReturnAllowed = false){self._quoted()} Take steps that end where "
-                "its events are, or export it without early return.",
+                f"FMU was told that it must not (earlyReturnAllowed = false){self._quote_messages()} Take steps that "
+                "end where its events are, or export it without early return.",
                 block=self.block.label,
                 t=t,
             )
@@ -194,30 +194,30 @@ class FmuInstance(LoadedFmu):
         return self.description.can_serialize
 
     def save(self) -> FmuState:
-        """Save the present state: states, inputs, parameters, memory of its solver, all that there is.
+        """Save the present state with all its parts: states, inputs, parameters, memory of the solver.
 
         Returns
         -------
         FmuState
-            To be given to `restore` or `serialize` of this very instance.
+            For `restore` and `serialize` of the same instance.
 
         Raises
         ------
         FmuError
-            If the FMU can't (`can_save`).
+            If the FMU can't save its state (`can_save`).
         FmuRuntimeError
-            If its function fails.
+            If the FMU's function fails.
         """
         self._check_can("canGetAndSetFMUState", "saved", self.can_save)
         return self._keep(self.call("saving its state", "getFMUState"), self.t, self._running)
 
     def restore(self, state: FmuState) -> None:
-        """Go back, or ahead, to a saved state, and get the outputs there; allowed after an error, too.
+        """Restore a saved state, earlier or later, and get the outputs there; this is allowed after an error, too.
 
         Raises
         ------
         FmuError
-            If the state is another instance's, or has been freed.
+            If the state belongs to another instance, or has been freed.
         FmuRuntimeError
             If the FMU's function fails.
         """
@@ -228,16 +228,16 @@ class FmuInstance(LoadedFmu):
         self._read(state.t)
 
     def serialize(self, state: FmuState | None = None) -> bytes:
-        """Turn a saved state, the present one if none is given, into bytes.
+        """Return a saved state, or the present one, as bytes.
 
-        They hold for an FMU of the same content on the same platform: a run that goes on in another process.
+        An FMU of the same content on the same platform can read them, so that a run continues in another process.
 
         Raises
         ------
         FmuError
-            If the FMU can't (`can_serialize`), or the state is another instance's.
+            If the FMU can't serialize its state (`can_serialize`), or the state belongs to another instance.
         FmuRuntimeError
-            If its function fails.
+            If the FMU's function fails.
         """
         self._check_can("canSerializeFMUState", "turned into bytes", self.can_serialize)
         if state is None:
@@ -247,12 +247,12 @@ class FmuInstance(LoadedFmu):
         return _HEADER.pack(_MAGIC, *self._identity(), state.t, state.running) + bytes(data)
 
     def deserialize(self, data: bytes) -> FmuState:
-        """Make a state of this instance from bytes; `restore` it after `begin`.
+        """Return a state of this instance, made from bytes; `restore` it after `begin`.
 
         Raises
         ------
         FmuError
-            If these bytes are no state of this FMU on this platform.
+            If the bytes are no state of this FMU on this platform.
         FmuRuntimeError
             If the FMU's function fails.
         """
@@ -260,7 +260,7 @@ class FmuInstance(LoadedFmu):
         head, rest = data[: _HEADER.size], data[_HEADER.size :]
         if len(head) < _HEADER.size or not head.startswith(_MAGIC):
             raise FmuError(
-                f"these {len(data)} bytes are no state of an FMU. Give what serialize() has returned.",
+                f"found {len(data)} bytes that are no state of an FMU; expected those of serialize(). Give these.",
                 block=self.block.label,
             )
         _, digest, platform, t, running = _HEADER.unpack(head)
@@ -268,9 +268,9 @@ class FmuInstance(LoadedFmu):
             here = bytes.fromhex(self.description.digest)
             found, expected = (d.hex()[:12] for d in (digest, here))
             raise FmuError(
-                f"these bytes are the state of another FMU: found SHA-256 {found}… on "
+                f"found the state of another FMU: SHA-256 {found}… on "
                 f"{platform.rstrip(bytes(1)).decode()}, expected {expected}… on {native_platform()}. Run the FMU that "
-                "they were saved with.",
+                "was saved.",
                 block=self.block.label,
             )
         return self._keep(self.call("reading a serialized state", "deserializeFMUState", rest), t, running)
@@ -279,7 +279,7 @@ class FmuInstance(LoadedFmu):
         return bytes.fromhex(self.description.digest), native_platform().encode().ljust(24, b"\0")
 
     def _keep(self, handle: Any, t: float, running: bool) -> FmuState:
-        self._final.value = False  # from now on it may go back, so the FMU has to keep what it needs for that
+        self._final.value = False  # the FMU may be set back from now on
         self._handles[id(handle)] = handle
         return FmuState(self, handle, t, running)
 
@@ -288,13 +288,14 @@ class FmuInstance(LoadedFmu):
             with suppress(Exception):
                 self._fmu.freeFMUState(handle)
 
-    def _check_can(self, flag: str, what: str, can: bool) -> None:
+    def _check_can(self, flag: str, action: str, can: bool) -> None:
         if not self._open:
-            raise FmuError(f"its run is over, so no state can be {what}. Do it within the run.", block=self.block.label)
+            text = f"its run is over, so no state can be {action}. Do it within the run."
+            raise FmuError(text, block=self.block.label)
         if not can:
             raise FmuError(
-                f"its state can't be {what}: {flag} is false in the FMU's description. Export it with that capability, "
-                "or run again from the start.",
+                f"its state can't be {action}: {flag} is false in the FMU's description. Export it with that "
+                "capability, or run again from the start.",
                 block=self.block.label,
             )
 
@@ -302,17 +303,17 @@ class FmuInstance(LoadedFmu):
         self._check_can("canGetAndSetFMUState", "restored", self.can_save)
         if state.instance is not self:
             raise FmuError(
-                f"this is a state of another instance, {state!r}. Carry it over: restore(deserialize(…)) of what "
-                "serialize() has returned there.",
+                f"found a state of another instance, {state!r}. Carry it over: restore(deserialize(data)) with the "
+                "data of that instance's serialize().",
                 block=self.block.label,
             )
         if state.is_free:
             raise FmuError(
-                f"this state has been freed, {state!r}. Keep it until it is restored.", block=self.block.label
+                f"found a state that has been freed, {state!r}. Keep it until it is restored.", block=self.block.label
             )
 
     def close(self) -> None:
-        """Free the saved states; terminate and free the instance."""
+        """Free the saved states, then terminate and free the instance."""
         if self._open:
             for handle in list(self._handles.values()):
                 self._release(handle)

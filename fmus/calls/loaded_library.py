@@ -1,4 +1,4 @@
-"""An FMU's library in this process, with one instance of it."""
+"""Library of an FMU, loaded in this process, with one instance."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FATAL = 4
 
 
 class LoadedFmu:
-    """An instance of an FMU: what it logs, its initialization, its variables, its end."""
+    """Instance of an FMU: log, initialization, variables, end."""
 
     def __init__(self, block: FmuBlock, *, model_exchange: bool = False):
         from fmpy.fmi3 import FMU3Model, FMU3Slave
@@ -34,7 +34,7 @@ class LoadedFmu:
         self._began = 0.0
         description, folder = self.description, Path.cwd()
         try:
-            files = unpacked(description)
+            files = unpack(description)
         except FmuError as error:
             error.at(block=block.label)
             raise
@@ -49,12 +49,12 @@ class LoadedFmu:
             self._fmu.instantiate(logMessage=self._log, loggingOn=True)
         except Exception as error:
             raise FmuFileError(
-                f"the FMU {str(description.file)!r} can't be loaded: {error}{self._quoted()} Check it with "
+                f"the FMU {str(description.file)!r} can't be loaded: {error}{self._quote_messages()} Check it with "
                 f"'fmpy validate {description.file}'.",
                 block=block.label,
             ) from error
         finally:
-            os.chdir(folder)  # FMPy stays in the binary's folder when loading it fails
+            os.chdir(folder)  # FMPy stays in the binary's folder if loading fails
         self._open = True
 
     def _log(self, environment: Any, status: int, category: bytes | None, message: bytes | None) -> None:
@@ -62,12 +62,12 @@ class LoadedFmu:
         if status and len(self.messages) < 1000:
             self.messages.append(f"{self.block.label}: {_STATUS[status]}: {text}")
 
-    def _quoted(self) -> str:
+    def _quote_messages(self) -> str:
         return f". The FMU says: {' / '.join(m.rstrip('.') for m in self.messages[-5:])}." if self.messages else "."
 
     @property
     def t(self) -> float:
-        """Time that the instance has reached in s."""
+        """Time of the instance in s."""
         return self._began
 
     # ---- initialization ----
@@ -80,12 +80,12 @@ class LoadedFmu:
         Parameters
         ----------
         stop_time : float, optional
-            End of the run in s; None where it may go on for ever. Some FMUs refuse to step beyond it, also after the
-            state of a longer run has been restored.
+            End of the run in s; None if it is open. Some FMUs refuse to step beyond it, even after the state of a
+            longer run has been restored.
         start_time : float
             Start of the run in s.
         values : mapping of str to array, optional
-            Further start values, by the FMU's names; they replace the block's.
+            Further start values, by the FMU's names; they override the block's.
         """
         self._began = start_time
         try:
@@ -97,13 +97,13 @@ class LoadedFmu:
     def _initialization_error(self, error: Exception) -> FmuRuntimeError:
         self._note(error)
         return FmuRuntimeError(
-            f"initialization failed ({error}){self._quoted()} Check its start values.",
+            f"initialization failed ({error}){self._quote_messages()} Check its start values.",
             block=self.block.label,
             t=self._began,
         )
 
     def reset(self) -> None:
-        """Go back to before the initialization (FMI 3.0, 2.3.1)."""
+        """Return to the state before the initialization (FMI 3.0, 2.3.1)."""
         self.call("resetting it", "reset")
         self.failed = self._running = False
 
@@ -115,10 +115,10 @@ class LoadedFmu:
             raise self._initialization_error(error) from error
         self._running = True
 
-    # ---- calls by names, for what is not done at each step ----
+    # ---- calls by names, which are not made at each step ----
 
-    def call(self, what: str, name: str, *arguments: Any) -> Any:
-        """Call a function of FMPy's interface; an error says what it was for.
+    def call(self, purpose: str, name: str, *arguments: Any) -> Any:
+        """Call a function of FMPy's interface; an error begins with the purpose of the call.
 
         Raises
         ------
@@ -130,8 +130,8 @@ class LoadedFmu:
         except Exception as error:
             self._note(error)
             raise FmuRuntimeError(
-                f"{what} failed ({error}){self._quoted()} Check that the FMU does what its description claims: "
-                f"loopwright validate {self.description.file}.",
+                f"{purpose} failed ({error}){self._quote_messages()} Check that the FMU does as its description "
+                f"claims: loopwright validate {self.description.file}.",
                 block=self.block.label,
                 t=self.t,
             ) from error
@@ -158,9 +158,9 @@ class LoadedFmu:
     def directional_derivative(
         self, unknowns: Sequence[str], knowns: Sequence[str], seed: Sequence[float]
     ) -> np.ndarray:
-        """Return how outputs and derivatives of states answer to a change of knowns (FMI 3.0, 2.2.11).
+        """Return the change of outputs and state derivatives for a change of knowns (FMI 3.0, 2.2.11).
 
-        The derivative is at the present time, states and inputs, with discrete states frozen.
+        The derivative is taken at the present time, states and inputs, with discrete states frozen.
 
         Parameters
         ----------
@@ -169,26 +169,26 @@ class LoadedFmu:
         knowns : sequence of str
             Inputs and continuous states, by the FMU's names.
         seed : array_like
-            The change of each element of the knowns.
+            Change of each element of the knowns.
 
         Returns
         -------
         numpy.ndarray
-            The change of each element of the unknowns.
+            Change of each element of the unknowns.
 
         Raises
         ------
         FmuError
             If the FMU has no directional derivatives.
         FmuRuntimeError
-            If its function fails.
+            If the FMU's function fails.
         UnknownNameError
-            If it has no such variable.
+            For an unknown variable.
         """
         about = self.description
         if not (about.model_exchange_has_derivatives if self.model_exchange else about.has_derivatives):
             raise FmuError(
-                "it gives no directional derivatives: providesDirectionalDerivatives is false in its description. Take "
+                "it has no directional derivatives: providesDirectionalDerivatives is false in its description. Use "
                 "linear_model(), which falls back on differences.",
                 block=self.block.label,
             )
@@ -212,7 +212,7 @@ class LoadedFmu:
         if not self._open:
             return
         self._open = False
-        if self.fatal:  # nothing may be called any more, not even to free it (FMI 3.0, 2.2.3)
+        if self.fatal:  # no function may be called any more, not even to free it (FMI 3.0, 2.2.3)
             return
         with suppress(Exception):
             if self._running and not self.failed:
@@ -221,8 +221,8 @@ class LoadedFmu:
             self._fmu.freeInstance()
 
 
-def unpacked(description: FmuDescription) -> Path:
-    """Return the folder that holds the FMU's files, unpacked once for each content.
+def unpack(description: FmuDescription) -> Path:
+    """Unpack an FMU, once for each content, and return the folder of its files.
 
     Raises
     ------
@@ -260,5 +260,5 @@ def unpacked(description: FmuDescription) -> Path:
 
 
 def status_of(code: int) -> str:
-    """Name a status as FMI 3.0 does (2.2.3), such as ``fmi3Discard``."""
+    """Return the name of a status in FMI 3.0 (2.2.3), such as ``fmi3Discard``."""
     return f"fmi3{_STATUS[code].capitalize()}" if 0 <= code < len(_STATUS) else f"status {code}"

@@ -1,6 +1,6 @@
-"""What an FMU of anyone's says about itself: versions 1.0 to 3.0, without running it.
+"""Summary of a third-party FMU, of FMI 1.0 to 3.0, without running it.
 
-A summary is made of dictionaries, lists, numbers and text alone, so that it is JSON as it stands.
+A summary consists of dictionaries, lists, numbers and text only, so that it can be written as JSON.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ INTERFACES = {
     "ModelExchange": "model exchange",
     "ScheduledExecution": "scheduled execution",
 }
-"""Elements of ``modelDescription.xml`` and what people call them."""
+"""Names of the interfaces by their elements in ``modelDescription.xml``."""
 
 # Folders of binaries in FMI 1.0 and 2.0 (2.3.1) as platform tuples of FMI 3.0 (2.5.1.4).
 _FOLDERS = {
@@ -46,7 +46,7 @@ _LOAD = "import ctypes, sys\ntry: ctypes.CDLL(sys.argv[1])\nexcept OSError as er
 
 
 def summarize(file: Path) -> dict[str, Any]:
-    """Read an FMU's description and what its archive holds.
+    """Return a summary of an FMU's description and archive.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def summarize(file: Path) -> dict[str, Any]:
             if getattr(experiment, attribute, None) is not None
         },
         "platforms": {folder: {"platform": tuple_of(folder), "files": names} for folder, names in binaries.items()},
-        "native": _native(file, native, binaries, interfaces),
+        "native": _native_binary(file, native, binaries, interfaces),
         "sources": sorted(name for name in entries if name.startswith("sources/") and not name.endswith("/")),
         "documentation": any(name.startswith("documentation/") and not name.endswith("/") for name in entries),
         "log_categories": [category.name for category in model.logCategories],
@@ -127,7 +127,7 @@ def read_archive(file: Path) -> tuple[list[str], Any]:
                 nested = next((e for e in entries if e.endswith("/modelDescription.xml")), None)
                 raise FmuFileError(
                     f"{str(file)!r} is a zip archive without modelDescription.xml, so it is no FMU. "
-                    + (f"There is {nested}: pack what is in that folder, not the folder." if nested else "")
+                    + (f"There is {nested}: pack the files in that folder, not the folder." if nested else "")
                 )
             text = archive.read("modelDescription.xml")
     except zipfile.BadZipFile as error:
@@ -155,7 +155,7 @@ def _read_model(file: Path) -> Any:
         return fmpy.read_model_description(str(file), validate=False)
     except Exception as error:  # FMPy raises bare exceptions
         raise FmuFileError(
-            f"the modelDescription.xml of {str(file)!r} can't be read: {error}. See what is wrong with it: "
+            f"the modelDescription.xml of {str(file)!r} can't be read: {error}. List its faults with "
             f"loopwright validate {file}"
         ) from error
 
@@ -164,8 +164,8 @@ def _read_model(file: Path) -> Any:
 
 
 def _interfaces(root: Any, model: Any) -> dict[str, dict[str, Any]]:
-    """Return the attributes of each interface as they stand in the file; what is left out there is false or 0."""
-    if model.fmiVersion == "1.0":  # the interface is not an element with attributes there
+    """Return the attributes of each interface that the file gives; those left out are false or 0."""
+    if model.fmiVersion == "1.0":  # the interface is no element there
         kind = "CoSimulation" if model.coSimulation is not None else "ModelExchange"
         return {kind: {"modelIdentifier": root.get("modelIdentifier")}}
     return {
@@ -182,11 +182,11 @@ def _flag(text: str) -> Any:
 
 
 def _notes(fmi: str, entries: Iterable[str], interfaces: Mapping[str, Mapping[str, Any]], tool: str) -> list[str]:
-    """Say what limits where an FMU can be used."""
+    """Return notes on the limits of an FMU's use."""
     notes = []
     if fmi == "1.0":
         notes.append(
-            "FMI 1.0 can be read here and nothing else: no block is made of it, and it is not run to validate it. "
+            "FMI 1.0 can be read here and nothing else: it can't become a block, and its validation does not run it. "
             "Export it with FMI 3.0."
         )
     python = tool.startswith("PythonFMU") or "resources/slavemodule.txt" in set(entries)
@@ -196,9 +196,9 @@ def _notes(fmi: str, entries: Iterable[str], interfaces: Mapping[str, Mapping[st
             "that they import. On Linux it loads only in a process that has libpython loaded, such as Python's own."
         )
     elif any(attributes.get("needsExecutionTool") in (True, 1) for attributes in interfaces.values()):
-        notes.append("It needs another program where it runs (needsExecutionTool): a coupling, not a model.")
+        notes.append("It needs another program to run (needsExecutionTool): it is a coupling, not a model.")
     if any(attributes.get("canBeInstantiatedOnlyOncePerProcess") in (True, 1) for attributes in interfaces.values()):
-        notes.append("It can be instantiated once in a process only (canBeInstantiatedOnlyOncePerProcess).")
+        notes.append("It can be instantiated only once in a process (canBeInstantiatedOnlyOncePerProcess).")
     return notes
 
 
@@ -206,7 +206,7 @@ def _notes(fmi: str, entries: Iterable[str], interfaces: Mapping[str, Mapping[st
 
 
 def tuple_of(folder: str) -> str | None:
-    """Return the FMI 3.0 platform tuple of a folder of binaries, None for one that this library doesn't know."""
+    """Return the FMI 3.0 platform tuple of a folder of binaries; None for an unknown folder."""
     name = _FOLDERS.get(folder, folder)
     parts = name.split("-")
     known = len(parts) in (2, 3) and parts[1] in SUFFIXES  # a third part is the ABI
@@ -229,7 +229,7 @@ def library_name(identifier: str, platform: str) -> str:
 
 
 def platforms_of_binary(data: bytes) -> set[str]:
-    """Return the platforms that a shared library is for, by its header; none if it is no library that is known here."""
+    """Return the platforms of a shared library, read from its header; none for an unknown format."""
     found: set[tuple[str, int]] = set()
     if data[:4] == b"\x7fELF" and len(data) >= 20:
         found.add(("linux", struct.unpack_from("<H" if data[5] == 1 else ">H", data, 18)[0]))
@@ -246,30 +246,30 @@ def platforms_of_binary(data: bytes) -> set[str]:
     return {f"{_MACHINES[s][m]}-{s}" for s, m in found if m in _MACHINES[s]}
 
 
-def _native(
+def _native_binary(
     file: Path, native: str, binaries: Mapping[str, list[str]], interfaces: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Any]:
-    """Say whether there is a binary for this machine, and what it misses here."""
+    """Return whether there is a binary for this machine, and the libraries and symbols that it lacks here."""
     system = native.split("-")[1]
     identifiers = {str(attributes.get("modelIdentifier")) for attributes in interfaces.values()}
     for folder, names in binaries.items():
         wanted = sorted({library_name(i, native) for i in identifiers} & set(names)) if system in SUFFIXES else []
         if tuple_of(folder) == native and wanted:
-            missing, undefined = _loading(file, folder, wanted)
+            missing, undefined = _find_missing(file, folder, wanted)
             return {
                 "platform": native, "available": True, "missing_libraries": missing, "undefined_symbols": undefined,
             }  # fmt: skip
     return {"platform": native, "available": False, "missing_libraries": [], "undefined_symbols": []}
 
 
-def _loading(file: Path, folder: str, names: Iterable[str]) -> tuple[list[str], list[str]]:
-    """Return the shared libraries and symbols that are missing here: from ldd, else from an attempt to load it."""
+def _find_missing(file: Path, folder: str, names: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Return the shared libraries and symbols that are missing here, from ldd or from an attempt to load."""
     missing: set[str] = set()
     undefined: set[str] = set()
     ldd = shutil.which("ldd") if sys.platform.startswith("linux") else None
     with tempfile.TemporaryDirectory(prefix="loopwright-") as made, zipfile.ZipFile(file) as archive:
         for name in archive.namelist():
-            if name.startswith(f"binaries/{folder}/"):  # all: it may come with libraries of its own
+            if name.startswith(f"binaries/{folder}/"):  # all files, since it may bring its own libraries
                 archive.extract(name, made)
         for name in names:
             library = str(Path(made) / "binaries" / folder / name)
@@ -314,18 +314,18 @@ def _variable(v: Any, state: bool) -> dict[str, Any]:
 
 
 def _shape(variable: Any) -> list[Any]:
-    """Return the sizes; a dimension given by a structural parameter has that one's start value."""
+    """Return the sizes; a dimension by a structural parameter takes its start value."""
     sizes = [d.start if d.start is not None else getattr(d.variable, "start", None) for d in variable.dimensions or ()]
     return [int(size) if size is not None and str(size).strip().isdigit() else None for size in sizes]
 
 
 def _count(variables: Iterable[Mapping[str, Any]]) -> int:
-    """Return how many numbers variables hold."""
+    """Return the number of elements of variables."""
     return sum(math.prod(size or 1 for size in v["shape"]) for v in variables)
 
 
 def _value(text: Any, kind: str | None) -> Any:
-    """Return a start value or limit as JSON has it; what JSON has no number for, or can't be read, stays text."""
+    """Return a start value or limit for JSON; a value that is no number in JSON, or can't be read, stays text."""
     if text is None or kind in ("String", "Binary", "Clock"):
         return text
     if isinstance(text, bool | int | float):

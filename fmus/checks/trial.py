@@ -1,9 +1,9 @@
-"""Run an FMU once in this process, which it may crash.
+"""Trial run of an FMU in this process, which the FMU may crash.
 
 The command is ``python -m loopwright.fmus.checks.trial FILE INTERFACE REPORT``.
 
-Each stage is written to the report, a line of JSON, before it begins, so that a crash says where it was. The last line
-of a run that came to its end has the stage "done".
+A line of JSON in the report names each stage before it begins, so that a crash shows its stage. The last line of a
+complete run has the stage "done".
 """
 
 from __future__ import annotations
@@ -65,11 +65,11 @@ def _run(
 
     three = model.fmiVersion.startswith("3.")
 
-    def logged(*parts: Any) -> None:  # FMI 2.0: environment, instance, status, category, text; 3.0: no instance
+    def log(*parts: Any) -> None:  # FMI 2.0: environment, instance, status, category, text; 3.0: no instance
         messages.append((parts[-1] or b"").decode(errors="replace"))
 
     start, stop, step = _times(model, interface)
-    fmu = instantiate_fmu(folder, model, fmi_type=interface, logger=logged, debug_logging=True)
+    fmu = instantiate_fmu(folder, model, fmi_type=interface, logger=log, debug_logging=True)
     begin("initialize")
     if three:
         fmu.enterInitializationMode(startTime=start, stopTime=stop)
@@ -92,7 +92,7 @@ def _run(
 
 
 def _times(model: Any, interface: str) -> tuple[float, float | None, float]:
-    """Return start and stop time and the step of the default experiment, or what is likely to be taken."""
+    """Return start time, stop time and step of the default experiment, with usual values for missing ones."""
     experiment = model.defaultExperiment
     start, stop, step = (
         None if (text := getattr(experiment, name, None)) is None else float(text)
@@ -109,7 +109,7 @@ def _times(model: Any, interface: str) -> tuple[float, float | None, float]:
 
 
 def _derivatives(fmu: Any, model: Any, three: bool, start: float) -> list[str]:
-    """Enter Continuous-Time Mode and evaluate the derivatives; return what is no finite number."""
+    """Enter Continuous-Time Mode and evaluate the derivatives; return the names of those that are not finite."""
     more = True
     rounds = 0
     while more:
@@ -128,7 +128,7 @@ def _derivatives(fmu: Any, model: Any, three: bool, start: float) -> list[str]:
 
 
 def _not_finite(fmu: Any, model: Any, three: bool) -> list[str]:
-    """Return the names of outputs that are no finite numbers."""
+    """Return the names of outputs that are not finite."""
     found = []
     for v in model.modelVariables:
         if v.causality != "output" or v.clocks or v.type not in ("Real", "Float64", "Float32"):

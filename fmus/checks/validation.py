@@ -1,7 +1,8 @@
-"""Check an FMU of anyone's: FMPy's validation, and what it lacks.
+"""Validation of a third-party FMU, by FMPy and by further checks.
 
-The archive, the description against the schemas of the standard that FMPy ships, the model structure, the binaries and
-sources declared; then each interface is instantiated, initialized and stepped once in a process of its own.
+The checks cover the archive, the description (against the standard's schemas, which FMPy ships), the model structure,
+and the declared binaries and sources. Then each interface is instantiated, initialized and stepped once in a process of
+its own.
 """
 
 from __future__ import annotations
@@ -30,15 +31,15 @@ _AGAIN = "Export it again with a newer version of its tool ({tool}), or report i
 
 
 @dataclass(frozen=True)
-class Problem:
-    """One thing that is wrong with an FMU.
+class FmuProblem:
+    """A fault of an FMU.
 
     Parameters
     ----------
     found : str
-        What is wrong, and where.
+        The fault, and its place.
     step : str
-        What to do next.
+        The next step.
     """
 
     found: str
@@ -46,26 +47,26 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Report:
-    """What a validation found.
+class ValidationReport:
+    """Result of a validation.
 
     Parameters
     ----------
-    problems : tuple of Problem
-        Nothing in it: the FMU is clean.
+    problems : tuple of FmuProblem
+        The faults; empty if the FMU is clean.
     done : tuple of str
-        What was checked and run.
+        Checks and runs that were done.
     left : tuple of str
-        What could not be checked here, and why.
+        Checks that could not be done here, with the reason.
     """
 
-    problems: tuple[Problem, ...]
+    problems: tuple[FmuProblem, ...]
     done: tuple[str, ...]
     left: tuple[str, ...]
 
 
-def validate(file: Path, *, run: bool = True) -> Report:
-    """Check an FMU.
+def validate(file: Path, *, run: bool = True) -> ValidationReport:
+    """Validate an FMU.
 
     Parameters
     ----------
@@ -77,19 +78,20 @@ def validate(file: Path, *, run: bool = True) -> Report:
     try:
         entries, root = read_archive(file)
     except FmuFileError as error:
-        return Report((Problem(str(error), "Export it again; the file may be cut off, or no FMU at all."),), (), ())
+        problem = FmuProblem(str(error), "Export it again; the file may be cut off, or no FMU at all.")
+        return ValidationReport((problem,), (), ())
     tool = root.get("generationTool") or "not named"
     again = _AGAIN.format(tool=tool)
     fmi = root.get("fmiVersion") or "(none)"
     if not (fmi in ("1.0", "2.0") or fmi.startswith("3.")):
-        problem = Problem(f"fmiVersion is {fmi!r}; expected 1.0, 2.0 or 3.0.", again)
-        return Report((problem,), (), ("everything else: the version isn't known",))
+        problem = FmuProblem(f"fmiVersion is {fmi!r}; expected 1.0, 2.0 or 3.0.", again)
+        return ValidationReport((problem,), (), ("everything else: the version isn't known",))
     problems = [*_archive(file, entries, again), *_description(file, again)]
     done = [f"description against FMI {fmi}'s schema and rules"]
     left: list[str] = []
     if fmi != "1.0":
-        problems += [Problem(found, again) for found in (*_initial_unknowns(root), *_sources(file, root, entries))]
-    problems += [Problem(*pair) for pair in _binaries(file, root, entries, tool)]
+        problems += [FmuProblem(found, again) for found in (*_initial_unknowns(root), *_sources(file, root, entries))]
+    problems += [FmuProblem(*pair) for pair in _binaries(file, root, entries, tool)]
     folders = binaries_of(entries)
     if folders:
         done.append(f"binaries for {', '.join(folders)}")
@@ -108,38 +110,39 @@ def validate(file: Path, *, run: bool = True) -> Report:
             problems.append(wrong)
     if fmi == "1.0":
         left.append("it was not run: FMI 1.0 isn't supported")
-    return Report(tuple(problems), tuple(done), tuple(left))
+    return ValidationReport(tuple(problems), tuple(done), tuple(left))
 
 
 # --- the archive and the description --------------------------------------------------------------------------------
 
 
-def _archive(file: Path, entries: Iterable[str], again: str) -> Iterator[Problem]:
+def _archive(file: Path, entries: Iterable[str], again: str) -> Iterator[FmuProblem]:
     with zipfile.ZipFile(file) as archive:
         try:
             broken = archive.testzip()
-        except Exception as error:  # what it raises depends on where the damage is
-            yield Problem(f"the archive is damaged: {error}.", "Copy or export it again.")
+        except Exception as error:  # the exception depends on the kind of damage
+            yield FmuProblem(f"the archive is damaged: {error}.", "Copy or export it again.")
         else:
             if broken is not None:
-                yield Problem(f"the archive is damaged: {broken} has a wrong checksum.", "Copy or export it again.")
+                yield FmuProblem(f"the archive is damaged: {broken} has a wrong checksum.", "Copy or export it again.")
     for name, count in Counter(entries).items():
         if count > 1:
-            yield Problem(f"the archive holds {name} {count} times.", again)
+            yield FmuProblem(f"the archive holds {name} {count} times.", again)
         if name.startswith("/") or ".." in name.split("/") or ":" in name:
-            yield Problem(f"the archive holds {name!r}, which points out of its folder.", "Don't unpack it. " + again)
+            found = f"the archive holds {name!r}, which points out of its folder."
+            yield FmuProblem(found, f"Don't unpack it. {again}")
 
 
-def _description(file: Path, again: str) -> Iterator[Problem]:
-    """Give what FMPy's validation finds: schema, names, start values, units, model structure."""
+def _description(file: Path, again: str) -> Iterator[FmuProblem]:
+    """Yield the faults that FMPy finds: schema, names, start values, units, model structure."""
     from fmpy.validation import validate_fmu
 
     for found in validate_fmu(str(file)):
-        yield Problem(_end(found), _next_step(found, again))
+        yield FmuProblem(_end_sentence(found), _next_step(found, again))
 
 
 def _next_step(found: str, again: str) -> str:
-    """Return the next step for a problem that FMPy found; its text is read, as FMPy gives nothing else."""
+    """Return the next step for a problem that FMPy found; FMPy gives its text only."""
     if "has no start value" in found:
         return "Give the variable a start value and export it again."
     if "is not defined" in found and "unit" in found:
@@ -147,13 +150,13 @@ def _next_step(found: str, again: str) -> str:
     return again
 
 
-def _end(text: str) -> str:
+def _end_sentence(text: str) -> str:
     text = text.strip()
     return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
 def _initial_unknowns(root: Any) -> Iterator[str]:
-    """Give what is wrong with the list of initial unknowns, beyond the set that FMPy compares (FMI 2.0, 2.2.8)."""
+    """Yield faults of the list of initial unknowns, beyond the set that FMPy compares (FMI 2.0, 2.2.8)."""
     structure = root.find("ModelStructure")
     if structure is None:
         return
@@ -170,7 +173,7 @@ def _initial_unknowns(root: Any) -> Iterator[str]:
 
 
 def _sources(file: Path, root: Any, entries: Iterable[str]) -> Iterator[str]:
-    """Give the source files that are declared and not there."""
+    """Yield faults of declared source files that are missing."""
     from lxml import etree
 
     there = set(entries)
@@ -179,7 +182,7 @@ def _sources(file: Path, root: Any, entries: Iterable[str]) -> Iterator[str]:
             try:
                 build = etree.fromstring(archive.read("sources/buildDescription.xml"))
             except (etree.XMLSyntaxError, zipfile.BadZipFile):
-                return  # FMPy's validation has said so
+                return  # FMPy's validation has reported that
         declared = [e.get("name") for e in build.findall("BuildConfiguration/SourceFileSet/SourceFile")]
         where = "sources/buildDescription.xml"
     else:
@@ -202,7 +205,7 @@ def _identifiers(root: Any) -> dict[str, str]:
 
 
 def _binaries(file: Path, root: Any, entries: list[str], tool: str) -> Iterator[tuple[str, str]]:
-    """Give what is wrong with the libraries: missing, or for another machine than their folder says."""
+    """Yield faults of libraries: missing, or for another machine than their folder's."""
     build = f"Export it again with its tool ({tool}); if it has sources, fmpy compile builds it for this machine."
     folders = binaries_of(entries)
     if not folders and not any(name.startswith("sources/") for name in entries):
@@ -211,7 +214,7 @@ def _binaries(file: Path, root: Any, entries: list[str], tool: str) -> Iterator[
         for folder, names in folders.items():
             platform = tuple_of(folder)
             if platform is None:
-                continue  # a folder of a tool's own is allowed
+                continue  # a tool may have folders of its own
             for library in sorted({library_name(i, platform) for i in _identifiers(root).values() if i}):
                 users = [who for who, i in _identifiers(root).items() if i and library_name(i, platform) == library]
                 if library not in names:
@@ -221,7 +224,7 @@ def _binaries(file: Path, root: Any, entries: list[str], tool: str) -> Iterator[
                     continue
                 try:
                     found = platforms_of_binary(archive.read(f"binaries/{folder}/{library}"))
-                except Exception:  # damage, which has been reported
+                except Exception:  # damage, which is reported already
                     continue
                 if platform not in found:
                     is_for = " and ".join(sorted(found)) or "no platform known here: it is no shared library"
@@ -245,21 +248,21 @@ def _reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]]
     return f"it has no binary for this machine, {native}"
 
 
-def try_out(file: Path, interface: str) -> Problem | None:
-    """Run an FMU for one step in a process of its own; return what goes wrong.
+def try_out(file: Path, interface: str) -> FmuProblem | None:
+    """Run an FMU for one step in a process of its own; return its fault, or None.
 
     Parameters
     ----------
     file : Path
         The FMU; it must have a binary for this machine.
     interface : {"CoSimulation", "ModelExchange"}
-        How to run it.
+        The interface to run.
     """
     name = INTERFACES[interface]
     with tempfile.TemporaryDirectory(prefix="loopwright-") as folder:
         report = Path(folder) / "report"
         command = [sys.executable, "-m", "loopwright.fmus.checks.trial", str(file.resolve()), interface, str(report)]
-        # A session of its own, so that what a hung FMU has started ends with it.
+        # A session of its own, so that the processes that a hung FMU has started end with it.
         process = subprocess.Popen(
             command,
             cwd=folder,
@@ -282,41 +285,41 @@ def try_out(file: Path, interface: str) -> Problem | None:
         lines = report.read_text(encoding="utf-8").splitlines() if report.is_file() else []
     told = [json.loads(line) for line in lines]
     last = told[-1] if told else {"stage": "load"}
-    said = _said([*last.get("messages", []), *output.decode(errors="replace").splitlines()])
+    said = _quote_lines([*last.get("messages", []), *output.decode(errors="replace").splitlines()])
     if hung:
-        return Problem(
+        return FmuProblem(
             f"{name}: {STAGES.get(last['stage'], 'it')} has not ended after {PATIENCE:g} s.{said}",
             "Run it in the tool that exported it; it may wait for a licence or another program.",
         )
     if last["stage"] == "done":
         if last["not_finite"]:
-            return Problem(
+            return FmuProblem(
                 f"{name}: after one step from its start values, {', '.join(last['not_finite'])} is no finite number.",
                 "Check its start values and inputs: see them with loopwright inspect.",
             )
-        return None if process.returncode == 0 else Problem(
-            f"{name}: it ran, and then {_death(process.returncode)}.{said}", "Report it to its makers."
+        return None if process.returncode == 0 else FmuProblem(
+            f"{name}: it ran, and then {_describe_exit(process.returncode)}.{said}", "Report it to its makers."
         )  # fmt: skip
     if last["stage"] == "failed":
         step = "Check its start values and inputs: see them with loopwright inspect."
         if last["at"] == "load":
-            step = "See what its binary needs: loopwright inspect names the libraries that are missing here."
-        return Problem(f"{name}: {STAGES[last['at']]} failed: {last['error']}{said}", step)
-    return Problem(
-        f"{name}: {STAGES[last['stage']]} {_death(process.returncode)}.{said}",
+            step = "Install the libraries that it lacks here: loopwright inspect names them."
+        return FmuProblem(f"{name}: {STAGES[last['at']]} failed: {last['error']}{said}", step)
+    return FmuProblem(
+        f"{name}: {STAGES[last['stage']]} {_describe_exit(process.returncode)}.{said}",
         "Don't load it into a program whose work you need. Report it to its makers.",
     )
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """End a trial and all that it has started."""
+    """End a trial and all processes that it has started."""
     if sys.platform == "win32":
         process.kill()
     else:
         os.killpg(process.pid, signal.SIGKILL)
 
 
-def _death(code: int) -> str:
+def _describe_exit(code: int) -> str:
     if code < 0:
         try:
             return f"crashed the process ({signal.Signals(-code).name})"
@@ -325,7 +328,7 @@ def _death(code: int) -> str:
     return f"ended the process with exit code {code}"
 
 
-def _said(lines: Iterable[str]) -> str:
-    """Quote the last lines that an FMU has said."""
+def _quote_lines(lines: Iterable[str]) -> str:
+    """Quote the last lines of an FMU's output."""
     kept = [line.strip() for line in lines if line.strip()]
     return f" It says: {' / '.join(kept[-4:])}" if kept else ""

@@ -1,7 +1,7 @@
-"""Build an FMU from a model: generate, compile, zip, cache.
+"""Build of an FMU from a model: generate, compile, zip, cache.
 
-A build is keyed by everything that goes into it (equations, variables, runtime, compiler, flags, version), so that the
-second build of the same model only looks up a file.
+The key of a build covers everything that goes into it (equations, variables, runtime, compiler, flags, version), so
+that the second build of the same model only looks up a file.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from .c_code import generate, runtime
 from .compiler import SUFFIXES, TARGETS, Compiler, check_platform, compile_shared, find_compiler, flags
 from .html_page import index_html
 from .model import ModelSpec
-from .scalars import scalarized
+from .scalars import scalarize
 from .xml_fmi2 import model_description2
 from .xml_fmi3 import build_description, model_description, package_version
 
@@ -41,7 +41,7 @@ _FOLDERS2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwi
 
 @dataclass(frozen=True)
 class Options:
-    """What an FMU is built as, beside its model.
+    """Options of a build, beside the model.
 
     Parameters
     ----------
@@ -60,13 +60,11 @@ class Options:
 
 @lru_cache(maxsize=1)
 def fmi_headers() -> tuple[Path, str]:
-    """Find the folder of FMI's header files, which FMPy brings, and its version."""
+    """Return the folder of FMI's header files, which FMPy ships, and FMPy's version."""
     spec = importlib.util.find_spec("fmpy")
     folder = Path(spec.origin).parent / "c-code" if spec is not None and spec.origin is not None else None
     if folder is None or not all((folder / f"fmi{v}Functions.h").is_file() for v in (2, 3)):
-        raise FmuError(
-            f"FMI's header files are not in {folder}. Install FMPy anew: pip install --force-reinstall fmpy."
-        )
+        raise FmuError(f"found no FMI header files in {folder}. Install FMPy anew: pip install --force-reinstall fmpy.")
     return folder, importlib.metadata.version("fmpy")
 
 
@@ -79,7 +77,7 @@ def _hash(*parts: str) -> str:
 
 
 def _text(value: Any) -> str:
-    """Write a model down, all of it, to be hashed."""
+    """Return all of a model as text, to be hashed."""
     if isinstance(value, ca.Function):
         return str(value.serialize())
     if is_dataclass(value):
@@ -92,7 +90,7 @@ def _text(value: Any) -> str:
 
 
 def _code_parts(fmi: int) -> list[str]:
-    """Give the text of what writes the files, so that a change of it (while developing) builds anew."""
+    """Return the text of the modules that write the files, so that a change of them builds anew."""
     folder = Path(__file__).parent
     written = ("build", "c_code", "html_page", "quantities", "scalars", "xml_fmi2", "xml_fmi3")
     modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
@@ -100,14 +98,14 @@ def _code_parts(fmi: int) -> list[str]:
 
 
 def build_key(spec: ModelSpec, options: Options, compiler: Compiler) -> str:
-    """Hash all that goes into a build; nothing is generated for it."""
+    """Return the hash of everything that goes into a build; nothing is generated for it."""
     toolchain = [f"{p} {flags(compiler, p)}" for p in options.platforms]
     made = [_text(spec), _text(options), *_code_parts(options.fmi)]
     return _hash(*made, compiler.identity, fmi_headers()[1], *toolchain)
 
 
 def _zip(files: Mapping[str, bytes]) -> bytes:
-    """Pack files with fixed dates, in sorted order: same content, same bytes (FMI 3.0, 2.5.1)."""
+    """Zip files with fixed dates, in sorted order: same content, same bytes (FMI 3.0, 2.5.1)."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in sorted(files):
@@ -152,7 +150,7 @@ def _archive(spec: ModelSpec, options: Options, compiler: Compiler, notify: Call
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file that is either there and complete, or not there."""
+    """Write a file so that it is complete or does not exist, never half written."""
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -181,7 +179,7 @@ def build_fmu(
 ) -> Path:
     """Build an FMU, or find it in the cache.
 
-    Same input, same bytes, on every machine with the same version of the compiler's package.
+    Equal inputs give equal bytes on every machine with the same version of the compiler's package.
 
     Parameters
     ----------
@@ -192,14 +190,14 @@ def build_fmu(
     fmi : {3, 2}
         FMI 3.0 or FMI 2.0.
     arrays : bool
-        Whether vectors and matrices are arrays of FMI 3.0; else, and in FMI 2.0 always, each element is a scalar
-        variable of its own: ``s[1]``, ``s[2]``, ``m[1,2]``.
+        Whether vectors and matrices are arrays of FMI 3.0. Else, and always in FMI 2.0, each element is a scalar
+        variable: ``s[1]``, ``s[2]``, ``m[1,2]``.
     platform : str or iterable of str, optional
         FMI 3.0 platform tuples (2.5.1.4) to build binaries for, or "all" of them; native if not given.
     documentation : str
         Plain text for ``documentation/index.html``, beside the equations and the table of variables.
     notify : callable, optional
-        Is told what takes long, in one line.
+        Called with a line of text before each long step.
 
     Returns
     -------
@@ -211,13 +209,13 @@ def build_fmu(
     CompilerError
         If there is no C compiler, or it fails.
     FmuError
-        If ``fmi`` is neither, or the cache or ``out`` can't be written.
+        For another ``fmi``, and if the cache or ``out`` can't be written.
     """
     if fmi not in (2, 3):
         raise FmuError(f"found fmi={fmi!r}, expected 3 (FMI 3.0) or 2 (FMI 2.0). Give one of them.")
     chosen = TARGETS if platform == "all" else (platform,) if isinstance(platform, str) else platform
     platforms = tuple(sorted(set(chosen or (native_platform(),))))
-    spec = spec if arrays and fmi == 3 else scalarized(spec)
+    spec = spec if arrays and fmi == 3 else scalarize(spec)
     options = Options(fmi, platforms, documentation)
     compiler = find_compiler()
     for name in platforms:

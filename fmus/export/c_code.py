@@ -1,7 +1,7 @@
-"""From a model to C: CasADi writes the equations, this module the tables around them.
+"""C code of a model: CasADi writes the equations, this module the tables around them.
 
-The generated ``model.c`` is the only file to compile: it includes the runtime (``runtime/``), so that the equations are
-inlined into the integrator.
+The generated ``model.c`` is the only file to compile: it includes the runtime (``runtime/``), so that the compiler
+inlines the equations into the integrator.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _COMMON = ("model.h", "core.c", "integrators.c", "events.c", "stepping.c")
 RUNTIME = {3: (*_COMMON, "fmi3.c", "fmi3_events.c", "fmi3_refused.c"), 2: (*_COMMON, "fmi2.c", "fmi2_refused.c")}
 _ORDER = {3: "FMI 3.0, 2.3, 3.2 and 4.2", 2: "FMI 2.0, 3.2.3 and 4.2.4"}
 
-# Longest function that is expanded: beyond, calls of shared functions keep the code small (compile time grows faster).
+# Longest function that is expanded; beyond it, calls of shared functions keep the code small (compile time grows fast).
 _SCALAR_LIMIT = 20_000
-# Longest function of the rates that is put into every stage of the integrators: left alone, the compiler calls it.
+# Longest function of the rates that is inlined into every stage of the integrators; the compiler alone would call it.
 _INLINE_LIMIT = 300
 _INLINE = "static inline __attribute__((always_inline))"
 _STEP_DESCRIPTION = (
@@ -44,22 +44,22 @@ _TOLERANCE_DESCRIPTION = (
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """A variable as the FMU has it: its value reference is an index into the table of variables.
+    """Variable of the FMU; its value reference is its index in the table of variables.
 
     Parameters
     ----------
     reference : int
         Value reference.
     kind : str
-        Which of time, fixed, tunable, input, state, discrete (state), derivative, output, (event) indicator it is.
+        One of time, fixed, tunable, input, state, discrete (state), derivative, output, (event) indicator.
     variable : Variable
-        What is known of it; of time and of derivatives only name, unit, shape and description count.
+        The model's variable; of time and of derivatives only name, unit, shape and description count.
     name : str
-        Its name in the FMU: ``der(x)`` for the derivative of ``x``.
+        Name in the FMU: ``der(x)`` for the derivative of ``x``.
     first : int
         Index of its first element in the values of an instance.
     of : int, optional
-        Of a derivative: reference of its state.
+        Reference of the state of a derivative.
     """
 
     reference: int
@@ -86,7 +86,7 @@ def _rate(state: Variable) -> Variable:
 
 
 def _settings(spec: ModelSpec) -> list[tuple[Kind, Variable, str]]:
-    """Give the parameters of the FMU's own integrator."""
+    """Return the parameters of the FMU's own integrator."""
     step = Variable(
         "v", "parameter", "tunable", description=_STEP_DESCRIPTION, start=spec.internal_step, unit="s", minimum=0.0
     )
@@ -118,7 +118,7 @@ def _indicators(spec: ModelSpec) -> list[tuple[Kind, Variable, str]]:
 
 
 def layout(spec: ModelSpec) -> tuple[Entry, ...]:
-    """Give every variable its value reference and its place among the values, in the order of ``model.h``."""
+    """Return all variables with value references and places among the values, in the order of ``model.h``."""
     time = Variable("t", unit="s", description="Simulation time")
     rows: list[tuple[Kind, Variable, str]] = [("time", time, "time")]
     rows += [("tunable" if v.variability == "tunable" else "fixed", v, v.name) for v in spec.parameters]
@@ -138,24 +138,24 @@ def layout(spec: ModelSpec) -> tuple[Entry, ...]:
     return tuple(entries)
 
 
-def scalar(f: ca.Function) -> ca.Function:
-    """Expand ``f`` to scalar operations (three times as fast in C) where that is possible and not too long."""
+def expand_scalar(f: ca.Function) -> ca.Function:
+    """Expand ``f`` to scalar operations (three times as fast in C), if that is possible and not too long."""
     if f.is_a("SXFunction"):
         return f
     try:
         expanded = f.expand()
-    except RuntimeError:  # interpolation tables and the like have no scalar expansion
+    except RuntimeError:  # interpolation tables, for example, have no scalar expansion
         return f
     return expanded if expanded.n_instructions() <= _SCALAR_LIMIT else f
 
 
-def symbolic(spec: ModelSpec) -> tuple[Any, Any]:
-    """Give all knowns (time, parameters, inputs, states) as one column; and derivatives, outputs, indicators of them.
+def to_symbols(spec: ModelSpec) -> tuple[Any, Any]:
+    """Return all knowns and all unknowns as columns: SX if all functions have a scalar expansion, else MX.
 
-    SX where all functions have a scalar expansion, else MX. The unknowns are one column too.
+    Knowns are time, parameters, inputs, states; unknowns are derivatives, outputs, indicators.
     """
     sizes = [1, *(sum(v.size for v in group) for group in (spec.parameters, spec.inputs, spec.states))]
-    functions = [scalar(f) for f in (spec.derivative, spec.output, spec.indicators) if f is not None]
+    functions = [expand_scalar(f) for f in (spec.derivative, spec.output, spec.indicators) if f is not None]
     sx = all(f.is_a("SXFunction") for f in functions)
     knowns = (ca.SX if sx else ca.MX).sym("knowns", sum(sizes))
     t, p, u, x = ca.vertsplit(knowns, [0, *(sum(sizes[: i + 1]) for i in range(4))])
@@ -168,31 +168,31 @@ def _call(f: ca.Function, args: Sequence[Any]) -> Any:
     return ca.densify(ca.reshape(out, f.numel_out(0), 1))
 
 
-def _plain(name: str, f: ca.Function) -> ca.Function:
-    """Write ``f`` under our own name, with a dense output (generated code leaves structural zeros unwritten)."""
-    f = scalar(f)
+def _dense_function(name: str, f: ca.Function) -> ca.Function:
+    """Return ``f`` by another name with a dense output, since generated code does not write structural zeros."""
+    f = expand_scalar(f)
     args = f.sx_in() if f.is_a("SXFunction") else f.mx_in()
     return ca.Function(name, args, [_call(f, args)])
 
 
 @dataclass(frozen=True, eq=False)
-class _Equations:
-    """All functions to generate, and the places of the nonzeros of the Jacobian if there are derivatives."""
+class _Functions:
+    """Functions to generate, and the places of the Jacobian's nonzeros if there are derivatives."""
 
     functions: list[ca.Function]
     nonzeros: list[tuple[int, int]] | None = None
 
 
-def _equations(spec: ModelSpec) -> _Equations:
-    functions = [_plain("lw_derivative", spec.derivative), _plain("lw_output", spec.output)]
+def _equations(spec: ModelSpec) -> _Functions:
+    functions = [_dense_function("lw_derivative", spec.derivative), _dense_function("lw_output", spec.output)]
     if spec.indicators is not None and spec.jump is not None:
-        functions += [_plain("lw_indicator", spec.indicators), _plain("lw_jump", spec.jump)]
+        functions += [_dense_function("lw_indicator", spec.indicators), _dense_function("lw_jump", spec.jump)]
     try:
-        knowns, unknowns = symbolic(spec)
+        knowns, unknowns = to_symbols(spec)
         seed, adjoint = knowns.sym("seed", knowns.numel()), knowns.sym("adjoint", unknowns.numel())
         forward = ca.densify(ca.jtimes(unknowns, knowns, seed))
         reverse = ca.densify(ca.jtimes(unknowns, knowns, adjoint, True))
-        linear, nonzeros = _linear(spec)
+        linear, nonzeros = _linear_functions(spec)
         derived = [
             ca.Function("lw_forward", [knowns, seed], [forward]),
             ca.Function("lw_reverse", [knowns, adjoint], [reverse]),
@@ -201,17 +201,17 @@ def _equations(spec: ModelSpec) -> _Equations:
     except (RuntimeError, NotImplementedError):  # an operation that CasADi can't differentiate
         if spec.integrator == "rodas":
             raise DefinitionError(
-                "its equations have no derivatives, which the integrator rodas needs. Choose rk4 or dopri5.",
+                "found equations without derivatives, which the integrator rodas needs. Choose rk4 or dopri5.",
                 block=spec.name,
                 port="integrator",
             ) from None
-        return _Equations(functions)
-    return _Equations(functions + derived, nonzeros)
+        return _Functions(functions)
+    return _Functions(functions + derived, nonzeros)
 
 
-def _linear(spec: ModelSpec) -> tuple[list[ca.Function], list[tuple[int, int]]]:
-    """Derive the derivatives by continuous states and time, and the indicators along a solution."""
-    f = scalar(spec.derivative)
+def _linear_functions(spec: ModelSpec) -> tuple[list[ca.Function], list[tuple[int, int]]]:
+    """Return functions of the Jacobian by continuous states and time and of the indicators' rates, and its nonzeros."""
+    f = expand_scalar(spec.derivative)
     kind: Any = ca.SX if f.is_a("SXFunction") else ca.MX
     t, x, u, p = (kind.sym(name, f.numel_in(i)) for i, name in enumerate("txup"))
     dx = _call(f, (t, x, u, p))
@@ -222,7 +222,7 @@ def _linear(spec: ModelSpec) -> tuple[list[ca.Function], list[tuple[int, int]]]:
     nonzeros = list(zip(*sparsity.get_triplet(), strict=True)) if sparsity.nnz() else []
     functions = [ca.Function("lw_jacobian", [t, x, u, p], [jacobian, slope])]
     if spec.indicators is not None:
-        f, g = scalar(spec.derivative), scalar(spec.indicators)
+        f, g = expand_scalar(spec.derivative), expand_scalar(spec.indicators)
         kind = ca.SX if f.is_a("SXFunction") and g.is_a("SXFunction") else ca.MX
         t, x, u, p = (kind.sym(name, f.numel_in(i)) for i, name in enumerate("txup"))
         z = _call(g, (t, x, u, p))
@@ -253,14 +253,14 @@ def _starts(entries: Iterable[Entry]) -> str:
 
 
 def _array(of: str, name: str, values: Iterable[object]) -> str:
-    """Write an array, of at least one element (C has no empty ones)."""
+    """Return the C text of an array, of at least one element, since C has no empty arrays."""
     texts = [str(v) for v in values] or ["0"]
     lines = [", ".join(texts[i : i + 8]) for i in range(0, len(texts), 8)]
     return f"static const {of} {name}[] = {{\n    " + ",\n    ".join(lines) + "\n};\n"
 
 
 def _tables(spec: ModelSpec, nonzeros: list[tuple[int, int]] | None) -> Iterable[str]:
-    """Write the nominal values of the continuous states, the events, and where the Jacobian is not zero."""
+    """Yield the C tables of nominal values of continuous states, of events, and of the Jacobian's nonzeros."""
     nominals = [1.0 if v.nominal is None else float(v.nominal) for v in spec.continuous for _ in range(v.size)]
     yield _array("double", "lw_nominals", map(repr, nominals))
     if spec.events:
@@ -271,7 +271,7 @@ def _tables(spec: ModelSpec, nonzeros: list[tuple[int, int]] | None) -> Iterable
         yield _array("int", "lw_jacobian_columns", (column for _, column in nonzeros))
 
 
-def _dimensions(spec: ModelSpec, token: str, equations: _Equations, n: int, fmi: int) -> str:
+def _dimensions(spec: ModelSpec, token: str, equations: _Functions, n: int, fmi: int) -> str:
     groups = {"P": spec.parameters, "U": spec.inputs, "X": spec.continuous, "D": spec.discrete, "Y": spec.outputs}
     nonzeros = equations.nonzeros
     lines = [f'#define LW_MODEL_NAME "{spec.name}"', f'#define LW_TOKEN "{token}"']
@@ -279,12 +279,12 @@ def _dimensions(spec: ModelSpec, token: str, equations: _Equations, n: int, fmi:
     lines += [f"#define LW_N_{letter} {sum(v.size for v in group)}" for letter, group in groups.items()]
     lines += [f"#define LW_N_Z {len(spec.events)}", f"#define LW_N_J {len(nonzeros or ())}"]
     lines += [f"#define LW_N_VARIABLES {n}", f"#define LW_HAS_DERIVATIVES {int(nonzeros is not None)}"]
-    for what in ("arg", "res", "iw", "w"):
-        lines.append(f"#define LW_SZ_{what.upper()} {max(getattr(f, f'sz_{what}')() for f in equations.functions)}")
+    for kind in ("arg", "res", "iw", "w"):
+        lines.append(f"#define LW_SZ_{kind.upper()} {max(getattr(f, f'sz_{kind}')() for f in equations.functions)}")
     return "\n".join(lines) + "\n"
 
 
-def _generated(functions: Sequence[ca.Function]) -> str:
+def _generate_equations(functions: Sequence[ca.Function]) -> str:
     generator = ca.CodeGenerator("eq.c", {"with_export": False, "casadi_int": "long long int"})
     for f in functions:
         generator.add(f)
@@ -295,30 +295,30 @@ def _generated(functions: Sequence[ca.Function]) -> str:
             text = text.replace(f"\n{declared}", f"\n{_INLINE} int {declared.partition('int ')[2]}")
     if missing := re.search(r"CASADI_MEM|_alloc_mem\(", text):
         raise DefinitionError(
-            f"the equations need memory of their own ({missing[0]}), as solvers and external functions do. "
+            f"found equations that need memory of their own ({missing[0]}), as solvers and external functions do. "
             "Write them without."
         )
     return text
 
 
 def generate(spec: ModelSpec, token: str, fmi: int = 3) -> tuple[str, bool]:
-    """Write ``model.c``.
+    """Return the text of ``model.c``.
 
     Parameters
     ----------
     spec : ModelSpec
         The model.
     token : str
-        Its instantiation token (FMI 3.0, 2.3.1).
+        The instantiation token (FMI 3.0, 2.3.1).
     fmi : {3, 2}
-        Version whose functions it has.
+        Version of FMI.
 
     Returns
     -------
     text : str
         The C text; it includes the files of `runtime`.
     derivatives : bool
-        Whether it has directional and adjoint derivatives.
+        Whether there are directional and adjoint derivatives.
     """
     entries = layout(spec)
     equations = _equations(spec)
@@ -326,7 +326,7 @@ def generate(spec: ModelSpec, token: str, fmi: int = 3) -> tuple[str, bool]:
         "/* Generated by Loopwright. */\n",
         _dimensions(spec, token, equations, len(entries), fmi),
         '#include "model.h"\n',
-        "/* The equations, written by CasADi. */\n" + _generated(equations.functions),
+        "/* The equations, written by CasADi. */\n" + _generate_equations(equations.functions),
         "#include <math.h>\n",
         _table(entries),
         _starts(entries),
@@ -338,6 +338,6 @@ def generate(spec: ModelSpec, token: str, fmi: int = 3) -> tuple[str, bool]:
 
 @lru_cache(maxsize=2)
 def runtime(fmi: int = 3) -> dict[str, str]:
-    """Read the files of the C runtime for a version of FMI."""
+    """Return the text of the C runtime's files for a version of FMI, by name."""
     folder = resources.files(__package__) / "runtime"
     return {name: (folder / name).read_text(encoding="utf-8") for name in RUNTIME[fmi]}

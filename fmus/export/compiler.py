@@ -1,6 +1,6 @@
-"""Find a C compiler and build a shared library with it.
+"""C compiler: it is found, and builds shared libraries.
 
-The ``ziglang`` package comes first: it is the same compiler on every machine and builds for all platforms from any of
+The ``ziglang`` package comes first: it is the same compiler on every machine, and builds for all platforms from any of
 them. Flags are fixed, so that one source gives one binary.
 """
 
@@ -25,8 +25,8 @@ from typing import Any
 from ...blocks.core.errors import CompilerError, near
 from ..platform import cache_folder, check_cache, native_platform
 
-#: FMI 3.0 platform tuples (2.5.1.4) that can be built for, and zig's name of each with the oldest system:
-#: glibc 2.17, macOS 11. On Windows the C library is the system's own since version 10.
+#: FMI 3.0 platform tuples (2.5.1.4) of the platforms to build for, and zig's name of each with the oldest system:
+#: glibc 2.17, macOS 11. On Windows the C library belongs to the system since version 10.
 TARGETS = {
     "x86_64-linux": "x86_64-linux-gnu.2.17",
     "aarch64-linux": "aarch64-linux-gnu.2.17",
@@ -39,7 +39,7 @@ SUFFIXES = {"linux": ".so", "windows": ".dll", "darwin": ".dylib"}
 # -ffp-contract=off: no fused multiply-add, so that every platform and every compiler rounds alike.
 FLAGS = ("-O2", "-std=c11", "-shared", "-fvisibility=hidden", "-ffp-contract=off", "-g0", "-s")
 TIMEOUT = 600.0
-"""Seconds after which a compilation is given up; the first one on a machine takes some, a slow machine a minute."""
+"""Seconds after which a compilation is stopped. The first one on a machine takes seconds, on a slow one a minute."""
 
 _INSTALL = 'Install one: pip install "loopwright[build]" (it brings ziglang), or set LOOPWRIGHT_CC to a command line.'
 
@@ -53,7 +53,7 @@ class Compiler:
     command : tuple of str
         Command line up to the flags.
     identity : str
-        What tells its version apart from another's; part of cache keys.
+        Text that identifies the compiler and its version; part of cache keys.
     zig : bool
         Whether it takes zig's ``-target``.
     """
@@ -64,12 +64,12 @@ class Compiler:
 
 
 def find_compiler() -> Compiler:
-    """Find the compiler to use: LOOPWRIGHT_CC, the ziglang package, else the system's cc, gcc or clang.
+    """Return the compiler to use: LOOPWRIGHT_CC, the ziglang package, else the system's cc, gcc or clang.
 
     Raises
     ------
     CompilerError
-        If there is none; it says what to install.
+        If there is none; the text says how to install one.
     """
     if given := os.environ.get("LOOPWRIGHT_CC"):
         command = tuple(shlex.split(given, posix=os.name != "nt"))
@@ -96,14 +96,14 @@ def _version(command: tuple[str, ...]) -> str:
 
 
 def flags(compiler: Compiler, platform: str) -> tuple[str, ...]:
-    """All flags for a platform but sources, include folders and the output."""
+    """Return all flags for a platform, without sources, include folders and the output."""
     target = ("-target", TARGETS[platform]) if compiler.zig else ()
     pic = () if platform.endswith("windows") else ("-fPIC",)
     return (*target, *FLAGS, *pic)
 
 
 def check_platform(compiler: Compiler, platform: str) -> None:
-    """Refuse a platform that can't be built for with this compiler."""
+    """Refuse a platform for which this compiler can't build."""
     if platform not in TARGETS and (compiler.zig or platform != native_platform()):
         raise CompilerError(f"there is no platform {platform!r}. {near(platform, TARGETS)}")
     if not compiler.zig and platform != native_platform() and "LOOPWRIGHT_CC" not in os.environ:
@@ -129,24 +129,24 @@ def compile_shared(
     sources : mapping of str to str
         Text of each file, headers too, by name.
     out : Path
-        The library to write. It appears at once, complete, or not at all.
+        The library to write; it appears complete or not at all.
     platform : str, optional
         FMI 3.0 platform tuple; native if not given.
     compiled : sequence of str, optional
-        Which of ``sources`` to compile; if not given, all that end in ``.c``.
+        Names of the sources to compile; if not given, all that end in ``.c``.
     include : sequence of Path
         Further folders of headers.
     compiler : Compiler, optional
-        As `find_compiler` gives it.
+        The compiler; `find_compiler`'s if not given.
 
     Raises
     ------
     CompilerError
-        If there is no compiler, it does not come to an end, or it fails: then its own message is quoted.
+        If there is no compiler, it does not end, or it fails; then its message is quoted.
     FmuError
         If the cache can't be written.
     """
-    check_cache()  # zig tries for ever where it can't
+    check_cache()  # zig retries for ever if it can't write there
     compiler = compiler or find_compiler()
     platform = platform or native_platform()
     check_platform(compiler, platform)
@@ -157,7 +157,7 @@ def compile_shared(
         folder = Path(temporary)
         for name, text in sources.items():
             (folder / name).write_text(text, encoding="utf-8", newline="\n")
-        library = out.name  # a relative name: it is written into some formats
+        library = out.name  # a relative name, since some formats contain it
         math = () if platform.endswith("windows") else ("-lm",)
         includes = [f"-I{path}" for path in include]
         command = [*compiler.command, *flags(compiler, platform), "-I.", *includes, "-o", library, *names, *math]
@@ -175,7 +175,7 @@ def _run(command: Sequence[str], folder: Path, platform: str) -> None:
     code, output, errors = _wait(command, folder, environment)
     if code:
         lines = (errors.strip() or output.strip() or "(nothing)").splitlines()
-        said = "\n".join(lines if len(lines) <= 40 else [*lines[:20], "...", *lines[-20:]])  # the first error counts
+        said = "\n".join(lines if len(lines) <= 40 else [*lines[:20], "...", *lines[-20:]])  # the first error matters
         raise CompilerError(
             f"the C compiler failed for {platform} with exit code {code}. Its message:\n{said}\n"
             f"The command was: {shlex.join(command)}\n"
@@ -184,7 +184,7 @@ def _run(command: Sequence[str], folder: Path, platform: str) -> None:
 
 
 def _wait(command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> tuple[int, str, str]:
-    """Run a compiler to its end; it and what it started end with this call, whatever happens."""
+    """Run a compiler; it and all processes that it started end with this call, whatever happens."""
     group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
     try:
         process = subprocess.Popen(
@@ -215,7 +215,7 @@ def _wait(command: Sequence[str], folder: Path, environment: Mapping[str, str]) 
 
 
 def _kill(process: subprocess.Popen[str]) -> None:
-    """End a process and, where there are process groups, all that it started."""
+    """End a process and, on POSIX, all processes that it started."""
     with suppress(OSError):
         if sys.platform != "win32":
             os.killpg(process.pid, signal.SIGKILL)

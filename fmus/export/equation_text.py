@@ -1,4 +1,4 @@
-"""Traced equations as text for people: ``der(velocity) = (force - stiffness*position)/mass``."""
+"""Text of traced equations, for people: ``der(velocity) = (force - stiffness*position)/mass``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FUNCTIONS = {
     ca.OP_LOG1P: "log1p", ca.OP_EXPM1: "expm1", ca.OP_HYPOT: "hypot", ca.OP_REMAINDER: "remainder",
     ca.OP_IF_ELSE_ZERO: "where",
 }  # fmt: skip
-# Operator, its precedence, and the least precedence that its left and its right operand need to go without parentheses.
+# Operator, its precedence, and the least precedences at which its left and right operands need no parentheses.
 _OPERATORS = {
     ca.OP_ADD: (" + ", _SUM, _SUM, _SUM), ca.OP_SUB: (" - ", _SUM, _SUM, _PRODUCT),
     ca.OP_MUL: ("*", _PRODUCT, _PRODUCT, _PRODUCT), ca.OP_DIV: ("/", _PRODUCT, _PRODUCT, _POWER),
@@ -29,30 +29,30 @@ Term = tuple[str, int]
 
 
 def number(value: float) -> str:
-    """Write a number in full, without a needless ``.0``."""
+    """Return a number in full, without a needless ``.0``."""
     value = float(value)
     short = f"{value:.12g}"
     return short if float(short) == value else repr(value)
 
 
-def _within(term: Term, least: int) -> str:
+def _parenthesize(term: Term, least: int) -> str:
     return term[0] if term[1] >= least else f"({term[0]})"
 
 
 def _term(op: int, operands: Sequence[Term]) -> Term | None:
-    """Write one operation; None if there is no text for it."""
+    """Return the text of an operation; None if there is none."""
     first = operands[0] if operands else ("", _ATOM)
     if op in _OPERATORS:
         sign, precedence, left, right = _OPERATORS[op]
-        return f"{_within(first, left)}{sign}{_within(operands[1], right)}", precedence
+        return f"{_parenthesize(first, left)}{sign}{_parenthesize(operands[1], right)}", precedence
     if op == ca.OP_NEG:
-        return f"-{_within(first, _PRODUCT)}", _SUM
+        return f"-{_parenthesize(first, _PRODUCT)}", _SUM
     if op == ca.OP_SQ:
-        return f"{_within(first, _ATOM)}^2", _POWER
+        return f"{_parenthesize(first, _ATOM)}^2", _POWER
     if op == ca.OP_TWICE:
-        return f"2*{_within(first, _PRODUCT)}", _PRODUCT
+        return f"2*{_parenthesize(first, _PRODUCT)}", _PRODUCT
     if op == ca.OP_INV:
-        return f"1/{_within(first, _POWER)}", _PRODUCT
+        return f"1/{_parenthesize(first, _POWER)}", _PRODUCT
     if op == ca.OP_IF_ELSE_ZERO:
         return f"where({first[0]}, {operands[1][0]}, 0)", _ATOM
     if op in _FUNCTIONS:
@@ -61,7 +61,7 @@ def _term(op: int, operands: Sequence[Term]) -> Term | None:
 
 
 def _choice(op: int, operands: Sequence[Term], choices: dict[str, tuple[str, str]]) -> Term | None:
-    """Write a choice as one: CasADi has it as where(c, a, 0) + where(not(c), b, 0)."""
+    """Return the text of a choice, which CasADi has as where(c, a, 0) + where(not(c), b, 0); else None."""
     if op == ca.OP_ADD and all(text in choices for text, _ in operands):
         (yes, a), (no, b) = (choices[text] for text, _ in operands)
         if no == f"not({yes})":
@@ -70,23 +70,23 @@ def _choice(op: int, operands: Sequence[Term], choices: dict[str, tuple[str, str
 
 
 def equations(f: ca.Function, knowns: Sequence[Sequence[str]], unknowns: Sequence[str], limit: int = 400) -> list[str]:
-    """Write a function of scalar operations as equations.
+    """Return a function of scalar operations as equations in text.
 
     Parameters
     ----------
     f : casadi.Function
-        With dense columns as arguments and one as its result.
+        A function of dense columns with one column as its result.
     knowns : sequence of sequences of str
-        For each argument, the names of its elements.
+        Names of the elements of each argument.
     unknowns : sequence of str
-        The names of the elements of the result.
+        Names of the elements of the result.
     limit : int
-        Number of operations from which on nobody reads it.
+        Number of operations beyond which the text would be too long to read.
 
     Returns
     -------
     list of str
-        One equation each, shared expressions first; empty if there is no scalar expansion, or it is too long.
+        One equation in each text, shared expressions first; empty without a scalar expansion, or beyond the limit.
     """
     try:
         f = f.expand()
@@ -95,7 +95,7 @@ def equations(f: ca.Function, knowns: Sequence[Sequence[str]], unknowns: Sequenc
     if f.n_instructions() > limit + f.numel_in() + f.numel_out():
         return []
     taken = {name for group in knowns for name in group}
-    uses = _uses(f)
+    uses = _count_uses(f)
     work: dict[int, Term] = {}
     shared: list[str] = []
     choices: dict[str, tuple[str, str]] = {}
@@ -127,8 +127,8 @@ def equations(f: ca.Function, knowns: Sequence[Sequence[str]], unknowns: Sequenc
     return [*shared, *(f"{name} = {results[i]}" for i, name in enumerate(unknowns))]
 
 
-def _uses(f: ca.Function) -> dict[int, int]:
-    """Count for each operation how often its result is read (places of work are used again)."""
+def _count_uses(f: ca.Function) -> dict[int, int]:
+    """Return the number of reads of each operation's result (places of work are reused)."""
     made: dict[int, int] = {}
     uses = dict.fromkeys(range(f.n_instructions()), 0)
     for k in range(f.n_instructions()):

@@ -1,4 +1,4 @@
-"""From a block's equations to an FMU."""
+"""Export of a block as an FMU."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ...blocks.tracing.structure import traced_parameters
 from ...blocks.tracing.trace import Traced, trace
 from .build import build_fmu
 from .html_page import block_text
-from .model import Event, Integrator, ModelSpec, Variable
+from .model import EventSpec, Integrator, ModelSpec, Variable
 
 _TINY = float(np.finfo(float).tiny)  # the least positive number that is not denormal
 
@@ -34,7 +34,7 @@ def model_spec(
     integrator: Integrator = "rk4",
     tolerance: float = 1e-8,
 ) -> ModelSpec:
-    """Return what an FMU of a continuous block consists of: its variables, and its equations as CasADi functions.
+    """Return the model of a continuous block: its variables, and its equations as CasADi functions.
 
     States that are outputs become output variables; the other outputs are computed. All parameters are symbols, so
     that each can be set in the FMU.
@@ -65,7 +65,7 @@ def model_spec(
 def _model_spec(block: Block, name: str, **experiment: Any) -> ModelSpec:
     _check_exportable(block, name)
     shapes = {port: spec.shape or () for port, spec in block.inputs.items()}
-    equations = _Equations(block, trace(block, shapes, sampled=False, zeros=False))
+    equations = _BlockEquations(block, trace(block, shapes, sampled=False, zeros=False))
     traced = equations.traced
     computed = [n for n in block.outputs if n not in block.states]
     return ModelSpec(
@@ -81,7 +81,7 @@ def _model_spec(block: Block, name: str, **experiment: Any) -> ModelSpec:
         derivative=equations.derivative(),
         output=equations.output(computed),
         events=tuple(
-            Event(n, cast(Any, port.direction), port.description, port.nominal or 1.0)
+            EventSpec(n, cast(Any, port.direction), port.description, port.nominal or 1.0)
             for n, port in block.events.items()
         ),
         indicators=equations.indicators(),
@@ -90,7 +90,7 @@ def _model_spec(block: Block, name: str, **experiment: Any) -> ModelSpec:
     )
 
 
-class _Equations:
+class _BlockEquations:
     """A block's traced equations as functions of (t, x, u, p), with the discrete states behind the continuous ones."""
 
     def __init__(self, block: Block, traced: Traced):
@@ -105,7 +105,7 @@ class _Equations:
         self.p = ca.MX.sym("p", sum(np.size(v) for _, v in traced_parameters(block)))
         columns = ca.vertsplit(self.u, inputs.cuts) if traced.inputs else []
         x = self.x[[self._rows.index(i) for i in range(len(self._rows))]] if self._rows else self.x
-        # the sample time does not enter a continuous model
+        # a continuous model has no sample time
         self._arguments = [self.t, x, *columns, ca.vertcat(self.p, 0.0)]
         names = (*traced.outputs, NEXT, GUARDS)
         self._made = dict(zip(names, f.call(self._arguments), strict=True))
@@ -118,7 +118,7 @@ class _Equations:
         return self._function("derivative", self._made[NEXT][self._rows[: self._n_continuous]])
 
     def output(self, computed: list[str]) -> Any:
-        """Return the computed outputs, in one column."""
+        """Return the computed outputs as one column."""
         return self._function("output", ca.vertcat(*(self._made[n] for n in computed)))
 
     def indicators(self) -> Any:
@@ -170,14 +170,14 @@ def build(
     Parameters
     ----------
     block : Block
-        A block with a ``derivative``; its parameter values become the FMU's start values.
+        A block with a ``derivative``; its parameters become the FMU's start values.
     out : path, optional
-        Where to put the file (or the folder for it); without it, the file in the cache is returned.
+        File, or folder for it; without it, the file in the cache is returned.
     name : str, optional
-        The model's name; the class name in lower case without one.
+        Name of the model; without it, the class name in lower case.
     internal_step : float
-        Start value, in s, of the FMU's parameter ``internal_step``: the longest step of its Runge-Kutta integrator
-        (order 4); the adaptive ones choose their own.
+        Start value, in s, of the FMU's parameter ``internal_step``: the longest step of its Runge-Kutta integrator of
+        order 4. The adaptive integrators choose their steps.
     integrator : {"rk4", "dopri5", "rodas"}
         Start value of the FMU's parameter ``integrator``, for co-simulation: explicit with a fixed step, explicit with
         an adaptive one, or implicit for stiff models.
@@ -188,21 +188,21 @@ def build(
     fmi : {3, 2}
         FMI 3.0 or FMI 2.0.
     arrays : bool
-        Whether vectors and matrices are arrays; else, and in FMI 2.0 always, each element is a variable: ``s[1]``.
+        Whether vectors and matrices are arrays. Else, and always in FMI 2.0, each element is a variable: ``s[1]``.
     platform : str or iterable of str, optional
-        FMI 3.0 platform tuples, such as ``"x86_64-linux"``, or ``"all"``; this machine's without one.
+        FMI 3.0 platform tuples, such as ``"x86_64-linux"``, or ``"all"``; without it, this machine's.
     documentation : str, optional
-        Plain text for the FMU's page of documentation; the block's docstring and the source of its equations if not
-        given.
+        Plain text for the FMU's page of documentation; without it, the block's docstring and the source of its
+        equations.
     notify : callable, optional
         Called with a line of text when a compilation starts.
 
     Raises
     ------
     DefinitionError, TraceError
-        A block that can't be exported.
+        For a block that can't be exported.
     CompilerError
-        No compiler, or one that failed.
+        If there is no compiler, or it fails.
     """
     spec = model_spec(
         block,
@@ -218,27 +218,26 @@ def build(
 
 
 def _check_exportable(block: Block, name: str) -> None:
-    """Refuse what an FMU would leave out without a word."""
+    """Refuse a block with parts that an FMU would leave out silently."""
     if isinstance(block, type) or not isinstance(block, Block):
         raise DefinitionError(f"found {block!r}; expected a block, such as Gantry().", block=name)
     if not (hasattr(block, "derivative") or block.events):
         raise DefinitionError(
-            "it has no derivative(t, x, u), so it is no continuous model; an FMU is made from one.", block=name
+            "found no derivative(t, x, u); expected a continuous model. Write one, or export another block.", block=name
         )
-    for what, why in (
+    for equation, reason in (
         ("guards", "an FMU has no guards"),
-        ("initial", "an FMU's states have start values, and none that are computed from its inputs"),
+        ("initial", "an FMU's states have fixed start values, not computed ones"),
     ):
-        if hasattr(block, what):
-            raise DefinitionError(f"it has {what}(…), but {why}. Export a block without.", block=name)
+        if hasattr(block, equation):
+            raise DefinitionError(f"it has {equation}(…), but {reason}. Export a block without.", block=name)
     for port, spec in block.inputs.items():
         if spec.shape is None:
-            raise DefinitionError("its shape is not declared; declare it with Input(shape=…).", block=name, port=port)
+            raise DefinitionError("found no declared shape; declare it with Input(shape=…).", block=name, port=port)
     for port, declared in {**block.inputs, **block.outputs, **block.states}.items():
         if isinstance(declared.unit, tuple):
             raise DefinitionError(
-                f"its entries have units of their own, {', '.join(declared.unit)}; a variable of an FMU has one. Split "
-                "the port.",
+                f"found several units, {', '.join(declared.unit)}; a variable of an FMU has one. Split the port.",
                 block=name,
                 port=port,
             )

@@ -1,4 +1,4 @@
-"""``documentation/index.html`` of an FMU: what it is, its equations, its variables. One file that needs no other."""
+"""Page ``documentation/index.html`` of an FMU: description, equations, events, variables. It needs no other file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ...blocks.core.block import Block
 from .c_code import Entry, layout
 from .equation_text import equations, number
 from .model import ModelSpec, Variable
-from .scalars import scalarized
+from .scalars import scalarize
 
 _STYLE = """
 :root { color-scheme: light dark; }
@@ -37,11 +37,11 @@ _GENERATED = re.compile(r"\n\n(?:Parameters|Inputs|Outputs|States|Events)\n-+\n"
 
 
 def block_text(block: Block) -> str:
-    """Give the text of a block's documentation: its docstrings, and the source of its equations where there is one."""
+    """Return the text of a block's documentation: its docstrings, and the source of its equations if there is one."""
     cls = type(block)
     module = inspect.getmodule(cls)
     about = module.__doc__ if module is not None and module.__name__ != "__main__" else None
-    # the first line is the model's description, and the sections on parameters and ports are the table's rows
+    # the first line is the model's description, and the table's rows replace the sections on parameters and ports
     written = _GENERATED.split(inspect.cleandoc(cls.__doc__ or ""), maxsplit=1)[0].partition("\n")[2]
     parts = [written, inspect.cleandoc(about or "")]
     inherited = {name: getattr(cls, name) for name in _EQUATIONS if getattr(cls, name, None) is not None}
@@ -55,7 +55,7 @@ def block_text(block: Block) -> str:
 def _source(function: Callable[..., Any]) -> str:
     try:
         return textwrap.dedent(inspect.getsource(function))
-    except (OSError, TypeError):  # typed at a prompt: there is no file to read
+    except (OSError, TypeError):  # typed at a prompt: there is no file
         return ""
 
 
@@ -64,8 +64,8 @@ def _names(variables: Iterable[Variable]) -> list[str]:
 
 
 def _equations(spec: ModelSpec) -> list[tuple[str, str]]:
-    """Give the printed equations, each group with its title; none if one group can't be printed."""
-    flat = scalarized(spec)
+    """Return groups of equations with their titles; none if one group can't be printed."""
+    flat = scalarize(spec)
     knowns = [["time"], _names(flat.states), _names(flat.inputs), _names(flat.parameters)]
     events = [e.name for e in spec.events]
     groups = [
@@ -74,9 +74,10 @@ def _equations(spec: ModelSpec) -> list[tuple[str, str]]:
     ]
     if spec.indicators is not None and spec.jump is not None:
         fires = (
-            "Event indicators: an event fires where its indicator comes to be above 0 (rising), or no longer (falling)"
+            "Event indicators: an event fires when its indicator rises above 0 (rising), or falls to 0 or below "
+            "(falling)"
         )
-        after = "States after an event; the name of an event is 1 where it fires, else 0"
+        after = "States after an event; the name of an event is 1 if it fires, else 0"
         groups.append((fires, spec.indicators, knowns, [e.indicator for e in spec.events]))
         groups.append((after, spec.jump, [*knowns, events], [f"next({v.name})" for v in flat.states]))
     found = []
@@ -86,7 +87,7 @@ def _equations(spec: ModelSpec) -> list[tuple[str, str]]:
         lines = equations(f, names, unknowns)
         if not lines:
             return []
-        kept = {f"next({v.name}) = {v.name}" for v in flat.states}  # a jump leaves them alone
+        kept = {f"next({v.name}) = {v.name}" for v in flat.states}  # unchanged by a jump
         found.append((title, "\n".join(line for line in lines if line not in kept)))
     return found
 
@@ -110,8 +111,8 @@ def _start(variable: Variable) -> str:
     return ", ".join(number(v) for v in values[:_MOST]) + more
 
 
-def _least(minimum: float) -> str:
-    """Write a minimum; the least number above another, which stands for an open bound, as that bound."""
+def _minimum_text(minimum: float) -> str:
+    """Return a minimum as text; the least number above an open bound is shown as that bound."""
     below = 0.0 if minimum == np.finfo(float).tiny else float(np.nextafter(minimum, -np.inf))
     return f"> {number(below)}" if len(number(below)) < len(number(minimum)) else number(minimum)
 
@@ -124,7 +125,7 @@ def _row(e: Entry) -> str:
         "continuous" if e.kind in ("time", "derivative") else v.variability,
         v.unit or "",
         _start(v),
-        "" if v.minimum is None else _least(v.minimum),
+        "" if v.minimum is None else _minimum_text(v.minimum),
         "" if v.maximum is None else number(v.maximum),
         v.description,
     ]
@@ -137,21 +138,21 @@ def _section(title: str, body: Sequence[str]) -> list[str]:
 
 
 def index_html(spec: ModelSpec, text: str = "", *, fmi: int = 3) -> str:
-    """Write ``documentation/index.html`` (FMI 3.0, 2.5.1; FMI 2.0, 2.3).
+    """Return the text of ``documentation/index.html`` (FMI 3.0, 2.5.1; FMI 2.0, 2.3).
 
     Parameters
     ----------
     spec : ModelSpec
-        The model, as it is exported: with arrays or without.
+        The model as exported, with arrays or without.
     text : str
-        Plain text of the author, such as a docstring; shown as it is.
+        Plain text by the author, such as a docstring; shown unchanged.
     fmi : {3, 2}
         Version of FMI.
 
     Returns
     -------
     str
-        HTML 5 that refers to nothing outside.
+        HTML 5 without references to other files.
     """
     rows = [_row(e) for e in layout(spec)]
     head = "".join(f'<th scope="col">{name}</th>' for name in _COLUMNS)
@@ -159,9 +160,9 @@ def index_html(spec: ModelSpec, text: str = "", *, fmi: int = 3) -> str:
     traced = _equations(spec)
     if traced:
         printed = [f"<p>{escape(title)}:</p>\n<pre>{escape(lines)}</pre>" for title, lines in traced]
-        printed.append("<p>As they are compiled; <code>where(c, a, b)</code> is a where c holds, else b.</p>")
+        printed.append("<p>These equations are compiled; <code>where(c, a, b)</code> is a where c holds, else b.</p>")
     else:
-        printed = ["<p>Too long to print, or with tables; <code>sources/model.c</code> has them.</p>"]
+        printed = ["<p>The equations are too long to print, or have tables; see <code>sources/model.c</code>.</p>"]
     lines = [
         "<!DOCTYPE html>",
         '<html lang="en">',

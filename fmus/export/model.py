@@ -1,7 +1,7 @@
-"""What an exporter needs to know of a model: its variables, its events, and its equations as CasADi functions.
+"""Model to export: its variables, its events, and its equations as CasADi functions.
 
-This is the seam between the side that traces Python equations and the side that writes FMUs. It holds nothing of FMI's
-files; a `ModelSpec` can be exported in any version and interface type.
+It connects the tracing of Python equations with the writing of FMUs. It depends on no version of FMI; a `ModelSpec` can
+be exported in any version and interface type.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ Causality = Literal["input", "output", "parameter", "local"]
 Variability = Literal["continuous", "discrete", "fixed", "tunable"]
 Integrator = Literal["rk4", "dopri5", "rodas"]
 
-#: Names that the exporter gives itself (FMI 3.0, 2.4.7: names are unique).
+#: Names that the exporter uses itself (FMI 3.0, 2.4.7: names are unique).
 RESERVED = ("time", "internal_step", "integrator", "tolerance")
-#: The integrators, by the value of the FMU's parameter ``integrator``.
+#: Values of the FMU's parameter ``integrator``.
 INTEGRATORS: dict[str, int] = {"rk4": 1, "dopri5": 2, "rodas": 3}
 DIRECTIONS: dict[str, int] = {"both": 0, "rising": 1, "falling": -1}
 _NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", re.ASCII)
@@ -38,7 +38,7 @@ _ALLOWED: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class Variable:
-    """A variable of a model (FMI 3.0, 2.4.7), scalar or array, Float64.
+    """Variable of a model (FMI 3.0, 2.4.7): Float64, scalar or array.
 
     Parameters
     ----------
@@ -52,18 +52,18 @@ class Variable:
     shape : tuple of int
         ``()`` for a scalar. Arrays are flattened row by row, as NumPy does.
     unit : str, optional
-        Such as ``"m/s2"``, ``"1"`` for none. Either every variable of a model has one, or no variable.
+        Unit, such as ``"m/s2"``, or ``"1"`` for none. Either all variables of a model have one, or no variable.
     description : str
         One line.
     start : array_like or float, optional
-        Required for parameters and states, 0 for an input that has none; a computed output has none. A single number
-        fills an array.
+        Start value: required for parameters and states, 0 by default for inputs, none for computed outputs. A single
+        number fills an array.
     minimum, maximum : float, optional
-        A value outside is refused when it is set.
+        Range; the FMU refuses to set a value outside.
     state : bool
         Whether this is a state.
     nominal : float, optional
-        Its usual size, positive; 1 if not given. Of a state, times the tolerance: the absolute tolerance.
+        Usual size, positive; 1 if not given. A state's nominal value times the tolerance is its absolute tolerance.
     """
 
     name: str
@@ -103,9 +103,9 @@ class Variable:
             )
         if self.unit is not None:
             parse_unit(self.unit)
-        object.__setattr__(self, "start", self._checked_start())
+        object.__setattr__(self, "start", self._check_start())
 
-    def _checked_start(self) -> np.ndarray[Any, Any] | None:
+    def _check_start(self) -> np.ndarray[Any, Any] | None:
         if not (self.causality in ("input", "parameter") or self.state):
             if self.start is not None:
                 raise ParameterError(f"{self.name} is computed, but has the start value {self.start}. Leave start out.")
@@ -138,23 +138,23 @@ class Variable:
 
     @property
     def flat_start(self) -> list[float]:
-        """The start values, flattened row by row; empty if it has none."""
+        """Start values, flattened row by row; empty if there are none."""
         return [] if self.start is None else [float(value) for value in np.ravel(np.asarray(self.start))]
 
 
 @dataclass(frozen=True)
-class Event:
-    """An event: its indicator z changes its domain, from z <= 0 to z > 0 or back.
+class EventSpec:
+    """Event of a model to export: its indicator z changes its domain, from z <= 0 to z > 0 or back.
 
-    The FMU's own integrators see a change that lasts over a quarter of a step, and a shorter one if the rate of z says
-    so; what swings several times within one integrator step can be missed: take shorter communication steps there.
+    The FMU's own integrators find a change that lasts over a quarter of a step, and a shorter one if the rate of z
+    shows it. Several changes within one integrator step can be missed: take shorter communication steps there.
 
     Parameters
     ----------
     name : str
-        As of a `Variable`; the FMU calls its indicator ``<name>.indicator``.
+        Name, like a `Variable`'s; the indicator's name in the FMU is ``<name>.indicator``.
     direction : {"both", "rising", "falling"}
-        Which changes fire it; rising is from z <= 0 to z > 0.
+        Direction of the changes that fire it; rising is from z <= 0 to z > 0.
     description : str
         One line.
     nominal : float
@@ -180,26 +180,26 @@ class Event:
 
     @property
     def indicator(self) -> str:
-        """Name of its indicator in the FMU."""
+        """Name of the indicator in the FMU."""
         return f"{self.name}.indicator"
 
 
 @dataclass(frozen=True, eq=False)
 class ModelSpec:
-    """A model to export: x' = derivative(t, x, u, p), y = output(t, x, u, p); at events x = jump(t, x, u, p, fired).
+    """Model to export: x' = derivative(t, x, u, p), y = output(t, x, u, p); at events x = jump(t, x, u, p, fired).
 
     All vectors are flat columns: the concatenation, in the order of the tuples, of each variable flattened row by row.
-    x is all states, the continuous ones first; x' is the rates of the continuous ones alone.
+    x holds all states, the continuous ones first; x' holds the rates of the continuous ones only.
 
     Parameters
     ----------
     name : str
-        A C identifier; it is FMI's modelName and modelIdentifier.
+        A C identifier, used as FMI's modelName and modelIdentifier.
     description : str
         One line.
     inputs, outputs, parameters, states : tuple of Variable
-        ``outputs`` are the computed ones. A state that is also an output is given once, in ``states``, with
-        causality "output". Discrete states follow the continuous ones.
+        ``outputs`` are the computed ones. A state that is also an output is listed once, in ``states``, with causality
+        "output". Discrete states follow the continuous ones.
     derivative : casadi.Function
         (t, x, u, p) -> (dx,).
     output : casadi.Function
@@ -207,9 +207,9 @@ class ModelSpec:
     internal_step : float
         Start value of the parameter ``internal_step``: longest step of the FMU's own integrator, s.
     stop_time, step_size : float
-        The default experiment, s.
-    events : tuple of Event
-        What may happen; without any, ``indicators`` and ``jump`` are None, and there are no discrete states.
+        Default experiment, s.
+    events : tuple of EventSpec
+        The events. Without events, ``indicators`` and ``jump`` are None, and there are no discrete states.
     indicators : casadi.Function, optional
         (t, x, u, p) -> (z,), one for each event.
     jump : casadi.Function, optional
@@ -218,7 +218,7 @@ class ModelSpec:
         Start value of the parameter ``integrator``: explicit Runge-Kutta of order 4 with the fixed ``internal_step``;
         explicit, adaptive, order 5(4); implicit, adaptive, order 4(3), for stiff models.
     tolerance : float
-        Start value of the parameter ``tolerance`` of the adaptive ones, relative; times ``nominal``, absolute.
+        Start value of the parameter ``tolerance`` of the adaptive integrators: relative; times ``nominal``, absolute.
     """
 
     name: str
@@ -232,7 +232,7 @@ class ModelSpec:
     internal_step: float = 1e-3
     stop_time: float = 1.0
     step_size: float = 1e-3
-    events: tuple[Event, ...] = ()
+    events: tuple[EventSpec, ...] = ()
     indicators: ca.Function | None = None
     jump: ca.Function | None = None
     integrator: Integrator = "rk4"
@@ -273,16 +273,16 @@ class ModelSpec:
 
     @property
     def continuous(self) -> tuple[Variable, ...]:
-        """The continuous states."""
+        """Continuous states."""
         return tuple(v for v in self.states if v.variability != "discrete")
 
     @property
     def discrete(self) -> tuple[Variable, ...]:
-        """The discrete states."""
+        """Discrete states."""
         return tuple(v for v in self.states if v.variability == "discrete")
 
     def __iter__(self) -> Iterator[Variable]:
-        """All variables: parameters, inputs, states, computed outputs."""
+        """Yield all variables: parameters, inputs, states, computed outputs."""
         yield from (*self.parameters, *self.inputs, *self.states, *self.outputs)
 
     def _check_kinds(self) -> None:
@@ -328,7 +328,7 @@ class ModelSpec:
                 block=self.name,
             )
 
-    def _check_function(self, field: str, n_out: int, what: str, *, fired: int | None = None) -> None:
+    def _check_function(self, field: str, n_out: int, contents: str, *, fired: int | None = None) -> None:
         f = getattr(self, field)
         letters = ["t", "x", "u", "p"] if fired is None else ["t", "x", "u", "p", "fired"]
         if not isinstance(f, ca.Function) or f.n_in() != len(letters) or f.n_out() != 1:
@@ -347,7 +347,7 @@ class ModelSpec:
                 )
         if f.numel_out(0) != n_out or (n_out and f.size2_out(0) != 1):
             raise DefinitionError(
-                f"found {f.size_out(0)[0]} x {f.size_out(0)[1]}, expected a column of {n_out}: {what}.",
+                f"found {f.size_out(0)[0]} x {f.size_out(0)[1]}, expected a column of {n_out}: {contents}.",
                 block=self.name,
                 port=field,
             )

@@ -1,7 +1,7 @@
-"""FMUs that carry Python: for equations that can't be traced, by the PythonFMU package.
+"""FMUs with Python inside, made by the package PythonFMU, for equations that can't be traced.
 
-They need an interpreter with NumPy and Loopwright where they run, and say so. What can be traced is better built by
-`loopwright.fmus.build`, whose FMUs need nothing.
+They need an interpreter with NumPy and Loopwright where they run, and their description says so. Build a block that can
+be traced with `loopwright.fmus.build`: such an FMU needs no other software.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from .html_page import block_text
 from .xml_fmi3 import _unit, package_version
 
 NEEDS = "Needs Python where it runs, with NumPy and Loopwright {version}: its equations are Python code."
-"""What is put behind the description of such an FMU."""
+"""Sentence at the end of such an FMU's description."""
 
 _INSTALL = 'Install it: pip install "loopwright[python-fmu]".'
 _MAKE = (
@@ -57,39 +57,39 @@ def build_python(
     files: Iterable[Path | str] = (),
     notify: Callable[[str], None] | None = None,
 ) -> Path:
-    """Export a block whose equations are any Python, as an FMI 2.0 co-simulation FMU that needs Python where it runs.
+    """Export a block with equations in any Python as an FMI 2.0 co-simulation FMU, which needs Python to run.
 
-    A continuous block is integrated by the Runge-Kutta method of order 4; a sampled one takes ``step_size`` as its
-    sample time, and steps must be multiples of it. Vectors are scalars with an index, ``s[1]``, ``s[2]``. The file
-    that defines the block's class goes into the FMU, unless it belongs to a package: then the package must be
-    installed where the FMU runs.
+    A continuous block is integrated by the Runge-Kutta method of order 4. A sampled block has ``step_size`` as its
+    sample time, and steps must be multiples of it. Vectors become scalars with an index, ``s[1]``, ``s[2]``. The file
+    that defines the block's class goes into the FMU. A file of a package does not: install the package where the FMU
+    runs.
 
     Parameters
     ----------
     block : Block
         The model.
     out : path, optional
-        File or folder for the FMU; the current folder without it.
+        File or folder for the FMU; without it, the current folder.
     name : str, optional
-        The model's name; the class name in lower case without one.
+        Name of the model; without it, the class name in lower case.
     internal_step : float
         Longest step of the integrator, s.
     stop_time, step_size : float
         Default experiment, s.
     files : iterable of path
-        Further files to take along: modules that the block's file imports, data.
+        Further files to include: modules that the block's file imports, data.
     notify : callable, optional
-        Called with a line of text before it takes long.
+        Called with a line of text before a long step.
 
     Raises
     ------
     DefinitionError
-        A block that can't be exported, or whose equations fail at the start values.
+        For a block that can't be exported, or whose equations fail at the start values.
     FmuError
-        PythonFMU is not installed, or fails.
+        If PythonFMU is not installed, or fails.
     """
     if importlib.util.find_spec("pythonfmu") is None:
-        raise FmuError(f"an FMU that carries Python is made by the package pythonfmu, which isn't there. {_INSTALL}")
+        raise FmuError(f"found no package pythonfmu; expected it, to make an FMU with Python inside. {_INSTALL}")
     name = name or type(block).__name__.lower()
     if not (name.isidentifier() and name.isascii()):
         raise DefinitionError(f"found {name!r} as the model's name; expected letters, digits and _, such as my_model.")
@@ -106,17 +106,17 @@ def build_python(
         "values": {k: {"kind": v["kind"], "shape": v["shape"], "start": v["start"]} for k, v in values.items()},
         "variables": _variables(values, kind),
     }
-    pickled = _pickled(block, name, None if source is None else type(block).__module__)
+    pickled = _pickle(block, name, None if source is None else type(block).__module__)
     taken = [path for path in (source, *map(Path, files)) if path is not None]
     for path in taken:
         if not path.exists():
-            raise DefinitionError(f"there is no file {str(path)!r} to take along. Check the path.", block=name)
+            raise DefinitionError(f"found no file {str(path)!r} to include. Check the path.", block=name)
     slave = (Path(__file__).parent / "python_slave.py").read_text(encoding="utf-8")
     digest = hashlib.sha256(repr((about, pickled, slave, package_version())).encode())
     for path in taken:
         digest.update(path.read_bytes() if path.is_file() else b"")
     about["guid"] = digest.hexdigest()[:32]
-    about["module"] = f"loopwright_{name}_{about['guid'][:8]}"  # one interpreter runs all: names must not clash
+    about["module"] = f"loopwright_{name}_{about['guid'][:8]}"  # one interpreter runs all FMUs, so names must differ
     (notify or (lambda message: None))(f"packing {name} with PythonFMU")
     with tempfile.TemporaryDirectory(prefix="loopwright-") as made:
         folder = Path(made)
@@ -127,14 +127,14 @@ def build_python(
         (folder / "in" / "loopwright.pickle").write_bytes(pickled)
         own = [folder / "in" / "loopwright.json", folder / "in" / "loopwright.pickle"]
         archive = _make(script, folder / "out", [*own, *taken], name, kind)
-        data = _completed(archive, about, values, block)
+        data = _complete(archive, about, values, block)
     target = Path.cwd() if out is None else Path(out)
     target = target / f"{name}.fmu" if target.is_dir() else target
     write_atomically(target, data)
     return target
 
 
-# --- what is exported -----------------------------------------------------------------------------------------------
+# --- content of the FMU ---------------------------------------------------------------------------------------------
 
 
 def _description(block: Block, name: str) -> str:
@@ -144,17 +144,19 @@ def _description(block: Block, name: str) -> str:
 
 def _kind(block: Block, name: str) -> str:
     if block.opaque:
-        raise DefinitionError("it has no equations of its own; export what it stands for.", block=name)
+        text = "found no equations of its own; expected a block with equations. Export the model that it represents."
+        raise DefinitionError(text, block=name)
     if block.events:
         raise DefinitionError(
             f"it has events ({', '.join(block.events)}), which an FMU with Python inside can't have so far; write its "
             "equations with NumPy functions and build it without Python.",
             block=name,
         )
-    for what in ("constants", "initial"):
-        if hasattr(block, what):
+    for equation in ("constants", "initial"):
+        if hasattr(block, equation):
             raise DefinitionError(
-                f"it has {what}(…), which an FMU with Python inside can't have; move it into the equations.", block=name
+                f"it has {equation}(…), which an FMU with Python inside can't have; move it into the equations.",
+                block=name,
             )
     if hasattr(block, "derivative"):
         return "continuous"
@@ -168,26 +170,26 @@ def _kind(block: Block, name: str) -> str:
 
 
 def _values(block: Block, name: str, kind: str) -> dict[str, dict[str, Any]]:
-    """Return what the FMU holds: kind, shape, start value, port or declaration of each."""
+    """Return the FMU's values by name: kind, shape, start value, and the port or declaration."""
     found: dict[str, dict[str, Any]] = {}
 
-    def put(key: str, what: str, start: Any, port: Any, **more: Any) -> None:
+    def put(key: str, role: str, start: Any, port: Any, **more: Any) -> None:
         array = np.asarray(start, dtype=float)
-        found[key] = {"kind": what, "shape": list(array.shape), "start": array.ravel().tolist(), "port": port} | more
+        found[key] = {"kind": role, "shape": list(array.shape), "start": array.ravel().tolist(), "port": port} | more
 
     shapes: dict[str, tuple[int, ...]] = {}
     for key, given in block.inputs.items():
         if given.shape is None:
-            raise DefinitionError("its shape is not declared; declare it with Input(shape=…).", block=name, port=key)
+            raise DefinitionError("found no declared shape; declare it with Input(shape=…).", block=name, port=key)
         shapes[key] = given.shape
         put(key, "input", np.broadcast_to(0.0 if given.default is None else given.default, given.shape), given)
     for key, value in traced_parameters(block):
-        put(key, "parameter", value, _declared(block, key))
+        put(key, "parameter", value, _declaration(block, key))
     for key, state in block.states.items():
         put(key, "state", state.start_value(block, shapes), state)
     x, u = (
         {k: float(v["start"][0]) if not v["shape"] else np.reshape(v["start"], v["shape"])
-         for k, v in found.items() if v["kind"] == what} for what in ("state", "input")
+         for k, v in found.items() if v["kind"] == role} for role in ("state", "input")
     )  # fmt: skip
     outputs = {k: p for k, p in block.outputs.items() if k not in block.states}
     if outputs and not hasattr(block, "output"):
@@ -195,22 +197,23 @@ def _values(block: Block, name: str, kind: str) -> dict[str, dict[str, Any]]:
             f"it declares the outputs {', '.join(outputs)} but has no output(t, x, u); write it.", block=name
         )
     rates = {"continuous": ["derivative"], "sampled": ["update"]}.get(kind, [])
-    for what, ports in [*((rate, block.states) for rate in rates), *([("output", outputs)] if outputs else [])]:
-        for (key, port), value in zip(ports.items(), _called(block, name, what, x, u, len(ports)), strict=True):
+    for equation, ports in [*((rate, block.states) for rate in rates), *([("output", outputs)] if outputs else [])]:
+        made = _call_at_start(block, name, equation, x, u, len(ports))
+        for (key, port), value in zip(ports.items(), made, strict=True):
             shape = list(np.shape(value))
-            expected = tuple(found[key]["shape"]) if what != "output" else port.shape
+            expected = tuple(found[key]["shape"]) if equation != "output" else port.shape
             if expected is not None and tuple(shape) != expected:
                 raise DefinitionError(
-                    f"its {what} gives shape {tuple(shape)}; expected {expected}.", block=name, port=key
+                    f"its {equation} gives shape {tuple(shape)}; expected {expected}.", block=name, port=key
                 )
-            if what == "output":
+            if equation == "output":
                 put(key, "output", value, port)
     return found
 
 
-def _called(block: Block, name: str, what: str, x: Any, u: Any, count: int) -> tuple[Any, ...]:
-    """Evaluate an equation at the start values."""
-    function = getattr(block, what)
+def _call_at_start(block: Block, name: str, equation: str, x: Any, u: Any, count: int) -> tuple[Any, ...]:
+    """Return an equation's results at the start values."""
+    function = getattr(block, equation)
     sampled = "T" in inspect.signature(function).parameters and not hasattr(block, "derivative")
     try:
         made = function(0.0, bundle("x", x), bundle("u", u), **({"T": 1.0} if sampled else {}))
@@ -219,20 +222,20 @@ def _called(block: Block, name: str, what: str, x: Any, u: Any, count: int) -> t
     except Exception as error:
         step, line = error.__traceback__, ""
         while step is not None:
-            if step.tb_frame.f_code.co_name == what:
+            if step.tb_frame.f_code.co_name == equation:
                 line = f" in line {step.tb_lineno} of {step.tb_frame.f_code.co_filename}"
             step = step.tb_next
         raise DefinitionError(
-            f"its {what} fails at the start values{line}: {type(error).__name__}: {error}. Correct it, or the start "
-            "values.",
+            f"its {equation} fails at the start values{line}: {type(error).__name__}: {error}. Correct it, or the "
+            "start values.",
             block=name,
         ) from error
     if len(parts) != count:
-        raise DefinitionError(f"its {what} returned {len(parts)} values; expected {count}.", block=name)
+        raise DefinitionError(f"its {equation} returned {len(parts)} values; expected {count}.", block=name)
     return parts
 
 
-def _declared(block: Any, name: str) -> Any:
+def _declaration(block: Any, name: str) -> Any:
     *outer, last = name.split(".")
     for part in outer:
         block = block.__dict__[part]
@@ -244,11 +247,11 @@ def _variables(values: dict[str, dict[str, Any]], kind: str) -> list[dict[str, A
     found = []
     running = "discrete" if kind == "sampled" else "continuous"
     for key, v in values.items():
-        what, port = v["kind"], v["port"]
-        causality = {"input": "input", "parameter": "parameter", "output": "output"}.get(what, "local")
-        if what == "state" and port.output:
+        role, port = v["kind"], v["port"]
+        causality = {"input": "input", "parameter": "parameter", "output": "output"}.get(role, "local")
+        if role == "state" and port.output:
             causality = "output"
-        variability = running if what != "parameter" else "tunable" if getattr(port, "tunable", True) else "fixed"
+        variability = running if role != "parameter" else "tunable" if getattr(port, "tunable", True) else "fixed"
         for i, index in enumerate(np.ndindex(*v["shape"])):
             suffix = f"[{','.join(str(n + 1) for n in index)}]" if index else ""
             found.append(
@@ -258,7 +261,7 @@ def _variables(values: dict[str, dict[str, Any]], kind: str) -> list[dict[str, A
                     "index": i,
                     "causality": causality,
                     "variability": variability,
-                    "initial": {"input": None, "output": "calculated"}.get(what, "exact"),
+                    "initial": {"input": None, "output": "calculated"}.get(role, "exact"),
                     "description": port.description,
                 }
             )
@@ -269,21 +272,21 @@ def _variables(values: dict[str, dict[str, Any]], kind: str) -> list[dict[str, A
 
 
 def _source(block: Block, name: str) -> Path | None:
-    """Return the file to take along, None where the class belongs to a package that can be imported."""
+    """Return the file to include; None if the class belongs to a package that can be imported."""
     module = sys.modules.get(type(block).__module__)
     if module is not None and getattr(module, "__package__", None):
         return None
     file = getattr(module, "__file__", None)
     if file is None or not Path(file).is_file():
         raise DefinitionError(
-            "its class was not defined in a file, so that there is nothing to take along; write it into a .py file.",
+            "found a class that is not defined in a file; expected a file to include. Write it into a .py file.",
             block=name,
         )
     return Path(file)
 
 
 class _Pickler(pickle.Pickler):
-    """Writes what the block's own file defines by its name in that file."""
+    """Pickler that writes objects of the block's own file by their names in that file."""
 
     def __init__(self, stream: io.BytesIO, module: str | None):
         super().__init__(stream, protocol=4)
@@ -294,17 +297,18 @@ class _Pickler(pickle.Pickler):
         return item.__qualname__ if own and self._module is not None else None
 
 
-def _pickled(block: Block, name: str, module: str | None) -> bytes:
+def _pickle(block: Block, name: str, module: str | None) -> bytes:
     stream = io.BytesIO()
     try:
         _Pickler(stream, module).dump(block)
-    except Exception as error:  # what it raises depends on the object
+    except Exception as error:  # the exception depends on the object
         raise DefinitionError(
             f"its parameters can't be written into the FMU: {error}. Keep to numbers, text and classes of its file.",
             block=name,
         ) from error
     if "<locals>" in type(block).__qualname__:
-        raise DefinitionError("its class is defined inside a function; define it at the top of its file.", block=name)
+        text = "found a class that is defined inside a function; define it at the top of its file."
+        raise DefinitionError(text, block=name)
     return stream.getvalue()
 
 
@@ -312,7 +316,7 @@ def _pickled(block: Block, name: str, module: str | None) -> bytes:
 
 
 def _make(script: Path, out: Path, files: list[Path], name: str, kind: str) -> Path:
-    """Run PythonFMU's builder in a process of its own: it leaves modules and paths behind, and runs the block."""
+    """Run PythonFMU's builder in a process of its own, since it leaves modules and paths behind and runs the block."""
     options = {
         "needsExecutionTool": True,
         "canHandleVariableCommunicationStepSize": kind != "sampled",
@@ -328,13 +332,13 @@ def _make(script: Path, out: Path, files: list[Path], name: str, kind: str) -> P
         said = "\n".join((done.stderr.strip() or done.stdout.strip() or "(nothing)").splitlines()[-12:])
         raise FmuError(
             f"PythonFMU failed for {name}. Its message:\n{said}\n"
-            "Where a module is missing, take it along with files=[…], or install it."
+            "If a module is missing, include it with files=[…], or install it."
         )
     return made
 
 
-def _completed(file: Path, about: dict[str, Any], values: dict[str, dict[str, Any]], block: Block) -> bytes:
-    """Add what PythonFMU leaves out: units, limits, initial unknowns, a page of documentation."""
+def _complete(file: Path, about: dict[str, Any], values: dict[str, dict[str, Any]], block: Block) -> bytes:
+    """Add the parts that PythonFMU leaves out: units, limits, initial unknowns, a page of documentation."""
     with zipfile.ZipFile(file) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
     root = ET.fromstring(files["modelDescription.xml"])

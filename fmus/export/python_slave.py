@@ -1,10 +1,10 @@
-"""What runs inside an FMU that needs Python: copied into it by `python_fmu.py`, never imported from here.
+"""Program inside an FMU that needs Python: `python_fmu.py` copies it there; it is never imported from here.
 
-It stands beside ``loopwright.json`` (variables and steps), ``loopwright.pickle`` (the block) and, where the block comes
-from a file of its own, that file. PythonFMU makes one object of the class for each instance of the FMU.
+It is beside ``loopwright.json`` (variables and steps), ``loopwright.pickle`` (the block) and, if the block comes from a
+file of its own, that file. PythonFMU makes one object of the class for each instance of the FMU.
 """
 
-# PythonFMU finds the class by importing this file: nothing here may be imported that the FMU doesn't need.
+# PythonFMU finds the class by importing this file, so it imports only modules that the FMU needs.
 import atexit
 import contextlib
 import ctypes
@@ -24,20 +24,22 @@ import numpy as np
 from pythonfmu import DefaultExperiment, Fmi2Causality, Fmi2Initial, Fmi2Slave, Fmi2Variability, Real
 
 _KEPT: list[Any] = []
-"""What PythonFMU 0.7 would free twice after an exception: it lets go of an instance when a call fails, and once more
-with the FMU. Without more references to it, the process crashes sooner or later."""
+"""Extra references to objects that PythonFMU 0.7 frees twice after an exception: it releases an instance when a call
+fails, and once more with the FMU. Without these references the process crashes sooner or later."""
 
 
 def _end_cleanly(resources: Path, name: str) -> None:
-    """Have the FMU's library let go of the interpreter while Python still runs.
+    """Make the FMU's library release the interpreter while Python still runs.
 
-    PythonFMU 0.7 does so once more when the process ends, by a pointer that has been freed by then: the process aborts
-    now and then, after all its work. On the second call the pointer is null.
+    PythonFMU 0.7 releases it again when the process ends, by a pointer that is freed by then: the process sometimes
+    aborts, after all its work. After this call the pointer is null.
     """
     library = resources.parent / "binaries" / "linux64" / f"{name}.so"
     if not sys.platform.startswith("linux") or str(library) in _ENDING:
         return
-    with contextlib.suppress(OSError, AttributeError):  # not loaded from there (while it is built), or mended
+    with contextlib.suppress(
+        OSError, AttributeError
+    ):  # not loaded from there (while it is built), or fixed in PythonFMU
         _ENDING[str(library)] = end = ctypes.CDLL(str(library), mode=os.RTLD_NOLOAD).finalizePythonInterpreter
         end.argtypes, end.restype = [], None
         atexit.register(end)
@@ -47,7 +49,7 @@ _ENDING: dict[str, Any] = {}
 
 
 class _Unpickler(pickle.Unpickler):
-    """Finds what the block's own file defines in the copy beside this file."""
+    """Unpickler that finds objects of the block's own file in the copy beside this file."""
 
     def __init__(self, stream: Any, module: Any):
         super().__init__(stream)
@@ -82,7 +84,7 @@ def _load(folder: Path, about: dict[str, Any]) -> Any:
 
 
 class LoopwrightSlave(Fmi2Slave):  # type: ignore[misc]
-    """A block's equations, evaluated with NumPy."""
+    """Slave of PythonFMU that evaluates a block's equations with NumPy."""
 
     def __init__(self, **kwargs: Any):
         super().__init__(**kwargs)
@@ -115,7 +117,7 @@ class LoopwrightSlave(Fmi2Slave):  # type: ignore[misc]
             try:
                 self._evaluate()
             except Exception as error:
-                raise self._failed(error) from error
+                raise self._error_to_raise(error) from error
         return float(self._values[name].flat[index])
 
     def _set(self, name: str, index: int, value: float) -> None:
@@ -128,17 +130,17 @@ class LoopwrightSlave(Fmi2Slave):  # type: ignore[misc]
         self._t = start_time
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Advance the states; where that fails, they stay as they were."""
+        """Advance the states; if that fails, they stay unchanged."""
         before = self._get_fmu_state()
         try:
             self._advance(current_time, step_size)
         except Exception as error:
             self._set_fmu_state(before)
-            raise self._failed(error) from error
+            raise self._error_to_raise(error) from error
         return True
 
-    def _failed(self, error: Exception) -> Exception:
-        """Return the error to raise: PythonFMU shows no more of it than its text."""
+    def _error_to_raise(self, error: Exception) -> Exception:
+        """Return the error to raise, with the line in its text, since PythonFMU shows the text only."""
         _KEPT.extend([self, self.log_queue, type(self)] * 4)
         line, step = "", error.__traceback__
         while step is not None:
@@ -158,19 +160,19 @@ class LoopwrightSlave(Fmi2Slave):  # type: ignore[misc]
             if n < 1 or abs(step_size - n * T) > 1e-9 * step_size:
                 raise ValueError(f"found a step of {step_size} s; expected a multiple of its sample time, {T} s")
             for i in range(n):
-                self._store(self._flat("update", current_time + i * T, self._states()))
+                self._store(self._call_flat("update", current_time + i * T, self._states()))
         self._t, self._stale = current_time + step_size, True
         self._evaluate()
 
     def _integrate(self, t: float, h: float, n: int) -> None:
-        """Take n steps of the Runge-Kutta method of order 4, inputs held."""
+        """Take n steps of the Runge-Kutta method of order 4, with inputs held."""
         x = self._states()
         for i in range(n):
             a = t + i * h
-            k1 = self._flat("derivative", a, x)
-            k2 = self._flat("derivative", a + h / 2, x + h / 2 * k1)
-            k3 = self._flat("derivative", a + h / 2, x + h / 2 * k2)
-            k4 = self._flat("derivative", a + h, x + h * k3)
+            k1 = self._call_flat("derivative", a, x)
+            k2 = self._call_flat("derivative", a + h / 2, x + h / 2 * k1)
+            k3 = self._call_flat("derivative", a + h / 2, x + h / 2 * k2)
+            k4 = self._call_flat("derivative", a + h, x + h * k3)
             x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         self._store(x)
 
@@ -196,27 +198,28 @@ class LoopwrightSlave(Fmi2Slave):  # type: ignore[misc]
             found[name], at = x[at : at + n].reshape(shape), at + n
         return found
 
-    def _call(self, what: str, t: float, x: Any, count: int) -> Any:
+    def _call(self, equation: str, t: float, x: Any, count: int) -> Any:
         if self._changed:
             changes = {name: self._values[name] for name in self._names("parameter")}
-            self._block, self._changed = _replaced(self._given, changes), False
+            self._block, self._changed = _replace(self._given, changes), False
         states = {n: float(v) if np.ndim(v) == 0 else v for n, v in self._split(x).items()}
         inputs = {n: float(v) if np.ndim(v := self._values[n]) == 0 else v.copy() for n in self._names("input")}
-        function = getattr(self._block, what)
+        function = getattr(self._block, equation)
         sampled = self._about["kind"] == "sampled" and "T" in inspect.signature(function).parameters
         keywords = {"T": self._about["step_size"]} if sampled else {}
         made = function(t, _bundle("x", states), _bundle("u", inputs), **keywords)
         parts = (made,) if count == 1 else tuple(made)
         if len(parts) != count:
-            raise ValueError(f"its {what} returned {len(parts)} values; expected {count}")
+            raise ValueError(f"its {equation} returned {len(parts)} values; expected {count}")
         return parts
 
-    def _flat(self, what: str, t: float, x: Any) -> Any:
+    def _call_flat(self, equation: str, t: float, x: Any) -> Any:
         names = self._names("state")
-        parts = [np.asarray(part, dtype=float) for part in self._call(what, t, x, len(names))]
+        parts = [np.asarray(part, dtype=float) for part in self._call(equation, t, x, len(names))]
         for name, part in zip(names, parts, strict=True):
             if part.shape != self._values[name].shape:
-                raise ValueError(f"its {what} gives shape {part.shape} for {name}; expected {self._values[name].shape}")
+                expected = self._values[name].shape
+                raise ValueError(f"its {equation} gives shape {part.shape} for {name}; expected {expected}")
         return np.concatenate([*(part.ravel() for part in parts), np.zeros(0)])
 
     def _evaluate(self) -> None:
@@ -242,10 +245,10 @@ def _bundle(kind: str, values: dict[str, Any]) -> Any:
     return namedtuple(kind, values)(**values)
 
 
-def _replaced(block: Any, changes: dict[str, Any]) -> Any:
-    """Return the block with other parameters, through its constructor, so that their bounds are checked."""
+def _replace(block: Any, changes: dict[str, Any]) -> Any:
+    """Return the block with other parameters, made by its constructor, which checks their bounds."""
     own = {name: value for name, value in changes.items() if "." not in name}
     for head in {name.partition(".")[0] for name in changes if "." in name}:
         inner = {name.partition(".")[2]: v for name, v in changes.items() if name.startswith(f"{head}.")}
-        own[head] = _replaced(getattr(block, head), inner)
+        own[head] = _replace(getattr(block, head), inner)
     return block.replace(**own)

@@ -1,4 +1,4 @@
-"""The type definitions of an FMU: one for each unit, by the quantity that it measures (FMI 3.0, 2.4.4; 2.0, 2.2.3)."""
+"""Type definitions of an FMU: one for each unit, by the quantity that it measures (FMI 3.0, 2.4.4; 2.0, 2.2.3)."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ _QUANTITIES = {
 
 
 def type_names(entries: Iterable[Entry]) -> dict[str, str]:
-    """Return the name of the type of each unit that is used, in the order of the units.
+    """Return the name of the type of each unit in use, in the order of the units.
 
-    A unit that measures one of the common quantities gives its type that name, any other its own; a name that a
-    variable has already gets an underscore, since the two must differ.
+    The name is that of the unit's quantity if it is a common one, else the unit's own. A name that a variable has
+    already gets an underscore, since the two must differ.
     """
     entries = tuple(entries)
     taken = {e.name for e in entries}
@@ -52,7 +52,7 @@ def type_names(entries: Iterable[Entry]) -> dict[str, str]:
 
 
 def quantity(unit: str) -> str | None:
-    """Return the quantity that a unit measures, by its own spelling first, then by its dimension; None if unknown."""
+    """Return the quantity that a unit measures, by its spelling, else by its dimension; None if unknown."""
     if unit in _QUANTITIES:
         return _QUANTITIES[unit]
     exponents = parse_unit(unit).exponents

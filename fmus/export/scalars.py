@@ -1,4 +1,4 @@
-"""Scalars in place of arrays, for FMI 2.0 and for importers that read no arrays."""
+"""Scalars in place of arrays, for FMI 2.0 and for importers that can't read arrays."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from .model import ModelSpec, Variable
 
 
 def _elements(variable: Variable) -> Iterator[Variable]:
-    """Give each element, row by row: ``s[1]``, ``s[2]``; ``m[1,2]``: FMI counts from 1 (FMI 2.0, 2.2.9)."""
+    """Yield each element, row by row: ``s[1]``, ``s[2]``; ``m[1,2]``. FMI counts from 1 (FMI 2.0, 2.2.9)."""
     for index in np.ndindex(variable.shape):
         start = None if variable.start is None else float(np.asarray(variable.start)[index])
         element = replace(variable, shape=(), start=start)
-        # Past the check of names: an index is no part of a name that a user may give.
+        # This bypasses the check of names, since users may give no name with an index.
         object.__setattr__(element, "name", f"{variable.name}[{','.join(str(i + 1) for i in index)}]")
         yield element
 
@@ -24,8 +24,8 @@ def _scalars(variables: Iterable[Variable]) -> tuple[Variable, ...]:
     return tuple(e for v in variables for e in (_elements(v) if v.shape else (v,)))
 
 
-def scalarized(spec: ModelSpec) -> ModelSpec:
-    """Give the same model with every array replaced by its elements; the flat vectors, and so the equations, stay.
+def scalarize(spec: ModelSpec) -> ModelSpec:
+    """Return the model with every array replaced by its elements; the flat vectors, and so the equations, are the same.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def scalarized(spec: ModelSpec) -> ModelSpec:
     Returns
     -------
     ModelSpec
-        The model, all variables of shape ``()``.
+        The model, with all variables of shape ``()``.
     """
     return replace(
         spec,

@@ -1,6 +1,6 @@
-"""``modelDescription.xml`` of an FMI 2.0 FMU: all variables are scalars of type Real.
+"""File ``modelDescription.xml`` of an FMI 2.0 FMU: all variables are scalars of type Real.
 
-A function of the model alone, as that of FMI 3.0: no time stamp, no random identifier.
+It depends on the model only, like that of FMI 3.0: it has no time stamp and no random identifier.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from .xml_fmi3 import (
     LOG_CATEGORIES,
     Dependency,
     _element,
-    _reinitialized,
+    _reinitialized_states,
     _types,
     _units_and_types,
     dependencies,
@@ -48,7 +48,7 @@ def _variable(e: Entry, reinitialized: set[str], types: Mapping[str, str]) -> st
 
 
 def _index(reference: int) -> int:
-    """Give the index of a variable, which FMI 2.0 counts from 1: value references follow the order of the variables."""
+    """Return the index of a variable, which FMI 2.0 counts from 1; value references follow the variables' order."""
     return reference + 1
 
 
@@ -71,36 +71,36 @@ def _unknowns(
 
 
 def _structure(spec: ModelSpec, entries: tuple[Entry, ...]) -> list[str]:
-    """Write the model structure (FMI 2.0, 2.2.8).
+    """Return the elements of the model structure (FMI 2.0, 2.2.8).
 
-    Knowns of outputs and derivatives are inputs, continuous states and time alone; initial unknowns are those of
-    FMI 3.0, and of the kinds of dependency only "constant" and "dependent" are theirs.
+    Knowns of outputs and derivatives are inputs, continuous states and time only. Initial unknowns are those of FMI
+    3.0, with "constant" and "dependent" as the only kinds of dependency.
     """
     found = dependencies(spec)
     knowns = {e.reference for e in entries if e.kind in ("time", "input", "state")}
 
-    def running(d: Dependency) -> str | None:
+    def kind_in_run(d: Dependency) -> str | None:
         return d.kind if d.known in knowns else None
 
-    def initial(d: Dependency) -> str:
+    def kind_at_start(d: Dependency) -> str:
         return d.kind if d.kind == "constant" else "dependent"
 
     return [
-        *_unknowns("Outputs", [e for e in entries if e.is_output], found, running),
-        *_unknowns("Derivatives", [e for e in entries if e.kind == "derivative"], found, running),
-        *_unknowns("InitialUnknowns", [e for e in entries if e.kind in ("derivative", "output")], found, initial),
+        *_unknowns("Outputs", [e for e in entries if e.is_output], found, kind_in_run),
+        *_unknowns("Derivatives", [e for e in entries if e.kind == "derivative"], found, kind_in_run),
+        *_unknowns("InitialUnknowns", [e for e in entries if e.kind in ("derivative", "output")], found, kind_at_start),
     ]
 
 
 def model_description2(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
-    """Write ``modelDescription.xml`` (FMI 2.0, 2.2).
+    """Return the text of ``modelDescription.xml`` (FMI 2.0, 2.2).
 
     Parameters
     ----------
     spec : ModelSpec
-        The model, without arrays (`_scalars.scalarized`).
+        The model, without arrays (`scalarize`).
     token : str
-        Its GUID.
+        The GUID.
     derivatives : bool
         Whether the binary has directional derivatives.
     """
@@ -137,7 +137,7 @@ def model_description2(spec: ModelSpec, token: str, *, derivatives: bool) -> str
         "tolerance": float(spec.tolerance),
         "stepSize": float(spec.step_size),
     }
-    reinitialized = _reinitialized(spec)
+    reinitialized = _reinitialized_states(spec)
     children = [
         _element("ModelExchange", both | {"completedIntegratorStepNotNeeded": True}, [sources]),
         _element("CoSimulation", both | stepping, [sources]),

@@ -1,6 +1,6 @@
-"""The two XML files of an FMI 3.0 FMU: ``modelDescription.xml`` and ``sources/buildDescription.xml``.
+"""XML files of an FMI 3.0 FMU: ``modelDescription.xml`` and ``sources/buildDescription.xml``.
 
-Both are functions of the model alone: no time stamp, no random identifier.
+Both depend on the model only: they have no time stamp and no random identifier.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ import casadi as ca
 
 from ...blocks.core.layout import Layout
 from ...blocks.core.units import BASE_UNITS, parse_unit
-from .c_code import Entry, layout, scalar, symbolic
+from .c_code import Entry, expand_scalar, layout, to_symbols
 from .model import ModelSpec
 from .quantities import quantity, type_names
 
 #: Log categories (FMI 3.0, 2.4.5) that the runtime uses.
 LOG_CATEGORIES = {
     "logStatusWarning": "Warnings",
-    "logStatusError": "Errors: what was found, what was expected, and what to do",
+    "logStatusError": "Errors, with the value found, the value expected, and the next step",
 }
-# Operations with a derivative of zero almost everywhere: behind them, a constant derivative is no linear equation.
+# Operations whose derivative is zero almost everywhere: with them, a constant derivative means no linear equation.
 _STEP_LIKE = {ca.OP_FLOOR, ca.OP_CEIL, ca.OP_SIGN, ca.OP_COPYSIGN, ca.OP_FMOD, ca.OP_REMAINDER, ca.OP_IF_ELSE_ZERO}
 _STEP_LIKE |= {ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_NOT, ca.OP_AND, ca.OP_OR}
 
 
 @lru_cache(maxsize=1)
 def package_version() -> str:
-    """Version of this package, ``0`` where it is not installed."""
+    """Return the version of this package; ``0`` if it is not installed."""
     try:
         return importlib.metadata.version("loopwright")
     except importlib.metadata.PackageNotFoundError:
@@ -41,12 +41,12 @@ def package_version() -> str:
 
 @dataclass(frozen=True)
 class Dependency:
-    """That an unknown depends on a known (FMI 3.0, 2.4.8).
+    """Dependency of an unknown on a known (FMI 3.0, 2.4.8).
 
     Parameters
     ----------
     known : int
-        Value reference.
+        Value reference of the known.
     kind : str
         FMI's dependenciesKind: constant, fixed, tunable or dependent.
     """
@@ -79,7 +79,7 @@ def _entry_at(entries: tuple[Entry, ...]) -> list[Entry]:
 
 
 def _second_order(knowns: Any, unknowns: Any) -> dict[tuple[int, int], set[int]] | None:
-    """For each element (unknown, known) of the Jacobian, which knowns it depends on; None if it can't be said."""
+    """Return the knowns on which each element (unknown, known) of the Jacobian depends; None if they can't be found."""
     try:
         f = ca.Function("f", [knowns], [unknowns]).expand()
     except RuntimeError:  # interpolation tables and the like have no scalar expansion
@@ -97,7 +97,7 @@ def _second_order(knowns: Any, unknowns: Any) -> dict[tuple[int, int], set[int]]
 
 
 def _kind(of: Iterable[set[int] | None], at: list[Entry]) -> str:
-    """Say how a known enters, from what the elements of its Jacobian depend on (None: not known)."""
+    """Return the kind of a dependency, from the knowns on which its Jacobian's elements depend (None: not found)."""
     kinds: set[str] = set()
     for elements in of:
         if elements is None:
@@ -109,7 +109,7 @@ def _kind(of: Iterable[set[int] | None], at: list[Entry]) -> str:
 
 
 def dependencies(spec: ModelSpec) -> dict[int, tuple[Dependency, ...]]:
-    """Find what each output, derivative and event indicator depends on, among time, parameters, inputs and states.
+    """Return the dependencies of outputs, derivatives and event indicators on time, parameters, inputs and states.
 
     Parameters
     ----------
@@ -119,11 +119,11 @@ def dependencies(spec: ModelSpec) -> dict[int, tuple[Dependency, ...]]:
     Returns
     -------
     dict
-        By value reference of the unknown: its dependencies, in the order of value references.
+        Dependencies by the value reference of the unknown, in the order of value references.
     """
     entries = layout(spec)
     at = _entry_at(entries)
-    knowns, unknowns = symbolic(spec)
+    knowns, unknowns = to_symbols(spec)
     calculated = ("derivative", "output", "indicator")
     first = next((e.first for e in entries if e.kind in calculated), 0)
     second = _second_order(knowns, unknowns)
@@ -135,9 +135,9 @@ def dependencies(spec: ModelSpec) -> dict[int, tuple[Dependency, ...]]:
     for unknown, known in sorted(blocks):
         found[unknown].append(Dependency(known, _kind(blocks[unknown, known], at)))
     for e in entries:
-        if e.kind == "state" and e.is_output:  # it is its own known
+        if e.kind == "state" and e.is_output:  # a state is its own known
             found[e.reference] = [Dependency(e.reference, "constant")]
-        if e.kind == "discrete" and e.is_output:  # it changes between two iterations of an event alone
+        if e.kind == "discrete" and e.is_output:  # it changes only between two iterations of an event
             found[e.reference] = []
     return {reference: tuple(items) for reference, items in found.items()}
 
@@ -153,11 +153,11 @@ def _unknown(tag: str, reference: int, items: Iterable[Dependency]) -> str:
 
 
 def _structure(spec: ModelSpec, entries: tuple[Entry, ...]) -> list[str]:
-    """Write the model structure (FMI 3.0, 2.4.8).
+    """Return the elements of the model structure (FMI 3.0, 2.4.8).
 
     Outputs, derivatives and event indicators list the knowns that can change between events or communication points;
-    fixed parameters and discrete states are frozen then. Initial unknowns are computed outputs and derivatives; states
-    have initial = exact and are knowns.
+    fixed parameters and discrete states are constant there. Initial unknowns are computed outputs and derivatives;
+    states have initial = exact and are knowns.
     """
     found = dependencies(spec)
     frozen = {e.reference for e in entries if e.kind in ("fixed", "discrete")}
@@ -178,11 +178,11 @@ def _structure(spec: ModelSpec, entries: tuple[Entry, ...]) -> list[str]:
     return rows
 
 
-def _reinitialized(spec: ModelSpec) -> set[str]:
-    """Name the continuous states that a jump may change (FMI 3.0, 2.4.7.4: reinit)."""
+def _reinitialized_states(spec: ModelSpec) -> set[str]:
+    """Return the names of the continuous states that a jump may change (FMI 3.0, 2.4.7.4: reinit)."""
     if spec.jump is None:
         return set()
-    jump = scalar(spec.jump)
+    jump = expand_scalar(spec.jump)
     if not jump.is_a("SXFunction"):
         return {v.name for v in spec.continuous}
     args = jump.sx_in()
@@ -232,12 +232,12 @@ def _unit(text: str) -> str:
 
 
 def _types(types: Mapping[str, str]) -> list[dict[str, object]]:
-    """Give the attributes of each type."""
+    """Return the attributes of each type."""
     return [{"name": name, "quantity": quantity(unit), "unit": unit} for unit, name in types.items()]
 
 
 def _units_and_types(units: Iterable[str], types: Iterable[str]) -> list[str]:
-    """Write both lists of definitions; a model without units has neither."""
+    """Return the elements of both lists of definitions; none for a model without units."""
     lists = (("UnitDefinitions", [_unit(unit) for unit in units]), ("TypeDefinitions", list(types)))
     return [_element(tag, {}, items) for tag, items in lists if items]
 
@@ -246,14 +246,14 @@ def _units_and_types(units: Iterable[str], types: Iterable[str]) -> list[str]:
 
 
 def model_description(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
-    """Write ``modelDescription.xml`` (FMI 3.0, 2.4).
+    """Return the text of ``modelDescription.xml`` (FMI 3.0, 2.4).
 
     Parameters
     ----------
     spec : ModelSpec
         The model.
     token : str
-        Its instantiation token.
+        The instantiation token.
     derivatives : bool
         Whether the binary has directional and adjoint derivatives.
     """
@@ -287,7 +287,7 @@ def model_description(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
         "tolerance": float(spec.tolerance),
         "stepSize": float(spec.step_size),
     }
-    reinitialized = _reinitialized(spec)
+    reinitialized = _reinitialized_states(spec)
     types = type_names(entries)
     categories = [_element("Category", {"name": n, "description": d}) for n, d in LOG_CATEGORIES.items()]
     children = [
@@ -303,7 +303,7 @@ def model_description(spec: ModelSpec, token: str, *, derivatives: bool) -> str:
 
 
 def build_description(spec: ModelSpec) -> str:
-    """Write ``sources/buildDescription.xml`` (FMI 3.0, 2.5.1.3): the one file to compile."""
+    """Return the text of ``sources/buildDescription.xml`` (FMI 3.0, 2.5.1.3), with the one file to compile."""
     files = _element("SourceFileSet", {"language": "C11"}, [_element("SourceFile", {"name": "model.c"})])
     configuration = _element("BuildConfiguration", {"modelIdentifier": spec.name}, [files])
     root = _element("fmiBuildDescription", {"fmiVersion": "3.0"}, [configuration])

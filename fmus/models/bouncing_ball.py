@@ -1,8 +1,8 @@
-"""A ball that bounces on the floor: ḣ = v, v̇ = −g, and at an impact, where h falls through 0, v⁺ = −e v⁻.
+"""Ball that bounces on the floor: ḣ = v, v̇ = −g, and at an impact, where h falls through 0, v⁺ = −e v⁻.
 
-Each bounce takes e times the time of the last, so that all of them are over by a finite time. At the first impact that
-would leave with less than ``resting_speed`` the ball therefore comes to rest: h = v = 0 from then on. It must start
-above the floor.
+Each bounce takes e times the time of the last, so that all bounces end within a finite time. Therefore the ball comes
+to rest at the first impact that it would leave with less than ``resting_speed``: then h = v = 0. It must start above
+the floor.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from ..export.from_block import build as _build
 
 
 class BouncingBall(Block):
-    """A ball that bounces on the floor and comes to rest."""
+    """Ball that bounces on the floor and comes to rest."""
 
     gravity: float = parameter(default=9.81, unit="m/s2", above=0.0, description="gravitational acceleration g")
     restitution: float = parameter(
         default=0.7, unit="1", minimum=0.0, maximum=1.0, description="coefficient of restitution e"
     )
     resting_speed: float = parameter(
-        default=0.01, unit="m/s", minimum=0.0, description="an impact that would leave slower than this is the last"
+        default=0.01, unit="m/s", minimum=0.0, description="the ball rests after an impact that would leave it slower"
     )
     start_height: float = parameter(
         default=1.0, unit="m", above=0.0, structural=True, description="height at the start"

@@ -1,4 +1,4 @@
-"""A direct current motor with permanent magnets, driven by a voltage against a load.
+"""Direct-current motor with permanent magnets, driven by a voltage against a load.
 
     L i̇ = u − R i − K ω
     J ω̇ = K i − b ω − τ_L
@@ -19,7 +19,7 @@ from ..export.from_block import build as _build
 
 
 class DcMotor(Block):
-    """A direct current motor with permanent magnets, driven by a voltage against a load."""
+    """Direct-current motor with permanent magnets, driven by a voltage against a load."""
 
     resistance: float = parameter(default=1.2, unit="Ohm", above=0.0, description="resistance R of the armature")
     inductance: float = parameter(default=2e-3, unit="H", above=0.0, description="inductance L of the armature")

@@ -1,4 +1,4 @@
-"""The biaxial gantry robot of Flixeder, Glück, Böck, Kugi (2014), section II, with the parameters of their Table II.
+"""Biaxial gantry robot of Flixeder, Glück, Böck, Kugi (2014), section II, with the parameters of their Table II.
 
 Two linear axes, y and z, each driven through a ball screw that is stiff and without backlash. With F the force on the
 end effector (E1, E6):
@@ -6,7 +6,8 @@ end effector (E1, E6):
     (m_t,i + m_J,i) s̈_i = u_i − F_F,i(ṡ_i) − F_G,i + F_i,        i ∈ {y, z}
     F_F,i(v) = F_c,i tanh(v / w) + c_v,i v,   F_G,y = 0,   F_G,z = g m_t,z
 
-``gantry.build()`` makes the FMU, ``gantry.nominal`` is the model that a controller inverts: one definition.
+``gantry.build()`` makes the FMU, and ``gantry.nominal`` is the model that a controller inverts: both have one
+definition.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ class Gantry(PlanarModel):
 
     @property
     def weight(self) -> Array:
-        """Weight F_G of each axis in N: that of the moved mass, on z alone."""
+        """Weight F_G of each axis in N: that of the translational mass, on z only."""
         return self.gravity * self.translational_mass * np.array([0.0, 1.0])
 
     def friction(self, x_v: Array) -> Array:
@@ -88,7 +89,7 @@ class Gantry(PlanarModel):
         return np.eye(2) / self.mass
 
     def coordinate_acceleration(self, x_c: Array, x_v: Array, motor_force: Array, force: Array) -> Array:
-        """Return ẋ_v of (1): f_v + G_v (u + F) with one division, which is what an FMU of it spends its time on."""
+        """Return ẋ_v of (1): f_v + G_v (u + F), with one division only, which takes most of an FMU's time."""
         return (motor_force + force - self.friction(x_v) - self.weight) / self.mass
 
     def derivative(self, t: Array, x: Any, u: Any) -> tuple[Array, Array]:
@@ -101,7 +102,7 @@ class Gantry(PlanarModel):
 
 
 nominal = Gantry()
-"""The gantry of Table II, matched: what the controller inverts."""
+"""The gantry of Table II, which is also the model that the controller inverts."""
 
 
 def build(
@@ -123,14 +124,14 @@ def build(
     model : Gantry, optional
         Parameters and start values.
     out : path, optional
-        Where to put the file; in the cache without it.
+        File to write; without it, the file in the cache is returned.
     name : str, optional
-        The model's name.
+        Name of the model.
     internal_step : float, optional
         Longest step of the FMU's own integrator in s.
     notify : callable, optional
         Called with a line of text when a compilation starts.
     **options
-        As `loopwright.fmus.build` takes them.
+        Further options of `loopwright.fmus.build`.
     """
     return _build(model, out, name=name, internal_step=internal_step, stop_time=11.0, notify=notify, **options)

@@ -1,18 +1,18 @@
-"""The gantry with a wall in its workspace: contact that is made and broken by events.
+"""Gantry with a wall in its workspace, with contact by events.
 
-The wall is a half-space with a spring and a damper in front, through the point p, with the unit normal n
-out of the wall. With the penetration δ = nᵀ(p − s), the force on the end effector in contact is
+The wall is a half-space with a spring and a damper in front, through the point p, with the unit normal n out of the
+wall. With the penetration δ = nᵀ(p − s), the force on the end effector in contact is
 
     F_w = n (k δ + d δ̇),        δ̇ = −nᵀ ṡ,
 
 and the gantry, equations (1) to (3), moves under u + F + F_w. Out of contact F_w = 0. The wall only pushes:
 
     touch     δ rises through 0                          → contact
-    press     k δ + d δ̇ rises through 0 while δ > 0       → contact (it had left, and turned before it was out)
+    press     k δ + d δ̇ rises through 0 while δ > 0       → contact (it was released, and turned before it was out)
     release   k δ + d δ̇ falls through 0                  → no contact
 
-It doesn't stick, so a damped wall lets go before δ = 0, while it still springs back. The state ``contact`` is 1 or 0. A
-start inside the wall needs its start value set to 1; it is 0 otherwise.
+It doesn't stick, so a damped wall releases before δ = 0, while it still springs back. The state ``contact`` is 1 or 0.
+For a start inside the wall set its start value to 1; the default is 0.
 
 By default the wall lies along y at z = 0.64 m, which cuts 10 mm off the top of the paper's ellipse. Stiffness and
 damping are our choice: 20 kN/m is a firm rubber, 100 N s/m damps the free bounce of the z axis by 8 %.
@@ -34,7 +34,7 @@ from .gantry import INTERNAL_STEP, Gantry
 class GantryContact(Gantry):
     """Biaxial gantry robot with a wall in its workspace.
 
-    Its `f_v` and `G_v`, inherited, are the gantry's: to a controller the wall's force is an external one.
+    It inherits the gantry's `f_v` and `G_v`: for a controller the wall's force is an external force.
     """
 
     wall_point: Array = parameter(default=(0.5, 0.64), shape=(2,), unit="m", description="a point p of the wall")
@@ -46,7 +46,7 @@ class GantryContact(Gantry):
 
     contact = State(unit="1", description="1 in contact, 0 else", discrete=True, output=True)
     contact_force = Output(shape=(2,), unit="N", description="force F_w of the wall on the end effector")
-    penetration = Output(unit="m", description="depth δ in the wall; negative: the gap")
+    penetration = Output(unit="m", description="depth δ in the wall; a gap is negative")
     touch = Event("rising", "the end effector reaches the wall", nominal=1e-3)
     press = Event("rising", "the wall pushes again", nominal=1.0)
     release = Event("falling", "the wall stops pushing", nominal=1.0)

@@ -1,19 +1,19 @@
-"""The gantry with compliant ball screws: what the paper's assumption of a stiff one (section II) leaves out.
+"""Gantry with compliant ball screws, which the paper assumes to be stiff (section II).
 
-In each axis the motor with its spindle, m_J, drives the slide, m_t, through a spring and a damper, which stand for nut,
+In each axis the motor with its spindle, m_J, drives the slide, m_t, through a spring and a damper, which model nut,
 spindle and bearings. With s the slide's position, s_m the motor's as seen from the slide, and δ = s_m − s:
 
     m_t,i s̈_i = k_i δ_i + d_i δ̇_i − ρ F_F,i(ṡ_i) − F_G,i + F_i,                i ∈ {y, z}
     m_J,i (s̈_i + δ̈_i) = u_i − k_i δ_i − d_i δ̇_i − (1 − ρ) F_F,i(ṡ_i + δ̇_i)
 
-F_F and F_G are the gantry's; ρ is the share of the friction that acts on the slide (the guides), the rest acts on the
-motor's side (nut, bearings). At k → ∞ this is the gantry.
+F_F and F_G are the gantry's; ρ is the share of the friction that acts on the slide (the guides); the rest acts on the
+motor (nut, bearings). For k → ∞ this is the gantry.
 
-The paper gives no number for the screws. Our choice: k puts the free resonance ω² = k (1/m_t + 1/m_J) at 100 Hz in
-both axes, d damps it by 12 %, both high for such a drive. The reason: a loop over the slide's position with a triple
-pole at −p has the gain 3 p/(2 ζ ω) at the resonance, which must stay below 1, so that the paper's p = 40 1/s demands
-ζ > 60/ω, 9.5 % at 100 Hz, friction aside. With a softer screw, or half of the damping, the paper's gains are unstable
-on this plant.
+The paper gives no number for the screws. Our choice: k puts the free resonance ω² = k (1/m_t + 1/m_J) at 100 Hz in both
+axes, and d damps it by 12 %; both are high for such a drive. The reason: a loop over the slide's position with a triple
+pole at −p has the gain 3 p/(2 ζ ω) at the resonance, which must stay below 1, so that the paper's p = 40 1/s needs ζ >
+60/ω, 9.5 % at 100 Hz, without friction. With a softer screw, or half of the damping, the paper's gains are unstable on
+this plant.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ INTERNAL_STEP = 1.0 / 10000.0
 class GantryElastic(Gantry):
     """Biaxial gantry robot with compliant ball screws.
 
-    Its `f_v` and `G_v`, inherited, are those of the stiff gantry: what a controller inverts that knows no compliance.
+    It inherits `f_v` and `G_v` of the stiff gantry, which a controller without knowledge of the compliance inverts.
     """
 
     equivalent_mass: Array = parameter(
@@ -57,7 +57,7 @@ class GantryElastic(Gantry):
 
     deflection = State(
         unit="m",
-        description="motor's position ahead of the slide's; starts where it carries the weight",
+        description="motor's position less the slide's; it starts where the screw carries the weight",
         start=lambda model: model.weight / model.screw_stiffness,
         nominal=1e-4,
     )
@@ -71,7 +71,7 @@ class GantryElastic(Gantry):
 
     @property
     def resonance(self) -> tuple[Array, Array]:
-        """Frequency in Hz, and damping ratio, of each axis' free resonance, friction aside."""
+        """Frequency in Hz and damping ratio of each axis' free resonance, without friction."""
         reduced = self.translational_mass * self.equivalent_mass / self.mass
         omega = np.sqrt(self.screw_stiffness / reduced)
         return omega / (2.0 * np.pi), self.screw_damping / (2.0 * reduced * omega)

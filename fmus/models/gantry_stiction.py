@@ -1,4 +1,4 @@
-"""The gantry with stiction: LuGre friction in place of the paper's smooth Coulomb friction.
+"""Gantry with stiction: LuGre friction in place of the paper's smooth Coulomb friction.
 
 Canudas de Wit, Olsson, Åström, Lischinsky, "A new model for control of systems with friction", IEEE TAC 40 (1995).
 Each axis carries a state z, the mean deflection of the bristles in the contact:
@@ -7,13 +7,13 @@ Each axis carries a state z, the mean deflection of the bristles in the contact:
     F_F,i = σ₀,i z_i + σ₁,i ż_i + c_v,i ṡ_i
     ż_i = ṡ_i − σ₀,i |ṡ_i| z_i / g_i(ṡ_i),   g_i(v) = F_c,i + (F_s,i − F_c,i) e^−(v / v_s)²
 
-At constant velocity v the friction is g(v) sgn v + c_v v: F_s breaks the contact away, v_s is where the Stribeck effect
-ends, and at speed it is the gantry's friction. Within |z| < F_s/σ₀ the axis sticks: it gives way like a spring.
+At constant velocity v the friction is g(v) sgn v + c_v v: F_s is the breakaway force, the Stribeck effect ends at v_s,
+and far above v_s it is the gantry's friction. Within |z| < F_s/σ₀ the axis sticks and yields like a spring.
 
-Table II has F_c and c_v alone. The rest is our choice: F_s = 1.3 F_c; v_s = 5 mm/s; σ₀ such that the bristles yield by
-about 30 µm at F_c, as rolling guides and ball nuts do, and σ₁ such that the axis, stuck, is damped by half.
+Table II has F_c and c_v only. The rest is our choice: F_s = 1.3 F_c; v_s = 5 mm/s; σ₀ such that the bristles yield by
+about 30 µm at F_c, as rolling guides and ball nuts do, and σ₁ such that the stuck axis has a damping ratio of a half.
 
-The bristles' rate is |v| σ₀/g: 3e4 1/s at 1 m/s. As this is stiff, the FMU starts with the implicit integrator.
+The bristles' rate is |v| σ₀/g: 3e4 1/s at 1 m/s. This is stiff, so the FMU starts with the implicit integrator.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from ..export.from_block import build as _build
 from ..export.model import Integrator
 
 INTERNAL_STEP = 1e-3
-"""Start value of the FMU's longest internal step in s; Runge-Kutta 4 would need 5e-5 s to be stable up to 1.7 m/s."""
+"""Start value of the FMU's longest internal step in s; Runge-Kutta 4 needs 5e-5 s to be stable up to 1.7 m/s."""
 
 
 class GantryStiction(Block):
@@ -105,7 +105,7 @@ class GantryStiction(Block):
         return self.coulomb_scale * in_bristles + self.viscous_scale * self.viscous_friction * velocity
 
     def acceleration_of(self, x: Any, u: Any) -> Array:
-        """Return Newton's law."""
+        """Return the acceleration, by Newton's law."""
         weight = self.gravity * self.translational_mass * np.array([0.0, 1.0])
         force = u.motor_force + u.external_force - self.friction(x.velocity, x.bristle) - weight
         return force / (self.translational_mass + self.equivalent_mass)

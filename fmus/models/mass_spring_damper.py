@@ -1,4 +1,4 @@
-"""A mass on a spring and a damper, driven by a force: m s̈ + d ṡ + k s = F."""
+"""Mass on a spring and a damper, driven by a force: m s̈ + d ṡ + k s = F."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..export.from_block import build as _build
 
 
 class MassSpringDamper(Block):
-    """A mass on a spring and a damper, driven by a force."""
+    """Mass on a spring and a damper, driven by a force."""
 
     mass: float = parameter(default=1.0, unit="kg", above=0.0, description="mass m")
     damping: float = parameter(default=1.0, unit="N.s/m", minimum=0.0, description="damping d")
@@ -22,7 +22,7 @@ class MassSpringDamper(Block):
 
     force = Input(unit="N", description="force F on the mass")
     position = State(
-        unit="m", description="position s, zero where the spring is free", start="start_position", output=True
+        unit="m", description="position s, zero at the free length of the spring", start="start_position", output=True
     )
     velocity = State(unit="m/s", description="velocity of the mass", start="start_velocity", output=True)
     acceleration = Output(unit="m/s2", description="acceleration of the mass")

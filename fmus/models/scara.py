@@ -1,7 +1,8 @@
-"""A two-link planar arm (SCARA), moving in the plane of the gantry: axes y and z, base at the origin.
+"""Two-link planar arm (SCARA) in the plane of the gantry: axes y and z, base at the origin.
 
 Joint angles q: q₁ from the y axis, q₂ from the first link to the second. With link lengths l, the distance c of each
-link's centre of mass from its joint, mass m, inertia I about it and the drives' inertias J, seen from the joints:
+link's centre of mass from its joint, mass m, inertia I about that centre, and the drives' inertias J, as seen from the
+joints:
 
     M(q) q̈ + C(q, q̇) q̇ + G(q) + τ_F(q̇) = τ + (dh)ᵀ F
 
@@ -13,11 +14,11 @@ link's centre of mass from its joint, mass m, inertia I about it and the drives'
 
     y = h(q) = l₁ (cos q₁, sin q₁) + l₂ (cos(q₁ + q₂), sin(q₁ + q₂))
 
-F is the force on the end effector. A SCARA moves horizontally: g = 0 unless it is set. The drives' rotors are taken to
-spin with their own joint alone. All numbers are our choice: an arm of 1.1 m that covers the paper's ellipse with its
-elbow bent by 59° to 129°.
+F is the force on the end effector. A SCARA moves horizontally: g = 0 by default. Each drive's rotor is assumed to spin
+with its own joint only. All numbers are our choice: an arm of 1.1 m that covers the paper's ellipse with its elbow bent
+by 59° to 129°.
 
-In a singular pose (q₂ = 0 or π) `FeedbackLinearization` stops the run: det(dh) = l₁ l₂ sin q₂.
+In a singular pose (q₂ = 0 or π) `FeedbackLinearization` stops the run, since det(dh) = l₁ l₂ sin q₂.
 """
 
 from __future__ import annotations
@@ -147,7 +148,7 @@ class Scara(PlanarModel):
         )
 
     def joint_angles(self, position: Array, *, elbow: int = 1) -> np.ndarray:
-        """Return the joint angles that put the end effector at a position: plain Python, for start values.
+        """Return the joint angles for a position of the end effector: plain Python, for start values.
 
         Parameters
         ----------
@@ -190,7 +191,7 @@ def _matrix(a: Array, b: Array, c: Array, d: Array) -> Array:
 
 
 nominal = Scara()
-"""The arm described above, matched: what the controller inverts."""
+"""The arm described above, which is also the model that the controller inverts."""
 
 
 def build(

@@ -1,4 +1,4 @@
-"""The way in which the derivatives of a linear model were found."""
+"""Methods by which the derivatives of a linear model are computed."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from enum import Enum
 
 
 class DerivativeMethod(Enum):
-    """A method that finds the derivatives of an FMU, or of a block that can't be traced."""
+    """Method for the derivatives of an FMU or a block."""
 
     DIRECTIONAL = "directional derivatives"
-    """The FMU computes them itself: they are exact."""
+    """Computed by the FMU: exact."""
     DIFFERENCES = "differences"
     """Differences of the FMU's equations at the point."""
     STEP_DIFFERENCES = "differences of steps"
     """Differences of a communication step, with the FMU's own solver."""
     IDENTIFIED = "identified from pulse responses"
-    """A model that is fitted to responses from rest, without the FMU's states."""
+    """Fit of a model to responses from rest, without the FMU's states."""
     BLOCK_DIFFERENCES = "differences of the block"
     """Differences of the function of an opaque block."""
     TRACED = "the traced Jacobian"
@@ -25,19 +25,18 @@ class DerivativeMethod(Enum):
 
 @dataclass(frozen=True)
 class Derivation:
-    """The way in which derivatives were found; ``str(…)`` is its text.
+    """Method by which derivatives were computed, with details; ``str(…)`` is its text.
 
     Attributes
     ----------
     method : DerivativeMethod
         The method.
     interface : str
-        The interface of FMI that was asked, ``"model_exchange"`` or ``"co_simulation"``; empty where the method has
-        only one.
+        FMI's interface in use, ``"model_exchange"`` or ``"co_simulation"``; empty if the method has only one.
     held : bool
-        Whether a step was made of the equations, by a matrix exponential with held inputs.
+        Whether a step was computed from the equations, by a matrix exponential with held inputs.
     order : int, optional
-        Number of states of a model that was identified.
+        Number of states of an identified model.
 
     Examples
     --------

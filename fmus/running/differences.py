@@ -1,4 +1,4 @@
-"""Difference quotients of what an FMU computes, with an estimate of their error."""
+"""Difference quotients of an FMU's results, with an estimate of their error."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ _EPS = float(np.finfo(float).eps)
 
 
 class Column:
-    """The elements of variables to be moved, one at a time, about a point.
+    """Elements of variables that are moved one at a time about a point.
 
     Parameters
     ----------
     about : FmuDescription
-        Of nominal values and bounds.
+        Description with nominal values and bounds.
     names : list of str
         The variables.
     at : array
-        All their elements.
+        All elements at the point.
     relative : float
-        How far to move, relative to an element's nominal value, or its value where that is larger.
+        Distance to move, relative to an element's nominal value, or to its value if that is larger.
     """
 
     def __init__(self, about: FmuDescription, names: list[str], at: np.ndarray, relative: float):
@@ -36,40 +36,40 @@ class Column:
         return values[self._slices[name]]
 
     def __iter__(self) -> Iterator[tuple[str, int, float, int]]:
-        """Yield variable, element, distance and side: 0 for both, ±1 where a bound leaves one."""
+        """Yield variable, element, distance and side: 0 for both sides, ±1 if a bound leaves one only."""
         for name, variable in self.variables.items():
             low = -np.inf if variable.minimum is None else variable.minimum
             high = np.inf if variable.maximum is None else variable.maximum
             for i in range(self._slices[name].start, self._slices[name].stop):
                 x = float(self.at[i])
                 d = self.relative * max(abs(x), abs(variable.nominal or 1.0))
-                d = (x + d) - x  # a distance that the numbers near x have
+                d = (x + d) - x  # the distance of two floating-point numbers near x
                 up, down = x + 4 * d <= high, x - 4 * d >= low
                 yield name, i, d, 0 if up and down else 1 if up else -1
 
 
-def columns(
+def differentiate(
     column: Column, values: np.ndarray, evaluate: Callable[[str, np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the matrix of derivatives and the estimated error of each entry.
 
-    Quotients over d, 2 d and 4 d are extrapolated twice, to order 6 in d (3 where a bound leaves one side). What the
-    last extrapolation has changed is the estimate; what rounding adds is eps max abs(f) / d.
+    Quotients over d, 2 d and 4 d are extrapolated twice, to order 6 in d (3 if a bound leaves one side only). The
+    estimate is the change by the last extrapolation, plus eps max abs(f) / d for rounding.
     """
     found, errors = [], []
     for name, i, d, side in column:
 
-        def moved(steps: int, name: str = name, i: int = i, d: float = d) -> np.ndarray:
+        def evaluate_moved(steps: int, name: str = name, i: int = i, d: float = d) -> np.ndarray:
             x = column.at.copy()
             x[i] += steps * d
             return evaluate(name, x)
 
         if side == 0:
-            one, two, four = ((moved(k) - moved(-k)) / (2 * k * d) for k in (1, 2, 4))
+            one, two, four = ((evaluate_moved(k) - evaluate_moved(-k)) / (2 * k * d) for k in (1, 2, 4))
             fine, coarse = (4 * one - two) / 3, (4 * two - four) / 3
             best = (16 * fine - coarse) / 15
         else:
-            one, two, four = ((moved(side * k) - values) / (side * k * d) for k in (1, 2, 4))
+            one, two, four = ((evaluate_moved(side * k) - values) / (side * k * d) for k in (1, 2, 4))
             fine, coarse = 2 * one - two, 2 * two - four
             best = (4 * fine - coarse) / 3
         found.append(best)

@@ -1,4 +1,4 @@
-"""An FMU as a block."""
+"""Block of an FMU."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ _STATUS = ("OK", "warning", "discard", "error", "fatal")
 
 
 class Fmu(Block):
-    """A co-simulation FMU (FMI 3.0, Float64 variables) as a block; its ports are the FMU's inputs and outputs.
+    """Co-simulation FMU (FMI 3.0, Float64 variables) as a block; its ports are the FMU's inputs and outputs.
 
-    Outputs are attributes (``plant.position``); ports whose names are no identifiers are reached by index
-    (``plant["axis.phi"]``) or get another name by ``rename``. Between communication points its inputs are held and its
-    outputs are those at the end of the last step. Inputs must be wired, or be given a value in ``start``.
+    Outputs are attributes (``plant.position``). A port whose name is no identifier is read by index
+    (``plant["axis.phi"]``), or gets another name by ``rename``. Between communication points the inputs are held, and
+    the outputs are those at the end of the last step. Wire each input, or give it a value in ``start``.
 
-    The file is checked when the block is made, and loaded only while a run lasts. The SHA-256 digest of what it held
-    then belongs to the block: two blocks are equal only if the files' contents were, and a file that has changed since
-    is an error.
+    The file is checked when the block is made, and loaded only for the duration of a run. The SHA-256 digest of its
+    content belongs to the block: two blocks are equal only if the contents were equal, and a file that has changed
+    since is an error.
     """
 
     opaque = True
@@ -64,7 +64,9 @@ class Fmu(Block):
         object.__setattr__(self, "_content", description.digest)
         new = [self.rename.get(name, name) for name in ports]
         if len(set(new)) < len(new):
-            raise ParameterError("two ports get the same name; rename them apart.", block=who, port="rename")
+            raise ParameterError(
+                "found one name for two ports; rename them to different names.", block=who, port="rename"
+            )
 
     def start_value(self, description: FmuDescription, name: str, value: Any) -> Any:
         """Return a start value in the variable's shape, after checking it.
@@ -72,12 +74,15 @@ class Fmu(Block):
         Raises
         ------
         UnknownNameError, ParameterError
-            No such variable, one that can't be set, another shape, a value out of its range.
+            For an unknown variable, one that can't be set, another shape, and a value out of its range.
         """
         who, port = self.label, f"start.{name}"
         if name in description.other:
             raise ParameterError(
-                f"it is {description.other[name]}; only Float64 can be set so far.", block=who, port=port
+                f"found a variable of type {description.other[name]}; expected Float64, which alone can be set. Leave "
+                "it out.",
+                block=who,
+                port=port,
             )
         variable = description.variables.get(name)
         if variable is None:
@@ -86,7 +91,8 @@ class Fmu(Block):
             )
         if variable.causality in ("output", "local") and variable.start is None:
             raise ParameterError(
-                "it is computed and has no start value; set the states and parameters that it follows from.",
+                "found a variable that is computed and has no start value; set the states and parameters that it "
+                "depends on.",
                 block=who,
                 port=port,
             )
@@ -97,20 +103,22 @@ class Fmu(Block):
                 f"found {value!r}; expected numbers of shape {variable.shape}.", block=who, port=port
             ) from None
         if not np.all(np.isfinite(array)):
-            raise ParameterError(f"found {value!r}; expected finite numbers{_in(variable)}.", block=who, port=port)
+            raise ParameterError(
+                f"found {value!r}; expected finite numbers{_unit_text(variable)}.", block=who, port=port
+            )
         for bound, wrong in ((variable.minimum, np.less), (variable.maximum, np.greater)):
             if bound is not None and np.any(wrong(array, bound)):
-                raise ParameterError(f"found {value!r}; the FMU allows {_range(variable)}.", block=who, port=port)
+                raise ParameterError(f"found {value!r}; the FMU allows {_range_text(variable)}.", block=who, port=port)
         return array
 
     @property
     def description(self) -> FmuDescription:
-        """What the FMU's description says.
+        """The FMU's description.
 
         Raises
         ------
         FmuFileError
-            If the file is gone, or is no longer the one that the block was made with.
+            If the file is missing, or has changed since the block was made.
         """
         try:
             found = read_description(self.file)
@@ -129,14 +137,14 @@ class Fmu(Block):
 
     @property
     def variable_step(self) -> bool:
-        """Whether its communication steps may differ in length (canHandleVariableCommunicationStepSize)."""
+        """Whether communication steps may differ in length (canHandleVariableCommunicationStepSize)."""
         return self.description.variable_step
 
     @property
     def fixed_internal_step(self) -> float | None:
-        """The step in s that it computes with inside, None where that is its own matter (fixedInternalStepSize).
+        """Fixed step of the FMU's own integrator in s (fixedInternalStepSize); None if there is none.
 
-        Communication steps are then to be multiples of it.
+        Communication steps must be multiples of it.
         """
         return self.description.fixed_internal_step
 
@@ -152,7 +160,7 @@ class Fmu(Block):
 
     @property
     def label(self) -> str:
-        """Name for messages: the given one, else ``fmu``."""
+        """Name for messages: the name given, else ``fmu``."""
         return self.name or self._hint or "fmu"
 
     @property
@@ -204,10 +212,10 @@ class Fmu(Block):
     ) -> FmuLinearization:
         """Linearize the FMU's continuous equations about an operating point.
 
-        They are found by the first of these that the FMU has: directional derivatives in model exchange
+        The method is the first of these that the FMU supports: directional derivatives in model exchange
         (Continuous-Time Mode), in co-simulation (Step Mode); differences in model exchange, in co-simulation
-        (Initialization Mode; FMI 3.0, 2.2.11, 2.3.3, 3.2, 4.2). An instance is loaded for it alone. Discrete states and
-        parameters are frozen.
+        (Initialization Mode; FMI 3.0, 2.2.11, 2.3.3, 3.2, 4.2). It loads an instance of its own. Discrete states and
+        parameters are constant.
 
         Parameters
         ----------
@@ -215,27 +223,27 @@ class Fmu(Block):
             Time in s.
         state : mapping or array, optional
             States by the FMU's names, discrete ones too, or all continuous states' elements in the order of the model
-            structure; the others have their start values.
+            structure; other states have their start values.
         inputs : mapping or array, optional
-            Inputs by their ports, or all inputs' elements; the others have their start values.
+            Inputs by their ports, or all inputs' elements; other inputs have their start values.
         interface : str, optional
-            ``"model_exchange"`` or ``"co_simulation"``, where it matters.
+            ``"model_exchange"`` or ``"co_simulation"`` to allow this interface only.
         exact : bool, optional
-            True for directional derivatives alone, False for differences.
+            True to allow directional derivatives only, False differences only.
 
         Returns
         -------
         FmuLinearization
-            The matrices, and how they were found.
+            The matrices, and the method by which they were computed.
 
         Raises
         ------
         FmuError
-            If the FMU can't, or does not take over the operating point.
+            If the FMU supports no such method, or does not accept the operating point.
         FmuRuntimeError
-            If one of its functions fails.
+            If one of the FMU's functions fails.
         ParameterError, UnknownNameError
-            If the operating point is given wrongly.
+            For an operating point with unknown names or wrong values.
         """
         return linear_model(self, t, state, inputs, interface, exact)
 
@@ -244,20 +252,20 @@ class Fmu(Block):
     ) -> FmuLinearization:
         """Linearize a communication step: states and outputs after it, by the states before it and the held inputs.
 
-        Differences of ``doStep`` in co-simulation: states move by their start values, since nothing else is allowed
-        there (FMI 3.0, 4.2), inputs in Step Mode, from a saved state where the FMU can save. Impacts and switches
-        within the step are in it. What is no variable of the FMU starts anew: memory of its solver, on which side of a
-        threshold it has been.
+        The method is differences of ``doStep`` in co-simulation. States are moved by their start values, the only way
+        that is allowed there (FMI 3.0, 4.2), inputs in Step Mode, from a saved state if the FMU can save one. Impacts
+        and switches within the step count. Memory that is no variable of the FMU starts anew with each difference, such
+        as that of its solver, or the side of a threshold.
 
         Parameters
         ----------
         h : float
             Length of the step in s.
         t, state, inputs
-            As for `linear_model`.
+            See `linear_model`.
         relative_step : float
-            How far a state or input is moved, relative to its nominal value, or its value where that is larger. An
-            adaptive solver with a coarse tolerance needs more.
+            Distance by which a state or input is moved, relative to its nominal value, or to its value if that is
+            larger. An adaptive solver with a coarse tolerance needs a larger one.
 
         Returns
         -------
@@ -267,11 +275,11 @@ class Fmu(Block):
         Raises
         ------
         FmuError
-            If the FMU's states have no exact start values, or it does not take over the operating point.
+            If the FMU's states have no exact start values, or it does not accept the operating point.
         FmuRuntimeError
-            If one of its functions fails.
+            If one of the FMU's functions fails.
         ParameterError, UnknownNameError
-            If the operating point is given wrongly.
+            For an operating point with unknown names or wrong values.
         """
         return step_difference(self, h, t, state, inputs, relative_step)
 
@@ -279,14 +287,14 @@ class Fmu(Block):
     def instantiate(
         self, wired: Sequence[str], stop_time: float | None, *, start_time: float = 0.0
     ) -> Iterator[FmuInstance]:
-        """Load the FMU for a run; it is terminated and freed whatever happens.
+        """Load the FMU for a run; it is terminated and freed at the end, in any case.
 
         Parameters
         ----------
         wired : sequence of str
-            The input ports that the run will set at each communication point.
+            Input ports that the run sets at each communication point.
         stop_time : float, optional
-            End of the run in s; None for a run that may be continued, as an FMU may refuse to step beyond it.
+            End of the run in s, beyond which an FMU may refuse to step; None for a run that may be continued.
         start_time : float
             Start of the run in s.
         """
@@ -298,12 +306,12 @@ class Fmu(Block):
             instance.close()
 
 
-def _in(variable: FmuVariable) -> str:
+def _unit_text(variable: FmuVariable) -> str:
     return f" in {variable.unit}" if variable.unit else ""
 
 
-def _range(variable: FmuVariable) -> str:
+def _range_text(variable: FmuVariable) -> str:
     low, high = variable.minimum, variable.maximum
     if low is not None and high is not None:
-        return f"{low:g} to {high:g}{_in(variable)}"
-    return f"at least {low:g}{_in(variable)}" if low is not None else f"at most {high:g}{_in(variable)}"
+        return f"{low:g} to {high:g}{_unit_text(variable)}"
+    return f"at least {low:g}{_unit_text(variable)}" if low is not None else f"at most {high:g}{_unit_text(variable)}"

@@ -16,19 +16,19 @@ from ..archive.description import FmuDescription
 from ..calls.fmu_block import FmuBlock
 from ..calls.loaded_library import LoadedFmu
 from .derivation import Derivation, DerivativeMethod
-from .differences import Column, columns
+from .differences import Column, differentiate
 
 EQUATIONS, STEP = 1e-5, 1e-4
-"""Differences, relative to nominal values: of equations, and of steps, where an adaptive solver leaves its traces."""
+"""Relative distances of differences: of equations, and of steps, which an adaptive solver makes less smooth."""
 
 
 @dataclass(frozen=True, eq=False)
 class FmuLinearization:
-    """A linear model of an FMU about an operating point (x0, u0) at the time t.
+    """Linear model of an FMU about an operating point (x0, u0) at the time t.
 
-    Of its equations: dx/dt = f + A (x − x0) + B (u − u0). Of a step of length h, with the inputs held: the states after
-    it are f + A (x − x0) + B (u − u0). In both cases y = y0 + C (x − x0) + D (u − u0), after the step where there is
-    one. f is zero, or x0, only at an equilibrium.
+    For the equations dx/dt = f + A (x − x0) + B (u − u0). For a step of length h with held inputs, the states after it
+    are f + A (x − x0) + B (u − u0). In both cases y = y0 + C (x − x0) + D (u − u0), for a step after it. At an
+    equilibrium f is zero, or x0 for a step.
     """
 
     A: np.ndarray
@@ -43,27 +43,27 @@ class FmuLinearization:
     """Names of the elements of the output ports."""
     t: float
     h: float | None
-    """Length of the step in s, None for a model of the equations."""
+    """Length of the step in s; None for a model of the equations."""
     x0: np.ndarray
     u0: np.ndarray
     f: np.ndarray
     y0: np.ndarray
     derivation: Derivation
-    """The way in which the derivatives were found."""
+    """Method by which the derivatives were computed."""
     uncertainty: np.ndarray
-    """Of each entry of [[A, B], [C, D]], its estimated error; zero where the FMU computed the derivatives."""
+    """Estimated error of each entry of [[A, B], [C, D]]; zero if the FMU computed the derivatives."""
 
     @property
     def how(self) -> str:
-        """The text of `derivation`, such as ``"differences of steps"``."""
+        """Text of `derivation`, such as ``"differences of steps"``."""
         return str(self.derivation)
 
 
 class LinearizableFmu(FmuBlock, Protocol):
-    """The block of an FMU, as its linear model needs it."""
+    """Members of an FMU's block that its linear model needs."""
 
     def start_value(self, description: FmuDescription, name: str, value: Any) -> Any:
-        """Return a start value, checked and in the variable's shape."""
+        """Return a start value in the variable's shape, after checking it."""
 
 
 class _Point:
@@ -77,20 +77,20 @@ class _Point:
         if not np.isfinite(self.t):
             raise ParameterError(f"found {t!r}; expected a time in s.", block=block.label, port="t")
         ports = {block.rename.get(name, name): name for name in self.inputs}
-        given_state = self._named(
+        given_state = self._match_names(
             state, {name: name for name in self.states}, "state", block.description.discrete_states
         )
-        given_inputs = self._named(inputs, ports, "inputs", ())
+        given_inputs = self._match_names(inputs, ports, "inputs", ())
         self.given = {n: block.start_value(about, n, v) for n, v in {**given_state, **given_inputs}.items()}
 
-    def _named(self, given: Any, names: Mapping[str, str], what: str, more: tuple[str, ...]) -> dict[str, Any]:
+    def _match_names(self, given: Any, names: Mapping[str, str], port: str, more: tuple[str, ...]) -> dict[str, Any]:
         if given is None:
             return {}
         if isinstance(given, Mapping):
             known = {**names, **{name: name for name in more}}
             for name in given:
                 if name not in known:
-                    raise UnknownNameError(f"found {name!r}. {near(name, known)}", block=self.block.label, port=what)
+                    raise UnknownNameError(f"found {name!r}. {near(name, known)}", block=self.block.label, port=port)
             return {known[name]: value for name, value in given.items()}
         vector, variables = np.ravel(np.asarray(given, dtype=float)), [self.about.variables[n] for n in names.values()]
         sizes = [v.size for v in variables]
@@ -98,24 +98,24 @@ class _Point:
             raise ParameterError(
                 f"found {vector.size} numbers; expected {sum(sizes)}, the elements of {', '.join(names) or 'nothing'}.",
                 block=self.block.label,
-                port=what,
+                port=port,
             )
         return Layout.of({v.name: v.shape for v in variables}).split(vector)
 
     def check(self, found: np.ndarray) -> None:
-        """Refuse an operating point that the FMU does not take over."""
+        """Refuse an operating point that the FMU does not accept."""
         for name, part in _layout(self.about, self.states).split(found).items():
             if name in self.given and not np.allclose(part, self.given[name], rtol=1e-9, atol=0.0):
                 raise FmuError(
                     f"its state was set to {self.given[name].tolist()}, but is {np.ravel(part).tolist()} when the FMU "
-                    f"has initialized at t = {self.t:.9g} s: an event there changes it, or its start value is no more "
-                    "than a guess. Choose a point that is not on an event.",
+                    f"has initialized at t = {self.t:.9g} s: an event there changes it, or its start value is only a "
+                    "guess. Choose a point that is not on an event.",
                     block=self.block.label,
                     port=name,
                 )
 
     def elements(self, names: list[str], *, ports: bool = False) -> tuple[str, ...]:
-        """Name each element of variables."""
+        """Return the names of all elements of variables."""
         rename = self.block.rename if ports else {}
         shapes = ((rename.get(n, n), self.about.variables[n].shape) for n in names)
         return tuple(label for name, shape in shapes for label in elements(name, shape, first=1))  # FMI counts from 1
@@ -148,7 +148,7 @@ def linear_model(
     if not about.states:
         raise FmuError(
             "its model structure lists no derivatives of continuous states that are Float64 variables, so its "
-            "equations can't be linearized. Take step_difference(), or identify it from a run.",
+            "equations can't be linearized. Use step_difference(), or identify it from a run.",
             block=block.label,
         )
     settable = all(about.variables[name].initial == "exact" for name in about.states)
@@ -159,26 +159,28 @@ def linear_model(
         (False, False, settable),
     )
     for exchange, derived, possible in ways:
-        if possible and exact in (None, derived) and interface in (None, _name(exchange)):
-            with _initialized(point, exchange) as instance:
-                return _directional(point, instance) if derived else _differenced(point, instance)
+        if possible and exact in (None, derived) and interface in (None, _interface_name(exchange)):
+            with _initialize(point, exchange) as instance:
+                return (
+                    _linearize_by_directions(point, instance) if derived else _linearize_by_differences(point, instance)
+                )
     raise FmuError(
         f"it can't be linearized in this way (interface={interface!r}, exact={exact!r}): it has "
         f"{'' if about.model_exchange else 'no '}model exchange, directional derivatives "
         f"{'there' if about.model_exchange_has_derivatives else 'not there'} and "
         f"{'in' if about.has_derivatives else 'not in'} co-simulation, and states that "
-        f"{'can' if settable else 'cannot'} be set at the start. Leave interface and exact to it.",
+        f"{'can' if settable else 'cannot'} be set at the start. Leave out interface and exact.",
         block=block.label,
     )
 
 
-def _name(exchange: bool) -> str:
+def _interface_name(exchange: bool) -> str:
     return "model_exchange" if exchange else "co_simulation"
 
 
 @contextmanager
-def _initialized(point: _Point, exchange: bool) -> Iterator[LoadedFmu]:
-    """Load the FMU, in Initialization Mode at the operating point."""
+def _initialize(point: _Point, exchange: bool) -> Iterator[LoadedFmu]:
+    """Load the FMU and enter Initialization Mode at the operating point."""
     instance = LoadedFmu(point.block, model_exchange=exchange)
     try:
         exact = {n: v for n, v in point.given.items() if point.about.variables[n].initial == "exact"}
@@ -189,13 +191,16 @@ def _initialized(point: _Point, exchange: bool) -> Iterator[LoadedFmu]:
 
 
 def _enter_continuous_time(point: _Point, instance: LoadedFmu) -> None:
-    """Settle the events of the start; then states without an exact start value are set (FMI 3.0, 3.2)."""
+    """Settle the events at the start, then set the states without an exact start value (FMI 3.0, 3.2)."""
     instance.begin()
     for _ in range(100):
         if not instance.call("the events at the start", "updateDiscreteStates")[0]:
             break
     else:
-        raise FmuError("the events at the start never settle. Choose another operating point.", block=point.block.label)
+        raise FmuError(
+            "the events at the start don't settle in 100 rounds. Choose another operating point.",
+            block=point.block.label,
+        )
     instance.call("entering Continuous-Time Mode", "enterContinuousTimeMode")
     guessed = [n for n in point.states if n in point.given and point.about.variables[n].initial != "exact"]
     if guessed:
@@ -215,8 +220,8 @@ def _values(point: _Point, instance: LoadedFmu) -> np.ndarray:
     return instance.values([*(point.about.states[n] for n in point.states), *point.outputs])
 
 
-def _directional(point: _Point, instance: LoadedFmu) -> FmuLinearization:
-    """Ask in Continuous-Time Mode or Step Mode; about discrete inputs, in Event Mode (FMI 3.0, 2.2.11)."""
+def _linearize_by_directions(point: _Point, instance: LoadedFmu) -> FmuLinearization:
+    """Linearize by directional derivatives in Continuous-Time or Step Mode, for discrete inputs in Event Mode."""
     if instance.model_exchange:
         _enter_continuous_time(point, instance)
     else:
@@ -232,13 +237,13 @@ def _directional(point: _Point, instance: LoadedFmu) -> FmuLinearization:
             size = about.variables[name].size
             found += [instance.directional_derivative(unknowns, [name], seed) for seed in np.eye(size).tolist()]
     J = np.array(found).reshape(len(found), values.size).T
-    derivation = Derivation(DerivativeMethod.DIRECTIONAL, _name(instance.model_exchange))
+    derivation = Derivation(DerivativeMethod.DIRECTIONAL, _interface_name(instance.model_exchange))
     return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=np.zeros(J.shape))
 
 
 @contextmanager
 def _mode_of(point: _Point, instance: LoadedFmu, name: str) -> Iterator[None]:
-    """Discrete inputs of model exchange belong to Event Mode."""
+    """Enter Event Mode for a discrete input of model exchange, and leave it again (FMI 3.0, 2.2.11)."""
     discrete = instance.model_exchange and point.about.variables[name].variability == "discrete"
     if discrete:
         instance.call("entering Event Mode", "enterEventMode")
@@ -248,8 +253,8 @@ def _mode_of(point: _Point, instance: LoadedFmu, name: str) -> Iterator[None]:
         instance.call("entering Continuous-Time Mode", "enterContinuousTimeMode")
 
 
-def _differenced(point: _Point, instance: LoadedFmu) -> FmuLinearization:
-    """Move states and inputs: in Continuous-Time Mode, else in Initialization Mode (FMI 3.0, 3.2 and 2.3.3)."""
+def _linearize_by_differences(point: _Point, instance: LoadedFmu) -> FmuLinearization:
+    """Linearize by differences in Continuous-Time Mode or Initialization Mode (FMI 3.0, 3.2 and 2.3.3)."""
     if instance.model_exchange:
         _enter_continuous_time(point, instance)
     x, u = instance.values(point.states), instance.values(point.inputs)
@@ -270,8 +275,8 @@ def _differenced(point: _Point, instance: LoadedFmu) -> FmuLinearization:
                 instance.set_values({name: column.part(name, column.at)})
         return found
 
-    J, uncertainty = columns(column, values, evaluate)
-    derivation = Derivation(DerivativeMethod.DIFFERENCES, _name(instance.model_exchange))
+    J, uncertainty = differentiate(column, values, evaluate)
+    derivation = Derivation(DerivativeMethod.DIFFERENCES, _interface_name(instance.model_exchange))
     return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=uncertainty)
 
 
@@ -290,16 +295,16 @@ def step_difference(
     for name in point.states:
         if about.variables[name].initial != "exact":
             raise FmuError(
-                "its state has no exact start value, and co-simulation lets it be set at the start alone. Take "
+                "its state has no exact start value, and co-simulation allows to set it at the start only. Use "
                 "linear_model() through model exchange, or identify it from a run.",
                 block=block.label,
                 port=name,
             )
-    with _initialized(point, exchange=False) as instance:
-        return _stepped(point, instance, h, relative_step)
+    with _initialize(point, exchange=False) as instance:
+        return _linearize_step(point, instance, h, relative_step)
 
 
-def _stepped(point: _Point, instance: LoadedFmu, h: float, relative_step: float) -> FmuLinearization:
+def _linearize_step(point: _Point, instance: LoadedFmu, h: float, relative_step: float) -> FmuLinearization:
     about, known = point.about, [*point.states, *point.inputs]
     instance.begin()
     x, u = instance.values(point.states), instance.values(point.inputs)
@@ -307,8 +312,10 @@ def _stepped(point: _Point, instance: LoadedFmu, h: float, relative_step: float)
     at = _layout(about, known).split(np.concatenate([x, u]))
     saved = instance.call("saving its state", "getFMUState") if about.can_save else None
 
-    def go(set_before: Mapping[str, Any], set_after: Mapping[str, Any], *, first: bool = False) -> np.ndarray:
-        """Step from the operating point; states move by the initialization, inputs in Step Mode."""
+    def step_from_point(
+        set_before: Mapping[str, Any], set_after: Mapping[str, Any], *, first: bool = False
+    ) -> np.ndarray:
+        """Take a step from the operating point; states are set by the initialization, inputs in Step Mode."""
         if not first and saved is not None and not set_before:
             instance.call("restoring its state", "setFMUState", saved)
         elif not first:
@@ -319,21 +326,21 @@ def _stepped(point: _Point, instance: LoadedFmu, h: float, relative_step: float)
         _, terminate, early, _ = instance.call(f"a step by {h:g} s", "doStep", point.t, h, saved is None)
         if terminate or early:
             raise FmuError(
-                f"it ends its step from t = {point.t:.9g} s by {h:g} s early, so that has no derivative. Take a "
+                f"it ends its step from t = {point.t:.9g} s by {h:g} s early, so the step has no derivative. Take a "
                 "smaller h.",
                 block=point.block.label,
             )
         return instance.values([*point.states, *point.outputs])
 
     try:
-        values = go({}, {}, first=True)
+        values = step_from_point({}, {}, first=True)
         column = Column(about, known, np.concatenate([x, u]), relative_step)
 
         def evaluate(name: str, moved: np.ndarray) -> np.ndarray:
             change = {name: column.part(name, moved)}
-            return go(change, {}) if name in point.states else go({}, change)
+            return step_from_point(change, {}) if name in point.states else step_from_point({}, change)
 
-        J, uncertainty = columns(column, values, evaluate)
+        J, uncertainty = differentiate(column, values, evaluate)
     finally:
         if saved is not None:
             instance._fmu.freeFMUState(saved)
@@ -342,5 +349,5 @@ def _stepped(point: _Point, instance: LoadedFmu, h: float, relative_step: float)
 
 
 def _layout(about: FmuDescription, names: list[str]) -> Layout:
-    """Return where variables stand that come one after the other."""
+    """Return the layout of variables, one after the other."""
     return Layout.of({name: about.variables[name].shape for name in names})

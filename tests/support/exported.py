@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.fmus.export.model import Event, ModelSpec, Variable
+from loopwright.fmus.export.model import EventSpec, ModelSpec, Variable
 
 M, D, K = 2.0, 0.5, 10.0
 
@@ -90,7 +90,7 @@ def bouncing_ball(**changes):
     given = {
         "z": lambda t, x, u, p: [x[0]],
         "jump": lambda t, x, u, p, fired: [x[0], ca.if_else(fired[0], -p[1] * x[1], x[1])],
-        "events": (Event("bounce", "falling", "Height above the floor"),),
+        "events": (EventSpec("bounce", "falling", "Height above the floor"),),
         "f": lambda t, x, u, p: [x[1], -p[0]],
     }
     return make_model(
@@ -114,7 +114,7 @@ def thermostat(**changes):
     def jump(t, x, u, p, fired):
         return [x[0], ca.if_else(fired[0], 0.0, ca.if_else(fired[1], 1.0, x[1]))]
 
-    given = {"events": (Event("too_warm", "rising"), Event("too_cold", "falling", nominal=0.5))}
+    given = {"events": (EventSpec("too_warm", "rising"), EventSpec("too_cold", "falling", nominal=0.5))}
     return make_model(
         "thermostat",
         (
@@ -175,7 +175,7 @@ def relay(**changes):
         lambda t, x, u, p: [x[1]],
         z=lambda t, x, u, p: [x[0] - p[0], x[0] + p[0]],
         jump=lambda t, x, u, p, fired: [x[0], ca.if_else(fired[0], -1.0, ca.if_else(fired[1], 1.0, x[1]))],
-        **({"events": (Event("above", "rising"), Event("below", "falling"))} | changes),
+        **({"events": (EventSpec("above", "rising"), EventSpec("below", "falling"))} | changes),
     )
 
 
@@ -191,7 +191,7 @@ def counter(jump, z=None, **changes):
         (Variable("y", "output"),),
         z=z or (lambda t, x, u, p: [x[0] + u[0] - 1.0]),
         jump=jump,
-        **({"events": (Event("reached"),)} | changes),
+        **({"events": (EventSpec("reached"),)} | changes),
     )
 
 

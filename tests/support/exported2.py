@@ -9,7 +9,7 @@ import fmpy.fmi2
 import numpy as np
 import pytest
 
-from loopwright.fmus.export.model import Event, ModelSpec, Variable
+from loopwright.fmus.export.model import EventSpec, ModelSpec, Variable
 
 
 class Instance2:
@@ -168,8 +168,8 @@ def ball():
         derivative=ca.Function("f", [t, x, u, p], [ca.vertcat(x[1], -p[0])]),
         output=ca.Function("g", [t, x, u, p], [p[0] * x[0] + x[1] ** 2 / 2]),
         events=(
-            Event("bounce", "falling", "The floor"),
-            Event("echo", "rising", "After a bounce, at the same instant"),
+            EventSpec("bounce", "falling", "The floor"),
+            EventSpec("echo", "rising", "After a bounce, at the same instant"),
         ),
         indicators=ca.Function("z", [t, x, u, p], [ca.vertcat(x[0], x[2] - x[3] - 0.5)]),
         jump=ca.Function("j", [t, x, u, p, fired], [ca.vertcat(x[0], velocity, x[2] + fired[0], x[3] + fired[1])]),

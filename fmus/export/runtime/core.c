@@ -1,7 +1,7 @@
-/* The part of the runtime that knows no FMI version: logging, variables, equations, derivatives, modes, states.
+/* Runtime of all FMI versions: logging, variables, equations, derivatives, modes, states.
  *
- * Functions return true when all went well; when not, they have logged why, and the instance is terminated until it is
- * reset or given back a state (in FMI, a function that returns an error leads to Terminated).
+ * Functions return true on success. Otherwise they have logged the reason, and the instance is terminated until it is
+ * reset or a state is restored (in FMI, a function that returns an error leads to Terminated).
  */
 #include <float.h>
 #include <math.h>
@@ -62,7 +62,7 @@ static bool lw_is_initialized(lw_instance *self, const char *function) {
 
 /* ---- equations ---- */
 
-/* Is values[0 .. n), which are to be those from index `first` on, finite? If not, log which isn't, and when. */
+/* Are values[0 .. n), those from index `first` on, finite? If not, log the element and the time. */
 static inline bool lw_is_finite(const double *values, size_t n) {
     bool finite = true;
     for (size_t i = 0; i < n; i++) finite &= isfinite(values[i]) != 0;
@@ -79,7 +79,7 @@ static bool lw_check_finite(lw_instance *self, const double *values, size_t firs
                    first + i - lw_variables[v].first, values[i], t);
 }
 
-/* The inputs at t: u, those held over the step; where u is NULL they move by their derivatives since its start. */
+/* The inputs at t: u, held over the step, or if u is NULL those that move by their derivatives since its start. */
 static inline const double *lw_inputs(lw_instance *self, const double *u, double t) {
 #if LW_MOVING_INPUTS
     if (!u) {
@@ -97,7 +97,7 @@ static inline const double *lw_inputs(lw_instance *self, const double *u, double
     return u;
 }
 
-/* What to give as u within a step. */
+/* The argument u within a step. */
 static inline const double *lw_inputs_of_step(const lw_instance *self) {
 #if LW_MOVING_INPUTS
     if (self->s.moving) return NULL;
@@ -114,7 +114,7 @@ static inline int lw_call(lw_instance *self, lw_function *f, const double *t, co
     return f(self->arg, self->res, self->iw, self->w, 0);
 }
 
-/* Outputs and derivatives at the last communication point: with the inputs held until then. */
+/* Outputs and derivatives at the last communication point, with the inputs held until then. */
 static bool lw_update(lw_instance *self, uint8_t *have, lw_function *f, size_t first, size_t n) {
     double *v = self->s.values;
     if (*have || n == 0) return true;
@@ -135,8 +135,8 @@ static bool lw_update_derivatives(lw_instance *self) {
 }
 
 #if LW_N_Z
-/* The importer sees z with a hysteresis around 0. It stops near the crossing, on either side: the jump is then to happen
- * once, and no indicator is to be 0 when it restarts (FMI 3.0, 3.2.1; FMI 2.0.5, 3.2.2). */
+/* The importer sees z with a hysteresis around 0. It stops near the crossing, on either side. The jump must then happen
+ * once, and no indicator may be 0 when it restarts (FMI 3.0, 3.2.1; FMI 2.0.5, 3.2.2). */
 #define LW_HYSTERESIS 1e-10
 
 static bool lw_update_indicators(lw_instance *self) {
@@ -153,7 +153,7 @@ static bool lw_update_indicators(lw_instance *self) {
 }
 #endif
 
-/* Something has changed that outputs, derivatives and event indicators are computed from. */
+/* Mark outputs, derivatives and event indicators as out of date. */
 static void lw_changed(lw_instance *self) {
     self->s.have_outputs = self->s.have_derivatives = self->s.have_indicators = 0;
     memcpy(self->s.values + LW_HELD, self->s.values + LW_U, LW_N_U * sizeof(double));
@@ -198,7 +198,7 @@ static bool lw_get(lw_instance *self, const char *function, const uint32_t *refe
     return lw_all_used(self, function, variable, left);
 }
 
-/* May it be set now (FMI 3.0, 2.3, 3.2 and 4.2; FMI 2.0.5, 3.2.3 and 4.2.4)? NULL, or why not. */
+/* May the variable be set now (FMI 3.0, 2.3, 3.2 and 4.2; FMI 2.0.5, 3.2.3 and 4.2.4)? NULL, or the reason. */
 static const char *lw_why_not_set(lw_instance *self, const lw_variable *variable) {
     lw_mode mode = (lw_mode)self->s.mode;
     lw_kind kind = variable->kind;
@@ -209,7 +209,7 @@ static const char *lw_why_not_set(lw_instance *self, const lw_variable *variable
     if (mode == LW_INSTANTIATED || mode == LW_INITIALIZING) return NULL;
     if (kind == LW_FIXED) return "is a fixed parameter; set it before " LW_API "ExitInitializationMode";
     if (kind == LW_STATE && (mode == LW_EVENT || mode == LW_CONTINUOUS) && self->s.model_exchange)
-        return NULL; /* some importers of Model Exchange set states as variables; it is the same as SetContinuousStates */
+        return NULL; /* some importers of Model Exchange set states as variables, which equals SetContinuousStates */
     if (kind == LW_STATE || kind == LW_DISCRETE) return "is a state; set its start value before " LW_API "ExitInitializationMode";
     if (mode == LW_INTERMEDIATE && kind == LW_TUNABLE) return "is a tunable parameter; set it between two steps";
     if (mode == LW_INTERMEDIATE && variable->is_discrete) return "is a discrete input; set it between two steps";
@@ -244,7 +244,7 @@ static bool lw_set(lw_instance *self, const char *function, const uint32_t *refe
         if (!(variable = lw_variable_at(self, function, references[i], left))) return false;
         if (!lw_check_set(self, function, variable, values)) return false;
         if (self->s.mode == LW_STEPPING && variable->kind == LW_TUNABLE) {
-            /* In Step Mode, what is read until the next step belongs to the end of the last one. */
+            /* In Step Mode, values that are read until the next step belong to the end of the last one. */
             if (!lw_update_derivatives(self) || !lw_update_indicators(self)) return false;
             self->s.step_size = 0.0;
         }
@@ -257,7 +257,7 @@ static bool lw_set(lw_instance *self, const char *function, const uint32_t *refe
     return lw_all_used(self, function, variable, left);
 }
 
-/* Model Exchange: the importer moves time and continuous states. The stop time is no bound: solvers look beyond it. */
+/* Model Exchange: the importer sets time and continuous states. The stop time is no bound: solvers evaluate beyond it. */
 static inline bool lw_set_time(lw_instance *self, const char *function, double t) {
     if (!isfinite(t)) return lw_fail(self, "%s: time was set to %g s, expected a finite number.", function, t);
     if (t == self->s.values[0]) return true;
@@ -290,7 +290,7 @@ static bool lw_check_known(lw_instance *self, const char *function, const lw_var
                    variable->name, lw_mode_names[self->s.mode], initializing ? ", or fixed parameters" : "");
 }
 
-/* Go over n references, moving their elements between `values` and the interval of each in `table`. */
+/* Copy the elements of n references between `values` and the interval of each in `table`. */
 static bool lw_transfer(lw_instance *self, const char *function, const uint32_t *references, size_t n, bool unknowns,
                         const double *from, double *to, double *table, size_t left) {
     const lw_variable *variable = NULL;
@@ -371,7 +371,7 @@ static bool lw_between_steps(lw_instance *self, const char *function) {
     return lw_fail(self, "%s was called in Intermediate Update Mode. Call it when the step has ended.", function);
 }
 
-/* Copy `from` to *state, which is allocated where there is none. */
+/* Copy `from` to *state, which is allocated if it is NULL. */
 static bool lw_copy_state(lw_instance *self, const char *function, const void *from, void **state) {
     lw_state *copy = *state ? *state : malloc(sizeof *copy);
     if (!copy) return lw_fail(self, "%s: out of memory.", function);
@@ -384,7 +384,7 @@ static bool lw_get_state(lw_instance *self, const char *function, void **state) 
     return lw_between_steps(self, function) && lw_copy_state(self, function, &self->s, state);
 }
 
-/* A state from outside: is it one of this very FMU, and of this interface type? */
+/* Does a state from outside belong to this FMU, and to this interface type? */
 static bool lw_accept_state(lw_instance *self, const char *function, const lw_state *state) {
     if (!state) return lw_fail(self, "%s: the state is NULL. Get one first.", function);
     if (state->magic != LW_MAGIC || state->mode < LW_INSTANTIATED || state->mode > LW_TERMINATED)
@@ -427,7 +427,7 @@ static inline bool lw_initialize(lw_instance *self, const char *function, double
     return true;
 }
 
-/* The relative tolerance that the importer wishes for, unless the parameter has been set. */
+/* The relative tolerance that the importer asks for, unless the parameter has been set. */
 static inline void lw_suggest_tolerance(lw_instance *self, double tolerance) {
     if (isfinite(tolerance) && tolerance > 0.0 && !self->s.tolerance_given)
         self->s.values[LW_TOLERANCE] = fmin(fmax(tolerance, LW_MIN_TOLERANCE), LW_MAX_TOLERANCE);
@@ -437,7 +437,7 @@ static inline void lw_suggest_tolerance(lw_instance *self, double tolerance) {
 static bool lw_start_domains(lw_instance *self);
 #endif
 
-/* Enter `next`: Step Mode, or Event Mode where it is used. */
+/* Enter `next`: Step Mode, or Event Mode if it is used. */
 static inline bool lw_start(lw_instance *self, const char *function, lw_mode next) {
     if (!lw_in_mode(self, function, LW_INITIALIZING) || !lw_update_outputs(self)) return false;
 #if LW_N_Z

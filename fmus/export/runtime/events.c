@@ -1,15 +1,15 @@
-/* Events: domains of the indicators, jumps, and where in a step an indicator crosses zero.
+/* Events: domains of the indicators, jumps, and location of zero crossings in a step.
  *
- * An indicator has a domain, z > 0 or z <= 0. An event fires when its domain changes in the declared direction. All that
- * fire at one instant jump at once; what a jump changes may fire again at the same instant. */
+ * An indicator has a domain, z > 0 or z <= 0. An event fires when its domain changes in the declared direction. All events
+ * that fire at one instant jump at once; a jump may make further events fire at the same instant. */
 #if LW_N_Z
 #define LW_MAX_ITERATIONS 100
 #define LW_MAX_EVENTS 10000
-/* Three times the same event within 2^-35 of the time: they accumulate. Nearer yet, they would be lost in rounding. */
+/* Events accumulate if one fires three times within 2^-35 of the time. Nearer ones would be lost in rounding. */
 #define LW_ZENO 2.9103830456733704e-11
 #define LW_ULPS 2.2204460492503131e-16
 
-/* The indicators at (t, x, u), and which of their domains differ from the present ones in the declared direction. */
+/* The indicators at (t, x, u), and the events whose domains differ from the present ones in the declared direction. */
 static bool lw_find_fired(lw_instance *self, double t, const double *x, const double *u, double *z, double *fired, bool *any) {
     if (lw_call(self, lw_indicator, &t, x, u, z))
         return lw_fail(self, "the event indicators can't be evaluated at t = %.9g s.", t);
@@ -57,7 +57,7 @@ static bool lw_too_many_iterations(lw_instance *self, double t, const double *fi
                    "their indicators on one side.", lw_names_of(fired, names, sizeof names), t, LW_MAX_ITERATIONS);
 }
 
-/* The event iteration at one instant; `any` says whether something has fired. */
+/* The event iteration at one instant; `any` is true if an event has fired. */
 static bool lw_iterate(lw_instance *self, double t, double *x, const double *u, bool *any) {
     double z[LW_N_Z], fired[LW_N_Z];
     bool again;
@@ -72,7 +72,7 @@ static bool lw_iterate(lw_instance *self, double t, double *x, const double *u, 
     }
 }
 
-/* At the end of initialization: domains are set, nothing fires. */
+/* Set the domains at the end of initialization; no event fires. */
 static bool lw_start_domains(lw_instance *self) {
     double *v = self->s.values;
     double z[LW_N_Z], fired[LW_N_Z];
@@ -84,7 +84,7 @@ static bool lw_start_domains(lw_instance *self) {
     return true;
 }
 
-/* Remember that events have been found at t; error if they accumulate there. `size` is how large times get. */
+/* Record that events have been found at t; error if they accumulate there. `size` is the size of times. */
 static bool lw_record(lw_instance *self, double t, double size, const double *fired) {
     for (int i = 0; i < LW_N_Z; i++) {
         if (fired[i] == 0.0) continue;
@@ -98,7 +98,7 @@ static bool lw_record(lw_instance *self, double t, double size, const double *fi
     return true;
 }
 
-/* ---- where a step crosses ---- */
+/* ---- location of crossings in a step ---- */
 
 /* A step of an integrator: from self->x at `from` to self->next at `to`, in between by self->dense. */
 typedef struct {
@@ -106,7 +106,7 @@ typedef struct {
     const double *u;
 } lw_span;
 
-/* A point of it, with the indicators and (where there are derivatives) their rates. */
+/* A point of it, with the indicators and, if there are derivatives, their rates. */
 typedef struct {
     double t;
     double z[LW_N_Z], rate[LW_N_Z];
@@ -147,7 +147,7 @@ static bool lw_evaluate(lw_instance *self, const lw_span *span, double t, lw_poi
                   : lw_check_finite(self, at->z, LW_Z, LW_N_Z, t);
 }
 
-/* Where indicator i comes to `positive`, after a and not after b: as near to the crossing as times can be told apart. */
+/* The time at which indicator i becomes `positive`, after a and not after b: as near to the crossing as times resolve. */
 static bool lw_locate(lw_instance *self, const lw_span *span, int i, bool positive, double a, double b, double *found) {
     lw_point at;
     while (b - a > span->resolution) {
@@ -161,8 +161,8 @@ static bool lw_locate(lw_instance *self, const lw_span *span, int i, bool positi
     return true;
 }
 
-/* Indicator i has the same domain at a and b. Does it leave it in between? Its rates say whether it may; the extremum is
- * found by bisection. `found` is a time in the other domain, NAN if there is none. */
+/* Does indicator i, with the same domain at a and b, leave it in between? Its rates show whether it may; bisection finds
+ * the extremum. `found` is a time in the other domain, NAN if there is none. */
 static bool lw_find_excursion(lw_instance *self, const lw_span *span, int i, lw_point a, lw_point b, double *found) {
     bool positive = self->s.positive[i];
     double towards = positive ? -1.0 : 1.0;
@@ -187,7 +187,7 @@ static bool lw_is_declared(int i, bool positive) {
     return !lw_events[i].direction || lw_events[i].direction == (positive ? 1 : -1);
 }
 
-/* The first event between two points, if any: its time, else INFINITY. Changes of domain that fire nothing are noted. */
+/* The time of the first event between two points, else INFINITY. Changes of domain that fire no event are recorded. */
 static bool lw_first_event(lw_instance *self, const lw_span *span, const lw_point *a, const lw_point *b, double *first) {
     double found[LW_N_Z], flipped[LW_N_Z];
     *first = INFINITY;
@@ -199,7 +199,7 @@ static bool lw_first_event(lw_instance *self, const lw_span *span, const lw_poin
         if (isnan(middle)) continue;
         if (lw_is_declared(i, !positive)) {
             if (!lw_locate(self, span, i, !positive, a->t, middle, &found[i])) return false;
-        } else if (!crossed) { /* there and back */
+        } else if (!crossed) { /* it left and returned */
             flipped[i] = middle;
             if (lw_is_declared(i, positive) && !lw_locate(self, span, i, positive, middle, b->t, &found[i])) return false;
         }
@@ -210,7 +210,7 @@ static bool lw_first_event(lw_instance *self, const lw_span *span, const lw_poin
     return true;
 }
 
-/* The first event of a step, if any: its time, else INFINITY. `pieces`: how finely the step is looked through. */
+/* The time of the first event of a step, else INFINITY. `pieces` is the number of parts that are searched. */
 static bool lw_scan(lw_instance *self, const lw_span *span, int pieces, double *first) {
     lw_point a, b;
     if (!lw_evaluate(self, span, span->from, &a)) return false;
@@ -236,7 +236,7 @@ static inline bool lw_enter_event_mode(lw_instance *self, const char *function) 
     return true;
 }
 
-/* One event iteration: jump if events fire now; `again` if they will once more, `moved` if a continuous state has. */
+/* One event iteration: jump if events fire now; `again` if more will fire, `moved` if a continuous state has changed. */
 static inline bool lw_update_discrete_states(lw_instance *self, const char *function, bool *again, bool *moved) {
     *again = *moved = false;
     if (!lw_in_mode(self, function, LW_EVENT)) return false;

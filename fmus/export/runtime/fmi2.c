@@ -86,7 +86,7 @@ fmi2Status fmi2Reset(fmi2Component c) {
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean toleranceDefined, fmi2Real tolerance, fmi2Real startTime,
         fmi2Boolean stopTimeDefined, fmi2Real stopTime) {
     LW_SELF;
-    /* checked here, for the message to name this function */
+    /* checked here so that the message names this function */
     if (!lw_initialize(self, "fmi2SetupExperiment", startTime, stopTimeDefined != fmi2False, stopTime)) return fmi2Error;
     self->s.mode = LW_INSTANTIATED;
     if (toleranceDefined) lw_suggest_tolerance(self, tolerance);
@@ -126,8 +126,8 @@ fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t nv
 /* ---- inputs that move over the next step, by their derivatives at its start (FMI 2.0, 4.2.1) ---- */
 
 #if LW_MOVING_INPUTS
-/* Derivatives of inputs by time, for the next step alone: u(t) = u + u1 (t - t0) + u2 (t - t0)^2 / 2 + ... from its start t0.
- * A later value of the input leaves them as they are. The limits of an input are those of the values that are set. */
+/* Derivatives of inputs by time, for the next step only: u(t) = u + u1 (t - t0) + u2 (t - t0)^2 / 2 + ... from its start t0.
+ * A later value of the input does not change them. The limits of an input apply to the values that are set. */
 static bool lw_set_slopes(lw_instance *self, const char *function, const fmi2ValueReference *references, size_t n,
                           const fmi2Integer *orders, const double *values) {
     lw_mode mode = (lw_mode)self->s.mode;
@@ -193,7 +193,7 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint, fmi2R
 
 /* ---- Model Exchange (FMI 2.0, 3.2.1 and 3.2.2) ---- */
 
-/* Is the call allowed, and are there as many values as there are? */
+/* Is the call allowed, and is the number of values right? */
 static bool lw_check_vector(lw_instance *self, const char *function, bool initializing, size_t found, size_t expected) {
     if (!self->s.model_exchange)
         return lw_fail(self, "%s: this is a Co-Simulation instance. Instantiate it as fmi2ModelExchange.", function);
@@ -202,7 +202,7 @@ static bool lw_check_vector(lw_instance *self, const char *function, bool initia
     return lw_fail(self, "%s: found room for %zu values, expected %zu.", function, found, expected);
 }
 
-/* Outside of the model's domain, the importer may try a shorter step (FMI 2.0, 2.1.3): the instance is not terminated. */
+/* Outside of the model's domain the importer may try a shorter step (FMI 2.0, 2.1.3), so the instance is not terminated. */
 static fmi2Status lw_evaluated(lw_instance *self, int32_t mode, bool ok) {
     if (ok) return fmi2OK;
     if (mode != LW_CONTINUOUS) return fmi2Error;

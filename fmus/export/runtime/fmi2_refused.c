@@ -1,5 +1,5 @@
 /* FMI 2.0: the functions that these FMUs don't support. Every symbol of the standard is exported (some importers ask for
- * all of them); each of these returns an error, or fmi2Discard where that does no harm, and logs why. */
+ * all of them); each of these returns an error, or fmi2Discard if that does no harm, and logs the reason. */
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-parameter"
 #endif
@@ -17,7 +17,7 @@ static fmi2Status lw_discard(lw_instance *self, const char *function, const char
 
 #define LW_REFUSE(name, why, ...) fmi2Status name(fmi2Component c, __VA_ARGS__) { return lw_refuse(c, #name, why); }
 
-/* ---- variables of other types: there are none, so asking for none is fine ---- */
+/* ---- variables of other types: there are none, so only calls with none succeed ---- */
 
 #define LW_NO_TYPE(type) \
     fmi2Status fmi2Get##type(fmi2Component c, const fmi2ValueReference vr[], size_t nvr, fmi2##type value[]) { \
@@ -59,7 +59,7 @@ fmi2Status fmi2GetIntegerStatus(fmi2Component c, const fmi2StatusKind s, fmi2Int
 fmi2Status fmi2GetBooleanStatus(fmi2Component c, const fmi2StatusKind s, fmi2Boolean *value) {
     if (!c) return fmi2Error;
     if (s != fmi2Terminated) return lw_discard(c, "fmi2GetBooleanStatus", "the only kind of type Boolean is fmi2Terminated");
-    *value = fmi2False; /* the model itself never asks for an end */
+    *value = fmi2False; /* the model never ends the simulation */
     return fmi2OK;
 }
 

@@ -1,5 +1,5 @@
-/* FMI 3.0: the functions of fmi3Functions.h that exported FMUs support. Those of Model Exchange and of Event Mode alone:
- * fmi3_events.c. The others: fmi3_refused.c. */
+/* FMI 3.0: the functions of fmi3Functions.h that exported FMUs support, but those of Model Exchange and of Event Mode only
+ * (fmi3_events.c). The others are in fmi3_refused.c. */
 #include "fmi3Functions.h"
 
 #define LW_OK(call) ((call) ? fmi3OK : fmi3Error)
@@ -63,14 +63,14 @@ fmi3Instance fmi3InstantiateModelExchange(fmi3String instanceName, fmi3String in
     return lw_instantiate_fmi3(instanceName, instantiationToken, loggingOn, instanceEnvironment, logMessage, true);
 }
 
-/* Intermediate update at the end of an internal step (FMI 3.0, 4.2.2). What the standard leaves open:
- * - it is called at accepted states alone, so intermediateStepFinished is always true; the last call of a step is that at its
- *   end, where canReturnEarly is false; where an event returns to Event Mode there is none, where one is handled inside doStep
- *   it comes after the jump;
+/* Intermediate update at the end of an internal step (FMI 3.0, 4.2.2). Points that the standard leaves open:
+ * - it is called at accepted states only, so intermediateStepFinished is always true; the last call of a step is at its
+ *   end, with canReturnEarly = false; it is missing if an event returns to Event Mode, and comes after the jump if an event
+ *   is handled inside doStep;
  * - all variables may be read and all continuous inputs be set, whether or not they are required intermediate variables;
  * - inputs are held until they are set again, so an input sampled in this way enters with order 1 in the internal step; those
  *   that are set at the end of the communication step hold for the next one;
- * - an earlyReturnTime beyond the present is met exactly, one that is not returns at once. */
+ * - a step ends exactly at an earlyReturnTime beyond the present, and at once for any other. */
 static bool lw_update_fmi3(lw_instance *self, double t, bool can_return_early, double *until) {
     fmi3IntermediateUpdateCallback update = (fmi3IntermediateUpdateCallback)self->update_sink;
     fmi3Boolean requested = fmi3False;

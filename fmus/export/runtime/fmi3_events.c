@@ -1,6 +1,6 @@
 /* FMI 3.0: Event Mode, and Model Exchange. */
 
-/* ---- Event Mode (FMI 3.0, 2.3.5; in Co-Simulation where there are events) ---- */
+/* ---- Event Mode (FMI 3.0, 2.3.5; in Co-Simulation if there are events) ---- */
 
 static bool lw_has_event_mode(lw_instance *self, const char *function) {
     if (self->s.model_exchange || self->event_mode_used) return true;
@@ -46,7 +46,7 @@ static bool lw_is_model_exchange(lw_instance *self, const char *function) {
     return lw_fail(self, "%s: this is a Co-Simulation instance. Use fmi3InstantiateModelExchange.", function);
 }
 
-/* Is the call allowed, and are there as many values as there are? */
+/* Is the call allowed, and is the number of values right? */
 static bool lw_check_vector(lw_instance *self, const char *function, bool initializing, size_t found, size_t expected) {
     if (!lw_is_model_exchange(self, function)) return false;
     if (!(initializing && self->s.mode == LW_INITIALIZING) && !lw_is_initialized(self, function)) return false;

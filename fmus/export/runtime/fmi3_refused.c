@@ -1,5 +1,5 @@
 /* FMI 3.0: the functions that these FMUs don't support. Every symbol of the standard is exported (some importers ask for
- * all of them); each of these returns fmi3Error and logs why. */
+ * all of them); each of these returns fmi3Error and logs the reason. */
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-parameter"
 #endif
@@ -11,7 +11,7 @@ static fmi3Status lw_refuse(lw_instance *self, const char *function, const char 
 
 #define LW_REFUSE(name, why, ...) fmi3Status name(__VA_ARGS__) { return lw_refuse(instance, #name, why); }
 
-/* ---- variables of other types: there are none, so asking for none is fine ---- */
+/* ---- variables of other types: there are none, so only calls with none succeed ---- */
 
 #define LW_NO_TYPE(name, ...) \
     fmi3Status name(fmi3Instance instance, const fmi3ValueReference v[], size_t n, __VA_ARGS__) { \

@@ -1,4 +1,4 @@
-/* One step of each integrator, discrete states held, and inputs too unless they move (u is NULL then, see lw_inputs): rk4
+/* One step of each integrator, with discrete states held, and inputs too unless they move (u is NULL, see lw_inputs): rk4
  * (explicit Runge-Kutta, order 4), dopri5 (explicit, embedded order 5(4): Dormand & Prince 1980) and rodas (linearly
  * implicit, order 4(3), stiffly accurate, L-stable: Hairer & Wanner, Solving Ordinary Differential Equations II, IV.7). */
 #define LW_MAX_SUBSTEPS 1e9
@@ -31,7 +31,7 @@ static inline int lw_rk4(lw_instance *self, double t, double h, const double *u,
     return failed;
 }
 
-/* Into how many equal substeps internal_step cuts h: negative (and logged) if too many. */
+/* Number of equal substeps of at most internal_step in h; negative, and logged, if too many. */
 static long lw_substeps(lw_instance *self, double h) {
     double step = self->s.values[LW_STEP], count = ceil(h / step - 1e-9);
     if (count <= LW_MAX_SUBSTEPS) return count < 1.0 ? 1 : (long)count;
@@ -59,16 +59,16 @@ static bool lw_fixed_steps(lw_instance *self, double t, double h) {
     long n = lw_substeps(self, h);
     if (n < 0) return false;
     const double *u = lw_inputs_of_step(self);
-    /* two calls, that held inputs cost nothing in the loop */
+    /* two calls, so that held inputs cost nothing in the loop */
     if (u ? lw_integrate(self, t, h, n, self->s.values + LW_U, false) : lw_integrate(self, t, h, n, NULL, false)) return true;
     lw_integrate(self, t, h, n, u, true); /* again, to name the variable and the time */
     return false;
 }
 #endif
 
-/* ---- what the adaptive ones share ----
+/* ---- common part of the adaptive integrators ----
  *
- * A step goes from self->x at t to self->next at t + h. The solution in between, needed where there are events:
+ * A step goes from self->x at t to self->next at t + h. The solution in between, needed for events, is
  * x + theta (d0 + (1 - theta) (d1 + theta (d2 + (1 - theta) d3))), theta from 0 to 1, d in self->dense. */
 
 static inline int lw_rate(lw_instance *self, double t, const double *x, const double *u, double *k) {
@@ -112,7 +112,7 @@ static void lw_combine(lw_instance *self, double h, const double *c, int n, doub
     }
 }
 
-/* ---- rk4 step by step; where there are events: with the cubic Hermite interpolant ---- */
+/* ---- rk4 step by step, for events with the cubic Hermite interpolant ---- */
 
 static int lw_rk4_step(lw_instance *self, double t, double h, const double *u) {
     double *const x = self->x, *const next = self->next;
@@ -181,7 +181,7 @@ static double lw_dopri5_step(lw_instance *self, double t, double h, const double
 #define LW_MATRIX(i, j) m[(size_t)(i) * LW_N_X + (j)]
 
 #if LW_MOVING_INPUTS
-/* How the unknowns change at (t, x) because the inputs move, per unit of time: into self->scratch. */
+/* Write the rate of the unknowns at (t, x) due to moving inputs into self->scratch. */
 static int lw_along_inputs(lw_instance *self, double t, const double *x) {
     double *knowns = self->sensitivity, *seed = self->seed, since = t - self->step_start;
     memcpy(knowns, self->s.values, LW_DX * sizeof(double));

@@ -1,4 +1,4 @@
-/* The runtime of exported FMUs: what a generated model provides, and what an instance holds.
+/* Runtime of exported FMUs: declarations of a generated model, and of an instance.
  *
  * One translation unit per FMU: the generated model.c defines the LW_ constants below, includes this header, then holds
  * the equations and tables, then includes core.c, integrators.c, events.c and stepping.c (no FMI version in them) and the
@@ -18,8 +18,8 @@
 
 /* Generated: LW_MODEL_NAME, LW_TOKEN; LW_FMI, the version; elements: LW_N_P, LW_N_U, LW_N_X (continuous states), LW_N_D (discrete states),
  * LW_N_Y; LW_N_Z events; LW_N_J nonzeros of the Jacobian; LW_N_VARIABLES; LW_HAS_DERIVATIVES; LW_SZ_ARG, LW_SZ_RES,
- * LW_SZ_IW, LW_SZ_W (work of the equations, the largest of all); LW_API, how names of FMI's functions begin. */
-#define LW_N_S (LW_N_X + LW_N_D) /* all states, as the equations see them */
+ * LW_SZ_IW, LW_SZ_W (work of the equations, the largest of all); LW_API, the prefix of names of FMI's functions. */
+#define LW_N_S (LW_N_X + LW_N_D) /* all states, as the equations take them */
 #define LW_P 1
 #define LW_U (LW_P + LW_N_P)
 #define LW_X (LW_U + LW_N_U)
@@ -70,20 +70,20 @@ typedef int lw_function(const double **arg, double **res, long long int *iw, dou
 typedef enum { LW_RK4 = 1, LW_DOPRI5 = 2, LW_RODAS = 3 } lw_integrator;
 typedef enum {
     LW_INSTANTIATED, LW_INITIALIZING, LW_STEPPING, LW_EVENT, LW_CONTINUOUS, LW_TERMINATED,
-    LW_INTERMEDIATE /* within a step: no state is ever taken in it */
+    LW_INTERMEDIATE /* within a step; no state is ever saved in it */
 } lw_mode;
 typedef enum { LW_LOG_WARNING = 1, LW_LOG_ERROR = 2 } lw_category;
 
-/* What an FMU state is made of: copied and serialized as it is. */
+/* Content of an FMU state, which is copied and serialized unchanged. */
 typedef struct {
     uint64_t magic;
     int32_t mode;
-    uint8_t have_outputs, have_derivatives, have_indicators; /* are the values of these those of now? */
+    uint8_t have_outputs, have_derivatives, have_indicators; /* are these up to date? */
     uint8_t model_exchange;
     uint8_t stop_time_defined, tolerance_given, iterations; /* iterations in this visit of Event Mode */
-    uint8_t moving, moved, unused[3]; /* do the inputs move in the next step; have they in the last one? */
+    uint8_t moving, moved, unused[3]; /* do the inputs move in the next step; did they in the last one? */
     double stop_time;
-    double step_size; /* of the adaptive integrators: to be tried next; 0: to be chosen anew */
+    double step_size; /* of the adaptive integrators, to try next; 0: choose anew */
     double values[LW_N_VALUES];
 #if LW_MOVING_INPUTS
     double slopes[LW_MAX_ORDER][LW_N_U]; /* derivatives of the inputs by time at the start of the next step, from order 1 on */
@@ -97,21 +97,21 @@ typedef struct {
 typedef struct lw_instance lw_instance;
 struct lw_instance {
     lw_state s;
-    bool event_mode_used, early_return_allowed; /* as the importer wants it */
+    bool event_mode_used, early_return_allowed; /* chosen by the importer */
     bool event_found;                           /* the last step ended at an event */
-    /* Intermediate update, or NULL: true if the step is to end early, at *until or now. */
+    /* Intermediate update, or NULL: returns true if the step must end early, at *until or now. */
     bool (*update)(lw_instance *self, double t, bool can_return_early, double *until);
     void (*update_sink)(void);
     lw_state *before; /* with an update: the state before the step */
 #if LW_MOVING_INPUTS
-    double step_start, inputs[LW_N_U]; /* where the derivatives of the inputs hold; the inputs at a time from there on */
+    double step_start, inputs[LW_N_U]; /* time at which the derivatives of the inputs hold; the inputs at a later time */
 #endif
     /* scratch of the integrators and of the equations */
     double x[LW_AT_LEAST_1(LW_N_S)], stage[LW_AT_LEAST_1(LW_N_S)], next[LW_AT_LEAST_1(LW_N_S)];
     double k1[LW_AT_LEAST_1(LW_N_X)], k2[LW_AT_LEAST_1(LW_N_X)], k3[LW_AT_LEAST_1(LW_N_X)], k4[LW_AT_LEAST_1(LW_N_X)];
     double k5[LW_AT_LEAST_1(LW_N_X)], k6[LW_AT_LEAST_1(LW_N_X)], k7[LW_AT_LEAST_1(LW_N_X)];
     double dense[4][LW_AT_LEAST_1(LW_N_X)]; /* the solution within the last step, see lw_dense */
-    double *matrix;                         /* LU factors and then pivots, of rodas; made when needed */
+    double *matrix;                         /* LU factors, then pivots, of rodas; allocated when needed */
     double jacobian[LW_AT_LEAST_1(LW_N_J)], slope[LW_AT_LEAST_1(LW_N_X)]; /* of the derivatives: by states; by time */
     double scratch[LW_N_VALUES + LW_N_Z];
     double seed[LW_N_VALUES], sensitivity[LW_N_VALUES]; /* in the order of the values */

@@ -1,8 +1,8 @@
-/* A communication step: the integrator that was chosen, with its step size and its events. */
+/* Communication step: the chosen integrator, with its step size and its events. */
 #define LW_MAX_STEPS 10000000
-#define LW_PIECES 4 /* of an adaptive step, each looked through for events */
+#define LW_PIECES 4 /* of an adaptive step, each searched for events */
 
-#define LW_SAME_INPUT 1e-12 /* an input that has moved to a value and is then set to it: equal but for rounding */
+#define LW_SAME_INPUT 1e-12 /* an input that has moved to a value and is then set to it is equal but for rounding */
 
 /* Have the inputs jumped since the last step? Then an adaptive integrator starts anew. */
 static bool lw_inputs_jumped(const lw_instance *self) {
@@ -33,18 +33,18 @@ static bool lw_step_too_small(lw_instance *self, double t, double h) {
                    t, h, lw_variables[v].name, (size_t)(LW_X + worst) - lw_variables[v].first, self->x[worst]);
 }
 
-/* Steps within a communication step: what is kept from one to the next. */
+/* Steps within a communication step: values that are kept from one to the next. */
 typedef struct {
     lw_integrator integrator;
-    double end;     /* of the communication step, or where it is to end early */
-    double segment; /* rk4: where the equal substeps began, since the last event */
-    double length;  /* rk4: of all of them */
-    long n, i;      /* rk4: substeps in all, and done */
-    bool fresh;     /* after a jump: slope and step size are to be found anew */
+    double end;     /* end of the communication step, or the earlier time at which it must end */
+    double segment; /* rk4: begin of the equal substeps, since the last event */
+    double length;  /* rk4: length of all substeps */
+    long n, i;      /* rk4: number of substeps, and of those done */
+    bool fresh;     /* after a jump: slope and step size must be found anew */
     bool rejected;
 } lw_run;
 
-/* An accepted step of an adaptive integrator from self->x at t, into self->next; `to` is where it ends. */
+/* An accepted step of an adaptive integrator from self->x at t, into self->next; it ends at `to`. */
 static inline bool lw_adaptive_step(lw_instance *self, lw_run *run, double t, double *to) {
     const double *u = lw_inputs_of_step(self);
     const bool implicit = run->integrator == LW_RODAS;
@@ -57,7 +57,7 @@ static inline bool lw_adaptive_step(lw_instance *self, lw_run *run, double t, do
     if (implicit && (lw_linearize(self, t, u) || !lw_is_finite(self->jacobian, LW_N_J) || !lw_is_finite(self->slope, LW_N_X)))
         return lw_fail(self, "the Jacobian can't be evaluated at t = %.9g s. Set integrator = 1 or 2.", t);
 #endif
-    /* With an intermediate update, internal_step bounds how long the importer isn't asked for inputs. */
+    /* With an intermediate update, internal_step bounds the time between two requests for inputs. */
     const double longest = self->update ? self->s.values[LW_STEP] : INFINITY;
     double h = self->s.step_size;
     if (run->fresh && !(h > 0.0)) h = lw_first_step(self, t, u, implicit ? 4 : 5, left);
@@ -75,7 +75,7 @@ static inline bool lw_adaptive_step(lw_instance *self, lw_run *run, double t, do
         double factor = isfinite(error) ? fmax(0.2, 0.9 * pow(error, exponent)) : 0.2;
         if (error <= 1.0) {
             factor = fmin(factor, run->rejected ? 1.0 : 5.0);
-            /* a step that the communication point has cut says little of the next one */
+            /* a step that a communication point cuts says little about the next one */
             self->s.step_size = last ? fmax(h, used * factor) : used * factor;
             *to = last ? run->end : t + used;
             return true;
@@ -100,7 +100,7 @@ static bool lw_next_step(lw_instance *self, lw_run *run, double t, double *to) {
     }
     run->i++;
     *to = run->i == run->n ? run->end : run->segment + run->length * ((double)run->i / (double)run->n);
-    /* where there are no events, as long as in lw_integrate: who only watches the step changes no bit */
+    /* without events as long as in lw_integrate, so that watching the step changes no bit */
     if (lw_rk4_step(self, t, LW_N_Z ? *to - t : run->length / (double)run->n, lw_inputs_of_step(self)))
         return lw_fail(self, "the equations can't be evaluated at t = %.9g s.", *to);
     return !LW_N_X || lw_check_finite(self, self->next, LW_X, LW_N_X, *to);
@@ -124,7 +124,7 @@ static bool lw_intermediate_update(lw_instance *self, lw_run *run, double t, boo
     lw_publish(self, t);
     self->s.mode = LW_INTERMEDIATE;
     bool wanted = self->update(self, t, can_return_early, &until);
-    if (self->s.mode == LW_TERMINATED) return false; /* what was refused has logged why */
+    if (self->s.mode == LW_TERMINATED) return false; /* the refused call has logged the reason */
     if (self->s.mode != LW_INTERMEDIATE)
         return lw_fail(self, "the intermediate update at t = %.9g s has left its mode, as by a reset. Get and set variables "
                        "in it, nothing else.", t);
@@ -140,7 +140,7 @@ static bool lw_intermediate_update(lw_instance *self, lw_run *run, double t, boo
 /* ---- a communication step ---- */
 
 #if LW_N_Z
-/* Inputs may have jumped at t: what fires by that happens first. `event`: it is left to Event Mode. */
+/* Inputs may have jumped at t; events that fire by that come first. `event` is true if they are left to Event Mode. */
 static bool lw_meet_inputs(lw_instance *self, double t, const double *u, bool *event) {
     double z[LW_N_Z], fired[LW_N_Z];
     bool any;
@@ -154,8 +154,8 @@ static bool lw_meet_inputs(lw_instance *self, double t, const double *u, bool *e
 }
 #endif
 
-/* Integrate from t over h to end: adaptively, with events, or with an intermediate update. The states there are in
- * self->next afterwards, the time is in `end`. Where Event Mode is used, an event ends the step: self->event_found. */
+/* Integrate from t over h to end: adaptively, with events, or with an intermediate update. Afterwards self->next holds the
+ * states at the end and `end` the time. If Event Mode is used, an event ends the step: self->event_found. */
 static bool lw_advance(lw_instance *self, double t, double h, double *end) {
     lw_run run = {.integrator = (lw_integrator)self->s.values[LW_INTEGRATOR], .end = *end, .fresh = true};
     run.segment = t;
@@ -212,7 +212,7 @@ static bool lw_advance(lw_instance *self, double t, double h, double *end) {
         }
         if (!self->update) continue;
         if (!lw_intermediate_update(self, &run, t, &leave)) return false;
-        if (leave || t >= run.end || !lw_inputs_jumped(self)) continue; /* set at the end, they are those of the next step */
+        if (leave || t >= run.end || !lw_inputs_jumped(self)) continue; /* inputs set at the end belong to the next step */
         self->s.step_size = 0.0;
         if (run.integrator != LW_RK4 && LW_N_X) run.fresh = true;
 #if LW_N_Z
@@ -247,7 +247,7 @@ static bool lw_try_step(lw_instance *self, double t, double h) {
     memcpy(v + LW_Y, self->scratch, LW_N_Y * sizeof(double));
     memcpy(v + LW_X, self->next, LW_N_S * sizeof(double));
 #if LW_MOVING_INPUTS
-    /* Derivatives hold for one step (FMI 2.0.5, 4.2.1). Where nothing is set then, an input stays where it has moved to. */
+    /* Derivatives hold for one step (FMI 2.0.5, 4.2.1). An input that is not set then keeps the value that it reached. */
     self->s.moved = self->s.moving;
     if (!u) {
         memcpy(v + LW_U, lw_inputs(self, NULL, end), LW_N_U * sizeof(double));
@@ -262,8 +262,8 @@ static bool lw_try_step(lw_instance *self, double t, double h) {
     return true;
 }
 
-/* Step from t over h, or to the first event (self->event_found; the time is then values[0]). When it fails, nothing has
- * changed: time, states, domains and outputs are those before it. */
+/* Step from t over h, or to the first event (self->event_found; the time is then values[0]). A failure changes nothing:
+ * time, states, domains and outputs are those before the step. */
 static bool lw_step(lw_instance *self, double t, double h) {
     double step_size = self->s.step_size;
 #if LW_N_Z

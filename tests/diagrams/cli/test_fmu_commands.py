@@ -341,7 +341,7 @@ def test_models_that_cant_be_built(here, capsys, monkeypatch):
         assert names(here) == SOURCES
         return err
 
-    assert "static: it has no derivative(t, x, u), so it is no continuous model" in fails("mine.py:Static")
+    assert "static: found no derivative(t, x, u); expected a continuous model" in fails("mine.py:Static")
     unlucky = f"Unlucky() can't be made in line {line_of('raise RuntimeError')}: RuntimeError: no luck. Correct it."
     assert unlucky in fails("mine.py:Unlucky")
     (here / "folder").mkdir()
@@ -490,7 +490,7 @@ def test_inspect_fmi_1(tmp_path, capsys):
 def test_tool_coupling_is_told(altered, capsys):
     file = altered("lag.fmu", description=lambda root: root.find("CoSimulation").set("needsExecutionTool", "true"))
     assert main(["inspect", str(file)]) == 0
-    assert "It needs another program where it runs (needsExecutionTool)" in capsys.readouterr().out
+    assert "It needs another program to run (needsExecutionTool)" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("command", ["inspect", "validate"])
@@ -516,7 +516,7 @@ def test_files_that_are_no_fmu(command, tmp_path, capsys):
     says(_zip({"a.txt": b""}), "is a zip archive without modelDescription.xml, so it is no FMU.")
     says(
         _zip({"a/modelDescription.xml": b""}),
-        "There is a/modelDescription.xml: pack what is in that folder, not the folder.",
+        "There is a/modelDescription.xml: pack the files in that folder, not the folder.",
     )
     says(_zip({"modelDescription.xml": b"<a>"}), "is no XML")
     says(_zip({"modelDescription.xml": b'<fmiModelDescription fmiVersion="9.0"/>'}), "9.0")
@@ -554,7 +554,7 @@ def test_a_missing_shared_library_is_named(altered, tmp_path, capsys):
     out = capsys.readouterr().out
     assert "co-simulation: loading and instantiating it failed: " in out
     assert "libabsent.so: cannot open shared object file" in out
-    assert "Next: See what its binary needs: loopwright inspect names the libraries that are missing here." in out
+    assert "Next: Install the libraries that it lacks here: loopwright inspect names them." in out
 
 
 @LINUX

@@ -10,7 +10,7 @@ from fmpy.validation import validate_fmu
 
 from loopwright.blocks.core.errors import DefinitionError, ParameterError
 from loopwright.fmus.export.build import build_fmu
-from loopwright.fmus.export.model import Event, Variable
+from loopwright.fmus.export.model import EventSpec, Variable
 from support.exported import E, G, ball, bouncing_ball, counter, heating, mass_spring_damper, relay, thermostat
 
 INTEGRATORS = (1, 2, 3)
@@ -128,7 +128,7 @@ def test_too_many_events_are_an_error(instance):
 def test_an_input_that_jumps_fires_at_the_communication_point(instance):
     """Each change of domain counts, in the declared direction alone."""
     for direction, expected in (("both", [1, 1, 2, 3]), ("rising", [1, 1, 1, 2]), ("falling", [0, 0, 1, 1])):
-        spec = counter(lambda t, x, u, p, fired: [x[0], x[1] + fired[0]], events=(Event("reached", direction),))
+        spec = counter(lambda t, x, u, p, fired: [x[0], x[1] + fired[0]], events=(EventSpec("reached", direction),))
         item = instance(build_fmu(spec)).initialize()
         found = []
         for k, u in enumerate((2.0, 3.0, 0.0, 2.0)):
@@ -149,7 +149,7 @@ def test_a_jump_may_fire_again_and_events_at_one_instant_fire_at_once(instance):
     spec = counter(
         lambda t, x, u, p, fired: [x[0] + fired[0], 10.0 * x[1] + fired[0] + 2.0 * fired[1] + 4.0 * fired[2]],
         z=lambda t, x, u, p: [u[0] - 1.0, x[0] - 0.5, u[0] - 1.0],
-        events=(Event("input"), Event("state"), Event("twin", "rising")),
+        events=(EventSpec("input"), EventSpec("state"), EventSpec("twin", "rising")),
     )
     item = instance(build_fmu(spec)).initialize()
     item.step(0.0, 1.0, u=2.0)
@@ -182,7 +182,7 @@ def touch(height):
     return counter(
         lambda t, x, u, p, fired: [x[0], x[1] + fired[0]],
         z=lambda t, x, u, p: [height - (t - 1.0) ** 2],
-        events=(Event("reached", "falling"),),
+        events=(EventSpec("reached", "falling"),),
     )
 
 
@@ -227,14 +227,14 @@ def test_a_tunable_parameter_acts_between_steps(ball_fmu, instance):
 @pytest.mark.parametrize(
     ("make", "error", "parts"),
     [
-        (lambda: Event("a b"), DefinitionError, ["event name 'a b'"]),
-        (lambda: Event("a", "up"), DefinitionError, ["the event a has direction 'up'", "both, rising, falling"]),
-        (lambda: Event("a", nominal=0.0), ParameterError, ["the event a has nominal 0.0"]),
+        (lambda: EventSpec("a b"), DefinitionError, ["event name 'a b'"]),
+        (lambda: EventSpec("a", "up"), DefinitionError, ["the event a has direction 'up'", "both, rising, falling"]),
+        (lambda: EventSpec("a", nominal=0.0), ParameterError, ["the event a has nominal 0.0"]),
         (lambda: Variable("x", nominal=-1.0), ParameterError, ["x has nominal -1.0, expected a positive number"]),
         (lambda: Variable("y", "output", "discrete"), DefinitionError, ["y is discrete, but neither input nor state"]),
         (lambda: Variable("tolerance"), DefinitionError, ["'tolerance' is reserved"]),
         (lambda: replace(bouncing_ball(), events=()), DefinitionError, ["found indicators and jump, but no events"]),
-        (lambda: bouncing_ball(events=(Event("a"), Event("b"))), DefinitionError, ["bouncing_ball.indicators", "column of 2"]),
+        (lambda: bouncing_ball(events=(EventSpec("a"), EventSpec("b"))), DefinitionError, ["bouncing_ball.indicators", "column of 2"]),
         (lambda: replace(bouncing_ball(), jump=None), DefinitionError, ["bouncing_ball.jump", "(t, x, u, p, fired)"]),
         (
             lambda: replace(thermostat(), states=thermostat().states[::-1]),
@@ -247,7 +247,7 @@ def test_a_tunable_parameter_acts_between_steps(ball_fmu, instance):
             ["found discrete states, but no events"],
         ),
         (
-            lambda: replace(bouncing_ball(), events=(Event("bounce"),), outputs=(Variable("bounce.indicator", "output", unit="m"),),
+            lambda: replace(bouncing_ball(), events=(EventSpec("bounce"),), outputs=(Variable("bounce.indicator", "output", unit="m"),),
                             output=bouncing_ball().indicators),
             DefinitionError,
             ["'bounce.indicator' names 2 variables"],

@@ -234,9 +234,9 @@ def test_wrong_settings_are_refused(msd, instance):
 
 def test_rodas_needs_derivatives(monkeypatch):
     monkeypatch.setattr(
-        "loopwright.fmus.export.c_code.symbolic", lambda spec: (_ for _ in ()).throw(RuntimeError("none"))
+        "loopwright.fmus.export.c_code.to_symbols", lambda spec: (_ for _ in ()).throw(RuntimeError("none"))
     )
-    with pytest.raises(DefinitionError, match="no derivatives, which the integrator rodas needs"):
+    with pytest.raises(DefinitionError, match="without derivatives, which the integrator rodas needs"):
         build_fmu(mass_spring_damper(integrator="rodas", description="not in the cache"))
 
 

@@ -393,14 +393,14 @@ def test_refused(models, tmp_path, monkeypatch):
         r"its derivative fails at the start values in line \d+ of .*my_models.py: KeyError: 'nothing'",
         models.FailsAtOnce(),
     )
-    refuse("its class is defined inside a function; define it at the top", models.local())
-    refuse("there is no file '.*nothing.py' to take along", models.Counter(), files=[tmp_path / "nothing.py"])
+    refuse("found a class that is defined inside a function; define it at the top", models.local())
+    refuse("found no file '.*nothing.py' to include", models.Counter(), files=[tmp_path / "nothing.py"])
     monkeypatch.setattr(Prompted, "__module__", "nowhere")
-    refuse("its class was not defined in a file", Prompted())
+    refuse("found a class that is not defined in a file", Prompted())
 
 
 def test_a_module_that_was_not_taken_along(models, tmp_path):
-    with pytest.raises(FmuError, match=r"(?s)No module named 'rates'.*take it along with files="):
+    with pytest.raises(FmuError, match=r"(?s)No module named 'rates'.*include it with files="):
         build_python(models.Decay(), tmp_path)
     assert list(tmp_path.iterdir()) == []
 

@@ -158,8 +158,8 @@ class Half(Through):
     ("block", "text"),
     [
         (Limited(), r"limited: it has guards\(…\), but an FMU has no guards"),
-        (Computed(), r"computed: it has initial\(…\), but an FMU's states have start values"),
-        (Mixed(), r"mixed\.z: its entries have units of their own, m, m/s; a variable of an FMU has one"),
+        (Computed(), r"computed: it has initial\(…\), but an FMU's states have fixed start values"),
+        (Mixed(), r"mixed\.z: found several units, m, m/s; a variable of an FMU has one"),
         (Half(), r"half: z without a unit, where others have one. Give unit=, '1' for no dimension"),
     ],
 )

@@ -222,7 +222,7 @@ def test_states_with_guessed_start_values_are_set_in_model_exchange_alone(motor,
 def test_an_fmu_that_hides_its_states_has_no_linear_model_but_a_step(motor, tmp_path):
     hidden = edited(motor, tmp_path, lambda s: re.sub(r"<ContinuousStateDerivative[^>]*/>", "", s))
     plant = Fmu(hidden)
-    with pytest.raises(FmuError, match=r"^fmu: its model structure lists no derivatives .* Take step_difference\(\)"):
+    with pytest.raises(FmuError, match=r"^fmu: its model structure lists no derivatives .* Use step_difference\(\)"):
         plant.linear_model()
     step = plant.step_difference(1e-3)
     E = expm(np.block([[A_MOTOR, B_MOTOR], [np.zeros((2, 5))]]) * 1e-3)
@@ -395,7 +395,7 @@ def test_directional_derivatives_are_refused_by_name(motor, tmp_path):
     with Fmu(underived, name="m").instantiate([], None) as run:
         run.begin()
         with pytest.raises(
-            FmuError, match=r"^m: it gives no directional derivatives: providesDirectionalDerivatives is false"
+            FmuError, match=r"^m: it has no directional derivatives: providesDirectionalDerivatives is false"
         ):
             run.directional_derivative(["torque"], ["current"], [1.0])
     with Fmu(motor, name="m").instantiate([], None) as run:
