@@ -1,19 +1,22 @@
-"""Frequency responses measured on the running diagram, by a test signal that is injected at a wire.
+"""Frequency responses measured on the running diagram, with a test signal injected at a wire.
 
-**Which signals.** At the wire, v is what the port puts out, d the test signal, u = v + d what all its consumers get. S
-= u/d, T = −v/d, L = −v/u: the loop that `Linearization.loop` cuts at this wire, all other loops closed. All of them
-are sampled where the linear model's loops are: at the ticks of the least common period of what is sampled, from the
-one on at which the wire is renewed, with d held from one to the next. They are the phasors of sequences, not of what
-is between the ticks: a plant's velocity read at 1 kHz holds the ripple of the controller's hold, aliased, and differs
-from the velocity's fundamental by 1e-4 to 1e-3. In a diagram that is continuous throughout, d is continuous too. Where
-v changes between the samples (several rates; continuous states), S and T are still what the linear model calls them,
-but no loop is cut by a held signal: there is no L.
+**Signals.** At the wire, v is the port's signal, d the test signal, and u = v + d the signal of all consumers. Then
+S = u/d, T = −v/d and L = −v/u: the loop that `Linearization.loop` cuts at this wire, with all other loops closed.
 
-**Frequencies** are moved by less than half a sample in a window, so that whole periods fit into it.
+All signals are sampled at the same ticks as the linear model's loops: once in the least common period of all sample
+times, from the tick on at which the wire is renewed. d is held from one sample to the next. The phasors are those of
+the sequences. Between the ticks a signal differs: a plant's velocity read at 1 kHz contains the aliased ripple of the
+controller's hold, and differs from the velocity's fundamental by 1e-4 to 1e-3. In a diagram without sampling, d is
+continuous too.
 
-**Procedure.** The signal is ramped in over a window. Then windows of whole periods follow, until the phasors of two of
-them agree, or so many have passed. Offset and drift are taken away. The last window counts; its distance from the one
-before is the estimate of its error: what has not settled yet, and noise. What is left beside the lines is the
+Where v changes between the samples (several rates, continuous states), S and T still agree with the linear model. But
+a held signal then cuts no loop: there is no L.
+
+**Frequencies** are changed by less than half a sample in a window, so that whole periods fit into it.
+
+**Procedure.** The signal is ramped in over a window. Windows of whole periods follow, until the phasors of two of them
+agree or the largest number of windows is reached. Offset and drift are subtracted. The last window gives the result;
+its distance from the window before estimates the error, due to settling and noise. The rest beside the lines is the
 distortion, a sign of an amplitude that leaves the linear range.
 """
 
@@ -22,10 +25,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...blocks.core.errors import OptionError
 from ..flat.evaluate import Pass
@@ -37,39 +41,49 @@ from ..linearization.loops_over_a_period import ticks_to_renewal
 from ..linearization.operating_point import operating_point
 from ..results.operating_point import OperatingPoint, PointOrigin
 from ..results.run import Snapshot
-from .injection import Experiment, injected
-from .waveforms import KINDS, Part, phasors_of, plan_of, step_for
+from .injection import InjectionRun, inject_signal
+from .waveforms import KINDS, Part, choose_step, compute_phasors, plan_signal
 
 if TYPE_CHECKING:
+    from control import FrequencyResponseData
+
     from ..linearization.linearize import Linearization
+
+Beginning: TypeAlias = OperatingPoint | Snapshot | float | None
 
 
 @dataclass(frozen=True, eq=False)
 class FrequencyResponse:
-    """A measured frequency response at a wire; how it is measured is said in this module.
+    """A measured frequency response at a wire; this module describes the measurement.
 
     Attributes
     ----------
+    diagram : Diagram
+        Diagram that was measured.
     wire : str
-        Where the test signal was added.
+        Wire to which the test signal was added.
+    kind : str
+        Kind of the test signal.
+    amplitude : float
+        Largest value of the test signal.
     omega : (K,) ndarray
-        Frequencies in rad/s, as they were measured.
+        Measured frequencies in rad/s.
     dt : float
-        Seconds between two samples; 0 where everything is continuous.
+        Seconds between two samples; 0 in a diagram without sampling.
     v, u, y : ndarray
-        Phasors relative to those of the test signal: of what the port puts out, of what its consumers get, of the
-        outputs; entry, injected entry, frequency.
+        Phasors of the port's signal, of its consumers' signal and of the outputs, relative to those of the test signal;
+        the axes are entry, injected entry and frequency.
     uncertainty : (K,) ndarray
-        Estimated error of L relative to its size: of v relative to v, plus that of u relative to u.
+        Estimated relative error of L: that of v plus that of u.
     distortion : (K,) ndarray
-        What v holds beside the line, relative to the line (rms); NaN for a chirp, which has all lines.
+        Rms of the rest of v beside the line, relative to the line; NaN for a chirp, which has all lines.
     windows : (K,) ndarray of int
-        How many windows it took.
+        Number of windows.
     settled : (K,) ndarray of bool
         Whether the phasors of the last two windows agreed.
     moved : float
-        How far the operating point has moved in the meantime: the largest change of a block's state, or an FMU's
-        output, from before the test signal to a window after its end, relative to 1 + its size.
+        Drift of the operating point: the largest change of a block's state or an FMU's output, from before the test
+        signal to a window after its end, relative to 1 + its size.
     """
 
     diagram: WiredDiagram = field(repr=False)
@@ -87,22 +101,22 @@ class FrequencyResponse:
     settled: np.ndarray = field(repr=False)
     moved: float
     held: bool
-    """Whether v stays between two samples, or everything is continuous: else −v/u is not a loop that can be cut."""
+    """Whether v is constant between two samples, or nothing is sampled; if not, −v/u is no loop."""
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
 
     @property
-    def S(self) -> Any:  # noqa: N802
+    def S(self) -> FrequencyResponseData:  # noqa: N802
         """Sensitivity u/d, as `control.FrequencyResponseData`."""
         return self._data(self.u, self.inputs, "S")
 
     @property
-    def T(self) -> Any:  # noqa: N802
+    def T(self) -> FrequencyResponseData:  # noqa: N802
         """Complementary sensitivity −v/d = 1 − S, as `control.FrequencyResponseData`."""
         return self._data(-self.v, self.inputs, "T")
 
     @property
-    def L(self) -> Any:  # noqa: N802
+    def L(self) -> FrequencyResponseData:  # noqa: N802
         """Loop transfer function −v/u at the wire, all other loops closed, as `control.FrequencyResponseData`.
 
         Raises
@@ -114,19 +128,27 @@ class FrequencyResponse:
         return self._data(self._loop(), self.inputs, "L")
 
     @property
-    def response(self) -> Any:
-        """From the test signal to the outputs, as `control.FrequencyResponseData`."""
+    def response(self) -> FrequencyResponseData:
+        """Response from the test signal to the outputs, as `control.FrequencyResponseData`.
+
+        Raises
+        ------
+        OptionError
+            If no outputs were measured.
+        """
         if not self.outputs:
             raise OptionError(
-                "no outputs were measured. Name them: frequency_response(…, outputs=[…]).", block=self.diagram.name
+                "found no measured outputs; expected some. Name them: frequency_response(…, outputs=[…]).",
+                block=self.diagram.name,
             )
         return self._data(self.y, self.outputs, "response")
 
     def _check_held(self) -> None:
         if not self.held:
             raise OptionError(
-                f"{self.wire!r} changes between two samples of {self.dt:g} s, while the test signal is held: −v/u is "
-                "not the loop that is cut there. Take S or T, or a wire that is renewed once in this time.",
+                f"found that {self.wire!r} changes between two samples of {self.dt:g} s; expected a signal that is "
+                "constant between them, as the test signal is: −v/u is no loop. Take S or T, or a wire that is "
+                "renewed once in this time.",
                 block=self.diagram.name,
                 port="wire",
             )
@@ -135,7 +157,7 @@ class FrequencyResponse:
         v, u = np.moveaxis(self.v, 2, 0), np.moveaxis(self.u, 2, 0)
         return np.moveaxis(-np.linalg.solve(u.swapaxes(1, 2), v.swapaxes(1, 2)).swapaxes(1, 2), 0, 2)
 
-    def _data(self, data: np.ndarray, outputs: tuple[str, ...], name: str) -> Any:
+    def _data(self, data: np.ndarray, outputs: tuple[str, ...], name: str) -> FrequencyResponseData:
         from control import FrequencyResponseData
 
         names = {"inputs": self.inputs, "outputs": outputs}
@@ -143,38 +165,47 @@ class FrequencyResponse:
         return FrequencyResponseData(data, self.omega, self.dt, name=f"{name}({self.wire})".replace(".", "_"), **plain)
 
     def deviation(self, linearization: Linearization, of: str | None = None) -> np.ndarray:
-        """Return how far the measurement is from a linear model at each frequency, relative to the model.
+        """Return the deviation of the measurement from a linear model at each frequency, relative to the model.
 
         Parameters
         ----------
         linearization : Linearization
-            Of the same diagram, at the operating point of the measurement.
+            Linear model of the same diagram, at the operating point of the measurement.
         of : {"L", "S", "T"}, optional
-            What is compared; matrices by their largest singular values. Without it L, or S where L is not to be had.
+            Function to compare, by the largest singular value of the difference. Without it L, or S if there is no L.
+
+        Returns
+        -------
+        (K,) ndarray
+            Relative deviation at each frequency.
 
         Raises
         ------
         OptionError
-            Another one, or a model of another sample time.
+            If there is no such function, or the model has another sample time.
         """
         of = ("L" if self.held else "S") if of is None else of
         made = {"L": linearization.loop, "S": linearization.sensitivity, "T": linearization.complementary}
         if of not in made:
-            raise OptionError(f"found of={of!r}; expected one of {', '.join(map(repr, made))}.", port="of")
+            raise OptionError(
+                f"found of={of!r}; expected one of {', '.join(map(repr, made))}. Choose one of them.", port="of"
+            )
         if of == "L":
             self._check_held()
         model = made[of](self.wire)
-        if not math.isclose(float(model.dt), self.dt, rel_tol=1e-12):
+        A, B, C, D = (np.asarray(matrix) for matrix in (model.A, model.B, model.C, model.D))
+        dt = float(model.dt)
+        if not math.isclose(dt, self.dt, rel_tol=1e-12):
             raise OptionError(
-                f"the linear model has the sample time {float(model.dt):g} s, the measurement {self.dt:g} s. Linearize "
-                "the same diagram, with the same step.",
+                f"found a linear model with the sample time {dt:g} s; expected that of the measurement, {self.dt:g} s. "
+                "Linearize the same diagram, with the same step.",
                 block=self.diagram.name,
             )
         measured = {"L": self._loop(), "S": self.u, "T": -self.v}[of]
         s = np.exp(1j * self.omega * self.dt) if self.dt else 1j * self.omega
         found = []
         for k, at in enumerate(s):
-            exact = model.C @ np.linalg.solve(at * np.eye(len(model.A)) - model.A, model.B) + model.D
+            exact = C @ np.linalg.solve(at * np.eye(len(A)) - A, B) + D
             found.append(np.linalg.norm(measured[:, :, k] - exact, 2) / np.linalg.norm(exact, 2))
         return np.array(found)
 
@@ -184,24 +215,24 @@ class FrequencyResponse:
 
 
 def frequency_response(
-    diagram: WiredDiagram, wire: str, frequencies: Any, *, amplitude: float, kind: str = "sine", at: Any = 0.0,
-    outputs: str | Iterable[str] = (), windows: int = 40, agreement: float = 1e-6, **options: Any,
+    diagram: WiredDiagram, wire: str, frequencies: ArrayLike, *, amplitude: float, kind: str = "sine",
+    at: Beginning = 0.0, outputs: str | Iterable[str] = (), windows: int = 40, agreement: float = 1e-6, **options: Any,
 ) -> FrequencyResponse:  # fmt: skip
     """Measure a frequency response; see `Diagram.frequency_response`."""
-    omega = _checked(diagram, frequencies, amplitude, kind, windows)
-    chosen, point, t0 = _beginning(diagram, at, dict(options))
+    omega = _check_request(diagram, frequencies, amplitude, kind, windows)
+    chosen, point, t0 = _find_beginning(diagram, at, dict(options))
     variant = diagram.replace(point.parameters) if point is not None and point.parameters else diagram
     discrete = diagram.has_clock or diagram.has_fmu
     if not discrete and chosen.get("step") is None and point is None:
-        chosen["step"] = step_for(omega)
+        chosen["step"] = choose_step(omega)
     flat = variant.flatten(chosen.get("step", None if point is None or diagram.has_clock else point.base))
     every = math.lcm(*(clock.every for clock in flat.distinct)) if flat.distinct else 1
     period = flat.base * every
     dt = float(period)
     if not omega[-1] * dt < np.pi:
         raise OptionError(
-            f"found {omega[-1]:g} rad/s; with samples every {dt:g} s only frequencies below {np.pi / dt:g} rad/s can "
-            "be told apart. Give lower frequencies, or a smaller step.",
+            f"found {omega[-1]:g} rad/s; expected less than {np.pi / dt:g} rad/s, as there is a sample every {dt:g} s. "
+            "Give lower frequencies, or a smaller step.",
             block=diagram.name,
             port="frequencies",
         )
@@ -211,64 +242,74 @@ def frequency_response(
         chosen = {"rtol": 1e-9, "atol": 1e-12, **chosen}
         if chosen.get("solver", "auto") not in ("euler", "heun", "rk4"):
             chosen.setdefault("max_step", 0.5 * np.pi / omega[-1])
-    plan = list(plan_of(kind, omega, dt, amplitude))
+    plan = list(plan_signal(kind, omega, dt, amplitude))
     tick = point.tick if point is not None else round(t0 / float(flat.base))
     wait = ticks_to_renewal(flat, [signal.port], tick) if discrete and every > 1 else 0  # as for the linear model
     held = (period, ((tick + wait) % every) * flat.base) if discrete else None
-    made = injected(diagram, signal, len(plan[0].waveform.amplitude), held)
+    made = inject_signal(diagram, signal, len(plan[0].waveform.amplitude), held)
     lines = np.concatenate([part.omega for part in plan])
-    found = _Found(len(lines), len(signal.entries), sum(len(o.entries) for o in measured))
+    found = _Measurement(len(lines), len(signal.entries), sum(len(o.entries) for o in measured))
     for j, entry in enumerate(signal.entries):
-        with Experiment(diagram, made, signal, measured, point, chosen) as experiment:
+        with InjectionRun(diagram, made, signal, measured, point, chosen) as run:
             if point is None and t0 > 0:
-                experiment.simulation.advance(t0)
+                run.simulation.advance(t0)
             if wait:
-                experiment.go(wait, 1)
-            before = experiment.stands()
+                run.go(wait, 1)
+            before = run.read_states()
             for i, part in enumerate(plan):
-                _measure(experiment, part, entry, j, every, windows, agreement, found, i)
-            experiment.play(plan[0].silence, entry, ramp=1.0)
-            experiment.go(plan[0].samples, every)
-            change = np.abs(experiment.stands() - before) / (1.0 + np.abs(before))
+                _measure(run, part, entry, j, every, windows, agreement, found, i)
+            run.play(plan[0].silence, entry, ramp=1.0)
+            run.go(plan[0].samples, every)
+            change = np.abs(run.read_states() - before) / (1.0 + np.abs(before))
             found.moved = max(found.moved, float(np.max(change, initial=0.0)))
     labels = tuple(e for o in measured for e in o.labels)
     return FrequencyResponse(
         variant, wire, kind, float(amplitude), lines, dt if discrete else 0.0, found.v, found.u, found.y,
         found.uncertainty, found.distortion, found.windows, found.settled, found.moved,
-        not discrete or (found.held and not _moves(flat, signal.port)), signal.labels, labels,
+        not discrete or (found.held and not _changes_between_ticks(flat, signal.port)), signal.labels, labels,
     )  # fmt: skip
 
 
-def _checked(diagram: WiredDiagram, frequencies: Any, amplitude: Any, kind: str, windows: Any) -> np.ndarray:
+def _check_request(
+    diagram: WiredDiagram, frequencies: ArrayLike, amplitude: object, kind: str, windows: object
+) -> np.ndarray:
+    """Refuse arguments that make no measurement; return the frequencies, sorted."""
     try:
         omega = np.unique(np.atleast_1d(np.asarray(frequencies, dtype=float)))
     except (TypeError, ValueError):
         omega = np.zeros(0)
     if not (omega.size and np.all(omega > 0.0) and np.all(np.isfinite(omega))):
         raise OptionError(
-            f"found {frequencies!r}; expected positive frequencies in rad/s.", block=diagram.name, port="frequencies"
+            f"found {frequencies!r}; expected positive frequencies in rad/s. Give some.",
+            block=diagram.name,
+            port="frequencies",
         )
     if isinstance(amplitude, bool) or not isinstance(amplitude, int | float) or not 0 < amplitude < math.inf:
         raise OptionError(
-            f"found {amplitude!r}; expected the largest value of the test signal, in the wire's unit.",
+            f"found {amplitude!r}; expected a positive number, the largest value of the test signal in the wire's "
+            "unit. Give one.",
             block=diagram.name,
             port="amplitude",
         )
     if kind not in KINDS:
         raise OptionError(
-            f"found {kind!r}; expected one of {', '.join(map(repr, KINDS))}.", block=diagram.name, port="kind"
+            f"found {kind!r}; expected one of {', '.join(map(repr, KINDS))}. Choose one of them.",
+            block=diagram.name,
+            port="kind",
         )
     if isinstance(windows, bool) or not isinstance(windows, int) or windows < 2:
         raise OptionError(
-            f"found {windows!r}; expected a number of windows, at least 2.", block=diagram.name, port="windows"
+            f"found {windows!r}; expected a whole number of windows, at least 2. Give one.",
+            block=diagram.name,
+            port="windows",
         )
     return omega
 
 
-def _beginning(
-    diagram: WiredDiagram, at: Any, options: dict[str, Any]
+def _find_beginning(
+    diagram: WiredDiagram, at: Beginning, options: dict[str, Any]
 ) -> tuple[dict[str, Any], OperatingPoint | None, float]:
-    """Return how to run, and where to begin: a point to be started at, or a time to run to."""
+    """Return the options of the run and its beginning: an operating point to start from, or None and a time in s."""
     if isinstance(at, Snapshot):
         recipe = dict(getattr(at.run, "recipe", {}) or {})
         options = {**recipe, **options}
@@ -285,18 +326,18 @@ def _beginning(
     return options, point, point.t
 
 
-def _moves(flat: FlatDiagram, port: tuple[str, str]) -> bool:
-    """Whether a signal follows continuous states, or time, between two ticks."""
+def _changes_between_ticks(flat: FlatDiagram, port: tuple[str, str]) -> bool:
+    """Whether a signal depends on continuous states, or on time, between two ticks."""
     t, x, w, p = flat.symbols()
-    column = Pass(flat, NONE, t, x, w, p).run().values.get(port)  # none: it is held, and nothing asks for it
+    column = Pass(flat, NONE, t, x, w, p).run().values.get(port)  # a held signal that nothing needs has none
     if not isinstance(column, ca.MX):
         return False
     by_x = ca.jacobian(column, x)[:, flat.continuous.tolist()] if flat.continuous.size else ca.MX(0, 1)
     return bool(by_x.nnz() or ca.depends_on(column, t))
 
 
-class _Found:
-    """What was measured, by line."""
+class _Measurement:
+    """Results of a measurement; the last axis is that of the lines."""
 
     def __init__(self, lines: int, n: int, outputs: int):
         self.v, self.u = np.zeros((n, n, lines), complex), np.zeros((n, n, lines), complex)
@@ -307,17 +348,20 @@ class _Found:
 
 
 def _measure(
-    experiment: Experiment, part: Part, entry: int, j: int, every: int, windows: int, agreement: float,
-    found: _Found, i: int,
+    run: InjectionRun, part: Part, entry: int, j: int, every: int, windows: int, agreement: float,
+    found: _Measurement, i: int,
 ) -> None:  # fmt: skip
-    """Play a part of the test signal until two windows agree; write down the phasors of the last one."""
+    """Play part i of the test signal at one entry until two windows agree; write the last one's phasors to ``found``.
+
+    ``j`` is the entry's place among the injected ones.
+    """
     n = part.samples
-    experiment.play(part.waveform, entry, ramp=n * every * float(experiment.flat.base))
-    experiment.go(n, every)
+    run.play(part.waveform, entry, ramp=n * every * float(run.flat.base))
+    run.go(n, every)
     last, error, count = None, np.full(len(part.lines), np.inf), 0
     while count < windows and not np.all(error <= agreement):
-        v, u, y = experiment.record(n, every)
-        here, rest = phasors_of(part, np.hstack([v, u, y]))
+        v, u, y = run.record(n, every)
+        here, rest = compute_phasors(part, np.hstack([v, u, y]))
         count, m = count + 1, v.shape[1]
         if last is not None:
             error = np.zeros(len(part.lines))
@@ -327,7 +371,7 @@ def _measure(
                 error += change / np.where(size > 0.0, size, 1.0)
         last = here
     assert last is not None
-    found.held &= experiment.held
+    found.held &= run.held
     where = slice(i, i + 1) if found.v.shape[2] > len(part.lines) else slice(None)
     d = last[:, m + j] - last[:, j]  # u − v at the entry where it was added
     scaled = (last / d[:, None]).T

@@ -1,11 +1,11 @@
-"""A test signal in a running diagram: the consumers of a port get what it puts out, plus the test signal."""
+"""A test signal in a running diagram: the consumers of a port get its signal plus the test signal."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -24,23 +24,23 @@ from ..simulation.start_at_point import copy_states
 from ..wiring.structure import Frame, Wire
 
 NEVER = 1e12
-"""A time in s that no run reaches."""
+"""Time in s that no run reaches."""
 
 
 class Excitation(Block):
     """Test signal: d = e g Σ aₖ sin(ωₖ τ + ½ cₖ τ² + φₖ), τ = t − t₀ modulo the period.
 
-    The ramp g rises from 0 to 1 within ``ramp`` from t₀ on, with two continuous derivatives.
+    The ramp g rises from 0 to 1 within ``ramp`` seconds from t₀ on, with two continuous derivatives.
     """
 
-    direction: Array = parameter(description="e, what a signal of size 1 adds to each entry")
+    direction: Array = parameter(description="e, the share of each entry in the signal")
     amplitude: Array = parameter(description="aₖ of each line")
     frequency: Array = parameter(unit="rad/s", description="ωₖ of each line")
     sweep: Array = parameter(description="cₖ of each line in rad/s²")
     phase: Array = parameter(unit="rad", description="φₖ of each line")
     start_time: float = parameter(unit="s", description="t₀")
     ramp: float = parameter(unit="s", description="length of the ramp")
-    period: float = parameter(unit="s", description="period of the whole signal")
+    period: float = parameter(unit="s", description="period of the signal")
     y = Output(shape=None, description="the test signal d")
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
@@ -56,7 +56,7 @@ class Excitation(Block):
 
 @dataclass(frozen=True, eq=False)
 class Waveform:
-    """A periodic test signal: its lines, and the samples of a period."""
+    """A periodic test signal: its lines, in the units of `Excitation`, and its period in s."""
 
     amplitude: np.ndarray
     frequency: np.ndarray
@@ -66,8 +66,16 @@ class Waveform:
 
 
 @dataclass(frozen=True, eq=False)
-class Injected:
-    """A diagram with a test signal added at one of its ports; all other blocks keep their paths."""
+class InjectedDiagram:
+    """A diagram with a test signal added at one of its ports; all other blocks keep their paths.
+
+    Attributes
+    ----------
+    source, sum : str
+        Paths of the test signal's block and of the sum.
+    lines : int
+        Number of lines of the test signal.
+    """
 
     diagram: WiredDiagram
     source: str
@@ -75,11 +83,17 @@ class Injected:
     lines: int
 
 
-def injected(diagram: WiredDiagram, signal: Signal, lines: int, held: tuple[Fraction, Fraction] | None) -> Injected:
-    """Return the diagram in which every consumer of a port gets the port's signal plus a test signal.
+def inject_signal(
+    diagram: WiredDiagram, signal: Signal, lines: int, held: tuple[Fraction, Fraction] | None
+) -> InjectedDiagram:
+    """Return a diagram in which every consumer of a port gets the port's signal plus a test signal.
 
     Parameters
     ----------
+    diagram : WiredDiagram
+        Diagram without the test signal.
+    signal : Signal
+        Port.
     lines : int
         Number of lines of the test signal.
     held : (Fraction, Fraction), optional
@@ -88,7 +102,7 @@ def injected(diagram: WiredDiagram, signal: Signal, lines: int, held: tuple[Frac
     Raises
     ------
     WiringError
-        A port that nothing is wired to.
+        If the port has no consumer.
     """
     lowered = diagram.scheduled
     table = lowered.copy()
@@ -99,12 +113,13 @@ def injected(diagram: WiredDiagram, signal: Signal, lines: int, held: tuple[Frac
                  if (w.block, w.port) == (block, port)]  # fmt: skip
     if not consumers:
         raise WiringError(
-            f"nothing is wired to it, so an injection at {signal.name!r} would act on nothing. Name a wire of a loop.",
+            f"found nothing wired to it; expected a consumer for the test signal at {signal.name!r}. Name a wire of a "
+            "loop.",
             block=block,
             port=port,
         )
     taken = {*table.blocks, *table.frames}
-    frame_path, total = _free("injection", taken), _free("injection_sum", taken)
+    frame_path, total = _find_free_name("injection", taken), _find_free_name("injection_sum", taken)
     source = f"{frame_path}.signal"
     shape = diagram.checked.shapes[signal.port]
     ones = np.ones(lines)
@@ -121,36 +136,38 @@ def injected(diagram: WiredDiagram, signal: Signal, lines: int, held: tuple[Frac
         wire: Wire = group[key]  # type: ignore[index]
         group[key] = Wire(total, "y", wire.index)  # type: ignore[index]
     table.wires[total, "u1"], table.wires[total, "u2"] = Wire(block, port), Wire(source, "y")
-    return Injected(diagram.with_structure(table), source, total, lines)
+    return InjectedDiagram(diagram.with_structure(table), source, total, lines)
 
 
-def _free(name: str, taken: set[str]) -> str:
+def _find_free_name(name: str, taken: set[str]) -> str:
     path, count = name, 2
     while path in taken:
         path, count = f"{name}_{count}", count + 1
     return path
 
 
-class Experiment:
-    """A run in the making with a test signal, which may be changed as it goes on: used in a ``with`` statement.
+class InjectionRun:
+    """A running simulation with a test signal that can be changed between samples; use it in a ``with`` statement.
 
     Parameters
     ----------
-    made : Injected
-        The diagram.
+    diagram : WiredDiagram
+        Diagram without the test signal.
+    made : InjectedDiagram
+        Diagram with the test signal.
     signal : Signal
-        Where the test signal is added.
-    outputs : sequence of Signal
-        What is measured, beside it.
+        Port to which the test signal is added.
+    outputs : iterable of Signal
+        Other signals to measure.
     point : OperatingPoint or None
-        Where the run begins; at its start without it.
+        Beginning of the run; the start of the diagram without it.
     options : mapping
-        How it is run.
+        Options of the run; see `RunOptions`.
     """
 
     def __init__(
-        self, diagram: WiredDiagram, made: Injected, signal: Signal, outputs: Any, point: OperatingPoint | None,
-        options: Mapping[str, Any],
+        self, diagram: WiredDiagram, made: InjectedDiagram, signal: Signal, outputs: Iterable[Signal],
+        point: OperatingPoint | None, options: Mapping[str, Any],
     ):  # fmt: skip
         self.made, self.signal, self.outputs = made, signal, list(outputs)
         ports = [signal.port, *(o.port for o in self.outputs)]
@@ -158,16 +175,16 @@ class Experiment:
         start: dict[str, Any] = {}
         if point is not None:
             before = diagram.replace(point.parameters) if point.parameters else diagram
-            start["start"] = _translated(point, before.flatten(point.base), made, signal)
+            start["start"] = _translate_point(point, before.flatten(point.base), made, signal)
         self.simulation = Simulation(
             made.diagram,
             RunOptions.of({**options, **start, "record": record, "states": False}, block=made.diagram.name),
         )
         self.flat: FlatDiagram = self.simulation.flat
         self.held = True
-        """Whether the signal has never changed between two samples that were recorded, at the ticks there."""
+        """Whether the signal has not changed at any tick between two recorded samples."""
 
-    def __enter__(self) -> Experiment:
+    def __enter__(self) -> InjectionRun:
         self.simulation.__enter__()
         return self
 
@@ -180,9 +197,9 @@ class Experiment:
         return self.simulation.t
 
     def play(self, waveform: Waveform, entry: int, ramp: float) -> None:
-        """Begin a test signal at one entry of the wire, now."""
+        """Begin a test signal at one entry of the wire, with a ramp in s, now."""
         path = self.made.source
-        block: Any = self.flat.table.blocks[path]
+        block = cast(Excitation, self.flat.table.blocks[path])
         direction = np.zeros(np.size(block.direction))
         direction[entry] = 1.0
         shape = np.shape(block.direction)
@@ -194,21 +211,22 @@ class Experiment:
         self.simulation.set_parameters(path, changed)
 
     def go(self, count: int, every: int) -> None:
-        """Go on by so many samples."""
+        """Advance the run by ``count`` samples of ``every`` ticks."""
         self.simulation.advance(count * every * self.flat.base)  # type: ignore[arg-type]
 
-    def stands(self) -> np.ndarray:
-        """Return the states of all blocks, and the outputs of all FMUs, at the last tick."""
+    def read_states(self) -> np.ndarray:
+        """Return the states of all blocks and the outputs of all FMUs at the last tick."""
         view = self.simulation.view
         return np.concatenate([view.x_next[: self.flat.states.total], view.w])
 
     def record(self, count: int, every: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Go on by so many samples; return v, u and the outputs, a row for each sample, both ends included.
+        """Advance the run by ``count`` samples of ``every`` ticks, and return v, u and the outputs.
 
-        v is what the port puts out, u what its consumers get: v plus the test signal.
+        v is the port's signal, u that of its consumers: v plus the test signal. Each has a row for each sample, both
+        ends included, and a column for each entry.
         """
         simulation = self.simulation
-        simulation.run(final=False)  # what was recorded before is left
+        simulation.run(final=False)  # leaves out earlier records
         first = simulation.view.tick
         simulation.record_instant()
         self.go(count, every)
@@ -224,17 +242,17 @@ class Experiment:
             all_ticks = v[between].reshape(count, every, -1)
             self.held &= bool(np.all(all_ticks == all_ticks[:, :1]))
 
-        def measured(port: tuple[str, str], entries: tuple[int, ...]) -> np.ndarray:
+        def read(port: tuple[str, str], entries: tuple[int, ...]) -> np.ndarray:
             data = np.asarray(run[".".join(port)])[rows].reshape(count + 1, -1)
             return np.array(data[:, list(entries)])
 
-        v, u = (measured(port, self.signal.entries) for port in (self.signal.port, (self.made.sum, "y")))
-        y = [measured(o.port, o.entries) for o in self.outputs]
+        v, u = (read(port, self.signal.entries) for port in (self.signal.port, (self.made.sum, "y")))
+        y = [read(o.port, o.entries) for o in self.outputs]
         return v, u, np.hstack([np.zeros((count + 1, 0)), *y])
 
 
-def _translated(point: OperatingPoint, old: FlatDiagram, made: Injected, signal: Signal) -> OperatingPoint:
-    """Return an operating point as the diagram with the injection takes it."""
+def _translate_point(point: OperatingPoint, old: FlatDiagram, made: InjectedDiagram, signal: Signal) -> OperatingPoint:
+    """Return an operating point of the diagram as one of the diagram with the test signal."""
     new = made.diagram.flatten(point.base)
     x = new.x0.copy()
     copy_states(point.x, old, new, x)

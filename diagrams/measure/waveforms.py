@@ -1,4 +1,4 @@
-"""Test signals: their lines, the windows in which they are measured, and the phasors read off a window."""
+"""Test signals: their lines, the windows of a measurement, and the phasors of a window."""
 
 from __future__ import annotations
 
@@ -13,17 +13,27 @@ from .injection import Waveform
 
 KINDS = ("sine", "multisine", "chirp")
 SAMPLES = 256
-"""Samples of a window at least."""
+"""Smallest number of samples in a window."""
 
 
-def step_for(omega: np.ndarray) -> Fraction:
-    """Return seconds between samples of a continuous diagram: 16 to a period of the highest frequency, in whole ns."""
+def choose_step(omega: np.ndarray) -> Fraction:
+    """Return the seconds between samples of a continuous diagram: 16 to a period of the highest frequency, whole ns."""
     return Fraction(max(1, round(2.0 * np.pi / (16.0 * omega[-1]) * 1e9)), 10**9)
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part of the test signal, with its window: number of samples, and the lines that are read off."""
+    """A part of the test signal and its window.
+
+    Attributes
+    ----------
+    samples : int
+        Samples of the window.
+    lines, omega : (K,) ndarray
+        Lines to read: whole periods in the window, and frequencies in rad/s.
+    every_line : bool
+        Whether the signal has all lines, as a chirp has.
+    """
 
     waveform: Waveform
     samples: int
@@ -33,12 +43,24 @@ class Part:
 
     @property
     def silence(self) -> Waveform:
-        """The same, without amplitude."""
+        """Waveform of this part with amplitude zero."""
         return replace(self.waveform, amplitude=0.0 * self.waveform.amplitude)
 
 
-def plan_of(kind: str, omega: np.ndarray, dt: float, amplitude: float) -> Iterator[Part]:
-    """Yield the parts of the test signal, one after the other."""
+def plan_signal(kind: str, omega: np.ndarray, dt: float, amplitude: float) -> Iterator[Part]:
+    """Yield the parts of a test signal, to be played one after the other.
+
+    Parameters
+    ----------
+    kind : {"sine", "multisine", "chirp"}
+        A part for each frequency, or one part for all.
+    omega : (K,) ndarray
+        Frequencies in rad/s, rising.
+    dt : float
+        Seconds between two samples.
+    amplitude : float
+        Largest value of the signal.
+    """
     zero = np.zeros(1)
     if kind == "sine":
         for w in omega:
@@ -67,11 +89,19 @@ def plan_of(kind: str, omega: np.ndarray, dt: float, amplitude: float) -> Iterat
     yield Part(waveform, n, lines, lines * unit, kind == "chirp")
 
 
-def phasors_of(part: Part, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the phasors (line, signal), and the rms beside the lines of the first signal relative to each line.
+def compute_phasors(part: Part, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the phasors, by line and signal, and the distortion of the first signal.
 
-    Over a window of whole periods the lines are orthogonal to all others. What the end differs from the beginning is a
-    drift, and is taken away.
+    The distortion is the rms of the rest beside the lines, relative to that of each line; NaN for a part with every
+    line. Over a window of whole periods the lines are orthogonal to all others. The difference of the window's end from
+    its beginning is a drift, and is subtracted.
+
+    Parameters
+    ----------
+    part : Part
+        Window and lines.
+    data : (samples + 1, signals) ndarray
+        Samples of the window, both ends included.
     """
     n = part.samples
     k = np.arange(n)

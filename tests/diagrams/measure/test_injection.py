@@ -20,8 +20,8 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Channel, Diagram, Rig, fig3, subsystem
 from loopwright.diagrams.linearization.derivatives import find_signal
-from loopwright.diagrams.measure.injection import injected
-from loopwright.diagrams.measure.waveforms import phasors_of, plan_of
+from loopwright.diagrams.measure.injection import inject_signal
+from loopwright.diagrams.measure.waveforms import compute_phasors, plan_signal
 from loopwright.fmus import Fmu, gantry, mass_spring_damper
 
 PATH = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))
@@ -119,11 +119,11 @@ def test_a_wire_out_of_an_fmu_is_one_like_any_other():
 
 
 def test_a_drift_is_no_part_of_a_phasor():
-    part = next(plan_of("sine", np.array([20.0]), 1e-3, 1.0))
+    part = next(plan_signal("sine", np.array([20.0]), 1e-3, 1.0))
     k = np.arange(part.samples + 1)
     angle = part.omega[0] * 1e-3 * k
     signal = 3.0 * np.cos(angle) - 4.0 * np.sin(angle) + 0.2 * np.sin(3 * angle) + 5.0 + 0.1 * k
-    phasors, rest = phasors_of(part, signal[:, None])
+    phasors, rest = compute_phasors(part, signal[:, None])
     np.testing.assert_allclose(phasors, [[3.0 + 4.0j]], rtol=1e-9)
     np.testing.assert_allclose(rest, 0.2 / 5.0, rtol=1e-9)
 
@@ -206,7 +206,7 @@ def test_an_operating_point_of_a_run_and_a_time_are_the_same():
 def test_the_injection_leaves_all_other_blocks_where_they_are():
     diagram = fig3_loop()
     flat = diagram.flatten()
-    made = injected(diagram, find_signal(flat, "v_perp"), 1, (flat.base, 0 * flat.base))
+    made = inject_signal(diagram, find_signal(flat, "v_perp"), 1, (flat.base, 0 * flat.base))
     assert set(made.diagram.blocks) - set(diagram.blocks) == {made.source, made.sum}
     assert set(made.diagram.names) == set(diagram.names)
     silent = made.diagram.simulate(0.2, progress=False)
@@ -219,11 +219,11 @@ def test_the_injection_leaves_all_other_blocks_where_they_are():
     [
         ({"frequencies": [0.0]}, OptionError, "positive"),
         ({"frequencies": "slow"}, OptionError, "positive"),
-        ({"frequencies": [1e4], "step": 1e-3}, OptionError, "be told apart"),
+        ({"frequencies": [1e4], "step": 1e-3}, OptionError, "expected less than 3141.59 rad.s, as there is a sample every"),
         ({"amplitude": 0.0}, OptionError, "amplitude"),
         ({"kind": "noise"}, OptionError, "'sine'"),
         ({"windows": 1}, OptionError, "at least 2"),
-        ({"wire": "place.y", "unwired": True}, WiringError, "nothing is wired"),
+        ({"wire": "place.y", "unwired": True}, WiringError, "found nothing wired to it"),
     ],
 )
 def test_what_does_not_fit_is_refused(changes, error, text):
