@@ -1,10 +1,9 @@
-"""The contract of a block, checked: `check_block`."""
+"""`check_block`: checks that a block keeps the contract of blocks."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -21,22 +20,23 @@ from .values import check_ports, check_purity, check_values
 
 @dataclass(frozen=True)
 class BlockReport:
-    """What `check_block` has found out about a block that keeps its contract.
+    """Findings of `check_block` about a block that keeps its contract.
 
     Attributes
     ----------
     block : str
         Name of the block.
     frames : mapping
-        For "sampled" and "continuous": "checked", or why the block refuses to stand in such a frame.
+        For "sampled" and "continuous": "checked", or the reason why the block refuses to stand in such a subsystem.
     checks : mapping
-        What was checked, with numbers, by "frame: rule" or by rule.
+        Result of each check, with numbers, by "sampled: rule", "continuous: rule" or by rule.
     feedthrough : mapping
-        By frame, the pairs (input, output) that show when the input is changed.
+        For "sampled" and "continuous": the pairs (input, output) in which the output changed with the input.
     unseen : mapping
-        By frame, the pairs that the trace has and that never showed: blocks are ordered as if they did.
+        Likewise, the pairs of the trace in which it never did. Blocks are ordered as if it did.
     swallowed : mapping
-        By frame, the pairs that show for numbers but never for NaN, as with ``np.where(u > 0.0, 1.0, 0.0)``.
+        Likewise, the pairs in which the output changes with numbers, but never becomes NaN with the input, as with
+        ``np.where(u > 0.0, 1.0, 0.0)``.
     quiet : tuple of str
         Events that never fired, in the exercise and in the run.
     """
@@ -51,19 +51,19 @@ class BlockReport:
 
     def __str__(self) -> str:
         lines = [f"{self.block} keeps the contract of a block."]
-        lines += [f"  {frame} frame: {text}" for frame, text in self.frames.items()]
-        lines += [f"  {what}: {text}" for what, text in self.checks.items()]
-        for frame, pairs in self.unseen.items():
-            lines += [f"  {frame}: {y} depends on {u} in the trace, and never did" for u, y in sorted(pairs)]
-        for frame, pairs in self.swallowed.items():
-            lines += [f"  {frame}: {y} is a number where {u} is NaN" for u, y in sorted(pairs)]
+        lines += [f"  {kind} subsystem: {text}" for kind, text in self.frames.items()]
+        lines += [f"  {rule}: {text}" for rule, text in self.checks.items()]
+        for kind, pairs in self.unseen.items():
+            lines += [f"  {kind}: {y} depends on {u} in the trace, and never did" for u, y in sorted(pairs)]
+        for kind, pairs in self.swallowed.items():
+            lines += [f"  {kind}: {y} is a number where {u} is NaN" for u, y in sorted(pairs)]
         lines += [f"  event {name}: never fired" for name in self.quiet]
         return "\n".join(lines)
 
 
 def check_block(
     block: Block,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: Mapping[str, object] | None = None,
     *,
     shapes: Mapping[str, Shape] | None = None,
     sample_time: float = 0.01,
@@ -74,44 +74,45 @@ def check_block(
     """Check that a block keeps the contract of blocks, the library's or one of your own.
 
     - Values: pickling and ``replace`` give an equal block, a changed parameter another one.
-    - Ports: units can be read and are as many as entries; what ``like`` names is there.
-    - Purity: the same arguments give the same results, are unchanged, and nothing is kept on the block.
-    - Shapes, and the traced results: as NumPy's, at random points; the derivatives of the trace as differences are.
+    - Ports: units can be read, and there are as many as entries; ``like`` names an input.
+    - Purity: the same arguments give the same results and stay unchanged; equations leave the block unchanged.
+    - Shapes and traced results are NumPy's at random points; derivatives of the trace are those of differences.
     - Feedthrough: no output changes with an input that the trace doesn't show.
-    - Smoothness in a continuous frame: outputs and rates jump only at `next_instant` and where an indicator of an event
+    - Smoothness in a continuous subsystem: outputs and rates jump only at `next_instant` and where an event's indicator
       changes its sign. Indicators are finite, and jumps at one instant come to an end.
-    - Runs in a sampled and in a continuous frame (where the block allows it): a saved state, pickled, goes on as the
-      straight run does, bit for bit.
+    - Runs in a sampled and in a continuous subsystem, where the block allows it: a run that goes on from a saved state,
+      pickled, equals the straight run bit for bit.
 
-    An FMU, and a transport delay, have no equations to look at: their values, ports and runs are checked.
+    An FMU and a transport delay have no equations; their values, ports and runs are checked.
 
     Parameters
     ----------
     block : Block
         The block.
     inputs : mapping, optional
-        For each input by name: a range ``(low, high)``, or a signal (a source of its own). Without one it is what the
-        port declares as minimum and maximum, else three times its nominal value to both sides.
+        For each input by name: a range ``(low, high)``, or a signal (a source of its own). Without one, the range from
+        the port's minimum to its maximum, else three times its nominal value to both sides.
     shapes : mapping, optional
         Shapes of inputs that take any; scalars without it.
     sample_time : float
-        Sample time of the sampled frame, and time between samples in the continuous one, in s.
+        Sample time of the sampled subsystem, and time between samples in the continuous one, in s.
     ticks : int
         Length of the runs in sample times, at least 4.
     seed : int
         Seed of points and signals.
     frames : list of str, optional
-        "sampled", "continuous" or both, in which the block must stand; without it those that it does not refuse.
+        "sampled", "continuous" or both: kinds of subsystems in which the block must stand. Without it, those that it
+        doesn't refuse.
 
     Returns
     -------
     BlockReport
-        What was checked; ``print`` it.
+        The findings; ``print`` them.
 
     Raises
     ------
     DefinitionError
-        A rule that is not kept: what was found, what was expected, what to do. A `TraceError`, `ShapeError` or
+        A rule that is not kept: the finding, the expectation, and the next step. A `TraceError`, `ShapeError` or
         `UnitError` where it is of this kind.
     SimulationError
         A run of the block that stopped; other ranges of its inputs may be needed.
@@ -142,7 +143,7 @@ def check_block(
 
 
 def _choose_kinds(frames: Iterable[str]) -> list[bool]:
-    """Return which kinds of frames are wanted: sampled True, continuous False."""
+    """Return the wanted kinds of subsystems: sampled True, continuous False."""
     names = [kind_text(sampled) for sampled in (True, False)]
     for name in (given := list(frames)):
         if name not in names:
@@ -155,7 +156,7 @@ def _choose_kinds(frames: Iterable[str]) -> list[bool]:
 
 
 class _Findings:
-    """What is found about a block, frame by frame."""
+    """Findings about a block, for one kind of subsystem after the other."""
 
     def __init__(self, exercise: Exercise, announced: list[float], checks: dict[str, str]):
         self.exercise, self.announced, self.checks = exercise, announced, checks
@@ -166,7 +167,7 @@ class _Findings:
         self.quiet: set[str] = set()
 
     def check_in(self, sampled: bool) -> LoopwrightError | None:
-        """Check the block in a frame of one kind; return the error with which it refuses to stand there."""
+        """Check the block in a subsystem of one kind; return the error with which it refuses to stand there."""
         exercise, kind, checks = self.exercise, kind_text(sampled), self.checks
         block = exercise.block
         if block.transport or block.stepped:
@@ -202,14 +203,14 @@ class _Findings:
         return None
 
     def check_run_in(self, sampled: bool) -> None:
-        """Check a run in a frame of one kind."""
+        """Check a run in a subsystem of one kind."""
         kind = kind_text(sampled)
         text, fired = check_run(self.exercise, sampled)
         self.quiet -= fired
         self.checks[f"{kind}: run"], self.frames[kind] = text, "checked"
 
     def report(self) -> BlockReport:
-        """Return what was found."""
+        """Return the findings as a report."""
         return BlockReport(
             self.exercise.block.label,
             self.frames,

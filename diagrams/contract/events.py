@@ -1,26 +1,28 @@
-"""The rules that a block keeps in continuous time: instants, smoothness in between, and events; see `check_block`."""
+"""Rules of a block in continuous time: instants, smoothness between them, and events; see `check_block`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
 
 from ...blocks.core.block import Block
 from ...blocks.tracing.symbols import bundle
-from .exercise import Bench, Point
+from .exercise import Bench, Columns, Point
 from .values import rule_error
 
-_INSTANTS = 200  # asked for at most
+N = TypeVar("N", float, np.ndarray)
+
+_INSTANTS = 200  # looked at, at most
 _SAME_INSTANT = 100  # jumps that may follow each other at one instant
-_FINENESS = 13  # refinements of an interval by 8, each
+_FINENESS = 13  # refinements of an interval, by 8 each
 
 
 def find_instants(block: Block, end: float) -> list[float]:
-    """Return the instants up to an end that a block announces, after checking that they rise."""
+    """Return the instants up to an end that a block announces, and check that they rise."""
     found: list[float] = []
     t = 0.0
     while len(found) < _INSTANTS:
@@ -30,7 +32,7 @@ def find_instants(block: Block, end: float) -> list[float]:
             raise rule_error(
                 "next_instant",
                 f"next_instant({t!r}) gave {following!r}; expected a later time, the same at every call, or math.inf. "
-                "Return the first one strictly after t.",
+                "Return the first instant strictly after t.",
                 block,
             )
         between = t + 0.5 * (min(following, end) - t)
@@ -39,7 +41,7 @@ def find_instants(block: Block, end: float) -> list[float]:
                 "next_instant",
                 f"next_instant({t!r}) gave {following!r}, but next_instant({between!r}) "
                 f"{block.next_instant(between)!r}; expected the same one from all times before it. Return the first "
-                "one strictly after t.",
+                "instant strictly after t.",
                 block,
             )
         if following > end:
@@ -50,7 +52,7 @@ def find_instants(block: Block, end: float) -> list[float]:
 
 
 def check_smooth(bench: Bench, announced: list[float]) -> int:
-    """Look for jumps that nothing announces, in a continuous frame, and return how many intervals were searched."""
+    """Look for jumps that nothing announces, in a continuous subsystem, and return the number of intervals searched."""
     if bench.sampled or not (bench.traced.outputs or bench.traced.states) or bench.block.memory:
         return 0
     searched = 0
@@ -66,22 +68,22 @@ def check_smooth(bench: Bench, announced: list[float]) -> int:
     for left, right in pairwise(edges):
         margin = 1e-6 * (right - left)
 
-        def time(s: Any, first: float = left + margin, span: float = right - left - 2.0 * margin) -> Any:
+        def time_at(s: N, first: float = left + margin, span: float = right - left - 2.0 * margin) -> N:
             return first + s * span
 
-        def along(s: np.ndarray, time: Any = time) -> np.ndarray:
-            return np.array(in_time.call([time(s)[None], *rest, bench.p])[0])
+        def values_at(s: np.ndarray, time_at: Callable[[np.ndarray], np.ndarray] = time_at) -> np.ndarray:
+            return np.array(in_time.call([time_at(s)[None], *rest, bench.p])[0])
 
-        def domains(s: float, time: Any = time) -> tuple[bool, ...]:
-            return _evaluate_domains(bench, [time(s), *rest])
+        def domains_at(s: float, time_at: Callable[[float], float] = time_at) -> tuple[bool, ...]:
+            return _evaluate_domains(bench, [time_at(s), *rest])
 
-        where = _find_jump(along, domains)
+        where = _find_jump(values_at, domains_at)
         searched += 1
         if where is not None:
             raise rule_error(
                 "next_instant",
-                f"its outputs, or their rates, jump at t = {time(where):.9g} s, and next_instant does not announce it; "
-                "expected smooth outputs between instants. Return this time from next_instant, or make it an Event.",
+                f"its outputs, or their rates, jump at t = {time_at(where):.9g} s, and next_instant does not announce "
+                "it; expected smooth outputs between instants. Return this time from next_instant, or make an Event.",
                 bench.block,
             )
     return searched + _search_signals(bench)
@@ -99,41 +101,42 @@ def _search_signals(bench: Bench) -> int:
         x = {n: v if bench.block.states[n].discrete else other.x[n] for n, v in one.x.items()}
         ends = [one.columns(), Point(one.t, x if number % 2 else one.x, {n: u[n] for n in one.u}, one.fired).columns()]
 
-        def at(s: Any, ends: Any = ends) -> list[Any]:
-            return [
-                ends[0][0],
-                *(np.outer(a, 1.0 - s) + np.outer(b, s) for a, b in zip(*(e[1:] for e in ends), strict=True)),
-            ]
+        def columns_at(s: np.ndarray, ends: list[Columns] = ends) -> Columns:
+            pairs = zip(*(e[1:] for e in ends), strict=True)
+            return [ends[0][0], *(np.outer(a, 1.0 - s) + np.outer(b, s) for a, b in pairs)]
 
-        def along(s: np.ndarray) -> np.ndarray:
-            found = [v for v in bench.evaluate_trace(at(s))[:shown] if v.size]
+        def values_at(s: np.ndarray) -> np.ndarray:
+            found = [v for v in bench.evaluate_trace(columns_at(s))[:shown] if v.size]
             return np.vstack([np.broadcast_to(v, (len(v), len(s))) for v in found]) if found else np.zeros((0, len(s)))
 
-        where = _find_jump(along, lambda s: _evaluate_domains(bench, at(np.array([s]))))
+        where = _find_jump(values_at, lambda s: _evaluate_domains(bench, columns_at(np.array([s]))))
         if where is not None:
-            near = [[float(f"{v:.6g}") for v in np.ravel(part)] for part in at(np.array([where]))[1:]]
+            near = [[float(f"{v:.6g}") for v in np.ravel(part)] for part in columns_at(np.array([where]))[1:]]
             shown_at = dict(zip(("x", *one.u), near, strict=True))
             raise rule_error(
                 "events",
-                f"in a continuous frame its outputs or derivatives jump at {shown_at} and "
-                "no indicator crosses zero there; expected every discontinuity to be an event. Declare an Event "
-                "with this indicator, and keep the branch in a State(discrete=True).",
+                f"in a continuous subsystem its outputs or derivatives jump at {shown_at} and no indicator crosses "
+                "zero there; expected every discontinuity to be an event. Declare an Event with an indicator that "
+                "does, and keep the branch in a State(discrete=True).",
                 bench.block,
             )
     return len(pairs)
 
 
-def _evaluate_domains(bench: Bench, columns: list[Any]) -> tuple[bool, ...]:
+def _evaluate_domains(bench: Bench, columns: Columns) -> tuple[bool, ...]:
     return () if bench.traced.indicators is None else tuple(bench.evaluate("indicators", columns) > 0.0)
 
 
-def _find_jump(along: Callable[[np.ndarray], np.ndarray], domains: Callable[[float], Any]) -> float | None:
-    """Return where in [0, 1] a row of a function jumps without a change of domains, or None.
+def _find_jump(
+    values_at: Callable[[np.ndarray], np.ndarray], domains_at: Callable[[float], tuple[bool, ...]]
+) -> float | None:
+    """Return a place in [0, 1] at which a row of a function jumps without a change of domains, or None.
 
-    The part with the largest change is refined: there a smooth function changes less and less, one that jumps as much.
+    The part with the largest change is refined again and again. The change of a smooth function shrinks with it, that
+    of a jump stays.
     """
     grid = np.linspace(0.0, 1.0, 65)
-    coarse = along(grid)
+    coarse = values_at(grid)
     for row in range(len(coarse)):
         s, values = grid, coarse[row]
         if not np.all(np.isfinite(values)):
@@ -146,10 +149,10 @@ def _find_jump(along: Callable[[np.ndarray], np.ndarray], domains: Callable[[flo
             if not change[i] > 1e-3 * first or not change[i] > 1e-7:
                 break
             s = np.linspace(s[i], s[i + 1], 9)
-            values = along(s)[row]
+            values = values_at(s)[row]
         else:
             low, high = max(s[0] - 1e-7, 0.0), min(s[-1] + 1e-7, 1.0)
-            if domains(low) == domains(high):
+            if domains_at(low) == domains_at(high):
                 return float(s[-1])
     return None
 
@@ -158,12 +161,12 @@ def _find_jump(along: Callable[[np.ndarray], np.ndarray], domains: Callable[[flo
 
 
 def check_events(bench: Bench) -> tuple[int, set[str]]:
-    """Go along the exercise in small steps, let events jump, and return how many fired, and which never did."""
+    """Go along the exercise in small steps, with jumps; return the number of events fired, and those that never did."""
     block, exercise = bench.block, bench.exercise
     if bench.traced.indicators is None:
         return 0, set()
     names, kinds = list(block.events), [port.direction for port in block.events.values()]
-    x, shown = bench.points[0].columns()[1], np.zeros(len(names), dtype=int)
+    x, shown = np.asarray(bench.points[0].columns()[1]), np.zeros(len(names), dtype=int)
     if block.starts_from_inputs:
         first = {n: np.asarray(v) for n, v in exercise.inputs_at(0).items()}
         x = np.concatenate([np.ravel(v) for v in _as_tuple(block.initial(bundle("u", first)), len(block.states))])
@@ -194,7 +197,7 @@ def check_events(bench: Bench) -> tuple[int, set[str]]:
                 raise rule_error(
                     "events",
                     f"at t = {t:.6g} s its events go on firing ({again}), {count} times at one instant; expected a "
-                    "jump after which nothing fires. Let it lead to a state in which the indicator stays where it is.",
+                    "jump after which nothing fires. Let it lead to a state in which the indicator keeps its sign.",
                     block,
                 )
             shown += fired

@@ -1,21 +1,22 @@
-"""What a block is exercised with: signals within the ranges of its inputs, and points to look at equations at."""
+"""Exercise of a block: signals within the ranges of its inputs, and points at which its equations are evaluated."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from dataclasses import replace as replace_fields
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...blocks.core.arithmetic import shape_of
 from ...blocks.core.block import Block
 from ...blocks.core.errors import OptionError, ShapeError, near
 from ...blocks.core.layout import Layout
-from ...blocks.core.ports import Output, PortUnit, Shape
-from ...blocks.core.signals import Signal, as_signal
+from ...blocks.core.ports import Output, PortUnit, Shape, State
+from ...blocks.core.signals import Call, Signal, as_signal
 from ...blocks.core.values import Array, parameter
 from ...blocks.tracing.equations import initial_state, start_values
 from ...blocks.tracing.numpy_check import GUARDS, NEXT, evaluate
@@ -23,10 +24,16 @@ from ...blocks.tracing.structure import traced_parameters
 from ...blocks.tracing.symbols import bundle
 from ...blocks.tracing.trace import Traced, constants_of
 from ..diagram import Diagram
+from ..results.run import Run
 from ..wiring.structure import Collector
 from ..wiring.subsystem import exact_time
 
 _SAMPLES = 400  # of the exercise, over its duration
+
+Columns = list[float | np.ndarray]
+"""Arguments of a traced function: t, then flat vectors, or matrices of one column for each point."""
+Values = dict[str, np.float64 | np.ndarray]
+"""Values of states, inputs or events by name."""
 
 
 class Wander(Block):
@@ -34,8 +41,8 @@ class Wander(Block):
 
     low: Array = parameter(description="smallest values")
     high: Array = parameter(description="largest values")
-    duration: float = parameter(unit="s", above=0.0, description="time in which it comes around")
-    seed: tuple[int, ...] = parameter(description="what frequencies and phases are drawn with")
+    duration: float = parameter(unit="s", above=0.0, description="period")
+    seed: tuple[int, ...] = parameter(description="seed of frequencies and phases")
     unit: PortUnit = parameter(default=None, description="unit of the signal")
     y = Output(shape=None, description="the signal")
 
@@ -68,12 +75,12 @@ class Point:
         """Return the point with another value of one input."""
         return replace_fields(self, u={**self.u, name: value})
 
-    def columns(self) -> list[Any]:
+    def columns(self) -> Columns:
         """Return t, x and the inputs as a traced function takes them."""
         return [self.t, np.concatenate([*map(np.ravel, self.x.values()), np.zeros(0)]), *map(np.ravel, self.u.values())]
 
-    def arguments(self) -> tuple[Any, dict[str, Any], dict[str, Any], dict[str, Any]]:
-        """Return copies as equations take them: NumPy's own numbers, and arrays."""
+    def arguments(self) -> tuple[np.float64, Values, Values, Values]:
+        """Return t, x, u and fired as equations take them: copies, as NumPy's numbers and arrays."""
         x, u = ({n: np.float64(v) if np.ndim(v) == 0 else np.array(v) for n, v in d.items()} for d in (self.x, self.u))
         return np.float64(self.t), x, u, {n: np.float64(v) for n, v in self.fired.items()}
 
@@ -84,7 +91,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Exercise:
-    """What drives a block: a range or a signal for each input.
+    """Ranges and signals that drive a block's inputs.
 
     Attributes
     ----------
@@ -93,7 +100,7 @@ class Exercise:
     ranges : dict
         Lowest and highest values of the inputs that are not wired to a signal.
     signals : dict
-        What the other inputs are wired to.
+        Signals that the other inputs are wired to.
     """
 
     block: Block
@@ -108,7 +115,7 @@ class Exercise:
     def of(
         cls,
         block: Block,
-        inputs: Mapping[str, Any],
+        inputs: Mapping[str, object],
         shapes: Mapping[str, Shape],
         sample_time: float,
         ticks: int,
@@ -131,21 +138,24 @@ class Exercise:
             if shape is None:
                 shape = tuple(shapes.get(name, () if port.default is None else np.shape(port.default)))
             given = inputs.get(name)
-            if given is not None and not _is_range(given):
-                signals[name] = as_signal(given, block=block.label, port=name)
-                continue
             reach = 3.0 * (port.nominal or 1.0)
             low, high = port.minimum, port.maximum
             low = low if low is not None else -reach if high is None else min(-reach, high - 2.0 * reach)
             high = high if high is not None else max(reach, low + 2.0 * reach)
-            ends = (low, high) if given is None else given
-            if given is not None and port.shape is None and name not in shapes:
-                shape = np.broadcast_shapes(*map(np.shape, ends))
+            ends: tuple[ArrayLike, ArrayLike] = (low, high)
+            if _is_range(given):
+                ends = given
+                if port.shape is None and name not in shapes:
+                    shape = np.broadcast_shapes(*map(np.shape, ends))
+            elif given is not None:
+                signals[name] = as_signal(given, block=block.label, port=name)
+                continue
             try:
                 lowest, highest = (np.array(np.broadcast_to(v, shape), dtype=float) for v in ends)
             except ValueError:
                 raise ShapeError(
-                    f"found a range of shape {np.shape(ends[0])}; expected {shape}. Give numbers, or arrays of it.",
+                    f"found a range of shape {np.shape(ends[0])}; expected {shape}. Give numbers, or arrays of this "
+                    "shape.",
                     block=block.label,
                     port=name,
                 ) from None
@@ -157,11 +167,11 @@ class Exercise:
 
     @property
     def duration(self) -> float:
-        """Time that the exercise takes in s."""
+        """Simulated time of the exercise in s."""
         return float(exact_time(self.sample_time) * self.ticks)
 
     def make_signals(self) -> dict[str, Signal]:
-        """Return what drives each input."""
+        """Return the signal that drives each input."""
         made = dict(self.signals)
         for number, (name, (low, high)) in enumerate(self.ranges.items()):
             unit = self.block.inputs[name].unit
@@ -172,7 +182,7 @@ class Exercise:
         return made
 
     def diagram(self, sampled: bool) -> Diagram:
-        """Return the block, driven, in a frame of one kind."""
+        """Return the block, driven, in a subsystem of one kind."""
         return _make_diagram("contract", [self.block(**self.make_signals())], self.sample_time if sampled else None)
 
     @cached_property
@@ -185,7 +195,7 @@ class Exercise:
         run = _make_diagram("exercise", roots, None).simulate(
             self.duration, step=self.duration / _SAMPLES, progress=False
         )
-        _, last = np.unique(run.t, return_index=True)  # where there are two samples of one time
+        _, last = np.unique(run.t, return_index=True)  # the last one of several samples of one time
         return {name: _read_rows(run, short, self.times, last) for short, (name, _) in names.items()}
 
     @property
@@ -194,22 +204,22 @@ class Exercise:
         return np.linspace(0.0, self.duration, _SAMPLES + 1)
 
     def inputs_at(self, i: int, rng: np.random.Generator | None = None) -> dict[str, np.ndarray]:
-        """Return the inputs at an instant; those that have a range anywhere in it, where a generator is given."""
+        """Return the inputs at an instant; with a generator, those with a range are drawn from it."""
         drawn = {} if rng is None else {n: rng.uniform(*ends) for n, ends in self.ranges.items()}
         return {n: np.asarray(drawn[n] if n in drawn else self.samples[n][i]) for n in self.shapes}
 
 
-def _is_range(given: Any) -> bool:
+def _is_range(given: object) -> TypeGuard[tuple[ArrayLike, ArrayLike]]:
     return isinstance(given, tuple) and len(given) == 2 and not any(isinstance(v, Signal | Block) for v in given)
 
 
-def _read_rows(run: Any, name: str, times: np.ndarray, kept: np.ndarray) -> np.ndarray:
+def _read_rows(run: Run, name: str, times: np.ndarray, kept: np.ndarray) -> np.ndarray:
     where = np.searchsorted(run.t[kept], times - 1e-9 * times[-1])
-    result: np.ndarray = run[name][kept][np.minimum(where, len(kept) - 1)]
-    return result
+    samples: np.ndarray = run[name][kept][np.minimum(where, len(kept) - 1)]
+    return samples
 
 
-def _make_diagram(name: str, roots: list[Any], sample_time: float | None) -> Diagram:
+def _make_diagram(name: str, roots: Sequence[Call | Signal], sample_time: float | None) -> Diagram:
     table = Collector(roots).structure()
     if sample_time is not None:
         table.frames[""] = replace_fields(table.frames[""], sample_time=exact_time(sample_time))
@@ -218,7 +228,7 @@ def _make_diagram(name: str, roots: list[Any], sample_time: float | None) -> Dia
 
 @dataclass
 class Bench:
-    """A block's equations in a frame of one kind, with NumPy and traced."""
+    """A block's equations in a subsystem of one kind, with NumPy and traced."""
 
     exercise: Exercise
     sampled: bool
@@ -240,25 +250,25 @@ class Bench:
         return self.exercise.block
 
     @property
-    def frame(self) -> str:
-        """The frame in words."""
+    def kind(self) -> str:
+        """The kind of subsystem in words."""
         return kind_text(self.sampled)
 
     def evaluate_with_numpy(self, point: Point, names: list[str]) -> dict[str, np.ndarray]:
-        """Return what equations give with NumPy, or nothing where they can't be computed."""
+        """Return the results of equations with NumPy, or none where they can't be computed."""
         try:
             found = evaluate(self.block, point.arguments(), self.T, self.numbers, names)
         except (ArithmeticError, np.linalg.LinAlgError):
             return {}
         return {name: np.asarray(value, dtype=float) for name, value in found.items()}
 
-    def evaluate_trace(self, columns: list[Any]) -> list[np.ndarray]:
-        """Return what the traced function gives, one column for each column of its arguments."""
+    def evaluate_trace(self, columns: Columns) -> list[np.ndarray]:
+        """Return the results of the traced function, one column for each column of its arguments."""
         return [np.array(v) for v in self.traced.function.call([*columns, self.p])]
 
-    def evaluate(self, what: str, columns: list[Any], *more: Any) -> np.ndarray:
-        """Return what the traced ``indicators`` or ``jump`` give."""
-        return np.ravel(np.array(getattr(self.traced, what).call([*columns, self.p, *more])[0]))
+    def evaluate(self, equation: str, columns: Columns, *more: np.ndarray) -> np.ndarray:
+        """Return the results of the traced ``indicators`` or ``jump``."""
+        return np.ravel(np.array(getattr(self.traced, equation).call([*columns, self.p, *more])[0]))
 
 
 def numbers_of(block: Block, T: float, method: str) -> dict[str, Any]:
@@ -268,7 +278,7 @@ def numbers_of(block: Block, T: float, method: str) -> dict[str, Any]:
 
 
 def points(exercise: Exercise, rng: np.random.Generator, count: int) -> Iterator[Point]:
-    """Yield points at which equations are looked at: inputs in their ranges, states around where they start."""
+    """Yield points at which equations are evaluated: inputs in their ranges, states around their start values."""
     block = exercise.block
     starts = start_values(block, exercise.shapes)
     for number in range(count):
@@ -285,12 +295,12 @@ def points(exercise: Exercise, rng: np.random.Generator, count: int) -> Iterator
         yield Point(float(exercise.times[i]), x, u, fired)
 
 
-def _draw_offset(rng: np.random.Generator, port: Any, shape: Shape) -> np.ndarray:
-    """Return how far a state is moved from where it starts: by whole numbers where it is discrete."""
+def _draw_offset(rng: np.random.Generator, port: State, shape: Shape) -> np.ndarray:
+    """Draw the distance of a state from its start value; a discrete state moves by whole numbers."""
     scale = port.nominal or 1.0
     return np.asarray(rng.integers(-1, 2, shape) * 1.0 if port.discrete else scale * rng.standard_normal(shape))
 
 
 def kind_text(sampled: bool) -> str:
-    """Return a kind of frame in words."""
+    """Return a kind of subsystem in words."""
     return "sampled" if sampled else "continuous"

@@ -1,28 +1,26 @@
-"""The rule that a run of a block keeps: saved and restored, it goes on as before; see `check_block`."""
+"""Rule of a block's runs: saved and restored, a run goes on as before; see `check_block`."""
 
 from __future__ import annotations
 
 import pickle
-from typing import Any
 
 import numpy as np
 
 from ...blocks.core.block import Block
 from ...blocks.core.errors import SimulationError
-from ..simulation.simulation import Simulation
+from ..results.run import Run
 from .exercise import Exercise, kind_text
 from .values import rule_error
 
 
 def check_run(exercise: Exercise, sampled: bool) -> tuple[str, set[str]]:
-    """Run the block, save and restore in the middle; return what was done, and the events that fired."""
+    """Run the block, save and restore in the middle; return a summary, and the events that fired."""
     block, kind = exercise.block, kind_text(sampled)
     diagram = exercise.diagram(sampled)
     half = exercise.sample_time * (exercise.ticks // 2)
     half = float(f"{half:.12g}")
-    options: dict[str, Any] = {"step": exercise.sample_time}
     try:
-        with diagram.simulation(**options) as straight:
+        with diagram.simulation(step=exercise.sample_time) as straight:
             straight.advance(half)
             before = straight.run()
             if before.final_state is None:
@@ -32,16 +30,16 @@ def check_run(exercise: Exercise, sampled: bool) -> tuple[str, set[str]]:
             expected = straight.run()
             straight.restore(before.final_state)
             straight.advance(half)
-            _compare(block, kind, expected, _later(straight, before))
-        with diagram.simulation(**options) as other:
+            _compare(block, kind, expected, straight.run(), before.final_state.t)
+        with diagram.simulation(step=exercise.sample_time) as other:
             other.advance(exercise.sample_time)
             other.restore(pickle.loads(saved))
             other.advance(half)
-            _compare(block, kind, expected, _later(other, before))
+            _compare(block, kind, expected, other.run(), before.final_state.t)
     except SimulationError as error:
         error.add_note(
-            f"This is check_block's run of {block.label} in a {kind} frame. If its inputs were out of range there, "
-            "give check_block(…, inputs={…}) others."
+            f"check_block ran {block.label} in a {kind} subsystem. If its inputs were out of range there, give others: "
+            "check_block(…, inputs={…})."
         )
         raise
     events = [*before.events, *expected.events]
@@ -50,15 +48,10 @@ def check_run(exercise: Exercise, sampled: bool) -> tuple[str, set[str]]:
     return text, {e.event for e in events}
 
 
-def _later(simulation: Simulation, before: Any) -> Any:
-    return simulation.run(), before.final_state.t
-
-
-def _compare(block: Block, kind: str, expected: Any, found: tuple[Any, float]) -> None:
-    """Compare a restored run with the straight one, after the instant at which it was saved."""
-    run, t = found
-    rows = [np.column_stack([r.t, r.data])[r.t > t] for r in (expected, run)]
-    events = [[(e.t, e.event) for e in r.events if e.t > t] for r in (expected, run)]
+def _compare(block: Block, kind: str, expected: Run, found: Run, t: float) -> None:
+    """Compare a restored run with the straight one, after the instant ``t`` at which it was saved."""
+    rows = [np.column_stack([r.t, r.data])[r.t > t] for r in (expected, found)]
+    events = [[(e.t, e.event) for e in r.events if e.t > t] for r in (expected, found)]
     same_shape = rows[0].shape == rows[1].shape
     same = same_shape and np.array_equal(rows[0], rows[1], equal_nan=True)
     if same and events[0] == events[1]:
@@ -71,7 +64,7 @@ def _compare(block: Block, kind: str, expected: Any, found: tuple[Any, float]) -
         )
     raise rule_error(
         "runs",
-        f"in a {kind} frame a run that was saved at t = {t:g} s and restored is another one {where}; expected the "
-        "straight run, bit for bit. What a block remembers must be in its states.",
+        f"in a {kind} subsystem a run that was saved at t = {t:g} s and restored is another one {where}; expected the "
+        "straight run, bit for bit. Keep all that the block remembers in its states.",
         block,
     )

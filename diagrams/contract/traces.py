@@ -1,4 +1,4 @@
-"""The rules that a traced block keeps: results, derivatives and dependencies as NumPy shows them; see `check_block`."""
+"""Rules of a traced block: results, derivatives and dependencies are NumPy's; see `check_block`."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Pair = tuple[str, str]
 
 
 def check_shapes(bench: Bench) -> None:
-    """Compare the shapes of NumPy's results with those declared and traced."""
+    """Compare the shapes of NumPy's results with the declared and traced ones."""
     own = [n for n in bench.traced.outputs if n not in bench.traced.states]
     for point in bench.points[:6]:
         for name, value in bench.evaluate_with_numpy(point, own).items():
             if value.shape != bench.traced.outputs[name]:
                 raise rule_error(
                     "shapes",
-                    f"with numbers its output has shape {value.shape} in a {bench.frame} frame, traced "
+                    f"with numbers its output has shape {value.shape} in a {bench.kind} subsystem, traced "
                     f"{bench.traced.outputs[name]}; expected one shape. Build it with np.stack.",
                     bench.block,
                     name,
@@ -57,9 +57,9 @@ def check_trace(bench: Bench) -> float:
             if worst > 1e-9:
                 raise rule_error(
                     "trace",
-                    f"in a {bench.frame} frame its traced {name} is {found[:3]} where NumPy gives {flat[:3]} "
-                    f"({point}); expected the same. Avoid what traces wrongly: math.…, float(…), masks, "
-                    "branches on values or types; use np.where and np.stack.",
+                    f"in a {bench.kind} subsystem its traced {name} is {found[:3]} where NumPy gives {flat[:3]} "
+                    f"({point}); expected the same. Use np.where and np.stack in place of math.…, float(…), masks, "
+                    "and branches on values or types, which trace wrongly.",
                     block,
                     kind=TraceError,
                 )
@@ -85,7 +85,7 @@ def check_derivatives(bench: Bench) -> float:
     for point in [*bench.points[:8], *_origin(bench)]:
         at = point.columns()
         flat = np.concatenate(at[1:]) if len(at) > 1 else np.zeros(0)
-        cuts = np.cumsum([len(v) for v in at[1:]])[:-1]
+        cuts = np.cumsum([np.size(v) for v in at[1:]])[:-1]
         h = np.diag(_STEP * (1.0 + np.abs(flat)))
         many = flat[:, None] + np.hstack([h, -h, 0.5 * h, -0.5 * h, 0.0 * h[:, :1]])
         y = np.array(values.call([at[0], *np.split(many, cuts), bench.p])[0])
@@ -107,9 +107,9 @@ def check_derivatives(bench: Bench) -> float:
         if off[i, j] > 1e-4:
             raise rule_error(
                 "derivatives",
-                f"in a {bench.frame} frame the traced derivative of {rows[i]} by {columns[j]} is {J[i, j]:.6g} where "
-                f"differences give {measured[i, j]:.6g} ({point}); expected the same. Write the equation so that it is "
-                "smooth there in every operation: u*u, not np.sqrt(u**4); no np.where for a single point.",
+                f"in a {bench.kind} subsystem the traced derivative of {rows[i]} by {columns[j]} is {J[i, j]:.6g} "
+                f"where differences give {measured[i, j]:.6g} ({point}); expected the same. Write the equation so that "
+                "it is smooth there in every operation: u*u, not np.sqrt(u**4); no np.where for a single point.",
                 bench.block,
             )
         worst = max(worst, float(off[i, j]))
@@ -117,7 +117,7 @@ def check_derivatives(bench: Bench) -> float:
 
 
 def _origin(bench: Bench) -> list[Point]:
-    """Return the start with all inputs zero, where their ranges include zero: many operations have an edge there."""
+    """Return the start with all inputs zero if their ranges include zero: many operations have an edge there."""
     exercise = bench.exercise
     if exercise.signals or any(np.any((low > 0) | (high < 0)) for low, high in exercise.ranges.values()):
         return []
@@ -126,7 +126,7 @@ def _origin(bench: Bench) -> list[Point]:
 
 
 def check_feedthrough(bench: Bench) -> tuple[set[Pair], set[Pair]]:
-    """Return the pairs (input, output) that show when an input is changed, and the traced ones that don't."""
+    """Return the pairs (input, output) in which the output changed with the input, and those of the trace alone."""
     outputs, own = list(bench.traced.outputs), [n for n in bench.traced.outputs if n not in bench.traced.states]
     depends = bench.traced.depends
     traced = {(u, y) for y in outputs for u in depends[y] if u in bench.traced.inputs}
@@ -141,8 +141,8 @@ def check_feedthrough(bench: Bench) -> tuple[set[Pair], set[Pair]]:
     for u, y in sorted(measured - traced):
         raise rule_error(
             "feedthrough",
-            f"in a {bench.frame} frame the output {y!r} changes with the input {u!r}, and the trace doesn't show it; "
-            "expected every dependency in it, since blocks are ordered by it. Use NumPy functions of u alone, no "
+            f"in a {bench.kind} subsystem the output {y!r} changes with the input {u!r}, and the trace doesn't show "
+            "it; expected every dependency in the trace, which orders the blocks. Use NumPy functions of u alone, no "
             "branches on values.",
             bench.block,
             y,
@@ -151,7 +151,7 @@ def check_feedthrough(bench: Bench) -> tuple[set[Pair], set[Pair]]:
 
 
 def find_swallowed(bench: Bench, pairs: set[Pair]) -> set[Pair]:
-    """Return the pairs (input, output) at which a NaN never comes through, though numbers do."""
+    """Return the pairs (input, output) in which a NaN never comes through, though numbers do."""
     found = set(pairs)
     for point in bench.points:
         for name in {u for u, _ in found}:
@@ -162,7 +162,7 @@ def find_swallowed(bench: Bench, pairs: set[Pair]) -> set[Pair]:
 
 
 def check_guards(bench: Bench) -> int:
-    """See that guards are numbers at points, and that each has an error; return how many there are."""
+    """Check that guards are numbers at points, and that each has an error; return the number of guards."""
     block, names = bench.block, [n for n in bench.traced.guards if n.isidentifier()]
     for point in bench.points[:3] if names else []:
         _, x, u, _ = point.arguments()

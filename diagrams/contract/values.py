@@ -1,31 +1,30 @@
-"""The rules that a block keeps as a value: parameters, ports, and equations that are pure; see `check_block`."""
+"""Rules of a block as a value: parameters, ports, and pure equations; see `check_block`."""
 
 from __future__ import annotations
 
 import inspect
 import math
 import pickle
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ...blocks.core.block import Block
 from ...blocks.core.errors import DefinitionError, LoopwrightError, UnitError
 from ...blocks.core.units import parse_unit
 from ...blocks.tracing.symbols import bundle, size, with_values
-from .exercise import Exercise, Point, numbers_of
+from .exercise import Exercise, Point, Values, numbers_of
 
 
 def rule_error(
-    rule: str, text: str, block: Block, port: str | None = None, kind: Any = DefinitionError
+    rule: str, text: str, block: Block, port: str | None = None, kind: type[LoopwrightError] = DefinitionError
 ) -> LoopwrightError:
     """Return the error for a rule that is not kept."""
-    error: LoopwrightError = kind(f"{rule}: {text}", block=block.label, port=port)
-    return error
+    return kind(f"{rule}: {text}", block=block.label, port=port)
 
 
 def check_values(block: Block) -> str:
-    """Check equality, pickling and ``replace``, and return what was done."""
+    """Check equality, pickling and ``replace``, and return a summary."""
     same = block.replace()
     if same != block or hash(same) != hash(block):
         raise rule_error(
@@ -58,7 +57,7 @@ def check_values(block: Block) -> str:
     return f"{pickled}; {len(changed)} of {len(block.parameters)} parameters replaced"
 
 
-def _can_be_pickled(value: Any) -> bool:
+def _can_be_pickled(value: object) -> bool:
     try:
         pickle.dumps(value)
     except Exception:
@@ -67,7 +66,7 @@ def _can_be_pickled(value: Any) -> bool:
 
 
 def _check_replace(block: Block, name: str) -> bool:
-    """Change one parameter and change it back; return whether it could be."""
+    """Change one parameter and change it back; return whether it has another value that is allowed."""
     old = block.parameters[name]
     for value in _other_values(old):
         if np.array_equal(value, old):
@@ -79,8 +78,9 @@ def _check_replace(block: Block, name: str) -> bool:
         if not np.array_equal(variant.parameters[name], value) or variant == block:
             raise rule_error(
                 "values",
-                f"replace({name}={value!r}) gave {variant!r}, and it {'equals' if variant == block else 'is not'} what "
-                f"was asked for; expected another block with this value. Don't change parameters in the constructor.",
+                f"replace({name}={value!r}) gave {variant!r}, "
+                f"{'equal to the block' if variant == block else 'with another value'}; expected another block with "
+                "this value. Don't change parameters in the constructor.",
                 block,
                 name,
             )
@@ -96,8 +96,8 @@ def _check_replace(block: Block, name: str) -> bool:
     return False
 
 
-def _other_values(value: Any) -> list[Any]:
-    """Return other values of a parameter, of which one may be allowed."""
+def _other_values(value: object) -> list[ArrayLike]:
+    """Return other values to try for a parameter."""
     if isinstance(value, bool):
         return [not value]
     if isinstance(value, int):
@@ -108,7 +108,7 @@ def _other_values(value: Any) -> list[Any]:
 
 
 def check_ports(block: Block) -> str:
-    """Check what the ports declare, and return how many there are."""
+    """Check the declarations of the ports, and return their number."""
     kinds = {"inputs": block.inputs, "outputs": block.outputs, "states": block.states, "events": block.events}
     count = 0
     for kind, ports in kinds.items():
@@ -152,20 +152,20 @@ def check_ports(block: Block) -> str:
 
 
 def check_purity(exercise: Exercise, sampled: bool, places: list[Point]) -> int:
-    """Evaluate every equation several times, and return how many there are."""
+    """Evaluate every equation several times, and return the number of equations."""
     block = exercise.block
     T = exercise.sample_time if sampled else math.nan
     shadow = with_values(block, numbers_of(block, T, "exact"))
     first = [_evaluate_all(shadow, point, T if sampled else None) for point in places]
-    before = _attributes(shadow)  # what is computed once and kept is there after the first time
+    before = _attributes(shadow)  # caches are filled by now
     for number, point in enumerate(places):
-        for what, value in _evaluate_all(shadow, point, T if sampled else None).items():
-            if first[number].get(what, value) != value:
+        for equation, value in _evaluate_all(shadow, point, T if sampled else None).items():
+            if first[number].get(equation, value) != value:
                 raise rule_error(
                     "purity",
-                    f"its {what} gives other values when it is called again with the same arguments ({point}); "
-                    "expected the same ones. Let it depend on nothing but (t, x, u) and parameters; what a block "
-                    "remembers is a State.",
+                    f"its {equation} gives other values when it is called again with the same arguments ({point}); "
+                    "expected the same ones. Let it depend on nothing but (t, x, u) and parameters; a block's memory "
+                    "is a State.",
                     block,
                 )
         after = _attributes(shadow)
@@ -180,43 +180,43 @@ def check_purity(exercise: Exercise, sampled: bool, places: list[Point]) -> int:
     return len(set().union(*first))
 
 
-def _evaluate_all(block: Any, point: Point, T: float | None) -> dict[str, bytes]:
-    """Return what every equation gives, as bytes; what can't be computed here is left to the trace."""
+def _evaluate_all(block: Block, point: Point, T: float | None) -> dict[str, bytes]:
+    """Return the result of every equation as bytes, without those that fail; tracing tells why they do."""
     result = {}
-    for what in ("output", "derivative", "update", "guards", "indicators", "jump", "initial"):
-        if not hasattr(block, what) or (what == "update" and T is None):
+    for equation in ("output", "derivative", "update", "guards", "indicators", "jump", "initial"):
+        if not hasattr(block, equation) or (equation == "update" and T is None):
             continue
         t, x, u, fired = point.arguments()
         given = [bundle("x", x), bundle("u", u)]
-        arguments = [given[1]] if what == "initial" else [t, *given]
-        if what == "jump":
+        arguments = [given[1]] if equation == "initial" else [t, *given]
+        if equation == "jump":
             arguments.append(bundle("fired", fired))
-        timed = T is not None and "T" in inspect.signature(getattr(block, what)).parameters
+        timed = T is not None and "T" in inspect.signature(getattr(block, equation)).parameters
         try:
             with np.errstate(all="ignore"):
-                found = getattr(block, what)(*arguments, **({"T": np.float64(T)} if timed else {}))
+                found = getattr(block, equation)(*arguments, **({"T": np.float64(T)} if timed else {}))
         except LoopwrightError:
             continue
-        except Exception:  # what fails is left to the trace
+        except Exception:  # a user's equation may raise anything
             continue
-        _expect_unchanged(block, what, point, x, u)
-        result[what] = _to_bytes(found)
+        _expect_unchanged(block, equation, point, x, u)
+        result[equation] = _to_bytes(found)
     return result
 
 
-def _expect_unchanged(block: Block, what: str, point: Point, x: dict[str, Any], u: dict[str, Any]) -> None:
+def _expect_unchanged(block: Block, equation: str, point: Point, x: Values, u: Values) -> None:
     for name, given, now in [*((n, point.x[n], v) for n, v in x.items()), *((n, point.u[n], v) for n, v in u.items())]:
         if not np.array_equal(np.asarray(given), np.asarray(now), equal_nan=True):
             raise rule_error(
                 "purity",
-                f"its {what} changes its argument {name!r} from {np.asarray(given).tolist()} to "
+                f"its {equation} changes its argument {name!r} from {np.asarray(given).tolist()} to "
                 f"{np.asarray(now).tolist()}; expected it unchanged. Return new values: y = u + 1, not u += 1.",
                 block,
                 name,
             )
 
 
-def _to_bytes(value: Any) -> bytes:
+def _to_bytes(value: object) -> bytes:
     if isinstance(value, dict):
         return b"".join(str(k).encode() + _to_bytes(v) for k, v in value.items())
     if isinstance(value, tuple | list):
@@ -224,12 +224,12 @@ def _to_bytes(value: Any) -> bytes:
     return np.asarray(value).tobytes()
 
 
-def _attributes(block: Any) -> dict[str, Any]:
-    """Return what tells whether an attribute has changed, by name."""
-    result = {}
+def _attributes(block: Block) -> dict[str, object]:
+    """Return every attribute's content as bytes by name, or its identity where it can't be pickled."""
+    result: dict[str, object] = {}
     for name, value in vars(block).items():
         try:
             result[name] = pickle.dumps(value)
         except Exception:  # an object's pickling may raise anything
-            result[name] = id(value)  # type: ignore[assignment]
+            result[name] = id(value)
     return result

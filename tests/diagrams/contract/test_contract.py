@@ -461,7 +461,7 @@ BROKEN = {
     Counting: (DefinitionError, "counting: purity: its output gives other values when it is called again"),
     Keeping: (DefinitionError, "keeping: purity: its attribute 'last' was changed by its equations"),
     Overwriting: (DefinitionError, r"overwriting\.u: purity: its output changes its argument 'u' from"),
-    Preset: (DefinitionError, r"preset\.gain: values: replace\(gain=2\.5\) gave .* equals what was asked for"),
+    Preset: (DefinitionError, r"preset\.gain: values: replace\(gain=2\.5\) gave .*, equal to the block"),
     Forgetful: (DefinitionError, r"forgetful: values: replace\(\) without changes gave .* not equal"),
     Laden: (DefinitionError, r"laden: values: it can't be pickled .* Define its class at the top of a module"),
     Partial: (DefinitionError, r"partial: values: pickled and read back it is .* expected"),
@@ -470,11 +470,11 @@ BROKEN = {
     Orphan: (DefinitionError, r"orphan\.y: ports: found like='w'; expected an input: u"),
     Clipped: (ShapeError, r"clipped\.y: its output gives shape \(\); expected \(2,\) as declared"),
     Sometimes: (ShapeError, r"sometimes\.y: shapes: with numbers its output has shape \(2,\)"),
-    Typed: (TraceError, "typed: trace: in a sampled frame its traced y is .* where NumPy gives"),
+    Typed: (TraceError, "typed: trace: in a sampled subsystem its traced y is .* where NumPy gives"),
     Rooted: (DefinitionError, r"rooted: derivatives: .* of y\[0\] by u\[0\] is nan where differences give"),
     Dotted: (DefinitionError, r"dotted: derivatives: .* of y\[0\] by u\[0\] is 0 where differences give 1"),
     Branching: (DefinitionError, r"branching: events: .* jump at .*'u': \[0\.3\]} and no indicator crosses zero there"),
-    Dragging: (DefinitionError, r"dragging: events: in a continuous frame its outputs or derivatives jump"),
+    Dragging: (DefinitionError, r"dragging: events: in a continuous subsystem its outputs or derivatives jump"),
     Sudden: (DefinitionError, r"sudden: next_instant: its outputs, or their rates, jump at t = 0\.37 s"),
     Bent: (DefinitionError, r"bent: next_instant: its outputs, or their rates, jump at t = 0\.37 s"),
     Pushed: (DefinitionError, r"pushed: next_instant: its outputs, or their rates, jump at t = 0\.37 s"),
@@ -483,7 +483,7 @@ BROKEN = {
     Flapping: (DefinitionError, r"flapping: events: at t = .* its events go on firing \(up\), 100 times"),
     Undefined: (DefinitionError, r"undefined\.up: events: its indicator is \[nan\]"),
     Unguarded: (DefinitionError, r"unguarded: guards: guard_error gave 'small is -1\.0'"),
-    Remembering: (DefinitionError, r"remembering: runs: in a sampled frame a run that was saved at t = 0\.5 s"),
+    Remembering: (DefinitionError, r"remembering: runs: in a sampled subsystem a run that was saved at t = 0\.5 s"),
 }
 OPTIONS = {Typed: {"inputs": {"u": (-50.0, 50.0)}}}
 
