@@ -1,154 +1,264 @@
-"""One pass over all blocks in the order of evaluation, with symbols or with numbers."""
+"""One evaluation of all blocks at an instant, in the order of evaluation: with symbols, or with numbers.
+
+Everything that a diagram does is read off such an `Instant`: its outputs, the next states, the rates between ticks, the
+indicators of events. With symbols it gives the functions that are run, differentiated and compiled; with numbers it
+finds out who made a value that is not finite.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from ...blocks.core.errors import SimulationError
+from ...blocks.core.layout import Layout
 from ...blocks.tracing.numpy_check import GUARDS, NEXT
 from ...blocks.tracing.symbols import size
-from ..wiring.structure import join
-from .flat_diagram import FlatDiagram
-from .layout import Clock, rows
+from ..wiring.evaluation_order import Step
+from ..wiring.structure import Wire, join
+from .block_functions import BlockFunctions
+from .layout import Clock, FlatLayout
+from .logic import choose, is_true, logic_and, logic_not, logic_or, to_number
 
-TRUE = 0.5
-"""A logic signal is true above this."""
+INDICATORS, JUMP = "indicators", "jump"
+"""Names of the equations of a block's events, beside its outputs, `NEXT` and `GUARDS`."""
+
+Apart = Callable[["Instant", str, tuple[str, ...], Any, Sequence[Any]], list[Any]]
+"""Evaluates a block from outside: called with the instant, the block's path, the names of the equations that are
+wanted, its states and its inputs as columns, it returns a column for each name."""
 
 
-class Pass:
-    """What all blocks make of one instant.
+def evaluate(
+    layout: FlatLayout,
+    functions: BlockFunctions,
+    acting: frozenset[Clock],
+    t: Any,
+    x: Any,
+    w: Any,
+    p: Any,
+    *,
+    fired: Any = None,
+    opened: bool = False,
+    order: Iterable[Step] | None = None,
+    before: Callable[[str, dict[str, Any]], None] | None = None,
+    visit: Callable[[Instant, str, dict[str, Any], dict[str, Any]], None] | None = None,
+    taps: Mapping[tuple[str, str], Callable[[Any], Any]] | None = None,
+    apart: Apart | None = None,
+) -> Instant:
+    """Evaluate all blocks at an instant.
 
     Parameters
     ----------
-    flat : FlatDiagram
-        The diagram.
+    layout : FlatLayout
+        Where everything stands.
+    functions : BlockFunctions
+        The functions of the blocks.
     acting : frozenset of Clock
         The clocks that tick; without any it is an instant between ticks.
     t, x, w, p : columns
-        Symbols, or numbers.
+        CasADi's symbols, or NumPy's numbers.
     fired : column, optional
         Which of the diagram's events fire; without it none does.
     opened : bool
-        Evaluate every box as if it acted.
-    order : list of Step, optional
+        Evaluate every subsystem as if it acted.
+    order : iterable of Step, optional
         Another order than that of a tick.
     before, visit : callable, optional
-        ``before(path, inputs)`` is called ahead of each block, ``visit(path, names, inputs, made)`` after it.
+        ``before(path, inputs)`` is called ahead of each block, ``visit(instant, path, inputs, made)`` after it, with
+        what it has made by name.
     taps : mapping, optional
-        By port: what its consumers get instead of what is put out there, a function of that.
+        By port: a function that gives what its consumers get, from what is put out there.
+    apart : callable, optional
+        Evaluates the blocks of `FlatLayout.apart`; required where there are any.
+    """
+    instant = Instant(layout, functions, acting, t, x, w, p, fired, opened, taps or {}, apart)
+    instant.run(layout.order.steps if order is None else order, before, visit)
+    return instant
+
+
+class Instant:
+    """The values of all blocks at an instant; see `evaluate`.
+
+    Attributes
+    ----------
+    values : dict
+        The flat columns of all outputs, by port.
+    returned : dict
+        Outputs of the blocks at ports that are tapped, as they were before the tap.
+    new : dict
+        Next states of the blocks that act, by path.
+    rates : dict
+        Time derivatives of the states of continuous blocks, by path.
+    held : dict
+        Outputs that are held from now on, by dotted port.
+    gates : dict
+        What enabled and triggered subsystems remember of their control from now on, by path.
+    guards : list
+        Columns that must be positive.
+    mismatch : list
+        For each torn port of an algebraic loop: what came round, and what was taken.
     """
 
     def __init__(
         self,
-        flat: FlatDiagram,
+        layout: FlatLayout,
+        functions: BlockFunctions,
         acting: frozenset[Clock],
         t: Any,
         x: Any,
         w: Any,
         p: Any,
-        *,
-        fired: Any = None,
-        opened: bool = False,
-        order: Any = None,
-        before: Callable[..., None] | None = None,
-        visit: Callable[..., None] | None = None,
-        taps: Mapping[tuple[str, str], Callable[[Any], Any]] | None = None,
+        fired: Any,
+        opened: bool,
+        taps: Mapping[tuple[str, str], Callable[[Any], Any]],
+        apart: Apart | None,
     ):
-        self.flat, self.acting, self.opened = flat, acting, opened
+        self.layout, self.functions, self.acting = layout, functions, acting
         self.t, self.x, self.w, self.p, self.fired = t, x, w, p, fired
-        self.order = flat.order.steps if order is None else order
-        self.before, self.visit, self.taps = before, visit, taps or {}
-        self.returned: dict[tuple[str, str], Any] = {}
-        """What the blocks put out at ports that are tapped."""
+        self.opened, self.taps, self.apart = opened, taps, apart
         self.values: dict[tuple[str, str], Any] = {}
+        self.returned: dict[tuple[str, str], Any] = {}
         self.new: dict[str, Any] = {}
-        """Next states of the blocks that act, by path."""
         self.rates: dict[str, Any] = {}
-        """Time derivatives of the states of continuous blocks, by path."""
         self.held: dict[str, Any] = {}
         self.gates: dict[str, Any] = {}
-        """What enabled and triggered boxes remember, by path."""
         self.guards: list[Any] = []
         self.mismatch: list[tuple[Any, Any]] = []
-        """For each torn port: what came round, and what was taken."""
-        self._gate: dict[str, Any] = {}
-        self._events = {(e.path, e.name): i for i, e in enumerate(flat.events)}
+        self._open: dict[str, Any] = {}
+        self._events = {(e.path, e.name): i for i, e in enumerate(layout.events)}
 
-    def run(self) -> Pass:
-        """Evaluate all blocks."""
-        flat, table, traced = self.flat, self.flat.table, self.flat.checked.traced
-        for name, where in flat.plant_outputs.slices.items():
-            self._put(flat.ports[name], rows(self.w, where))
+    def run(
+        self,
+        order: Iterable[Step],
+        before: Callable[[str, dict[str, Any]], None] | None,
+        visit: Callable[[Instant, str, dict[str, Any], dict[str, Any]], None] | None,
+    ) -> None:
+        """Evaluate all blocks; called once, by `evaluate`."""
+        layout, table, traced = self.layout, self.layout.table, self.functions.traced
+        for name, where in layout.plant_outputs.slices.items():
+            self._put(layout.ports[name], rows(self.w, where))
         acts = {path: self._acts(table.frame_of[path]) for path in traced}
-        for name, where in flat.held.slices.items():
-            path, port = flat.ports[name]
+        for name, where in layout.held.slices.items():
+            path, port = layout.ports[name]
             if not acts[path]:
                 self._put((path, port), rows(self.x, where))
         torn = {}
-        for name, where in flat.loops.slices.items():
-            path, port = flat.ports[name]
+        for name, where in layout.loops.slices.items():
+            path, port = layout.ports[name]
             if acts[path]:
                 torn[path, port] = rows(self.x, where)
                 self._put((path, port), torn[path, port])
-        for path, names in self.order:
+        for path, names in order:
             if not acts[path]:
                 continue
             trace = traced[path]
-            inputs = {
-                q: flat.source(path, q, self.values) if flat.is_made(path, q, self.values) else None
-                for q in trace.inputs
-            }
-            if self.before is not None:
-                self.before(path, inputs)
-            made = self._evaluate(path, names, inputs)
-            if self.visit is not None:
-                self.visit(path, names, inputs, dict(zip(names, made, strict=True)))
+            inputs = {q: self.source(path, q) if self._is_made(path, q) else None for q in trace.inputs}
+            if before is not None:
+                before(path, inputs)
+            made = dict(zip(names, self._evaluate(path, names, inputs), strict=True))
+            if visit is not None:
+                visit(self, path, inputs, made)
             gate = self.gate_of(path)
-            for name, column in zip(names, made, strict=True):
+            for name, column in made.items():
                 if name == NEXT:
                     self._advance(path, column, gate)
                 elif name == GUARDS:
                     self.guards += [choose(gate, column, np.ones(len(trace.guards)))] if trace.guards else []
                 else:
                     self._output(path, name, column, gate, torn)
-        for box in self.flat.gates.slices:
+        for box in layout.gates.slices:
             if self._acts(box):
                 self.is_open(box)  # one without blocks of its own remembers, too
-        for path in flat.starts.slices:  # what has another rate than the box that resets it
+        for path in layout.starts.slices:  # blocks of another rate than the subsystem that resets them
             if not acts[path] and any(self._resets(box) for box in table.gates(table.frame_of[path])):
                 self.new[path] = self._state(path)
-        return self
 
     def _acts(self, frame: str) -> bool:
-        clock = self.flat.clocks.get(frame)
+        clock = self.layout.clocks.get(frame)
         return clock is None or self.opened or clock in self.acting
 
-    def arguments(self, path: str, inputs: dict[str, Any] | None = None) -> list[Any]:
-        """Return t, x, the inputs and p of a block, as its functions take them."""
-        flat, shapes = self.flat, self.flat.checked.traced[path].inputs
-        if inputs is None:
-            inputs = {q: flat.source(path, q, self.values) for q in shapes}
-        columns = [np.zeros(size(s)) if inputs[q] is None else inputs[q] for q, s in shapes.items()]
-        return [self.t, self._state(path), *columns, rows(self.p, flat.parameters.slices[path])]
+    # --- one block ---------------------------------------------------------------------------------------------------
+
+    def source(self, path: str, port: str) -> Any:
+        """Return the flat column at an input of a block, or of what is stepped from outside."""
+        wire = self.layout.table.wires.get((path, port))
+        if wire is None:
+            default = self.layout.table.blocks[path].inputs[port].default
+            return np.ravel(np.asarray(default))
+        return self.part(wire)
+
+    def part(self, wire: Wire) -> Any:
+        """Return the part of an output's flat column that a wire takes."""
+        column = self.values[wire.block, wire.port]
+        if wire.index is None:
+            return column
+        shape = self.layout.log.shapes[join(wire.block, wire.port)]
+        index = np.ravel(np.arange(size(shape)).reshape(shape)[wire.index])
+        return column[index.tolist()] if not isinstance(column, np.ndarray) else column[index]
+
+    def _is_made(self, path: str, port: str) -> bool:
+        """Whether the signal at an input has been computed, or is a default."""
+        wire = self.layout.table.wires.get((path, port))
+        return wire is None or (wire.block, wire.port) in self.values
+
+    def events_of(self, path: str, name: str, *more: Any) -> Any:
+        """Return the column of a block's `INDICATORS`, or of its states after a `JUMP`.
+
+        Parameters
+        ----------
+        *more : column
+            Further arguments of the equation: which of the block's events fire.
+        """
+        trace = self.functions.traced[path]
+        t, state, inputs, p = self._arguments(path, {q: self.source(path, q) for q in trace.inputs})
+        if path in self.layout.apart:
+            return self._call_apart(path, (name,), state, [*inputs, *more])[0]
+        function = trace.indicators if name == INDICATORS else trace.jump
+        return function.call([t, state, *inputs, p, *more])[0]
 
     def _evaluate(self, path: str, names: tuple[str, ...], inputs: dict[str, Any]) -> list[Any]:
-        # what is not made yet is not depended on
-        made = self.flat.block_function(path, names).call(self.arguments(path, inputs))
+        t, state, columns, p = self._arguments(path, inputs)
+        if path in self.layout.apart:
+            return self._call_apart(path, names, state, columns)
+        made = self.functions.of(path, names).call([t, state, *columns, p])
         return [ca.densify(m) for m in made]
+
+    def _arguments(self, path: str, inputs: dict[str, Any]) -> tuple[Any, Any, list[Any], Any]:
+        """Return t, x, the inputs and p of a block, as its functions take them.
+
+        Inputs that are not computed yet are not used by the outputs that are; zeros stand in.
+        """
+        shapes = self.functions.traced[path].inputs
+        columns = [np.zeros(size(s)) if inputs[q] is None else inputs[q] for q, s in shapes.items()]
+        return self.t, self._state(path), columns, rows(self.p, self.layout.parameters.slices[path])
+
+    def _call_apart(self, path: str, names: tuple[str, ...], state: Any, inputs: Sequence[Any]) -> list[Any]:
+        if self.apart is None:
+            raise no_evaluator(path)
+        return self.apart(self, path, names, state, inputs)
+
+    def size_of(self, path: str, name: str) -> int:
+        """Return the number of entries of an output of a block, or of another of its equations."""
+        trace = self.functions.traced[path]
+        if name in trace.outputs:
+            return size(trace.outputs[name])
+        if name == GUARDS:
+            return len(trace.guards)
+        return len(self.layout.table.blocks[path].events) if name == INDICATORS else Layout.of(trace.states).total
 
     def _advance(self, path: str, column: Any, gate: Any) -> None:
         state = self._state(path)
-        if self.flat.checked.traced[path].advance == "derivative":
+        if self.functions.traced[path].advance == "derivative":
             self.rates[path] = choose(gate, column, np.zeros(column.numel()))
         elif column.numel():
             self.new[path] = choose(gate, column, state)
 
     def _output(self, path: str, name: str, column: Any, gate: Any, torn: dict[tuple[str, str], Any]) -> None:
         full = join(path, name)
-        held = self.flat.held.slices.get(full)
+        held = self.layout.held.slices.get(full)
         if held is not None:
             column = choose(gate, column, rows(self.x, held))
             self.held[full] = column
@@ -163,107 +273,89 @@ class Pass:
             column = self.taps[port](column)
         self.values[port] = column
 
-    def residual(self) -> Any:
-        """Return the largest mismatch of the torn ports, relative to 1 + their size."""
-        if not self.mismatch:
-            return ca.MX(0.0)
-        made, taken = (ca.vertcat(*columns) for columns in zip(*self.mismatch, strict=True))
-        return ca.norm_inf(made - taken) / (1 + ca.norm_inf(taken))
-
-    # --- boxes that are enabled or triggered ------------------------------------------------------------------------
+    # --- subsystems that are enabled or triggered ---------------------------------------------------------------------
 
     def gate_of(self, path: str) -> Any:
-        """Whether all boxes around a block are open at this instant: True, or a number or symbol."""
+        """Whether all subsystems around a block are open at this instant: True, or a number or symbol."""
         gate: Any = True
-        for box in self.flat.table.gates(self.flat.table.frame_of[path]):
-            gate = both(gate, self.is_open(box))
+        for box in self.layout.table.gates(self.layout.table.frame_of[path]):
+            gate = logic_and(gate, self.is_open(box))
         return gate
 
     def control(self, box: str) -> Any:
-        """Return the signal that enables or triggers a box."""
-        wire = self.flat.table.controls[box]
-        return self.flat.part(self.values[wire.block, wire.port], wire)
+        """Return the signal that enables or triggers a subsystem."""
+        return self.part(self.layout.table.controls[box])
 
     def is_open(self, box: str) -> Any:
-        """Whether a box itself is open, and what it remembers of it."""
+        """Whether a subsystem itself is open; takes note of what it remembers of its control."""
         if self.opened:
             return True
-        if box in self._gate:
-            return self._gate[box]
-        table, frame = self.flat.table, self.flat.table.frames[box]
-        last = rows(self.x, self.flat.gates.slices[box])
+        if box in self._open:
+            return self._open[box]
+        table, frame = self.layout.table, self.layout.table.frames[box]
+        last = rows(self.x, self.layout.gates.slices[box])
         if (box, "enable") in self._events or not self._acts(box):
-            gate = above(last)  # blocks of another rate in it go by its last tick
+            gate = is_true(last)  # blocks of another rate in it go by its last tick
         elif (box, "trigger") in self._events:
             i = self._events[box, "trigger"]
-            gate = False if self.fired is None else above(self.fired[i : i + 1])
+            gate = False if self.fired is None else is_true(self.fired[i : i + 1])
         else:
             outer: Any = True
             for around in table.gates(box.rpartition(".")[0]):
-                outer = both(outer, self.is_open(around))
-            now = above(self.control(box))
+                outer = logic_and(outer, self.is_open(around))
+            now = is_true(self.control(box))
             if frame.control == "enabled":
-                gate, remembered = now, both(outer, now)
+                gate, remembered = now, logic_and(outer, now)
             else:
-                rising, falling = both(now, negated(above(last))), both(negated(now), above(last))
-                gate = {"rising": rising, "falling": falling, "both": either(rising, falling)}[frame.when]
+                was = is_true(last)
+                rising, falling = logic_and(now, logic_not(was)), logic_and(logic_not(now), was)
+                gate = {"rising": rising, "falling": falling, "both": logic_or(rising, falling)}[frame.when]
                 remembered = now
-            self.gates[box] = choose(outer, number(remembered), last)
-        self._gate[box] = gate
+            self.gates[box] = choose(outer, to_number(remembered), last)
+        self._open[box] = gate
         return gate
 
     def _state(self, path: str) -> Any:
-        """Return the states of a block; those at the start where a box around it has just been enabled."""
-        flat = self.flat
-        state = rows(self.x, flat.states.slices[path])
-        if path not in flat.starts.slices or self.opened:
+        """Return the states of a block; those at the start where a subsystem around it has just been enabled."""
+        layout = self.layout
+        state = rows(self.x, layout.states.slices[path])
+        if path not in layout.starts.slices or self.opened:
             return state
         outer: Any = True
-        for box in flat.table.gates(flat.table.frame_of[path]):
-            outer = both(outer, self.is_open(box))
+        for box in layout.table.gates(layout.table.frame_of[path]):
+            outer = logic_and(outer, self.is_open(box))
             if self._resets(box):
-                entering = both(outer, negated(above(rows(self.x, flat.gates.slices[box]))))
-                state = choose(entering, rows(self.x, flat.starts.slices[path]), state)
+                entering = logic_and(outer, logic_not(is_true(rows(self.x, layout.gates.slices[box]))))
+                state = choose(entering, rows(self.x, layout.starts.slices[path]), state)
         return state
 
     def _resets(self, box: str) -> bool:
-        """Whether states may start anew at this instant because a box, not by an event, is enabled."""
-        return self.flat.table.frames[box].when == "reset" and (box, "enable") not in self._events and self._acts(box)
+        """Whether states may start anew at this instant because a subsystem, not by an event, is enabled."""
+        frame = self.layout.table.frames[box]
+        return frame.when == "reset" and (box, "enable") not in self._events and self._acts(box)
+
+    # --- stages -------------------------------------------------------------------------------------------------------
+
+    def replace_columns(self, change: Callable[[Any], Any]) -> None:
+        """Replace every column that was made so far, as where a stage of a schedule ends."""
+        for part in (self.returned, self.values):
+            part.update({port: change(column) for port, column in part.items()})
+        for made in (self.new, self.rates, self.held, self.gates, self._open):
+            made.update({name: change(column) for name, column in made.items()})
+        self.guards = [change(column) for column in self.guards]
+        self.mismatch = [(change(made), change(taken)) for made, taken in self.mismatch]
 
 
-def above(value: Any) -> Any:
-    """Whether a logic signal (a column of one entry) is true."""
-    if isinstance(value, ca.MX):
-        return value > TRUE
-    return bool(float(np.ravel(np.array(value))[0]) > TRUE)
+def no_evaluator(path: str) -> SimulationError:
+    """Return the error of a block that is evaluated from outside where nothing was given that does it."""
+    return SimulationError(
+        "it is evaluated from outside, and nothing was given that does so. Give what evaluates it by its path.",
+        block=path,
+    )
 
 
-def both(a: Any, b: Any) -> Any:
-    """Logic and, of truth values or symbols."""
-    if isinstance(a, bool):
-        return b if a else False
-    if isinstance(b, bool):
-        return a if b else False
-    return ca.logic_and(a, b)
-
-
-def either(a: Any, b: Any) -> Any:
-    """Logic or, of truth values or symbols."""
-    return a or b if isinstance(a, bool) and isinstance(b, bool) else ca.logic_or(a, b)
-
-
-def negated(a: Any) -> Any:
-    """Logic not, of a truth value or a symbol."""
-    return not a if isinstance(a, bool) else ca.logic_not(a)
-
-
-def number(a: Any) -> Any:
-    """Return 1.0 or 0.0 for a truth value; a symbol stays."""
-    return np.array([float(a)]) if isinstance(a, bool) else a
-
-
-def choose(condition: Any, a: Any, b: Any) -> Any:
-    """Return ``a`` where the condition holds, else ``b``; NaN in the other one does no harm."""
-    if isinstance(condition, bool):
-        return a if condition else b
-    return ca.if_else(condition, a, b)
+def rows(vector: Any, where: slice) -> Any:
+    """Return a part of a column; an empty one stays a column, which slicing a single entry would not give."""
+    if isinstance(vector, np.ndarray):
+        return vector[where]
+    return vector[where] if where.stop > where.start else ca.MX(0, 1)

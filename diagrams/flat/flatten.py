@@ -15,7 +15,7 @@ from ..wiring.check import Checked
 from ..wiring.evaluation_order import evaluation_order
 from ..wiring.structure import Structure, join
 from .flat_diagram import FlatDiagram
-from .layout import Clock, FlatEvent, StateLayout
+from .layout import Clock, FlatEvent, StateLayout, sample_time_of
 
 
 def flatten(
@@ -79,7 +79,7 @@ def flatten(
             if (p, q) in table.wires
         }
     )
-    packed = {path: traced[path].pack(blocks[path], _period(table, path)) for path in paths}
+    packed = {path: traced[path].pack(blocks[path], sample_time_of(table, path)) for path in paths}
     log_shapes = dict(plant_outputs.shapes) | {join(p, q): s for p in paths for q, s in traced[p].outputs.items()}
     start_values = [
         np.ravel(port.start_value(blocks[path], traced[path].inputs))
@@ -143,14 +143,6 @@ def _events(table: Structure, checked: Checked) -> Iterator[FlatEvent]:
         if trace.indicators is not None:
             for name, event in table.blocks[path].events.items():
                 yield FlatEvent(path, name, event.direction, getattr(event, "hysteresis", 0.0), False)
-
-
-def _period(table: Structure, path: str) -> float:
-    frame = table.frame_of[path]
-    if table.triggered_around(frame) is not None:
-        return math.nan
-    rate = table.rate(frame)
-    return math.nan if rate is None else float(rate)
 
 
 def _clocks(table: Structure, step: Fraction | None, name: str) -> tuple[Fraction, dict[str, Clock]]:

@@ -1,135 +1,173 @@
-"""What a diagram does between ticks, and at events: functions of (t, x, w, p) made from one pass over the blocks."""
+"""What a diagram does at a tick, between ticks, and at events: schedules of stages, traced from its blocks.
+
+    (x_next, z, log, ok) = F(t, x, w, p)    at a tick, for every set of clocks that act
+    dx = f(t, x, w, p)                      between ticks: the rates of the continuous states
+    (g, open) = h(t, x, w, p)               between ticks: the indicators of all events
+    x_next = J(t, x, w, p, fired)           at events
+
+``ok`` is 1 while everything is finite and every guard positive. The vectors are those of `FlatLayout`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
+import numpy as np
 
-from .evaluate import Pass, above, both, choose, negated
-from .flat_diagram import FlatDiagram
-from .layout import Clock, rows
+from .block_functions import BlockFunctions
+from .evaluate import INDICATORS, JUMP, Apart, evaluate, rows
+from .layout import NONE, Clock, FlatLayout
+from .logic import choose, is_true, logic_and, logic_not
+from .stages import Schedule
+from .total_derivative import Derivative
+from .trace_stages import trace_schedule
+from .vectors import log, loop_mismatch, next_x, plant_inputs, rates
 
-NONE: frozenset[Clock] = frozenset()
-
-
-def flow(flat: FlatDiagram) -> Any:
-    """Return ``(t, x, w, p) -> dx``: the rates of the entries `FlatDiagram.continuous` of x."""
-    arguments, dx = _rates(flat)
-    return ca.Function("flow", arguments, [ca.densify(dx)], ["t", "x", "w", "p"], ["dx"])
-
-
-def flow_jacobian(flat: FlatDiagram) -> Any:
-    """Return ``(t, x, w, p) -> ∂dx/∂x`` by the continuous entries of x."""
-    arguments, dx = _rates(flat)
-    by_x = ca.jacobian(dx, arguments[1])[:, flat.continuous.tolist()]
-    return ca.Function("flow_jacobian", arguments, [ca.densify(by_x)], ["t", "x", "w", "p"], ["jacobian"])
+LARGEST = float(np.finfo(float).max)
 
 
-def _rates(flat: FlatDiagram) -> tuple[list[Any], Any]:
-    t, x, w, p = flat.symbols()
-    done = Pass(flat, NONE, t, x, w, p).run()
-    of_all = ca.vertcat(
-        *(done.rates.get(path, ca.MX.zeros(where.stop - where.start)) for path, where in flat.states.slices.items())
+def make_symbols(layout: FlatLayout) -> dict[str, Any]:
+    """Return fresh symbols of t, x, w and p, by these names."""
+    sizes = {"t": 1, "x": layout.width, "w": layout.plant_outputs.total, "p": layout.parameters.total}
+    return {name: ca.MX.sym(name, size) for name, size in sizes.items()}
+
+
+def trace_tick(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[Clock]) -> Schedule:
+    """Return ``(t, x, w, p) -> (x_next, z, log, ok)``: a tick at which the given clocks act."""
+    symbols = make_symbols(layout)
+
+    def results(apart: Apart) -> Mapping[str, Any]:
+        instant = evaluate(layout, functions, acting, **symbols, apart=apart)
+        found = {"x_next": next_x(instant), "z": plant_inputs(instant), "log": log(instant)}
+        sizes = (ca.norm_1(found[name]) for name in ("log", "x_next", "z") if found[name].numel())
+        ok = sum(sizes, ca.MX(0.0)) <= LARGEST  # false for any NaN or infinity
+        if instant.guards:
+            ok = ca.logic_and(ok, ca.mmin(ca.vertcat(*instant.guards) > 0))
+        return {**found, "ok": ok}
+
+    return trace_schedule("tick", symbols, results)
+
+
+def trace_driven(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
+    """Return ``(t, x, w, p) -> z`` between ticks: the inputs of what is stepped from outside."""
+    symbols = make_symbols(layout)
+    return trace_schedule(
+        "driven",
+        symbols,
+        lambda apart: {"z": plant_inputs(evaluate(layout, functions, NONE, **symbols, apart=apart))},
     )
-    return [t, x, w, p], of_all[flat.continuous.tolist()] if flat.continuous.size else ca.MX(0, 1)
 
 
-def indicators(flat: FlatDiagram) -> Any:
-    """Return ``(t, x, w, p) -> (g, open)``: what events look at, and 1 where the boxes around an event are open."""
-    t, x, w, p = flat.symbols()
-    done = Pass(flat, NONE, t, x, w, p).run()
-    g, opened, blocks = [], [], dict[str, Any]()
-    for event in flat.events:
-        if event.box:
-            g.append(done.control(event.path) - 0.5)
-            gate: Any = True
-            for box in flat.table.gates(event.path.rpartition(".")[0]):
-                gate = both(gate, done.is_open(box))
-        else:
-            path = event.path
-            if path not in blocks:
-                made = flat.checked.traced[path].indicators.call(done.arguments(path))[0]
-                blocks[path] = ca.vertsplit(made)
-            g.append(blocks[path][list(flat.table.blocks[path].events).index(event.name)])
-            gate = done.gate_of(path)
-        opened.append(ca.MX(1.0) if gate is True else ca.MX(0.0) if gate is False else gate)
-    results = [ca.densify(ca.vertcat(*column)) for column in (g, opened)]
-    return ca.Function("indicators", [t, x, w, p], results, ["t", "x", "w", "p"], ["g", "open"])
+def trace_output(layout: FlatLayout, functions: BlockFunctions, port: tuple[str, str]) -> Schedule:
+    """Return ``(t, x, w, p) -> y``: an output between ticks, without entries where nothing evaluates it then."""
+    symbols = make_symbols(layout)
+
+    def results(apart: Apart) -> Mapping[str, Any]:
+        return {"y": evaluate(layout, functions, NONE, **symbols, apart=apart).values.get(port, ca.MX(0, 1))}
+
+    return trace_schedule("output", symbols, results)
 
 
-def jump(flat: FlatDiagram) -> Any:
-    """Return ``(t, x, w, p, fired) -> x`` after the events that fire; each sees the instant before all of them."""
-    t, x, w, p = flat.symbols()
-    fired = ca.MX.sym("fired", len(flat.events))
-    done = Pass(flat, NONE, t, x, w, p, fired=fired).run()
+def trace_flow(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
+    """Return ``(t, x, w, p) -> dx``: the rates of the entries of x that are integrated."""
+    symbols = make_symbols(layout)
+    return trace_schedule(
+        "flow", symbols, lambda apart: {"dx": rates(evaluate(layout, functions, NONE, **symbols, apart=apart))}
+    )
+
+
+def trace_indicators(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
+    """Return ``(t, x, w, p) -> (g, open)``: indicators of all events, and 1 where the subsystems around are open."""
+    symbols = make_symbols(layout)
+
+    def results(apart: Apart) -> Mapping[str, Any]:
+        instant = evaluate(layout, functions, NONE, **symbols, apart=apart)
+        g, opened, blocks = [], [], dict[str, Any]()
+        for event in layout.events:
+            if event.box:
+                g.append(instant.control(event.path) - 0.5)
+                gate: Any = True
+                for box in layout.table.gates(event.path.rpartition(".")[0]):
+                    gate = logic_and(gate, instant.is_open(box))
+            else:
+                path = event.path
+                if path not in blocks:
+                    blocks[path] = ca.vertsplit(instant.events_of(path, INDICATORS))
+                g.append(blocks[path][list(layout.table.blocks[path].events).index(event.name)])
+                gate = instant.gate_of(path)
+            opened.append(ca.MX(1.0) if gate is True else ca.MX(0.0) if gate is False else gate)
+        return {"g": ca.vertcat(*g), "open": ca.vertcat(*opened)}
+
+    return trace_schedule("indicators", symbols, results)
+
+
+def trace_jump(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
+    """Return ``(t, x, w, p, fired) -> x_next``: x after the events that fire; each sees the instant before them all."""
+    symbols = make_symbols(layout)
+    x, fired = symbols["x"], ca.MX.sym("fired", len(layout.events))
+    states, starts = layout.states.slices, layout.starts.slices
     own: dict[str, list[int]] = {}
-    for i, event in enumerate(flat.events):
+    for i, event in enumerate(layout.events):
         own.setdefault(event.path, []).append(i)
-    for path, indices in own.items():
-        mine = ca.vertcat(*(fired[i] for i in indices))
-        if path in flat.table.controls:
-            continue
-        state = rows(x, flat.states.slices[path])
-        after = flat.checked.traced[path].jump.call([*done.arguments(path), mine])[0]
-        acts = both(done.gate_of(path), ca.sum1(mine) > 0.5)
-        done.new[path] = choose(acts, ca.densify(after), state)
-    for i, event in enumerate(flat.events):
-        if event.box and event.name == "enable":
-            mode = rows(x, flat.gates.slices[event.path])
-            turned = above(fired[i : i + 1])
-            done.gates[event.path] = choose(turned, 1 - mode, mode)
-            if flat.table.frames[event.path].when == "reset":
-                opens = both(turned, negated(above(mode)))
-                for path in flat.starts.slices:
-                    if event.path in flat.table.gates(flat.table.frame_of[path]):
-                        old = done.new.get(path, rows(x, flat.states.slices[path]))
-                        done.new[path] = choose(opens, rows(x, flat.starts.slices[path]), old)
-    x_next = ca.densify(flat.next_columns(x, done))
-    return ca.Function("jump", [t, x, w, p, fired], [x_next], ["t", "x", "w", "p", "fired"], ["x_next"])
+
+    def results(apart: Apart) -> Mapping[str, Any]:
+        instant = evaluate(layout, functions, NONE, **symbols, fired=fired, apart=apart)
+        for path, indices in own.items():
+            if path in layout.table.controls:
+                continue
+            mine = ca.vertcat(*(fired[i] for i in indices))
+            after = instant.events_of(path, JUMP, mine)
+            acts = logic_and(instant.gate_of(path), ca.sum1(mine) > 0.5)
+            instant.new[path] = choose(acts, ca.densify(after), rows(x, states[path]))
+        for i, event in enumerate(layout.events):
+            if event.box and event.name == "enable":
+                mode = rows(x, layout.gates.slices[event.path])
+                turned = is_true(fired[i : i + 1])
+                instant.gates[event.path] = choose(turned, 1 - mode, mode)
+                if layout.table.frames[event.path].when == "reset":
+                    opens = logic_and(turned, logic_not(is_true(mode)))
+                    for path, where in starts.items():
+                        if event.path in layout.table.gates(layout.table.frame_of[path]):
+                            old = instant.new.get(path, rows(x, states[path]))
+                            instant.new[path] = choose(opens, rows(x, where), old)
+        return {"x_next": next_x(instant)}
+
+    return trace_schedule("jump", {**symbols, "fired": fired}, results)
 
 
-def loop_equations(flat: FlatDiagram, acting: frozenset[Clock]) -> Any:
-    """Return ``(t, x, w, p) -> (r, J)``: what came round a loop less what was taken, and its derivative by that.
+def trace_loops(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[Clock]) -> Derivative | None:
+    """Return ``(t, x, w, p) -> (r, ∂r/∂v)``: what came round the algebraic loops less what was taken, v.
 
-    None where no torn port acts.
+    The values v are the entries `FlatLayout.active_loops` of x. None where no torn port acts.
     """
-    t, x, w, p = flat.symbols()
-    done = Pass(flat, acting, t, x, w, p).run()
-    if not done.mismatch:
+    active = layout.active_loops(acting)
+    if not active:
         return None
-    r = ca.vertcat(*(made - taken for made, taken in done.mismatch))
-    active = active_loops(flat, acting)
-    J = ca.jacobian(r, x)[:, active]
-    return ca.Function("loops", [t, x, w, p], [ca.densify(r), ca.densify(J)], ["t", "x", "w", "p"], ["r", "J"])
+    symbols = make_symbols(layout)
+
+    def results(apart: Apart) -> Mapping[str, Any]:
+        return {"r": loop_mismatch(evaluate(layout, functions, acting, **symbols, apart=apart))}
+
+    return Derivative(trace_schedule("loops", symbols, results), [("x", active)])
 
 
-def active_loops(flat: FlatDiagram, acting: frozenset[Clock]) -> list[int]:
-    """Return the entries of x that hold the torn ports that act, in the order in which they come round."""
-    done: list[int] = []
-    for path, names in flat.order.steps:
-        clock = flat.clocks.get(flat.table.frame_of[path])
-        if clock is not None and clock not in acting:
-            continue
-        for name in names:
-            where = flat.loops.slices.get(f"{path}.{name}")
-            if where is not None:
-                done += range(where.start, where.stop)
-    return done
+def differentiate_flow(layout: FlatLayout, flow: Schedule) -> Derivative:
+    """Return ``(t, x, w, p) -> ∂dx/∂x`` by the entries of x that are integrated."""
+    return Derivative(flow, [("x", layout.continuous.tolist())], values=False)
 
 
-def flow_jacobian_with_loops(flat: FlatDiagram) -> Any:
+def differentiate_flow_with_loops(layout: FlatLayout, functions: BlockFunctions) -> Derivative:
     """Return ``(t, x, w, p) -> (∂f/∂x, ∂f/∂v, ∂r/∂x, ∂r/∂v)`` for loops with values v and residual r(x, v) = 0.
 
     By the implicit function theorem the derivative of the rates f is ∂f/∂x − ∂f/∂v (∂r/∂v)⁻¹ ∂r/∂x.
     """
-    t, x, w, p = flat.symbols()
-    done = Pass(flat, NONE, t, x, w, p).run()
-    of_all = ca.vertcat(
-        *(done.rates.get(path, ca.MX.zeros(where.stop - where.start)) for path, where in flat.states.slices.items())
-    )
-    dx = of_all[flat.continuous.tolist()]
-    r = ca.vertcat(*(made - taken for made, taken in done.mismatch))
-    columns = flat.continuous.tolist(), active_loops(flat, NONE)
-    results = [ca.densify(ca.jacobian(e, x)[:, c]) for e in (dx, r) for c in columns]
-    return ca.Function("flow_jacobian", [t, x, w, p], results)
+    symbols = make_symbols(layout)
+
+    def results(apart: Apart) -> Mapping[str, Any]:
+        instant = evaluate(layout, functions, NONE, **symbols, apart=apart)
+        return {"dx": rates(instant), "r": loop_mismatch(instant)}
+
+    by = [("x", layout.continuous.tolist()), ("x", layout.active_loops(NONE))]
+    return Derivative(trace_schedule("flow_with_loops", symbols, results), by, values=False)

@@ -1,17 +1,26 @@
-"""Where things stand in the flat vectors of a diagram, and at which ticks boxes act."""
+"""The layout of a flattened diagram: where everything stands in its vectors, and when it acts. Pure data.
+
+A flattened diagram has five vectors: ``x``, the states of all blocks and whatever else is kept from one instant to the
+next; ``w``, the outputs of what is stepped from outside (FMUs, transport delays); ``z``, its inputs; ``p``, the
+parameters; and ``log``, all outputs. A `FlatLayout` says where each thing stands in them, holds their start values, and
+lists the clocks, the events and the order of evaluation. It knows no CasADi and can be pickled: what runs the diagram
+in another process, or in compiled code, needs this and the functions.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from fractions import Fraction
+from functools import cached_property
 
-import casadi as ca
 import numpy as np
 
 from ...blocks.core.layout import Layout
 from ...blocks.core.ports import Shape
-from ..wiring.structure import join
+from ..wiring.evaluation_order import Order
+from ..wiring.structure import Structure, join
 
 
 @dataclass(frozen=True)
@@ -52,7 +61,7 @@ class StateLayout(Layout):
 
 @dataclass(frozen=True)
 class Clock:
-    """The ticks at which a box acts: ``offset``, ``offset + every``, …, on the common base."""
+    """The ticks at which a sampled subsystem acts: ``offset``, ``offset + every``, …, on the common base."""
 
     every: int = 1
     offset: int = 0
@@ -66,9 +75,13 @@ class Clock:
         return self.offset if k < self.offset else k + self.every - (k - self.offset) % self.every
 
 
+NONE: frozenset[Clock] = frozenset()
+"""The clocks that act between two ticks."""
+
+
 @dataclass(frozen=True)
 class FlatEvent:
-    """An event of the flattened diagram: of a block, or of a box that is enabled or triggered in continuous time."""
+    """An event of the flattened diagram: of a block, or of a subsystem that is enabled or triggered between ticks."""
 
     path: str
     name: str
@@ -77,8 +90,131 @@ class FlatEvent:
     box: bool
 
 
-def rows(vector: Any, where: slice) -> Any:
-    """Return a part of a column; an empty one stays a column, which slicing a single entry would not give."""
-    if isinstance(vector, np.ndarray):
-        return vector[where]
-    return vector[where] if where.stop > where.start else ca.MX(0, 1)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FlatLayout:
+    """Where everything of a flattened diagram stands, and when it acts.
+
+    Attributes
+    ----------
+    table : Structure
+        The blocks and wires.
+    base : Fraction
+        Seconds between two ticks.
+    clocks : dict
+        For every subsystem that is sampled: at which ticks it acts.
+    states : StateLayout
+        Where the states of the blocks stand in x: by block, and by state.
+    held, gates, starts, loops : Layout
+        Where the other parts of x stand: outputs that are held, what enabled and triggered subsystems remember of
+        their control, start values of states that are reset, the last solution of algebraic loops.
+    plant_outputs, plant_inputs, parameters, log : Layout
+        Where things stand in w, z, p and log.
+    continuous : ndarray of int
+        The entries of x that are integrated.
+    events : tuple of FlatEvent
+        All events between ticks.
+    x0, p : ndarray
+        Start values of x (before any block computes its own), and parameter values.
+    order, start_order : Order
+        In which order ports are evaluated at an instant, and at the start.
+    ports : dict
+        Block and port behind every dotted path; an FMU's port may have dots of its own.
+    apart : frozenset of str
+        Blocks that are evaluated from outside, in stages of their own; see `loopwright.diagrams.flat.stages`.
+    """
+
+    table: Structure
+    base: Fraction
+    clocks: dict[str, Clock]
+    states: StateLayout
+    held: Layout
+    gates: Layout
+    starts: Layout
+    loops: Layout
+    plant_outputs: Layout
+    plant_inputs: Layout
+    parameters: Layout
+    log: Layout
+    continuous: np.ndarray
+    events: tuple[FlatEvent, ...]
+    x0: np.ndarray
+    p: np.ndarray
+    order: Order
+    start_order: Order
+    ports: dict[str, tuple[str, str]]
+    apart: frozenset[str] = frozenset()
+
+    def __post_init__(self) -> None:
+        for values in (self.continuous, self.x0, self.p):
+            values.setflags(write=False)  # a run has its own
+
+    @property
+    def width(self) -> int:
+        """Number of entries of x."""
+        return self.x0.size
+
+    @cached_property
+    def labels(self) -> list[str]:
+        """Names of all entries of x: ``path.state`` of states, ``held(path.port)``, ``gate(path)`` and so on."""
+        others = ((self.held, "held"), (self.gates, "gate"), (self.starts, "start"), (self.loops, "loop"))
+        return self.states.labels + [f"{kind}({label})" for layout, kind in others for label in layout.labels]
+
+    @property
+    def continuous_labels(self) -> list[str]:
+        """Names of the entries of x that are integrated."""
+        return [self.labels[i] for i in self.continuous]
+
+    @cached_property
+    def distinct(self) -> tuple[Clock, ...]:
+        """The different clocks."""
+        return tuple(sorted(set(self.clocks.values()), key=lambda c: (c.every, c.offset)))
+
+    @cached_property
+    def hybrid(self) -> bool:
+        """Whether something happens between ticks: continuous states, events, or a transport delay."""
+        delayed = any(self.table.blocks[self.ports[name][0]].transport for name in self.plant_inputs.slices)
+        return bool(self.continuous.size or self.events or delayed)
+
+    def acting(self, k: int) -> frozenset[Clock]:
+        """Return the clocks that tick at tick ``k``."""
+        return frozenset(c for c in self.distinct if c.acts(k))
+
+    def ticks(self, k: int, last: int, *, every: bool) -> Iterator[int]:
+        """Yield the ticks to visit after tick ``k``: all, or those at which something acts, and the last one."""
+        if every or not self.distinct or Clock() in self.distinct:
+            yield from range(k + 1, last + 1)
+            return
+        while (k := min(c.after(k) for c in self.distinct)) < last:
+            yield k
+        yield last
+
+    def taken_at(self, acting: frozenset[Clock]) -> np.ndarray:
+        """Return the entries of x that a tick renews at which the given clocks act: what sampled subsystems keep."""
+        if acting not in self._taken:
+            owners = [(where, name) for part in (self.states, self.starts) for name, where in part.slices.items()]
+            owners += [(where, self.ports[name][0]) for name, where in self.held.slices.items()]
+            frames = [(where, self.table.frame_of[path]) for where, path in owners]
+            frames += [(where, box) for box, where in self.gates.slices.items()]
+            found = [np.arange(w.start, w.stop) for w, frame in frames if self.clocks.get(frame) in acting]
+            self._taken[acting] = np.concatenate([*found, np.zeros(0, dtype=int)])
+        return self._taken[acting]
+
+    @cached_property
+    def _taken(self) -> dict[frozenset[Clock], np.ndarray]:
+        return {}
+
+    def active_loops(self, acting: frozenset[Clock]) -> list[int]:
+        """Return the entries of x that hold the torn ports that act, in the order in which they come round."""
+        found: list[int] = []
+        for path, names in self.order.steps:
+            clock = self.clocks.get(self.table.frame_of[path])
+            if clock is None or clock in acting:
+                found += self.loops.entries(full for name in names if (full := join(path, name)) in self.loops.slices)
+        return found
+
+
+def sample_time_of(table: Structure, path: str) -> float:
+    """Return the sample time of a block in s; NaN in continuous time, and where a trigger says when it acts."""
+    frame = table.frame_of[path]
+    rate = table.rate(frame)
+    return math.nan if rate is None or table.triggered_around(frame) is not None else float(rate)

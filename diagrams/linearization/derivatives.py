@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -14,14 +15,20 @@ import numpy as np
 from ...blocks.core.errors import NonFiniteError, UnknownNameError, near
 from ...blocks.core.layout import Layout, elements
 from ...blocks.tracing.symbols import size
-from ..flat.evaluate import Pass
+from ...blocks.tracing.trace import Traced
+from ..flat.evaluate import Apart, Instant, evaluate
 from ..flat.flat_diagram import FlatDiagram
-from ..flat.functions import active_loops
 from ..flat.layout import Clock
+from ..flat.stages import Evaluators, Schedule
+from ..flat.total_derivative import Derivative
+from ..flat.trace_stages import trace_schedule
+from ..flat.vectors import loop_mismatch, next_x, plant_inputs, rates
 from ..results.signal_names import resolve
 from ..simulation.workspace import Workspace
 from ..wiring.structure import Wire, join
 from .findings import Finding, StepsOnly
+
+_RESULTS, _ARGUMENTS = ("x", "z", "y", "dx", "r"), ("x", "w", "d")
 
 
 @dataclass(frozen=True)
@@ -93,7 +100,12 @@ class Parts:
     """
 
     def __init__(
-        self, flat: FlatDiagram, inputs: Sequence[Signal], outputs: Sequence[Signal], openings: Sequence[Signal]
+        self,
+        flat: FlatDiagram,
+        inputs: Sequence[Signal],
+        outputs: Sequence[Signal],
+        openings: Sequence[Signal],
+        evaluators: Evaluators | None = None,
     ):
         self.flat, self.inputs, self.outputs, self.openings = flat, inputs, outputs, openings
         lengths = Layout.of({str(i): (len(s.entries),) for i, s in enumerate(inputs)})
@@ -101,14 +113,15 @@ class Parts:
         self.cut: dict[tuple[str, str], set[int]] = {}
         for s in openings:
             self.cut.setdefault(s.port, set()).update(s.entries)
-        self._functions: dict[Any, Any] = {}
-        self._workspace = Workspace(flat) if flat.loops.slices else None
+        self.evaluators = evaluators
+        self._schedules: dict[frozenset[Clock], Schedule] = {}
+        self._derivatives: dict[frozenset[Clock], Derivative] = {}
+        self._workspace = Workspace(flat, evaluators) if flat.loops.slices else None
 
     @cached_property
     def varies(self) -> bool:
         """Whether the flow between ticks depends on time."""
-        t, x, w, p = self.flat.symbols()
-        return bool(ca.depends_on(self.flat.flow(t, x, w, p), t)) or self._workspace is not None
+        return bool(self.flat.flow.depends("dx", "t").any()) or self._workspace is not None
 
     def _taps(self, d: Any, c: Any) -> dict[tuple[str, str], Any]:
         injected: dict[tuple[str, str], list[tuple[int, int]]] = {}
@@ -130,7 +143,7 @@ class Parts:
 
         return {port: tap(port) for port in {*injected, *self.cut}}
 
-    def _measured(self, done: Pass) -> Any:
+    def _measured(self, done: Instant) -> Any:
         columns = []
         for signal in self.outputs:
             column = done.returned.get(signal.port)
@@ -143,37 +156,33 @@ class Parts:
             )
         return ca.vertcat(*columns) if columns else ca.MX(0, 1)
 
-    def _closed(self, acting: frozenset[Clock]) -> Any:
+    def _closed(self, acting: frozenset[Clock]) -> Schedule:
         """Return ``(t, x, w, p) -> c``: what the ports that are cut put out in the closed diagram."""
-        key = ("closed", acting)
-        if key not in self._functions:
-            t, x, w, p = self.flat.symbols()
-            done = Pass(self.flat, acting, t, x, w, p).run()
-            c = ca.vertcat(*(ca.densify(ca.MX(done.values[port])) for port in self.cut))
-            self._functions[key] = ca.Function("closed", [t, x, w, p], [c])
-        return self._functions[key]
+        if acting not in self._schedules:
+            flat, symbols = self.flat, self.flat.symbols()
 
-    def _function(self, acting: frozenset[Clock]) -> Any:
-        """Return values and Jacobians by (x, w, d) at an instant; ``NONE`` is one between ticks."""
-        if acting in self._functions:
-            return self._functions[acting]
-        flat = self.flat
-        t, x, w, p = flat.symbols()
-        d = ca.MX.sym("d", self.n_inputs)
-        c = ca.MX.sym("c", sum(size(flat.checked.shapes[port]) for port in self.cut))
-        done = Pass(flat, acting, t, x, w, p, taps=self._taps(d, c)).run()
-        sources = [flat.source(*flat.ports[name], done.values) for name in flat.plant_inputs.slices]
-        z = ca.vertcat(*(ca.MX(ca.densify(ca.DM(s))) if isinstance(s, np.ndarray) else s for s in sources))
-        of_all = ca.vertcat(
-            *(done.rates.get(path, ca.MX.zeros(where.stop - where.start)) for path, where in flat.states.slices.items())
-        )
-        dx = of_all[flat.continuous.tolist()] if flat.continuous.size else ca.MX(0, 1)
-        r = ca.vertcat(*(made - taken for made, taken in done.mismatch)) if done.mismatch else ca.MX(0, 1)
-        results = [flat.next_columns(x, done), z, self._measured(done), dx, r]
-        jacobians = [ca.densify(ca.jacobian(e, v)) for e in results for v in (x, w, d)]
-        f = ca.Function("parts", [t, x, w, p, d, c], [*map(ca.densify, results), *jacobians])
-        self._functions[acting] = f
-        return f
+            def results(apart: Apart) -> Mapping[str, Any]:
+                instant = evaluate(flat, flat.blocks, acting, **symbols, apart=apart)
+                return {"c": ca.vertcat(*(ca.densify(ca.MX(instant.values[port])) for port in self.cut))}
+
+            self._schedules[acting] = trace_schedule("closed", symbols, results)
+        return self._schedules[acting]
+
+    def _derivative(self, acting: frozenset[Clock]) -> Derivative:
+        """Return values and derivatives by (x, w, d) at an instant; ``NONE`` is one between ticks."""
+        if acting not in self._derivatives:
+            flat, symbols = self.flat, self.flat.symbols()
+            d = ca.MX.sym("d", self.n_inputs)
+            c = ca.MX.sym("c", sum(size(flat.checked.shapes[port]) for port in self.cut))
+
+            def results(apart: Apart) -> Mapping[str, Any]:
+                instant = evaluate(flat, flat.blocks, acting, **symbols, taps=self._taps(d, c), apart=apart)
+                found = {"x_next": next_x(instant), "z": plant_inputs(instant), "y": self._measured(instant)}
+                return {**found, "dx": rates(instant), "r": loop_mismatch(instant)}
+
+            schedule = trace_schedule("parts", {**symbols, "d": d, "c": c}, results)
+            self._derivatives[acting] = Derivative(schedule, [(name, None) for name in _ARGUMENTS])
+        return self._derivatives[acting]
 
     def _solved(self, acting: frozenset[Clock], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return x with the algebraic loops solved at an instant."""
@@ -187,16 +196,15 @@ class Parts:
         """
         flat = self.flat
         x = self._solved(acting, t, x, w)
-        c = self._closed(acting)(t, x, w, flat.p) if self.cut else np.zeros(0)
-        numbers = self._function(acting).call([t, x, w, flat.p, np.zeros(self.n_inputs), c])
-        names, arguments = ("x", "z", "y", "dx", "r"), ("x", "w", "d")
-        found: dict[Any, Any] = {n: np.ravel(np.array(v)) for n, v in zip(names, numbers[:5], strict=True)}
+        at = t, x, w, flat.p
+        c = self._closed(acting)(*at, evaluators=self.evaluators)[0] if self.cut else np.zeros(0)
+        numbers = self._derivative(acting)(*at, np.zeros(self.n_inputs), c, evaluators=self.evaluators)
+        names, arguments = _RESULTS, _ARGUMENTS
         keys = [(n, a) for n in names for a in arguments]
-        for key, value in zip(keys, numbers[5:], strict=True):
-            found[key] = np.array(value).reshape(value.shape)
+        found: dict[Any, Any] = dict(zip([*names, *keys], numbers, strict=True))
         self._check_finite(found, keys, t)
         if found["r"].size:
-            where = active_loops(flat, acting)
+            where = flat.active_loops(acting)
             through_all = np.linalg.solve(
                 found["r", "x"][:, where].T, np.vstack([found[n, "x"][:, where] for n in names[:4]]).T
             ).T
@@ -225,16 +233,23 @@ def steps_only(flat: FlatDiagram) -> tuple[Finding, ...]:
 
     A quantizer, an encoder, a comparison: their derivative is zero everywhere, and it is known as such.
     """
-    found, known = list[Finding](), dict[int, list[tuple[str, str]]]()
-    for path, trace in flat.checked.traced.items():
-        if id(trace) not in known:
-            known[id(trace)] = _steps(trace)
-        for port, source in known[id(trace)]:
-            found.append(StepsOnly(path, port, source))
-    return tuple(found)
+    return tuple(
+        StepsOnly(path, port, source)
+        for path, trace in flat.checked.traced.items()
+        for port, source in _steps_of(trace)
+    )
 
 
-def _steps(trace: Any) -> list[tuple[str, str]]:
+_STEPS: WeakKeyDictionary[Traced, list[tuple[str, str]]] = WeakKeyDictionary()  # traces are shared, and looked at once
+
+
+def _steps_of(trace: Traced) -> list[tuple[str, str]]:
+    if trace not in _STEPS:
+        _STEPS[trace] = _steps(trace)
+    return _STEPS[trace]
+
+
+def _steps(trace: Traced) -> list[tuple[str, str]]:
     try:
         f = trace.function.expand()
     except RuntimeError:  # a table, or an opaque block

@@ -16,7 +16,7 @@ import numpy as np
 from ...blocks.core.errors import LoopwrightError, OptionError, WiringError
 from ...fmus.running.derivation import Derivation, DerivativeMethod
 from ..flat.flat_diagram import FlatDiagram
-from ..flat.functions import NONE
+from ..flat.layout import NONE
 from ..flat.wired_diagram import WiredDiagram
 from ..results.operating_point import OperatingPoint
 from ..wiring.subsystem import exact_time
@@ -238,7 +238,7 @@ def _linearize(
     found = [[find_signal(flat, n) for n in group] for group in names]
     for signal in found[2]:
         _check_opening(flat, signal)
-    parts, channels = Parts(flat, *found), list[str]()
+    parts, channels = Parts(flat, found[0], found[1], found[2]), list[str]()
     if diagram.has_clock or (diagram.has_fmu and step is not None):
         if loop:
             _check_loop(flat, parts, at)
@@ -269,16 +269,10 @@ def _linearize(
         uncertainty=model.uncertainty,
         memory=model.memory,
         openings=tuple(names[2]),
-        findings=(*_steps_only(flat), *model.findings),
+        findings=(*steps_only(flat), *model.findings),
         plants=plants,
         step=step,
     )
-
-
-def _steps_only(flat: FlatDiagram) -> tuple[Finding, ...]:
-    if "steps" not in flat._functions:
-        flat._functions["steps"] = steps_only(flat)
-    return flat._functions["steps"]  # type: ignore[no-any-return]
 
 
 def _check_loop(flat: FlatDiagram, parts: Parts, at: OperatingPoint) -> None:

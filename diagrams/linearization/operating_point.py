@@ -51,7 +51,7 @@ def judged(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) -> Oper
     x, found, who = point.x, 0.0, ""
     rates = np.zeros(flat.width)
     if flat.continuous.size:
-        rates[flat.continuous] = np.ravel(np.array(flat.flow(point.t, x, point.w, flat.p)))
+        rates[flat.continuous] = flat.flow(point.t, x, point.w, flat.p)[0]
     changes = {
         path: np.maximum(np.abs(x_next[where] - x[where]), np.abs(rates[where])) / (1.0 + np.abs(x[where]))
         for path, where in flat.states.slices.items()

@@ -19,7 +19,7 @@ from ...blocks.core.block import Block
 from ...blocks.core.instants import left_of
 from ...fmus.running.derivation import Derivation
 from ..flat.flat_diagram import FlatDiagram
-from ..flat.functions import NONE
+from ..flat.layout import NONE
 from ..results.operating_point import OperatingPoint
 from .derivatives import Parts, Signal
 from .findings import EventWithinPeriod, Finding, MemoryActs, UnusualStart
@@ -157,8 +157,7 @@ class Chain:
         if not flat.events:
             return
         (g0, _), (g1, opened) = (
-            (np.ravel(np.array(v)) for v in flat.indicators(t, x, here.w, flat.p))
-            for t, x in ((here.t, here.x), (here.t + h, x_end))
+            flat.indicators(t, x, here.w, flat.p) for t, x in ((here.t, here.x), (here.t + h, x_end))
         )
         for event, a, b, now in zip(flat.events, g0 > 0, g1 > 0, opened > 0.5, strict=True):
             if a != b and now:
@@ -295,13 +294,8 @@ def moves_between(flat: FlatDiagram, parts: Parts, at: OperatingPoint) -> tuple[
 
 
 def _moves(flat: FlatDiagram, signal: Signal) -> bool:
-    import casadi as ca
-
-    from ..flat.evaluate import Pass
-
-    t, x, w, p = flat.symbols()
-    column = Pass(flat, NONE, t, x, w, p).run().values.get(signal.port)  # none: it is held, and nothing asks for it
-    return bool(isinstance(column, ca.MX) and ca.jacobian(column, x)[:, flat.continuous.tolist()].nnz())
+    """Whether a signal follows continuous states between two ticks."""
+    return bool(flat.output(signal.port).depends("y", "x")[:, flat.continuous].any())
 
 
 # --- what counts as a state ------------------------------------------------------------------------------------------

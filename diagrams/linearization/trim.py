@@ -17,8 +17,11 @@ import numpy as np
 
 from ...blocks.core.errors import OptionError, SimulationError
 from ...blocks.core.layout import Layout
-from ..flat.evaluate import Pass
+from ..flat.evaluate import Apart, evaluate
 from ..flat.flat_diagram import FlatDiagram
+from ..flat.total_derivative import Derivative
+from ..flat.trace_stages import trace_schedule
+from ..flat.vectors import join_columns, loop_mismatch, next_x, plant_inputs, rates
 from ..flat.wired_diagram import WiredDiagram
 from ..results.operating_point import OperatingPoint, PointOrigin
 from .operating_point import judged, operating_point
@@ -54,33 +57,30 @@ class _Equations:
         """Where the entries of each free parameter stand among those of all."""
         sizes = {"x": len(self.free_x), "w": at.w.size, "plants": len(self.free_p), "q": self.free_q.total}
         self.unknowns = Layout.of({name: (size,) for name, size in sizes.items()})
-        self.function = self._function()
+        self.acting = frozenset(flat.clocks.values())
+        self.loops = len(flat.active_loops(self.acting))
+        self.function = self._differentiated()
         self._memory: tuple[bytes | None, Any] = (None, None)
         self.names, self.wanted, self.keep = self._rows()
 
-    def _function(self) -> Any:
-        flat = self.flat
-        t, x, w, p = flat.symbols()
-        acting = frozenset(flat.clocks.values())
-        done = Pass(flat, acting, t, x, w, p).run()
-        of_all = ca.vertcat(
-            *(done.rates.get(path, ca.MX.zeros(s.stop - s.start)) for path, s in flat.states.slices.items())
-        )
-        dx = of_all[flat.continuous.tolist()] if flat.continuous.size else ca.MX(0, 1)
-        after = flat.next_columns(x, done)
-        change = (after - x)[self.sampled] if self.sampled else ca.MX(0, 1)
-        loop = [made - taken for made, taken in done.mismatch]
-        y = [done.values[port][list(entries)] for port, entries in self.target.signals]
-        sources = [flat.source(*flat.ports[name], done.values) for name in flat.plant_inputs.slices]
-        z = [ca.MX(ca.densify(ca.DM(c))) if isinstance(c, np.ndarray) else c for c in sources]
-        results = [ca.vertcat(*column) if column else ca.MX(0, 1) for column in ([dx], [change], loop, y, z)]
-        jacobians = [ca.densify(ca.jacobian(e, v)) for e in results for v in ((x, w, p) if self.parameters else (x, w))]
-        return ca.Function("trim", [t, x, w, p], [*map(ca.densify, results), *jacobians])
+    def _differentiated(self) -> Derivative:
+        """Return the residuals of rates, ticks, loops and targets, then z, and their derivatives."""
+        flat, symbols = self.flat, self.flat.symbols()
+
+        def results(apart: Apart) -> Mapping[str, Any]:
+            instant = evaluate(flat, flat.blocks, self.acting, **symbols, apart=apart)
+            change = (next_x(instant) - symbols["x"])[self.sampled] if self.sampled else ca.MX(0, 1)
+            y = join_columns([instant.values[port][list(entries)] for port, entries in self.target.signals])
+            loop, z = loop_mismatch(instant), plant_inputs(instant)
+            return {"dx": rates(instant), "change": change, "loop": loop, "y": y, "z": z}
+
+        by = ("x", "w", "p") if self.parameters else ("x", "w")
+        return Derivative(trace_schedule("trim", symbols, results), [(name, None) for name in by])
 
     def _rows(self) -> tuple[list[str], np.ndarray, np.ndarray]:
         """Return for every equation its name, what is wanted, and whether it counts."""
         flat, states, target = self.flat, self.flat.labels, self.target
-        loops = self.function.numel_out(2)
+        loops = self.loops
         names = [
             *(f"d/dt {states[i]}" for i in flat.continuous),
             *(f"{states[i]} per tick" for i in self.sampled),
@@ -149,8 +149,8 @@ class _Equations:
             if f.where is not None:
                 p[f.where] = f.packed(value)
                 by_q[f.where, columns] = f.slope(value)
-        numbers = [np.array(v) for v in self.function.call([self.at.t, x, w, p])]
-        values, rest = [np.ravel(v) for v in numbers[:5]], numbers[5:]
+        numbers = self.function(self.at.t, x, w, p)
+        values, rest = numbers[:5], numbers[5:]
         many, where = 3 if self.parameters else 2, self.unknowns.slices
 
         def derivative(i: int) -> np.ndarray:
@@ -185,7 +185,7 @@ class _Equations:
         """Return the residual relative to 1 + the size of what it belongs to."""
         r, _, _ = self.at_unknown(unknown)
         x, w, xp, _ = self.split(unknown)
-        n = self.function.numel_out(2)
+        n = self.loops
         sizes = [x[self.flat.continuous], x[self.sampled], np.zeros(n), self.target.wanted, w, xp]
         relative: np.ndarray = np.abs(r) / (1.0 + np.abs(np.concatenate(sizes)))
         return relative
@@ -318,7 +318,7 @@ def _completed(
     """Return the operating point with all its signals: the boxes hold what they put out there."""
     flat = diagram.flatten(guess.base)
     at_tick = flat.at_tick(frozenset(flat.clocks.values()))
-    x_next, z, log, _ = (np.ravel(np.array(v)) for v in at_tick(guess.t, x, w, flat.p))
+    x_next, z, log, _ = at_tick(guess.t, x, w, flat.p)
     values = {name: log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
     x = x.copy()
     for name, where in flat.held.slices.items():

@@ -224,9 +224,7 @@ def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[li
 
 
 def _place(free: Free, diagram: WiredDiagram, flat: FlatDiagram) -> None:
-    trace, free.block = flat.checked.traced[free.path], diagram.structure.blocks[free.path]
-    rate = flat.table.rate(flat.table.frame_of[free.path])
-    period = np.nan if rate is None or flat.table.triggered_around(flat.table.frame_of[free.path]) else float(rate)
+    free.block = diagram.structure.blocks[free.path]
     if ".".join(free.keys) not in dict(traced_parameters(free.block)):
         raise ParameterError(
             "it is structure: the equations were traced with this value, so it can't be found by a trim. Try values "
@@ -237,7 +235,7 @@ def _place(free: Free, diagram: WiredDiagram, flat: FlatDiagram) -> None:
     free.where = flat.parameters.slices[free.path]
 
     def pack(block: Any) -> np.ndarray:
-        packed = trace.pack(block, period)
+        packed = flat.pack(free.path, block)
         if packed.size != free.where.stop - free.where.start:  # type: ignore[union-attr]
             raise ParameterError("its structure changes with this value.", block=free.path, port=".".join(free.keys))
         return packed

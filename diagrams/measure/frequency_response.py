@@ -27,14 +27,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...blocks.core.errors import OptionError
-from ..flat.evaluate import Pass
 from ..flat.flat_diagram import FlatDiagram
-from ..flat.functions import NONE
 from ..flat.wired_diagram import WiredDiagram
 from ..linearization.derivatives import find_signal
 from ..linearization.loops_over_a_period import ticks_to_renewal
@@ -328,12 +325,8 @@ def _find_beginning(
 
 def _changes_between_ticks(flat: FlatDiagram, port: tuple[str, str]) -> bool:
     """Whether a signal depends on continuous states, or on time, between two ticks."""
-    t, x, w, p = flat.symbols()
-    column = Pass(flat, NONE, t, x, w, p).run().values.get(port)  # a held signal that nothing needs has none
-    if not isinstance(column, ca.MX):
-        return False
-    by_x = ca.jacobian(column, x)[:, flat.continuous.tolist()] if flat.continuous.size else ca.MX(0, 1)
-    return bool(by_x.nnz() or ca.depends_on(column, t))
+    output = flat.output(port)
+    return bool(output.depends("y", "x")[:, flat.continuous].any() or output.depends("y", "t").any())
 
 
 class _Measurement:

@@ -11,14 +11,13 @@ import numpy as np
 from ...blocks.core.block import Block
 from ...blocks.core.errors import NonFiniteError, OptionError, SimulationError
 from ...blocks.core.instants import is_before, left_of
-from ..flat.functions import active_loops
 from ..results.stored import Occurrence
 from ..solvers.base import Problem, Step
 from ..solvers.choose import make_solver
 from .diagnosis import forget_trials, opaque_failure, state_values
 from .events import Domains
 from .solver_setup import absolute_tolerances, remembers, time_scale_of
-from .transport_delays import delays_of, driven_function, keep_step
+from .transport_delays import delays_of, keep_step
 from .workspace import Workspace
 
 NOTHING: frozenset[Any] = frozenset()
@@ -62,7 +61,7 @@ class Continuous:
         self._beyond: tuple[float, np.ndarray] | None = None
         """The last trial of the solver at which a rate was not finite."""
         self._resolution = rtol, atol
-        self._loops = active_loops(flat, NOTHING)
+        self._loops = flat.active_loops(NOTHING)
         self._opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
         self.delays = delays_of(flat)
         self._flow, self._jacobian = workspace.flow(), None
@@ -100,7 +99,7 @@ class Continuous:
             self._jump = workspace.bind_jump()
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
-            self._drive = workspace.plain(driven_function(flat), [self._driven], workspace.trial)
+            self._drive = workspace.plain(flat.driven, [self._driven], workspace.trial)
         self.sources = [
             (path, flat.table.blocks[path])
             for path in sorted(flat.checked.traced)

@@ -10,13 +10,20 @@ from ...blocks.core.errors import NonFiniteError, SimulationError
 from ...blocks.tracing.numpy_check import GUARDS, NEXT
 from ...blocks.tracing.opaque_equations import raise_failure
 from ...blocks.tracing.symbols import bundle
-from ..flat.evaluate import Pass
+from ..flat.evaluate import Instant, evaluate
 from ..flat.flat_diagram import FlatDiagram
 from ..flat.layout import Clock
+from ..flat.stages import Evaluators, evaluate_apart
 from .vectors import Vectors
 
 
-def failure(flat: FlatDiagram, here: Vectors, log: np.ndarray, acting: frozenset[Clock]) -> SimulationError:
+def failure(
+    flat: FlatDiagram,
+    here: Vectors,
+    log: np.ndarray,
+    acting: frozenset[Clock],
+    evaluators: Evaluators | None = None,
+) -> SimulationError:
     """Return the error of the first block that made a value that is not finite, or whose guard fails.
 
     Parameters
@@ -29,6 +36,8 @@ def failure(flat: FlatDiagram, here: Vectors, log: np.ndarray, acting: frozenset
         The outputs of all blocks there.
     acting : frozenset of Clock
         The clocks that act there.
+    evaluators : mapping, optional
+        What evaluates blocks from outside, by path.
     """
     forget_trials(flat)
     for name, where in flat.plant_outputs.slices.items():
@@ -37,14 +46,14 @@ def failure(flat: FlatDiagram, here: Vectors, log: np.ndarray, acting: frozenset
             return _non_finite(path, port, here.w[where], "It comes out of the FMU.")
     found: list[SimulationError] = []
 
-    def visit(path: str, names: tuple[str, ...], inputs: dict[str, Any], made: dict[str, Any]) -> None:
-        if not found and done.gate_of(path) is not False:
-            error = _wrong(flat, here.x, path, names, inputs, {n: np.ravel(np.array(v)) for n, v in made.items()})
+    def visit(instant: Instant, path: str, inputs: dict[str, Any], made: dict[str, Any]) -> None:
+        if not found and instant.gate_of(path) is not False:
+            error = _wrong(flat, here.x, path, inputs, {n: np.ravel(np.array(v)) for n, v in made.items()})
             if error is not None:
                 found.append(error)
 
-    done = Pass(flat, acting, float(here.t[0]), here.x, here.w, here.p, visit=visit)
-    done.run()
+    apart = evaluate_apart(evaluators)
+    evaluate(flat, flat.blocks, acting, float(here.t[0]), here.x, here.w, here.p, visit=visit, apart=apart)
     return opaque_failure(flat) or (found[0] if found else _overflow(flat, log))
 
 
@@ -68,12 +77,12 @@ def opaque_failure(flat: FlatDiagram) -> SimulationError | None:
 
 
 def _wrong(
-    flat: FlatDiagram, x: np.ndarray, path: str, names: tuple[str, ...], inputs: dict[str, Any], made: dict[str, Any]
+    flat: FlatDiagram, x: np.ndarray, path: str, inputs: dict[str, Any], made: dict[str, Any]
 ) -> SimulationError | None:
     trace, block = flat.checked.traced[path], flat.table.blocks[path]
     shaped = shaped_inputs(trace, inputs)
     u = bundle("u", shaped)
-    for name in sorted(names, key=lambda n: n != GUARDS):  # a guard says more than the NaN behind it
+    for name in sorted(made, key=lambda n: n != GUARDS):  # a guard says more than the NaN behind it
         if name == GUARDS:
             for guard, value in zip(trace.guards, made[name], strict=True):
                 if not value > 0:

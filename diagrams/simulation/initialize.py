@@ -10,9 +10,11 @@ import numpy as np
 from ...blocks.core.errors import LoopwrightError, NonFiniteError, SimulationError
 from ...blocks.tracing.equations import initial_state
 from ...blocks.tracing.symbols import bundle
-from ..flat.evaluate import Pass, above
+from ..flat.evaluate import Instant, evaluate
 from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import Clock
+from ..flat.layout import NONE
+from ..flat.logic import is_true
+from ..flat.stages import evaluate_apart
 from .diagnosis import inputs_text, shaped_inputs
 from .plants import Plant
 from .transport_delays import Delays
@@ -71,8 +73,7 @@ def _set_initial_states(workspace: Workspace) -> None:
                 u = bundle("u", shaped_inputs(trace, inputs))
                 x[flat.states.slices[path]] = _initial(path, block, u, trace.states)
 
-        args = flat, frozenset[Clock](), 0.0, x, workspace.here.w, workspace.p
-        Pass(*args, opened=True, order=flat.start_order.steps, before=before).run()
+        _evaluate(workspace, order=flat.start_order.steps, before=before)
     for path, where in flat.starts.slices.items():
         x[where] = x[flat.states.slices[path]]
 
@@ -98,12 +99,18 @@ def _hold_first_outputs(workspace: Workspace) -> None:
     flat, x = workspace.flat, workspace.here.x
     if not flat.held.slices and not flat.gates.slices:
         return
-    done = Pass(flat, frozenset(), 0.0, x, workspace.here.w, workspace.p, opened=True).run()
+    done = _evaluate(workspace)
     for name, column in done.held.items():
         where = flat.held.slices[name]
         x[where] = np.ravel(np.array(column))
     for subsystem, where in flat.gates.slices.items():
-        x[where] = float(above(done.control(subsystem)))
+        x[where] = float(is_true(done.control(subsystem)))
+
+
+def _evaluate(workspace: Workspace, **options: Any) -> Instant:
+    """Evaluate all blocks at t = 0 with the run's numbers, every subsystem as if it acted."""
+    flat, here, apart = workspace.flat, workspace.here, evaluate_apart(workspace.evaluators)
+    return evaluate(flat, flat.blocks, NONE, 0.0, here.x, here.w, here.p, opened=True, apart=apart, **options)
 
 
 def _initial(path: str, block: Any, u: Any, states: Mapping[str, tuple[int, ...]]) -> np.ndarray:

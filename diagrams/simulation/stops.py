@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..flat.evaluate import TRUE
 from ..flat.flat_diagram import FlatDiagram
+from ..flat.logic import TRUE
 from ..results.stored import Stopped
 from ..wiring.structure import join
 

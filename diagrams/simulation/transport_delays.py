@@ -208,14 +208,7 @@ def delays_of(flat: FlatDiagram) -> Delays | None:
                 port="initial_value",
             ) from None
     outputs = [flat.plant_outputs.slices[join(p, "y")] for p in paths]
-    rows, columns = driven_function(flat).jac_sparsity(0, 2).get_triplet()
     into, out = (np.concatenate([np.arange(s.start, s.stop) for s in part]) for part in (inputs, outputs))
-    straight = bool(np.any(np.isin(rows, into) & np.isin(columns, out)))  # from one delay into another one, or itself
+    straight = bool(np.any(flat.driven.depends("z", "w")[np.ix_(into, out)]))  # from a delay into another, or itself
     smoothed = not (flat.loops.slices or straight)
     return Delays([b.delay for b in blocks], inputs, outputs, starts, smoothed=smoothed)
-
-
-def driven_function(flat: FlatDiagram) -> Any:
-    """Return ``(t, x, w, p) -> z`` between ticks."""
-    f = flat.at_tick(frozenset())
-    return f.slice("driven", [0, 1, 2, 3], [1])

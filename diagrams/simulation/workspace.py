@@ -12,8 +12,9 @@ from ...blocks.core.block import Block
 from ...blocks.core.errors import ParameterError, SimulationError
 from ...blocks.tracing.structure import is_traced_by
 from ..flat.flat_diagram import FlatDiagram
-from ..flat.functions import NONE, active_loops
-from ..flat.layout import Clock
+from ..flat.layout import NONE, Clock
+from ..flat.stages import Bound, Evaluators, Schedule
+from ..flat.total_derivative import Derivative
 from .diagnosis import failure
 from .vectors import Vectors
 
@@ -23,25 +24,6 @@ _ITERATIONS = 50
 _ROUNDING = 1e-14
 
 
-class Bound:
-    """A function with its results, bound to vectors: evaluated by a call, without a copy."""
-
-    def __init__(self, function: Any, inputs: list[np.ndarray], outputs: list[np.ndarray] | None = None):
-        self.buffer, self.call = function.buffer()
-        if outputs is None:
-            outputs = [np.zeros(function.numel_out(i)) for i in range(function.n_out())]
-        self.outputs = outputs
-        for i, vector in enumerate(inputs):
-            self.buffer.set_arg(i, view(vector))
-        for i, vector in enumerate(outputs):
-            self.buffer.set_res(i, view(vector))
-
-
-def view(vector: np.ndarray) -> Any:
-    """Return the memory of a vector, as CasADi's buffers take it."""
-    return memoryview(vector)  # type: ignore[arg-type]
-
-
 class Workspace:
     """The numbers of one run, with the diagram's functions bound to them.
 
@@ -49,6 +31,8 @@ class Workspace:
 
     Attributes
     ----------
+    evaluators : mapping or None
+        What evaluates the blocks of opaque stages, by path.
     here, trial : Vectors
         The instant that the run has reached, and the one that a solver tries.
     p : ndarray
@@ -64,8 +48,8 @@ class Workspace:
         Shape (1,); 0 where a value was not finite or a guard failed.
     """
 
-    def __init__(self, flat: FlatDiagram):
-        self.flat = flat
+    def __init__(self, flat: FlatDiagram, evaluators: Evaluators | None = None):
+        self.flat, self.evaluators = flat, evaluators
         self.p = flat.p.copy()
         self.here, self.trial = Vectors(flat, self.p), Vectors(flat, self.p)
         self.x_next = np.zeros(flat.width)
@@ -79,10 +63,14 @@ class Workspace:
         self._solved: dict[Any, Callable[[], None]] = {}
 
     def _bind(
-        self, function: Any, vectors: Vectors, outputs: list[np.ndarray] | None = None, *more: np.ndarray
+        self,
+        function: Schedule | Derivative,
+        vectors: Vectors,
+        outputs: list[np.ndarray] | None = None,
+        *more: np.ndarray,
     ) -> Bound:
         arguments = [vectors.t, vectors.x, vectors.w, vectors.p, *more]
-        bound = Bound(self.flat.fast(function), arguments, outputs)
+        bound = function.bind(arguments, outputs, self.evaluators)
         self._kept.append(bound)  # the buffer lives as long as its call
         return bound
 
@@ -110,7 +98,7 @@ class Workspace:
             A value that is not finite, or a guard that fails.
         """
         if not self.ok[0]:
-            raise failure(self.flat, self.here, self.log, acting).at(t=float(self.here.t[0]))
+            raise failure(self.flat, self.here, self.log, acting, self.evaluators).at(t=float(self.here.t[0]))
 
     def tick(self, acting: frozenset[Clock] = NONE) -> None:
         """Go through a tick at ``here``: evaluate everything, `check` it, and take over the next states."""
@@ -165,21 +153,19 @@ class Workspace:
             If it is a source in continuous time that announces when it is not smooth.
         """
         flat = self.flat
-        frame, where = flat.table.frame_of[path], flat.parameters.slices[path]
-        rate = None if flat.table.triggered_around(frame) is not None else flat.table.rate(frame)
         if not is_traced_by(block, flat.table.blocks[path]):
             raise ParameterError(
                 "its equations change with these parameters, so that a run can't take them over: it takes numbers of "
                 "the same shape, and none in the place of a zero. Start a run of diagram.replace(…).",
                 block=path,
             )
-        if not flat.table.is_sampled(frame) and _plans_ahead(block):
+        if not flat.table.is_sampled(flat.table.frame_of[path]) and _plans_ahead(block):
             raise ParameterError(
                 "a solver plans ahead with the times at which it is not smooth, so its parameters can't change in a "
                 "run. Start a run of diagram.replace(…).",
                 block=path,
             )
-        self.p[where] = flat.checked.traced[path].pack(block, math.nan if rate is None else float(rate))
+        self.p[flat.parameters.slices[path]] = flat.pack(path, block)
 
     # --- what a solver tries -----------------------------------------------------------------------------------------
 
@@ -193,11 +179,9 @@ class Workspace:
         if not self.looped or self.loop_solver(NONE, trial) is None:
             call = self._of_trial(flat.jacobian)
             return lambda t, x: call(t, x).reshape(n, n, order="F")
-        from ..flat.functions import flow_jacobian_with_loops
-
-        bound = self._bind(flow_jacobian_with_loops(flat), trial)
+        bound = self._bind(flat.jacobian_with_loops, trial)
         solve: Any = self.loop_solver(NONE, trial)
-        m = len(active_loops(flat, NONE))
+        m = len(flat.active_loops(NONE))
 
         def through(t: float, x: np.ndarray) -> np.ndarray:
             trial.t[0] = t
@@ -215,7 +199,7 @@ class Workspace:
         bound = self._bind(self.flat.indicators, self.trial)
         return self._trial_call(bound), bound.outputs[1]
 
-    def _of_trial(self, function: Any) -> Callable[[float, np.ndarray], np.ndarray]:
+    def _of_trial(self, function: Schedule | Derivative) -> Callable[[float, np.ndarray], np.ndarray]:
         return self._trial_call(self._bind(function, self.trial))
 
     def _trial_call(self, bound: Bound) -> Callable[[float, np.ndarray], np.ndarray]:
@@ -232,7 +216,7 @@ class Workspace:
 
         return evaluate
 
-    def plain(self, function: Any, outputs: list[np.ndarray], vectors: Vectors) -> Callable[[], None]:
+    def plain(self, function: Schedule, outputs: list[np.ndarray], vectors: Vectors) -> Callable[[], None]:
         """Return the call of another function of (t, x, w, p) between ticks."""
         call: Callable[[], None] = self._bind(function, vectors, outputs).call
         solve = self.loop_solver(NONE, vectors)
@@ -256,7 +240,7 @@ class Workspace:
             return None
         bound = self._bind(function, vectors)
         r, J = bound.outputs
-        where = np.array(active_loops(self.flat, acting))
+        where = np.array(self.flat.active_loops(acting))
         n, x, call = len(where), vectors.x, bound.call
 
         def size_of(r: np.ndarray, v: np.ndarray) -> float:

@@ -219,7 +219,11 @@ def test_the_injection_leaves_all_other_blocks_where_they_are():
     [
         ({"frequencies": [0.0]}, OptionError, "positive"),
         ({"frequencies": "slow"}, OptionError, "positive"),
-        ({"frequencies": [1e4], "step": 1e-3}, OptionError, "expected less than 3141.59 rad.s, as there is a sample every"),
+        (
+            {"frequencies": [1e4], "step": 1e-3},
+            OptionError,
+            "expected less than 3141.59 rad.s, as there is a sample every",
+        ),
         ({"amplitude": 0.0}, OptionError, "amplitude"),
         ({"kind": "noise"}, OptionError, "'sine'"),
         ({"windows": 1}, OptionError, "at least 2"),

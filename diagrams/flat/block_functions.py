@@ -1,0 +1,43 @@
+"""The functions of a diagram's blocks, each made once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ...blocks.tracing.numpy_check import GUARDS, NEXT
+from ...blocks.tracing.trace import Traced
+
+
+class BlockFunctions:
+    """The traced equations of a diagram's blocks, and functions of parts of them.
+
+    An instant may evaluate some outputs of a block before its other ones: for these there is a function of their own.
+
+    Parameters
+    ----------
+    traced : mapping
+        The traced equations of every block, by path. Blocks of equal structure share theirs.
+    """
+
+    def __init__(self, traced: Mapping[str, Traced]):
+        self.traced = traced
+        self._parts: dict[tuple[int, tuple[str, ...]], Any] = {}
+
+    def of(self, path: str, names: tuple[str, ...]) -> Any:
+        """Return the CasADi function (t, x, one column per input, p) of a block that evaluates only ``names``.
+
+        Parameters
+        ----------
+        names : tuple of str
+            Outputs, `NEXT` and `GUARDS`, in this order.
+        """
+        trace = self.traced[path]
+        every = (*trace.outputs, NEXT, GUARDS)
+        if names == every:
+            return trace.function
+        key = (id(trace), names)
+        if key not in self._parts:
+            f = trace.function
+            self._parts[key] = f.slice("block", list(range(f.n_in())), [every.index(n) for n in names])
+        return self._parts[key]

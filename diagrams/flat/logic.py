@@ -1,0 +1,53 @@
+"""Logic of truth values and symbols alike: the signals that enable and trigger subsystems.
+
+A condition is a Python ``bool`` where it is known while a diagram is traced, else a CasADi symbol; so whatever is known
+is left out of the traced function.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+TRUE = 0.5
+"""A logic signal is true above this."""
+
+
+def is_true(value: Any) -> Any:
+    """Whether a logic signal (a column of one entry) is true."""
+    if isinstance(value, ca.MX):
+        return value > TRUE
+    return bool(float(np.ravel(np.array(value))[0]) > TRUE)
+
+
+def logic_and(a: Any, b: Any) -> Any:
+    """Logic and, of truth values or symbols."""
+    if isinstance(a, bool):
+        return b if a else False
+    if isinstance(b, bool):
+        return a if b else False
+    return ca.logic_and(a, b)
+
+
+def logic_or(a: Any, b: Any) -> Any:
+    """Logic or, of truth values or symbols."""
+    return a or b if isinstance(a, bool) and isinstance(b, bool) else ca.logic_or(a, b)
+
+
+def logic_not(a: Any) -> Any:
+    """Logic not, of a truth value or a symbol."""
+    return not a if isinstance(a, bool) else ca.logic_not(a)
+
+
+def to_number(a: Any) -> Any:
+    """Return 1.0 or 0.0 for a truth value; a symbol stays."""
+    return np.array([float(a)]) if isinstance(a, bool) else a
+
+
+def choose(condition: Any, a: Any, b: Any) -> Any:
+    """Return ``a`` where the condition holds, else ``b``; NaN in the other one does no harm."""
+    if isinstance(condition, bool):
+        return a if condition else b
+    return ca.if_else(condition, a, b)

@@ -1,0 +1,339 @@
+"""Staged schedules: a function of the whole diagram as a sequence of stages.
+
+What a diagram does at an instant is one function of ``(t, x, w, p)``. Some blocks can't be part of a traced function:
+they are evaluated from outside, by a library in C or by Python. Such a block splits the function into *stages*:
+
+    traced stage       one CasADi function of (t, x, w, p, c): everything between two blocks that are evaluated from
+                       outside. It writes a part of c, the last one the results.
+    opaque stage       one block, called with its states and inputs, which stand in c; it writes its outputs, or the
+                       rates of its states, into c.
+
+The vector ``c`` carries what later stages need. A block whose outputs do not depend on an input stands in two stages:
+its outputs come first, its rates when the input is known, as in the order of evaluation.
+
+A `Schedule` without an opaque stage has exactly one stage, and that is an ordinary CasADi function: every diagram of
+traced blocks is evaluated in this way. The total derivative of a schedule is the chain rule over its stages
+(`loopwright.diagrams.flat.total_derivative`).
+
+Two uses stand on this:
+
+- *Model exchange.* The outputs and rates of such an FMU depend on the state that a solver tries, so that it is
+  evaluated within the flow, the outputs and the indicators. Its instance is an `Evaluator`: fmi3SetTime,
+  fmi3SetContinuousStates and fmi3SetFloat64 for what comes in, fmi3GetFloat64 and
+  fmi3GetContinuousStateDerivatives for what goes out, fmi3GetDirectionalDerivative for the Jacobian. As a CasADi
+  callback it would cost 15 µs a call and lose its derivatives.
+- *Compiled code.* Every traced stage becomes one C function with the arguments that are listed here; the compiled loop
+  calls them in turn, and the FMUs between them through function pointers. ``c`` is one array.
+
+Blocks of users' own Python (`Block.opaque`) are callbacks in a traced stage nevertheless: in a sampled subsystem they
+are composed with a discretization, which needs them as functions, and their numbers are the same to the last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+
+from ...blocks.core.layout import Layout
+from .evaluate import Apart, Instant, no_evaluator
+
+
+class Evaluator(Protocol):
+    """Evaluates a block from outside of the traced functions; its parameters are its own."""
+
+    def evaluate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Return the equations that are wanted, one after the other, flat.
+
+        Parameters
+        ----------
+        names : tuple of str
+            Outputs by their names; ``"next"``: the rates of all states (in a sampled subsystem the next states);
+            ``"guards"``; ``"indicators"``: one for each event; ``"jump"``: all states after events.
+        t : float
+            Time in s.
+        x, u : ndarray
+            The block's states and inputs, flat. Inputs that none of ``names`` depends on may be zeros. Behind them, for
+            ``"jump"``, stands 1 for each event that fires, else 0.
+        """
+        ...
+
+    def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
+        """Return the derivative of `evaluate` by (t, x, u), shape (n, 1 + x.size + u.size); None: by differences."""
+        ...
+
+
+Evaluators = Mapping[str, Evaluator]
+"""What evaluates the blocks of opaque stages, by their paths. They belong to one run."""
+
+
+@dataclass(frozen=True, eq=False)
+class TracedStage:
+    """One CasADi function over the blocks between two that are evaluated from outside.
+
+    Attributes
+    ----------
+    name : str
+        Name of its function.
+    arguments : tuple of MX
+        Symbols of the schedule's arguments; behind them that of c, where something is carried.
+    results : tuple of MX
+        Expressions of these: of the part of c that it makes; of the last stage the schedule's results.
+    function : casadi.Function
+        From the arguments to the results.
+    makes : slice
+        Which part of c it makes; empty for the last stage.
+    """
+
+    name: str
+    arguments: tuple[Any, ...]
+    results: tuple[Any, ...]
+    function: Any
+    makes: slice
+
+    @cached_property
+    def fast(self) -> Any:
+        """The function as it is evaluated fastest, with the same results to the last bit; see `speed_up`."""
+        return speed_up(self.function)
+
+
+@dataclass(frozen=True, eq=False)
+class OpaqueStage:
+    """A block that is evaluated from outside.
+
+    Attributes
+    ----------
+    path : str
+        The block.
+    names : tuple of str
+        What is evaluated of it; see `Evaluator.evaluate`.
+    states, inputs : slice
+        Where its states and inputs stand in c.
+    makes : slice
+        Which part of c it makes.
+    has_parameters : bool
+        Whether the block has numbers of its own among the diagram's parameters.
+    """
+
+    path: str
+    names: tuple[str, ...]
+    states: slice
+    inputs: slice
+    makes: slice
+    has_parameters: bool
+
+    def evaluator(self, evaluators: Evaluators) -> Evaluator:
+        """Return what evaluates it.
+
+        Raises
+        ------
+        SimulationError
+            If nothing was given that does.
+        """
+        if self.path not in evaluators:
+            raise no_evaluator(self.path)
+        return evaluators[self.path]
+
+    def run(self, evaluator: Evaluator, t: np.ndarray, c: np.ndarray) -> None:
+        """Evaluate it at c, and write its part of c."""
+        c[self.makes] = evaluator.evaluate(self.names, float(t[0]), c[self.states], c[self.inputs])
+
+
+@dataclass(frozen=True, eq=False)
+class Schedule:
+    """A function of the whole diagram, in stages; the last one is traced and makes the results.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    arguments, results : tuple of str
+        Names of its arguments, the time ``t`` first, and of its results. All of them are columns.
+    stages : tuple of TracedStage and OpaqueStage
+        In the order in which they are evaluated.
+    width : int
+        Number of entries of c, which is carried from stage to stage.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    results: tuple[str, ...]
+    stages: tuple[TracedStage | OpaqueStage, ...]
+    width: int
+
+    @property
+    def opaque(self) -> tuple[OpaqueStage, ...]:
+        """Its opaque stages."""
+        return tuple(stage for stage in self.stages if isinstance(stage, OpaqueStage))
+
+    @property
+    def last(self) -> TracedStage:
+        """The stage that makes the results."""
+        last = self.stages[-1]
+        assert isinstance(last, TracedStage)
+        return last
+
+    @property
+    def function(self) -> Any:
+        """The one CasADi function of a schedule without opaque stages.
+
+        Raises
+        ------
+        SimulationError
+            Of a schedule that has some: there is no one function.
+        """
+        if self.opaque:
+            raise no_evaluator(self.opaque[0].path)
+        return self.last.function
+
+    def __call__(self, *arguments: Any, evaluators: Evaluators | None = None) -> list[np.ndarray]:
+        """Evaluate it with numbers; return the results, flat.
+
+        Parameters
+        ----------
+        *arguments : array_like
+            One column for each argument.
+        evaluators : mapping, optional
+            What evaluates the blocks of opaque stages, by path.
+        """
+        c, t = np.zeros(self.width), np.ravel(arguments[0])
+        made: list[np.ndarray] = []
+        for stage in self.stages:
+            if isinstance(stage, OpaqueStage):
+                stage.run(stage.evaluator(evaluators or {}), t, c)
+                continue
+            values = stage.function.call([*arguments, c] if self.width else [*arguments])
+            made = [np.ravel(np.array(value)) for value in values]
+            if stage is not self.last:
+                c[stage.makes] = made[0]
+        return made
+
+    def bind(
+        self,
+        arguments: Sequence[np.ndarray],
+        results: Sequence[np.ndarray] | None = None,
+        evaluators: Evaluators | None = None,
+    ) -> Bound:
+        """Return it bound to vectors, to be evaluated many times.
+
+        Parameters
+        ----------
+        arguments : sequence of ndarray
+            The vectors from which it is evaluated; what stands in them at the time of the call counts.
+        results : sequence of ndarray, optional
+            The vectors into which it is evaluated; new ones without them.
+        evaluators : mapping, optional
+            What evaluates the blocks of opaque stages, by path.
+        """
+        if len(self.stages) == 1:
+            return bind_function(self.last.fast, arguments, results)
+        c, calls, kept = np.zeros(self.width), list[Callable[[], None]](), list[Bound]()
+        for stage in self.stages:
+            if isinstance(stage, OpaqueStage):
+                calls.append(_call_of(stage, stage.evaluator(evaluators or {}), arguments[0], c))
+            else:
+                into = results if stage is self.last else [c[stage.makes]]
+                kept.append(bind_function(stage.fast, [*arguments, c], into))
+                calls.append(kept[-1].call)
+        return Bound(_one_after_the_other(calls), kept[-1].outputs, kept)
+
+    def depends(self, result: str, argument: str) -> np.ndarray:
+        """Return which entries of a result may depend on which of an argument, shape (n, m), of truth values."""
+        i, k = self.results.index(result), self.arguments.index(argument)
+        of_c = np.zeros((self.width, self.last.arguments[k].numel()), bool)
+        for stage in self.stages:
+            if isinstance(stage, OpaqueStage):
+                through = np.any(of_c[[*_range(stage.states), *_range(stage.inputs)]], axis=0)
+                of_c[stage.makes] = through | (argument == "t")
+            elif stage is not self.last:
+                of_c[stage.makes] = _depends(stage, 0, k, of_c)
+        return _depends(self.last, i, k, of_c)
+
+
+def evaluate_apart(evaluators: Evaluators | None) -> Apart:
+    """Return what `evaluate` takes as ``apart`` where it evaluates with numbers."""
+
+    def call(
+        instant: Instant, path: str, names: tuple[str, ...], states: np.ndarray, inputs: Sequence[Any]
+    ) -> list[Any]:
+        if path not in (evaluators or {}):
+            raise no_evaluator(path)
+        u = np.concatenate([np.zeros(0), *(np.ravel(np.array(column)) for column in inputs)])
+        made = (evaluators or {})[path].evaluate(names, float(instant.t), np.ravel(states), u)
+        parts = Layout.of({name: (instant.size_of(path, name),) for name in names}).split(np.asarray(made))
+        return [ca.DM(part) for part in parts.values()]
+
+    return call
+
+
+class Bound:
+    """A function bound to vectors: evaluated by ``call``, without a copy.
+
+    Attributes
+    ----------
+    call : callable
+        Evaluates it: from the vectors that it is bound to, into ``outputs``.
+    outputs : list of ndarray
+        One for each result; matrices stand in columns, one after the other.
+    """
+
+    def __init__(self, call: Callable[[], None], outputs: list[np.ndarray], kept: Any = None):
+        self.call, self.outputs = call, outputs
+        self.kept = kept
+        """Whatever must live as long as the call."""
+
+
+def bind_function(function: Any, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray] | None = None) -> Bound:
+    """Bind a CasADi function to vectors, through its buffers."""
+    buffer, call = function.buffer()
+    made = [np.zeros(function.numel_out(i)) for i in range(function.n_out())] if results is None else [*results]
+    for i, vector in enumerate(arguments):
+        buffer.set_arg(i, _view(vector))
+    for i, vector in enumerate(made):
+        buffer.set_res(i, _view(vector))
+    return Bound(call, made, buffer)
+
+
+def speed_up(function: Any) -> Any:
+    """Return a function in the form that is evaluated fastest: scalar operations where no block looks up a table.
+
+    The results are the same to the last bit.
+    """
+    try:
+        return function.expand()
+    except RuntimeError:
+        return function
+
+
+def _view(vector: np.ndarray) -> Any:
+    return memoryview(vector)  # type: ignore[arg-type]
+
+
+def _range(part: slice) -> range:
+    return range(part.start, part.stop)
+
+
+def _depends(stage: TracedStage, i: int, k: int, of_c: np.ndarray) -> np.ndarray:
+    """Return what result ``i`` of a stage depends on of argument ``k``: straight, or through c."""
+
+    def pattern(argument: int) -> np.ndarray:
+        return np.array(ca.DM(stage.function.jac_sparsity(i, argument), 1).full() != 0.0)
+
+    found = pattern(k)
+    return found if not len(of_c) else found | (pattern(len(stage.arguments) - 1) @ of_c)
+
+
+def _call_of(stage: OpaqueStage, evaluator: Evaluator, t: np.ndarray, c: np.ndarray) -> Callable[[], None]:
+    return lambda: stage.run(evaluator, t, c)
+
+
+def _one_after_the_other(calls: Sequence[Callable[[], None]]) -> Callable[[], None]:
+    def call() -> None:
+        for each in calls:
+            each()
+
+    return call

@@ -1,0 +1,158 @@
+"""The total derivative of a schedule: the chain rule over its stages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ...blocks.core.errors import ParameterError
+from ...blocks.core.layout import Layout
+from .stages import Bound, Evaluator, Evaluators, OpaqueStage, Schedule, TracedStage, bind_function, speed_up
+
+By = tuple[str, Sequence[int] | None]
+"""An argument of a schedule, and the entries by which it is differentiated; None for all."""
+
+_STEP = float(np.cbrt(np.finfo(float).eps))  # of a difference; the same as of blocks in users' own Python
+
+
+class Derivative:
+    """The results of a schedule and their total derivatives by some of its arguments.
+
+    It is evaluated into the results, where they are wanted, then for each result its derivative by each argument.
+    Without opaque stages this is one CasADi function. With some, ``D``, the derivative of everything that is carried
+    from stage to stage, is built up on the way: where a stage makes part of c from the argument v and from c, that
+    part of D is ∂/∂v + ∂/∂c D. Of an opaque stage the evaluator gives the derivative.
+
+    Parameters
+    ----------
+    schedule : Schedule
+        What is differentiated.
+    by : sequence of (str, sequence of int or None)
+        By which arguments, and which entries of them.
+    values : bool, default: True
+        Whether the results themselves are wanted, too.
+
+    Raises
+    ------
+    ParameterError
+        A derivative by the parameters, where a block that is evaluated from outside has some.
+    """
+
+    def __init__(self, schedule: Schedule, by: Sequence[By], *, values: bool = True):
+        self.schedule, self.by, self.values = schedule, tuple(by), values
+        owner = next((stage.path for stage in schedule.opaque if stage.has_parameters), None)
+        if owner is not None and any(name == "p" for name, _ in by):
+            raise ParameterError(
+                "it is evaluated from outside, so that there is no derivative by its parameters. Leave them as they "
+                "are.",
+                block=owner,
+            )
+        numels = dict(zip(schedule.arguments, (a.numel() for a in schedule.last.arguments), strict=False))
+        sizes = [numels[name] if entries is None else len(entries) for name, entries in by]
+        self._columns = Layout.of({str(i): (size,) for i, size in enumerate(sizes)})
+        traced = [stage for stage in schedule.stages if isinstance(stage, TracedStage)]
+        self._functions = {id(stage): self._differentiate(stage) for stage in traced}
+
+    def _differentiate(self, stage: TracedStage) -> Any:
+        """Return the function of a traced stage's results and its derivatives, by the arguments and by c."""
+        symbols = dict(zip(self.schedule.arguments, stage.arguments, strict=False))
+        staged = bool(self.schedule.opaque)
+        whole = [] if not staged else [(stage.arguments[-1], None)]
+        variables = [*((symbols[name], entries) for name, entries in self.by), *whole]
+        slopes = [_slope(e, symbol, entries) for e in stage.results for symbol, entries in variables]
+        names = [*self.schedule.arguments, *(["carried"] if staged else [])]
+        shown = stage.results if staged or self.values else ()
+        outputs = [f"o{i}" for i in range(len(shown) + len(slopes))]
+        return ca.Function(f"{stage.name}_derivative", [*stage.arguments], [*shown, *slopes], names, outputs)
+
+    @cached_property
+    def fast(self) -> Any:
+        """The one function of a schedule without opaque stages as it is evaluated fastest."""
+        return speed_up(self._functions[id(self.schedule.last)])
+
+    def __call__(self, *arguments: Any, evaluators: Evaluators | None = None) -> list[np.ndarray]:
+        """Evaluate it with numbers; return the results, flat, if they are wanted, and the derivatives as matrices.
+
+        Parameters
+        ----------
+        *arguments : array_like
+            One column for each argument of the schedule.
+        evaluators : mapping, optional
+            What evaluates the blocks of opaque stages, by path.
+        """
+        schedule = self.schedule
+        count = len(schedule.results)
+        if not schedule.opaque:
+            made = [np.array(v).reshape(v.shape) for v in self._functions[id(schedule.last)].call([*arguments])]
+            shown = count if self.values else 0
+            return [*map(np.ravel, made[:shown]), *made[shown:]]
+        c, D = np.zeros(schedule.width), np.zeros((schedule.width, self._columns.total))
+        made = []
+        for stage in schedule.stages:
+            if isinstance(stage, OpaqueStage):
+                self._pass_through(stage, stage.evaluator(evaluators or {}), float(np.ravel(arguments[0])[0]), c, D)
+                continue
+            made = [np.array(v).reshape(v.shape) for v in self._functions[id(stage)].call([*arguments, c])]
+            if stage is not schedule.last:
+                c[stage.makes] = np.ravel(made[0])
+                D[stage.makes] = np.hstack(made[1:-1]) + made[-1] @ D
+        wide, many = made[count:], len(self.by) + 1
+        found = [np.hstack(wide[i : i + many - 1]) + wide[i + many - 1] @ D for i in range(0, count * many, many)]
+        cut = [J[:, where] for J in found for where in self._columns.slices.values()]
+        return [*(map(np.ravel, made[:count]) if self.values else ()), *cut]
+
+    def _pass_through(self, stage: OpaqueStage, evaluator: Evaluator, t: float, c: np.ndarray, D: np.ndarray) -> None:
+        """Evaluate an opaque stage, and lead the derivative through it."""
+        x, u = c[stage.states].copy(), c[stage.inputs].copy()
+        c[stage.makes] = evaluator.evaluate(stage.names, t, x, u)
+        J = evaluator.differentiate(stage.names, t, x, u)
+        J = _differences(stage, evaluator, t, x, u) if J is None else np.asarray(J)
+        D[stage.makes] = J[:, 1:] @ np.vstack([D[stage.states], D[stage.inputs]])
+        for (name, _), where in zip(self.by, self._columns.slices.values(), strict=True):
+            if name == "t":
+                D[stage.makes, where] += J[:, :1]
+
+    def bind(
+        self,
+        arguments: Sequence[np.ndarray],
+        results: Sequence[np.ndarray] | None = None,
+        evaluators: Evaluators | None = None,
+    ) -> Bound:
+        """Return it bound to vectors; see `Schedule.bind`. Matrices are written column by column."""
+        if not self.schedule.opaque:
+            return bind_function(self.fast, arguments, results)
+        made = self(*arguments, evaluators=evaluators)
+        into = [np.zeros(v.size) for v in made] if results is None else [*results]
+
+        def call() -> None:
+            for vector, value in zip(into, self(*arguments, evaluators=evaluators), strict=True):
+                vector[:] = value.ravel(order="F")
+
+        return Bound(call, into)
+
+
+def _slope(expression: Any, symbol: Any, entries: Sequence[int] | None) -> Any:
+    slope = ca.jacobian(expression, symbol)
+    return ca.densify(slope if entries is None else slope[:, list(entries)])
+
+
+def _differences(stage: OpaqueStage, evaluator: Evaluator, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return the derivative of a block by (t, x, u), by central differences of fourth order."""
+    at = np.concatenate([[t], x, u])
+
+    def evaluate(v: np.ndarray) -> np.ndarray:
+        return np.array(evaluator.evaluate(stage.names, float(v[0]), v[1 : 1 + x.size], v[1 + x.size :]))
+
+    columns = []
+    for i, middle in enumerate(at):
+        slopes = []
+        for step in (_STEP * max(abs(middle), 1.0), 2.0 * _STEP * max(abs(middle), 1.0)):
+            high, low = at.copy(), at.copy()
+            high[i], low[i] = middle + step, middle - step
+            slopes.append((evaluate(high) - evaluate(low)) / (high[i] - low[i]))
+        columns.append((4.0 * slopes[0] - slopes[1]) / 3.0)
+    return np.array(columns).T

@@ -1,0 +1,141 @@
+"""Tracing a schedule: the evaluation of all blocks is cut at every block that is evaluated from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from .evaluate import Apart, Instant
+from .stages import OpaqueStage, Schedule, TracedStage
+from .vectors import join_columns
+
+
+def trace_schedule(name: str, arguments: Mapping[str, Any], results: Callable[[Apart], Mapping[str, Any]]) -> Schedule:
+    """Trace a function of the whole diagram.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    arguments : mapping
+        The symbols that it is a function of, by name; the time ``t`` comes first.
+    results : callable
+        Evaluates the diagram with these symbols and returns the results by name, as expressions. It is called with
+        what `evaluate` takes as ``apart``: this cuts the evaluation at the blocks that are evaluated from outside.
+    """
+    cuts = _Cuts()
+    made = {n: ca.densify(ca.MX(e)) for n, e in results(cuts).items()}  # a buffer holds every entry, zeros too
+    names, symbols = tuple(arguments), tuple(arguments.values())
+    if not cuts.made:
+        function = ca.Function(name, [*symbols], [*made.values()], [*names], [*made])
+        last = TracedStage(name, symbols, tuple(made.values()), function, slice(0, 0))
+        return Schedule(name, names, tuple(made), (last,), 0)
+    return _in_stages(name, names, symbols, made, cuts.made)
+
+
+@dataclass
+class _Cut:
+    """Where a block is evaluated from outside, and what was made between that and the cut before.
+
+    Attributes
+    ----------
+    carried : list of (symbol, expression)
+        What was made since the cut before; behind the cut the symbol stands for it.
+    outputs : list of MX
+        Symbols of what the block makes.
+    """
+
+    path: str
+    names: tuple[str, ...]
+    states: Any
+    inputs: Any
+    has_parameters: bool
+    carried: list[tuple[Any, Any]]
+    outputs: list[Any]
+
+
+class _Cuts:
+    """Cuts an evaluation with symbols: called for each block that is evaluated from outside."""
+
+    def __init__(self) -> None:
+        self.made: list[_Cut] = []
+
+    def __call__(
+        self, instant: Instant, path: str, names: tuple[str, ...], states: Any, inputs: Sequence[Any]
+    ) -> list[Any]:
+        carried: dict[int, tuple[Any, Any]] = {}
+
+        def carry(column: Any) -> Any:
+            if not isinstance(column, ca.MX) or column.is_constant() or column.is_symbolic():
+                return column
+            key = column.__hash__()
+            if key not in carried:
+                carried[key] = ca.MX.sym("carried", column.numel()), column
+            return carried[key][0]
+
+        own = instant.layout.parameters.slices[path]
+        outputs = [ca.MX.sym(f"{path}.{name}", instant.size_of(path, name)) for name in names]
+        columns = [ca.MX(ca.DM(u)) if not isinstance(u, ca.MX) else u for u in inputs]
+        instant.replace_columns(carry)
+        self.made.append(
+            _Cut(path, names, states, join_columns(columns), own.stop > own.start, [*carried.values()], outputs)
+        )
+        return outputs
+
+
+def _in_stages(
+    name: str, names: tuple[str, ...], symbols: tuple[Any, ...], results: Mapping[str, Any], cuts: Sequence[_Cut]
+) -> Schedule:
+    """Return the schedule of an evaluation that was cut: all that is carried gets its place in one vector c."""
+    _drop_unused(results.values(), cuts)
+    places: list[tuple[Any, slice]] = []
+    width = 0
+
+    def place(size: int) -> slice:
+        nonlocal width
+        width += size
+        return slice(width - size, width)
+
+    parts: list[tuple[list[Any], slice, OpaqueStage]] = []
+    for cut in cuts:
+        first = width
+        places += [(symbol, place(symbol.numel())) for symbol, _ in cut.carried]
+        states, inputs = place(cut.states.numel()), place(cut.inputs.numel())
+        end = width
+        places += [(symbol, place(symbol.numel())) for symbol in cut.outputs]
+        opaque = OpaqueStage(cut.path, cut.names, states, inputs, slice(end, width), cut.has_parameters)
+        parts.append(([*(e for _, e in cut.carried), cut.states, cut.inputs], slice(first, end), opaque))
+    c = ca.MX.sym("c", width)
+    known = [symbol for symbol, where in places if where.stop > where.start]
+    values = [c[where] for _, where in places if where.stop > where.start]
+
+    def of_c(expressions: Iterable[Any]) -> tuple[Any, ...]:
+        return tuple(ca.densify(e) for e in ca.substitute([*expressions], known, values))
+
+    stages: list[TracedStage | OpaqueStage] = []
+    arguments, names_in = (*symbols, c), [*names, "carried"]
+    for i, (expressions, makes, opaque) in enumerate(parts):
+        if makes.stop > makes.start:
+            made = of_c([ca.vertcat(*expressions)])
+            function = ca.Function(f"{name}_{i}", [*arguments], [*made], names_in, ["made"])
+            stages.append(TracedStage(f"{name}_{i}", arguments, made, function, makes))
+        stages.append(opaque)
+    made = of_c(results.values())
+    function = ca.Function(name, [*arguments], [*made], names_in, [*results])
+    stages.append(TracedStage(name, arguments, made, function, slice(0, 0)))
+    return Schedule(name, names, tuple(results), tuple(stages), width)
+
+
+def _drop_unused(results: Iterable[Any], cuts: Sequence[_Cut]) -> None:
+    """Leave out what no later stage needs of what was made before a cut."""
+    needed = _symbols_of(results)
+    for cut in reversed(cuts):
+        cut.carried = [(symbol, e) for symbol, e in cut.carried if symbol.__hash__() in needed]
+        needed |= _symbols_of([*(e for _, e in cut.carried), cut.states, cut.inputs])
+
+
+def _symbols_of(expressions: Iterable[Any]) -> set[int]:
+    return {symbol.__hash__() for e in expressions for symbol in ca.symvar(e)}

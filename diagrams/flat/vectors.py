@@ -1,0 +1,70 @@
+"""The vectors of the whole diagram at an instant that was evaluated with symbols."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ...blocks.core.layout import Layout
+from .evaluate import Instant, rows
+
+
+def next_x(instant: Instant) -> Any:
+    """Return x after an instant: with the new states, held outputs and gates."""
+    layout, parts = instant.layout, list[Any]()
+    made: list[tuple[Layout, Mapping[str, Any]]] = [
+        (layout.states, instant.new),
+        (layout.held, instant.held),
+        (layout.gates, instant.gates),
+        (layout.starts, {}),
+        (layout.loops, {}),
+    ]
+    for part, new in made:
+        parts += [new.get(name, rows(instant.x, where)) for name, where in part.slices.items()]
+    return join_columns(parts)
+
+
+def rates(instant: Instant) -> Any:
+    """Return the rates of the entries of x that are integrated."""
+    layout = instant.layout
+    if not layout.continuous.size:
+        return ca.MX(0, 1)
+    states = layout.states.slices.items()
+    of_all = join_columns([instant.rates.get(path, ca.MX.zeros(s.stop - s.start)) for path, s in states])
+    return of_all[layout.continuous.tolist()]
+
+
+def plant_inputs(instant: Instant) -> Any:
+    """Return z: the inputs of what is stepped from outside."""
+    layout = instant.layout
+    sources = [instant.source(*layout.ports[name]) for name in layout.plant_inputs.slices]
+    return join_columns([ca.MX(ca.densify(ca.DM(s))) if isinstance(s, np.ndarray) else s for s in sources])
+
+
+def log(instant: Instant) -> Any:
+    """Return w, all outputs of blocks, x, and, where loops are solved, the residual of the algebraic loops."""
+    layout = instant.layout
+    blocks = [*layout.log.slices][len(layout.plant_outputs.slices) :]
+    outputs = [instant.values[layout.ports[name]] for name in blocks]
+    return ca.vertcat(instant.w, *outputs, instant.x, *([residual(instant)] if layout.loops.slices else []))
+
+
+def loop_mismatch(instant: Instant) -> Any:
+    """Return what came round the algebraic loops less what was taken there."""
+    return join_columns([made - taken for made, taken in instant.mismatch])
+
+
+def residual(instant: Instant) -> Any:
+    """Return the largest mismatch of the algebraic loops, relative to 1 + the size of what was taken."""
+    if not instant.mismatch:
+        return ca.MX(0.0)
+    made, taken = (ca.vertcat(*columns) for columns in zip(*instant.mismatch, strict=True))
+    return ca.norm_inf(made - taken) / (1 + ca.norm_inf(taken))
+
+
+def join_columns(columns: Sequence[Any]) -> Any:
+    """Return columns one below the other; a column without entries where there are none."""
+    return ca.vertcat(*columns) if columns else ca.MX(0, 1)
