@@ -226,7 +226,7 @@ class Block(Value, Wireable):
                 "away; expected less than 1e-9 of the state. Take a smaller sample time, or another method."
             )
         return GuardError(
-            f"guard {name!r} is {value:.6g}; expected a positive value. Check what its inputs are: "
+            f"guard {name!r} is {value:.6g}; expected a positive value. Check its inputs: "
             f"{', '.join(f'{k} = {np.asarray(v).tolist()}' for k, v in u._asdict().items())}."
         )
 

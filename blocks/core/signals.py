@@ -54,7 +54,7 @@ def register_operator_block(name: str) -> Callable[[type[B]], type[B]]:
     return register
 
 
-class Node(Protocol):
+class WirableBlock(Protocol):
     """The members of a block that wiring needs."""
 
     @property
@@ -232,7 +232,11 @@ class Call(Wired):
     """A block with its inputs: one node of a diagram."""
 
     def __init__(
-        self, block: Node, wires: dict[str, Signal], names: tuple[str | None, ...] = (), origin: Call | None = None
+        self,
+        block: WirableBlock,
+        wires: dict[str, Signal],
+        names: tuple[str | None, ...] = (),
+        origin: Call | None = None,
     ):
         self.block, self.wires, self.names = block, wires, names
         self.origin = self if origin is None else origin
@@ -291,7 +295,7 @@ class UnknownAttributeError(UnknownNameError, AttributeError):
     """An unknown output or parameter was read as an attribute."""
 
 
-def primary_outputs(block: Node) -> list[str]:
+def primary_outputs(block: WirableBlock) -> list[str]:
     """Return the outputs that a call of ``block`` unpacks into."""
     return [name for name, port in block.outputs.items() if not getattr(port, "secondary", False)]
 
@@ -329,7 +333,7 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
     )
 
 
-def bind(block: Node, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Signal]:
+def bind(block: WirableBlock, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Signal]:
     """Match the arguments of a call with the block's inputs.
 
     Raises

@@ -11,10 +11,10 @@ from ..core.block import Block
 from ..core.errors import ParameterError
 from ..core.ports import Input, Output
 from ..core.values import Array, parameter, shorten
-from .branching import Numbered
+from .branching import NumberedInputs
 
 
-class Minimum(Numbered):
+class Minimum(NumberedInputs):
     """Smallest of its inputs, element by element: y = min(u₁, u₂, …); NaN in any of them passes through.
 
     Raises
@@ -31,7 +31,7 @@ class Minimum(Numbered):
         return self.fold(u, lambda a, b: np.where(a < b, a, np.where(b <= a, b, a + b)))
 
 
-class Maximum(Numbered):
+class Maximum(NumberedInputs):
     """Largest of its inputs, element by element: y = max(u₁, u₂, …); NaN in any of them passes through.
 
     Raises

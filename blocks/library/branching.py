@@ -53,7 +53,7 @@ def expect_scalar(value: Array, port: str) -> Array:
     return value
 
 
-class Numbered(Block):
+class NumberedInputs(Block):
     """Base of the blocks with ``count`` inputs ``u1``, ``u2``, …, of one shape (a scalar goes with any)."""
 
     count: int = parameter(default=2, minimum=1, description="number of inputs")

@@ -17,7 +17,7 @@ from ..core.block import Block
 from ..core.errors import ParameterError, near
 from ..core.ports import Event, Input, Output, State
 from ..core.values import Array, parameter
-from .branching import Numbered, check_fits, expect_scalar, truth
+from .branching import NumberedInputs, check_fits, expect_scalar, truth
 
 _OPERATORS = {">": (1.0, 1.0), "<": (-1.0, 1.0), "<=": (1.0, 0.0), ">=": (-1.0, 0.0)}
 """For each relation: a sign s, and the value of y where s (u₁ − u₂) is positive."""
@@ -83,7 +83,7 @@ class Compare(Block):
         return self.decide(u)
 
 
-class _Combined(Numbered):
+class _Combined(NumberedInputs):
     """Base of `And` and `Or`: an event for each input, and no state."""
 
     y = Output(shape=None, description="1 or 0")

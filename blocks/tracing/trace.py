@@ -159,7 +159,7 @@ def _is_ours(value: Any) -> bool:
 
 
 class _Tracer:
-    """One trace in the making."""
+    """Tracing of one block."""
 
     def __init__(self, block: Block, shapes: dict[str, Shape], sampled: bool, method: str, zeros: bool):
         self.block, self.shapes, self.sampled, self.method, self.zeros = block, shapes, sampled, method, zeros

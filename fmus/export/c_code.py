@@ -30,8 +30,8 @@ _SCALAR_LIMIT = 20_000
 _INLINE_LIMIT = 300
 _INLINE = "static inline __attribute__((always_inline))"
 _STEP_DESCRIPTION = (
-    "Longest step of the explicit Runge-Kutta method of order 4 (integrator = 1); a communication step h, or what an "
-    "event leaves of it, takes ceil(h / internal_step) equal substeps, at least one"
+    "Longest step of the explicit Runge-Kutta method of order 4 (integrator = 1); a communication step h, or its "
+    "remainder after an event, takes ceil(h / internal_step) equal substeps, at least one"
 )
 _INTEGRATOR_DESCRIPTION = (
     "Integrator of Co-Simulation. 1: explicit Runge-Kutta, order 4, fixed step; 2: explicit Runge-Kutta, order 5(4), "

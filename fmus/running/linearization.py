@@ -66,7 +66,7 @@ class LinearizableFmu(FmuBlock, Protocol):
         """Return a start value in the variable's shape, after checking it."""
 
 
-class _Point:
+class _OperatingPoint:
     """An operating point, as values of the FMU's variables."""
 
     def __init__(self, block: LinearizableFmu, t: float, state: Any, inputs: Any):
@@ -143,7 +143,7 @@ def linear_model(
             block=block.label,
             port="interface",
         )
-    point = _Point(block, t, state, inputs)
+    point = _OperatingPoint(block, t, state, inputs)
     about = point.about
     if not about.states:
         raise FmuError(
@@ -179,7 +179,7 @@ def _interface_name(exchange: bool) -> str:
 
 
 @contextmanager
-def _initialize(point: _Point, exchange: bool) -> Iterator[LoadedFmu]:
+def _initialize(point: _OperatingPoint, exchange: bool) -> Iterator[LoadedFmu]:
     """Load the FMU and enter Initialization Mode at the operating point."""
     instance = LoadedFmu(point.block, model_exchange=exchange)
     try:
@@ -190,7 +190,7 @@ def _initialize(point: _Point, exchange: bool) -> Iterator[LoadedFmu]:
         instance.close()
 
 
-def _enter_continuous_time(point: _Point, instance: LoadedFmu) -> None:
+def _enter_continuous_time(point: _OperatingPoint, instance: LoadedFmu) -> None:
     """Settle the events at the start, then set the states without an exact start value (FMI 3.0, 3.2)."""
     instance.begin()
     for _ in range(100):
@@ -216,11 +216,11 @@ def _set_states(instance: LoadedFmu, x: np.ndarray) -> None:
     instance.call("setting the continuous states", "setContinuousStates", vector, x.size)
 
 
-def _values(point: _Point, instance: LoadedFmu) -> np.ndarray:
+def _values(point: _OperatingPoint, instance: LoadedFmu) -> np.ndarray:
     return instance.values([*(point.about.states[n] for n in point.states), *point.outputs])
 
 
-def _linearize_by_directions(point: _Point, instance: LoadedFmu) -> FmuLinearization:
+def _linearize_by_directions(point: _OperatingPoint, instance: LoadedFmu) -> FmuLinearization:
     """Linearize by directional derivatives in Continuous-Time or Step Mode, for discrete inputs in Event Mode."""
     if instance.model_exchange:
         _enter_continuous_time(point, instance)
@@ -242,7 +242,7 @@ def _linearize_by_directions(point: _Point, instance: LoadedFmu) -> FmuLineariza
 
 
 @contextmanager
-def _mode_of(point: _Point, instance: LoadedFmu, name: str) -> Iterator[None]:
+def _mode_of(point: _OperatingPoint, instance: LoadedFmu, name: str) -> Iterator[None]:
     """Enter Event Mode for a discrete input of model exchange, and leave it again (FMI 3.0, 2.2.11)."""
     discrete = instance.model_exchange and point.about.variables[name].variability == "discrete"
     if discrete:
@@ -253,7 +253,7 @@ def _mode_of(point: _Point, instance: LoadedFmu, name: str) -> Iterator[None]:
         instance.call("entering Continuous-Time Mode", "enterContinuousTimeMode")
 
 
-def _linearize_by_differences(point: _Point, instance: LoadedFmu) -> FmuLinearization:
+def _linearize_by_differences(point: _OperatingPoint, instance: LoadedFmu) -> FmuLinearization:
     """Linearize by differences in Continuous-Time Mode or Initialization Mode (FMI 3.0, 3.2 and 2.3.3)."""
     if instance.model_exchange:
         _enter_continuous_time(point, instance)
@@ -290,7 +290,7 @@ def step_difference(
     for name, value in (("h", h), ("relative_step", relative_step)):
         if not 0 < value < np.inf:
             raise ParameterError(f"found {value!r}; expected a positive number.", block=block.label, port=name)
-    point = _Point(block, t, state, inputs)
+    point = _OperatingPoint(block, t, state, inputs)
     about = point.about
     for name in point.states:
         if about.variables[name].initial != "exact":
@@ -304,7 +304,7 @@ def step_difference(
         return _linearize_step(point, instance, h, relative_step)
 
 
-def _linearize_step(point: _Point, instance: LoadedFmu, h: float, relative_step: float) -> FmuLinearization:
+def _linearize_step(point: _OperatingPoint, instance: LoadedFmu, h: float, relative_step: float) -> FmuLinearization:
     about, known = point.about, [*point.states, *point.inputs]
     instance.begin()
     x, u = instance.values(point.states), instance.values(point.inputs)
