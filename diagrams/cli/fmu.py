@@ -32,7 +32,7 @@ _SHOWN = {"parameter", "structuralParameter", "calculatedParameter", "input", "o
 _STATUS = "\n\nexit status: 0 done, 1 {one}, 2 wrong usage"
 
 
-def add_commands(commands: Any) -> None:
+def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the three commands to the parser of `main`."""
     raw = argparse.RawDescriptionHelpFormatter
     build = commands.add_parser(
@@ -64,9 +64,9 @@ def add_commands(commands: Any) -> None:
     )
     inspect = commands.add_parser(
         "inspect",
-        help="show what an FMU is",
+        help="show an FMU's description",
         formatter_class=raw,
-        description="Show what an FMU of any tool says about itself (FMI 1.0 to 3.0), without running it.",
+        description="Show the description of an FMU of any tool (FMI 1.0 to 3.0), without running it.",
         epilog=_STATUS.format(one="it can't be read").strip(),
     )
     inspect.add_argument("file", metavar="FILE.fmu")
@@ -97,8 +97,8 @@ def _parse_positive(text: str) -> float:
 def _check_file(name: str) -> Path:
     path = Path(name).expanduser()
     if not path.is_file():
-        what = "is a folder" if path.is_dir() else "there is no such file"
-        raise OptionError(f"{what}; expected an FMU. Check the path.", block=str(path))
+        found = "is a folder" if path.is_dir() else "there is no such file"
+        raise OptionError(f"{found}; expected an FMU. Check the path.", block=str(path))
     return path
 
 
@@ -150,7 +150,7 @@ def run_build(arguments: argparse.Namespace) -> int:
 
 
 def _build_options(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Return the keywords for ``build`` that were given, checked against each other."""
+    """Return the given keywords for ``build``, checked against each other."""
     names = ("name", "integrator", "tolerance", "internal_step", "fmi", "platform")
     options = {name: value for name in names if (value := getattr(arguments, name)) is not None}
     if arguments.no_arrays:
@@ -179,13 +179,13 @@ def _option_text(name: str) -> str:
     return "--no-arrays" if name == "arrays" else f"--{name.replace('_', '-')}"
 
 
-#: Builds: takes the options, a file to write or None, and a folder for ``<name>.fmu`` then.
 Make = Callable[[dict[str, Any], Path | None, Path], Path]
+"""Builds an FMU and returns it: takes the options, a file or None, and the folder for ``<name>.fmu`` without a file."""
 
 
 @contextlib.contextmanager
 def _find_model(arguments: argparse.Namespace) -> Iterator[Make]:
-    """Give what builds the model that is asked for."""
+    """Yield the builder of the given model."""
     text = arguments.model
     if text in plants():
         module = importlib.import_module(f"{gantry.__package__}.{text}")
@@ -196,7 +196,7 @@ def _find_model(arguments: argparse.Namespace) -> Iterator[Make]:
                 model.block, arguments.python, build_model, type(model.block).__name__.lower(), model.beside
             )
     else:
-        hint = near(text, plants())  # it names all of them where none is close
+        hint = near(text, plants())  # names all of them where none is close
         known = f" The plants: {', '.join(plants())}." if close_names(text, plants()) else ""
         raise OptionError(f"there is no model {text!r}. {hint}{known} A model of yours is FILE.py:Name.", port="MODEL")
 
@@ -268,7 +268,8 @@ def _summary_lines(s: Mapping[str, Any]) -> Iterable[tuple[str, str]]:
     state = "there is a binary" if native["available"] else "no binary"
     yield "this machine", f"{native['platform']}: {state}"
     if native["missing_libraries"]:
-        yield "", f"its binary needs what is missing here: {', '.join(native['missing_libraries'])}. Install that."
+        missing = ", ".join(native["missing_libraries"])
+        yield "", f"its binary needs libraries that are missing here: {missing}. Install them."
     elif native["undefined_symbols"]:
         first, n = native["undefined_symbols"][0], len(native["undefined_symbols"])
         more = f" and {n - 1} more" if n > 1 else ""
@@ -342,4 +343,4 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "inspect": run_inspect,
     "validate": run_validate,
 }
-"""What carries out each command."""
+"""The function of each command, by the command's name."""

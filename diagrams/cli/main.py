@@ -85,16 +85,16 @@ def _make_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Run experiments of the paper: A path following, B compliance, C hand guiding, D force tracking.\n"
         "Writes the samples (A.csv), the key numbers (A.json, SI units) and two figures (A_path, A_signals;\n"
-        ".png and .svg) of each, in place of an earlier run's. A run that fails writes what it recorded, and why it\n"
-        'failed ("error" in A.json); one that recorded nothing writes nothing, and an earlier run\'s files stay.',
+        ".png and .svg) of each, in place of an earlier run's. A run that fails writes its record until then, and the\n"
+        'reason ("error" in A.json). A run without a record writes nothing, and an earlier run\'s files stay.',
         epilog="options (--option), with their defaults:\n  "
         + "\n  ".join(option_lines())
         + "\n  An option that only some experiments have is given to those.\n\nkey numbers:\n"
         + "\n".join(f"  {name:{width}}  [{unit}] {text}" for name, (unit, text) in DEFINITIONS.items())
-        + '\n  In A.json a number that there is none of is null; "never" lists the settling times without end.\n\n'
+        + '\n  In A.json a number that does not exist is null; "never" lists the settling times without end.\n\n'
         "exit status:\n  0    done\n  1    a run failed, or a plant could not be built\n"
         "  2    wrong usage; nothing was run\n"
-        "  130  interrupted (Ctrl-C); what was recorded until then is written",
+        "  130  interrupted (Ctrl-C); the record until then is written",
     )
     run.add_argument("letters", nargs="*", metavar="LETTER", help="A, B, C, D, also as A,B or AB; all four without one")
     run.add_argument("--out", metavar="DIR", default="out", help="folder for the files (default: out)")
@@ -123,7 +123,7 @@ def _version() -> str:
 
 
 def _make_folder(name: str) -> Path:
-    """Make the folder, and find out whether files can be written there."""
+    """Make the folder, and check that files can be written there."""
     folder = Path(name).expanduser()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -189,7 +189,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _simulate(experiment: Experiment) -> tuple[Run | None, str | None, bool]:
-    """Run an experiment; return its record, the reason where it failed, and whether it was interrupted."""
+    """Run an experiment; return its run, the reason of a failure, and whether it was interrupted."""
     try:
         return experiment.simulate(), None, False
     except LoopwrightError as error:
@@ -224,13 +224,13 @@ def _write(
 
 
 def _files(letter: str, folder: Path) -> list[Path]:
-    """Return every file that a run of an experiment writes."""
+    """Return the files that a run of an experiment writes."""
     figures = (f"_{kind}.{form}" for kind in ("path", "signals") for form in ("png", "svg"))
     return [folder / f"{letter}{ending}" for ending in (".csv", ".json", *figures)]
 
 
 def _earlier_files_text(letter: str, folder: Path) -> str:
-    """Say that an earlier run's files stay, where there are some."""
+    """Return a remark that an earlier run's files stay, if there are any."""
     return f"; the files of an earlier run stay in {folder}" if any(f.exists() for f in _files(letter, folder)) else ""
 
 

@@ -36,7 +36,7 @@ def option_lines() -> Iterable[str]:
 
 
 def parse_letters(given: Sequence[str]) -> list[str]:
-    """Return the experiments that are meant: ``A B``, ``A,B`` and ``AB`` alike."""
+    """Return the letters of experiments: ``A B``, ``A,B`` and ``AB`` alike, all of them without one."""
     pieces = [piece.strip() for text in given for piece in text.split(",")]
     for piece in pieces:
         if (not piece and len(pieces) == 1) or any(letter not in EXPERIMENTS for letter in piece.upper()):
@@ -98,6 +98,6 @@ def share(letters: Sequence[str], options: Mapping[str, Any]) -> dict[str, dict[
 
 
 def _join(letters: Sequence[str]) -> str:
-    """Write A; A and B; A, B and C."""
+    """Write a list in words: A; A and B; A, B and C."""
     *first, last = letters
     return f"{', '.join(first)} and {last}" if first else last

@@ -6,12 +6,12 @@ import argparse
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
 
 from ...blocks.core.errors import DefinitionError, FmuError, FmuFileError, LoopwrightError, OptionError, near
 from ...fmus.models import gantry
 from ..diagram import Diagram
+from ..document.report import Report
 from ..paper.experiments import EXPERIMENTS, Experiment
 from .options import parse_options, share
 from .text import say
@@ -21,7 +21,7 @@ DEFAULT = "B"
 """The experiment whose Fig. 3 is taken: both admittances are in it."""
 
 
-def add_report(commands: Any) -> None:
+def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the command to the parser of `main`."""
     report = commands.add_parser(
         "report",
@@ -29,13 +29,13 @@ def add_report(commands: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         description="Analyse a diagram for design: operating points, poles, margins of its loops, admittance and\n"
         "coupled stability, each number confirmed by an independent computation; and write it as one HTML page.\n\n"
-        "WHAT is an experiment of the paper (A, B, C or D; B without one: Fig. 3 with both admittances)\n"
+        "DIAGRAM is an experiment of the paper (A, B, C or D; B without one: Fig. 3 with both admittances)\n"
         "or FILE.py:NAME, a diagram of yours, or a function without arguments that returns one.",
         epilog="options of the experiments: as in loopwright run --help\n\n"
         "exit status:\n  0    done\n  1    the analysis failed, or a plant could not be built; nothing is written\n"
         "  2    wrong usage; nothing was analysed\n  130  interrupted (Ctrl-C); nothing is written",
     )
-    report.add_argument("what", nargs="?", metavar="WHAT", help="A, B, C, D, or FILE.py:NAME")
+    report.add_argument("diagram", nargs="?", metavar="DIAGRAM", help="A, B, C, D, or FILE.py:NAME")
     report.add_argument("--out", metavar="FILE.html", help="the page (default: fig3.html, or the diagram's name)")
     report.add_argument("--pdf", action="store_true", help="the same as PDF beside it (pip install 'loopwright[pdf]')")
     report.add_argument("--json", action="store_true", help="all numbers as JSON beside it")
@@ -54,16 +54,16 @@ def report_command(arguments: argparse.Namespace) -> int:
     """Make the diagram, analyse it, write the files; return the exit status."""
     from ..document.files import check_files, write_report
 
-    what = arguments.what or DEFAULT
+    subject = arguments.diagram or DEFAULT
     with contextlib.ExitStack() as open_file:
         try:
-            diagram, experiment = open_file.enter_context(_open_subject(what, arguments))
+            diagram, experiment = open_file.enter_context(_open_subject(subject, arguments))
         except OptionError:
             raise
         except LoopwrightError as error:
             say(f"loopwright: error: {error}", sys.stderr)
             return 1 if isinstance(error, FmuError) and not isinstance(error, FmuFileError) else 2
-        out = arguments.out or (f"{diagram.name}.html" if arguments.what else "fig3.html")
+        out = arguments.out or (f"{diagram.name}.html" if arguments.diagram else "fig3.html")
         check_files(out, pdf=arguments.pdf, json=arguments.json)
         began = time.perf_counter()
         try:
@@ -85,7 +85,7 @@ def report_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _analyse(diagram: Diagram, experiment: Experiment | None, tell: Callable[[str], None]) -> Any:
+def _analyse(diagram: Diagram, experiment: Experiment | None, tell: Callable[[str], None]) -> Report:
     from ..report.analyse import analyse
     from ..report.drawings import with_drawing
 
@@ -94,7 +94,7 @@ def _analyse(diagram: Diagram, experiment: Experiment | None, tell: Callable[[st
 
 @contextlib.contextmanager
 def _progress(name: str) -> Iterator[Callable[[str], None]]:
-    """Show on a terminal which section is being made, and since when."""
+    """Show the section in the making on a terminal, with the time since the start."""
     if not sys.stderr.isatty():
         yield lambda key: None
         return
@@ -107,30 +107,30 @@ def _progress(name: str) -> Iterator[Callable[[str], None]]:
         yield lambda key: progress.update(task, description=f"{name}: {key.replace('_', ' ')}")
 
 
-# --- what is analysed -----------------------------------------------------------------------------------------------
+# --- the diagram ---------------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
-def _open_subject(what: str, arguments: argparse.Namespace) -> Iterator[tuple[Diagram, Experiment | None]]:
-    """Yield the diagram, and its experiment where it is one."""
-    if ".py" in what:
+def _open_subject(subject: str, arguments: argparse.Namespace) -> Iterator[tuple[Diagram, Experiment | None]]:
+    """Yield the diagram, and its experiment where it has one."""
+    if ".py" in subject:
         for name, given in (("--option", arguments.options), ("--plant", arguments.plant)):
             if given:
                 raise OptionError("it is for experiments; set it in the file.", port=name)
-        with load_user_file(what, port="WHAT") as (module, path, name):
+        with load_user_file(subject, port="DIAGRAM") as (module, path, name):
             found = _find_diagram(vars(module), str(path), path.name, name)
             yield (found.diagram, found) if isinstance(found, Experiment) else (found, None)
         return
-    experiment = _make_experiment(what, arguments)
+    experiment = _make_experiment(subject, arguments)
     yield experiment.diagram, experiment
 
 
-def _make_experiment(what: str, arguments: argparse.Namespace) -> Experiment:
-    letter = what.upper()
+def _make_experiment(name: str, arguments: argparse.Namespace) -> Experiment:
+    letter = name.upper()
     if letter not in EXPERIMENTS:
         raise OptionError(
-            f"found {what!r}; expected one of {', '.join(EXPERIMENTS)}, or FILE.py:NAME, such as loop.py:diagram.",
-            port="WHAT",
+            f"found {name!r}; expected one of {', '.join(EXPERIMENTS)}, or FILE.py:NAME, such as loop.py:diagram.",
+            port="DIAGRAM",
         )
     options = share([letter], parse_options(arguments))[letter]
     if options.get("plant") is None:
@@ -138,17 +138,17 @@ def _make_experiment(what: str, arguments: argparse.Namespace) -> Experiment:
     return EXPERIMENTS[letter](**options)
 
 
-def _find_diagram(names: dict[str, Any], who: str, file: str, name: str) -> Diagram | Experiment:
-    """Return what a name of a user's file stands for."""
-    known = [key for key, value in names.items() if isinstance(value, Diagram | Experiment)]
+def _find_diagram(names: Mapping[str, object], source: str, file: str, name: str) -> Diagram | Experiment:
+    """Return the diagram or experiment that a name stands for in a user's file."""
+    known = {key: value for key, value in names.items() if isinstance(value, Diagram | Experiment)}
     if not name:
         if len(known) == 1:
-            return names[known[0]]  # type: ignore[no-any-return]
-        example = f" Write {file}:{known[0]}." if known else f" Write {file}:NAME."
-        raise OptionError(f"expected FILE.py:NAME. Its diagrams: {', '.join(known) or 'none'}.{example}", block=who)
+            return next(iter(known.values()))
+        example = f" Write {file}:{next(iter(known), 'NAME')}."
+        raise OptionError(f"expected FILE.py:NAME. Its diagrams: {', '.join(known) or 'none'}.{example}", block=source)
     if name not in names:
         hint = near(name, known) if known else "There is no Diagram in it."
-        raise OptionError(f"there is no {name!r} in it. {hint}", block=who)
+        raise OptionError(f"there is no {name!r} in it. {hint}", block=source)
     found = names[name]
     if callable(found) and not isinstance(found, Diagram | Experiment | type):
         try:
@@ -159,12 +159,12 @@ def _find_diagram(names: dict[str, Any], who: str, file: str, name: str) -> Diag
             raise DefinitionError(
                 f"{name}() fails: {type(error).__name__}: {error}. Give a diagram, or a function without arguments "
                 "that returns one.",
-                block=who,
+                block=source,
             ) from error
     if not isinstance(found, Diagram | Experiment):
         raise OptionError(
             f"found {type(found).__name__} for {name!r}; expected a Diagram. Its diagrams: "
             f"{', '.join(known) or 'none'}.",
-            block=who,
+            block=source,
         )
     return found

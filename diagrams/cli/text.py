@@ -1,4 +1,4 @@
-"""What the command line prints, as the terminal can show it."""
+"""Output of the command line, as the terminal can show it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def say(text: str, stream: IO[str] | None = None) -> None:
 
 
 def fit(text: str, stream: IO[str]) -> str:
-    """Return the text as the stream can print it."""
+    """Return the text in characters that the stream can print."""
     encoding = getattr(stream, "encoding", None) or "utf-8"
     try:
         text.encode(encoding)

@@ -1,4 +1,4 @@
-"""A model out of a user's file: ``FILE.py:Name``, a Block class or an instance."""
+"""Models in users' files: ``FILE.py:Name``, a Block class or an instance."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MODULE = "loopwright_user_model"
 
 @dataclass(frozen=True)
 class UserModel:
-    """A block of a user's file.
+    """A block in a user's file.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def load_user_file(text: str, *, port: str) -> Iterator[tuple[ModuleType, Path, 
 
 def _split_name(text: str, port: str = "MODEL", example: str = "model.py:Motor") -> tuple[Path, str]:
     head, colon, name = text.rpartition(":")
-    if not colon or not head.endswith(".py"):  # a drive's colon is none of ours
+    if not colon or not head.endswith(".py"):  # the colon of a Windows drive, or none
         head, name = text, ""
     path = Path(head).expanduser()
     if path.suffix != ".py":
@@ -96,16 +96,16 @@ def _load(path: Path) -> Iterator[ModuleType]:
         assert spec is not None
         assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
-        sys.modules[_MODULE] = module  # inspect finds sources by it
+        sys.modules[_MODULE] = module  # inspect finds the source by this name
         try:
-            with contextlib.redirect_stdout(sys.stderr):  # what it prints is no result of ours
+            with contextlib.redirect_stdout(sys.stderr):  # its prints are no result of the command
                 spec.loader.exec_module(module)
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # sys.exit() too: a script without a guard
             step = f"Correct it; python {path.name} shows the whole traceback."
             if isinstance(error, SystemExit):
-                step = 'Put what it does as a script behind if __name__ == "__main__".'
+                step = 'Put its script behind if __name__ == "__main__".'
             raise DefinitionError(
                 f"importing it fails{_line_text(error, path)}: {type(error).__name__}: {_message(error)}. {step}",
                 block=str(path),
@@ -130,7 +130,7 @@ def _is_in(module: ModuleType, name: str, folder: Path) -> bool:
 
 
 def _find_block(module: ModuleType, path: Path, name: str) -> Block:
-    who = str(path)
+    source = str(path)
     blocks = {
         key: value
         for key, value in vars(module).items()
@@ -139,18 +139,18 @@ def _find_block(module: ModuleType, path: Path, name: str) -> Block:
     }
     if not name:
         example = f" Write {path.name}:{next(iter(blocks))}." if blocks else ""
-        raise OptionError(f"expected FILE.py:Name. Its models: {', '.join(blocks) or 'none'}.{example}", block=who)
+        raise OptionError(f"expected FILE.py:Name. Its models: {', '.join(blocks) or 'none'}.{example}", block=source)
     found = vars(module).get(name)
     if found is None:
         hint = near(name, blocks) if blocks else "There is no Block in it."
-        raise OptionError(f"there is no {name!r} in it. {hint}", block=who)
+        raise OptionError(f"there is no {name!r} in it. {hint}", block=source)
     if isinstance(found, Block):
         return found
     if not (isinstance(found, type) and issubclass(found, Block)):
         raise OptionError(
             f"found {type(found).__name__} for {name!r}; expected a Block: a class, or an instance with its "
             f"parameters. Its models: {', '.join(blocks) or 'none'}.",
-            block=who,
+            block=source,
         )
     needed = [key for key, spec in found.parameter_specs.items() if spec.required]
     if needed:
@@ -158,21 +158,21 @@ def _find_block(module: ModuleType, path: Path, name: str) -> Block:
         raise OptionError(
             f"{name} needs {' and '.join(needed)}. Make an instance in the file, {instance} = "
             f"{name}({', '.join(f'{key}=…' for key in needed)}), and give {path.name}:{instance}.",
-            block=who,
+            block=source,
         )
     try:
         return found()
     except LoopwrightError as error:
-        raise OptionError(f"{name}() can't be made: {error}", block=who) from error
+        raise OptionError(f"{name}() can't be made: {error}", block=source) from error
     except Exception as error:
         raise DefinitionError(
             f"{name}() can't be made{_line_text(error, path)}: {type(error).__name__}: {_message(error)}. Correct it.",
-            block=who,
+            block=source,
         ) from error
 
 
 def _line_text(error: BaseException, path: Path) -> str:
-    """Say which line of a file an error came through last."""
+    """Return the last line of a file that an error came through, as words."""
     if isinstance(error, SyntaxError) and error.filename is not None:
         return f" in line {error.lineno} of {error.filename}"
     line, step = "", error.__traceback__

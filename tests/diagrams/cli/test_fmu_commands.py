@@ -319,7 +319,7 @@ def test_wrong_usage_of_build(arguments, text, here, capsys):
     [
         ("x = 1\nimport no_such_module\n", "in line 2: ModuleNotFoundError: No module named 'no_such_module'. Correct it"),
         ("def f(:\n", "SyntaxError: invalid syntax. Correct it"),
-        ("import sys\nsys.exit(3)\n", 'in line 2: SystemExit: 3. Put what it does as a script behind if __name__ == "__main__".'),
+        ("import sys\nsys.exit(3)\n", 'in line 2: SystemExit: 3. Put its script behind if __name__ == "__main__".'),
         ("import mine\nmine.nothing\n", "in line 2: AttributeError: module 'mine' has no attribute 'nothing'"),
     ],
 )  # fmt: skip
@@ -547,7 +547,7 @@ def test_a_missing_shared_library_is_named(altered, tmp_path, capsys):
         ctypes.CDLL(str(tmp_path / "lag.so"))
     file = altered("lag.fmu", files={"binaries/x86_64-linux/lag.so": binary})
     assert main(["inspect", str(file)]) == 0
-    assert "its binary needs what is missing here: libabsent.so. Install that." in capsys.readouterr().out
+    assert "its binary needs libraries that are missing here: libabsent.so. Install them." in capsys.readouterr().out
     assert main(["inspect", str(file), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["native"]["missing_libraries"] == ["libabsent.so"]
     assert main(["validate", str(file)]) == 1

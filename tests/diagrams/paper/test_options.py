@@ -245,8 +245,8 @@ def test_a_folder_to_which_nothing_can_be_written_is_noticed_before_the_run(caps
 def test_help_tells_the_exit_statuses_and_what_becomes_of_files(capsys):
     assert main(["run", "--help"]) == 0
     text = capsys.readouterr().out
-    assert "  130  interrupted (Ctrl-C); what was recorded until then is written" in text
-    assert "one that recorded nothing writes nothing, and an earlier run's files stay." in text
+    assert "  130  interrupted (Ctrl-C); the record until then is written" in text
+    assert "A run without a record writes nothing, and an earlier run's files stay." in text
     assert "path=" not in text
 
 
