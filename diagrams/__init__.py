@@ -52,7 +52,7 @@ from .results.stored import Occurrence, Stopped
 from .simulation.run_options import RunOptions
 from .simulation.simulation import Simulation
 from .simulation.view import SimulationView
-from .wiring.structure import Frame, Wire
+from .wiring.structure import SubsystemSettings, Wire
 from .wiring.subsystem import Subsystem, subsystem
 
 __all__ = [
@@ -65,7 +65,6 @@ __all__ = [
     "Drawing",
     "Fig3Diagram",
     "FlatDiagram",
-    "Frame",
     "FrequencyResponse",
     "GainCrossover",
     "GangOfFour",
@@ -93,6 +92,7 @@ __all__ = [
     "StabilityMap",
     "Stopped",
     "Subsystem",
+    "SubsystemSettings",
     "Table",
     "Wire",
     "analyse",

@@ -158,7 +158,7 @@ class Diagram(WiredDiagram):
             States that keep the value with which the search begins.
         at : OperatingPoint, Snapshot or float, optional
             Where the search begins, as in `linearize`; also the time at which sources are taken, and what discrete
-            states and enabled boxes are. Without it, the start.
+            states and enabled subsystems are. Without it, the start.
         tolerance : float
             Largest residual of an equation, relative to 1 + the size of what it belongs to.
         **options
@@ -312,10 +312,10 @@ class Diagram(WiredDiagram):
         self,
         path: str | os.PathLike[str] | None = None,
         *,
-        box: str = "",
+        subsystem: str = "",
         closed: bool | Iterable[str] | None = None,
     ) -> Drawing:
-        """Draw the diagram itself: blocks, boxes with their rates, wires with their names, FMUs marked.
+        """Draw the diagram itself: blocks, subsystems with their rates, wires with their names, FMUs marked.
 
         Signals run from left to right; what closes a loop runs back below. Nothing but Python is needed.
 
@@ -323,7 +323,7 @@ class Diagram(WiredDiagram):
         ----------
         path : path, optional
             File to write, ``.svg``.
-        box : str
+        subsystem : str
             Path of the subsystem whose inside is drawn; the whole diagram without it.
         closed : bool or list of str, optional
             Subsystems that are drawn closed: all of them, or those of the list. Without it all are open, in a diagram
@@ -346,7 +346,7 @@ class Diagram(WiredDiagram):
         >>> Diagram("demo", Gain(gain=2)(Sine(frequency=1))).draw().svg[:4]
         '<svg'
         """
-        drawing = Drawing(draw(self, box=box, closed=closed))
+        drawing = Drawing(draw(self, subsystem=subsystem, closed=closed))
         if path is not None:
             drawing.save(path)
         return drawing

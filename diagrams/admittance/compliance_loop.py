@@ -145,7 +145,7 @@ class AdmittanceLoop(Value):
         """
         names = (*(f"{kind}_{s}" for kind in ("admittance", "pid") for s in SIDES),)
         linearization = cast(FeedbackLinearization, diagram["controller.feedback_linearization"])
-        sensor, frame = cast(ForceSensor, diagram["sensors.force_sensor"]), diagram.frames["controller"]
+        sensor, frame = cast(ForceSensor, diagram["sensors.force_sensor"]), diagram.subsystems["controller"]
         found: dict[str, Any] = {name: diagram[f"controller.{name}"] for name in names}
         if frame.sample_time is None:
             raise UnknownNameError(

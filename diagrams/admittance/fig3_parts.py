@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ..flat.wired_diagram import WiredDiagram
 
 SENSOR = "sensors.force_sensor"
-_BOX = "controller"
+_CONTROLLER = "controller"
 
 
 def plant_path(diagram: WiredDiagram) -> str:
@@ -56,22 +56,22 @@ def check_wires(diagram: WiredDiagram) -> None:
 
 def _expected_wires(diagram: WiredDiagram, plant: str) -> dict[tuple[str, str], str]:
     """Return the source of each input in Fig. 3."""
-    position, velocity, theta = f"{plant}.position", f"{plant}.velocity", f"{_BOX}.path_projection.theta"
-    transform, linearization = f"{_BOX}.transverse_transform", f"{_BOX}.feedback_linearization"
-    found: dict[tuple[str, str], str] = {(f"{_BOX}.path_projection", "position"): position}
+    position, velocity, theta = f"{plant}.position", f"{plant}.velocity", f"{_CONTROLLER}.path_projection.theta"
+    transform, linearization = f"{_CONTROLLER}.transverse_transform", f"{_CONTROLLER}.feedback_linearization"
+    found: dict[tuple[str, str], str] = {(f"{_CONTROLLER}.path_projection", "position"): position}
     for block in (transform, linearization):
         found |= {(block, "theta"): theta, (block, "position"): position, (block, "velocity"): velocity}
-    for block in (f"{_BOX}.force_projection", linearization):
+    for block in (f"{_CONTROLLER}.force_projection", linearization):
         found |= {(block, "theta"): theta, (block, "force"): f"{SENSOR}.measured"}
     for side, coordinate in (("par", "eta"), ("perp", "xi")):
-        admittance, pid = f"{_BOX}.admittance_{side}", f"{_BOX}.pid_{side}"
-        found[admittance, "force"] = f"{_BOX}.force_projection.f_{side}"
+        admittance, pid = f"{_CONTROLLER}.admittance_{side}", f"{_CONTROLLER}.pid_{side}"
+        found[admittance, "force"] = f"{_CONTROLLER}.force_projection.f_{side}"
         found[pid, "coordinate"] = f"{transform}.{coordinate}"
         found[pid, "reference"] = f"{admittance}.path_reference"
         found[linearization, f"v_{side}"] = f"{pid}.v"
     last = f"{linearization}.motor_force"
     for name, kind in (("saturation", Saturation), ("computation", (UnitDelay, Gain))):
-        block = f"{_BOX}.{name}"
+        block = f"{_CONTROLLER}.{name}"
         if isinstance(diagram.blocks.get(block), kind):
             found[block, "u"], last = last, f"{block}.y"
     found[plant, "motor_force"] = last
@@ -91,22 +91,23 @@ def delay_of(diagram: WiredDiagram) -> int:
         If the sensors have another sample time or offset than the controller, or a delay, or if ``computation`` is
         more than a delay.
     """
-    frames = diagram.frames
-    box, sensors = frames[_BOX], frames["sensors"]
+    subsystems = diagram.subsystems
+    controller, sensors = subsystems[_CONTROLLER], subsystems["sensors"]
     found = (sensors.sample_time, sensors.offset, sensors.delay)
-    if found != (box.sample_time, box.offset, 0):
+    if found != (controller.sample_time, controller.offset, 0):
         told = " s, ".join(str(v) for v in found)
         raise ParameterError(
-            f"found the sample time, offset and delay {told}; expected {box.sample_time} s, {box.offset} s, 0: the "
-            "reduced loop reads the sensors at the controller's ticks. Linearize the diagram itself.",
+            f"found the sample time, offset and delay {told}; expected {controller.sample_time} s, "
+            f"{controller.offset} s, 0: the reduced loop reads the sensors at the controller's ticks. Linearize the "
+            "diagram itself.",
             block="sensors",
         )
-    last = diagram.blocks.get(f"{_BOX}.computation")
+    last = diagram.blocks.get(f"{_CONTROLLER}.computation")
     late = isinstance(last, UnitDelay)
     if last is not None and not late and not (isinstance(last, Gain) and bool(np.all(last.gain == 1.0))):
         raise ParameterError(
             f"found {type(last).__name__}; expected a UnitDelay, or a Gain of 1 in its place. Linearize the diagram "
             "itself.",
-            block=f"{_BOX}.computation",
+            block=f"{_CONTROLLER}.computation",
         )
-    return box.delay + int(late)
+    return controller.delay + int(late)

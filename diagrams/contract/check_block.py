@@ -26,7 +26,7 @@ class BlockReport:
     ----------
     block : str
         Name of the block.
-    frames : mapping
+    kinds : mapping
         For "sampled" and "continuous": "checked", or the reason why the block refuses to stand in such a subsystem.
     checks : mapping
         Result of each check, with numbers, by "sampled: rule", "continuous: rule" or by rule.
@@ -42,7 +42,7 @@ class BlockReport:
     """
 
     block: str
-    frames: Mapping[str, str]
+    kinds: Mapping[str, str]
     checks: Mapping[str, str]
     feedthrough: Mapping[str, frozenset[tuple[str, str]]] = field(default_factory=dict)
     unseen: Mapping[str, frozenset[tuple[str, str]]] = field(default_factory=dict)
@@ -51,7 +51,7 @@ class BlockReport:
 
     def __str__(self) -> str:
         lines = [f"{self.block} keeps the contract of a block."]
-        lines += [f"  {kind} subsystem: {text}" for kind, text in self.frames.items()]
+        lines += [f"  {kind} subsystem: {text}" for kind, text in self.kinds.items()]
         lines += [f"  {rule}: {text}" for rule, text in self.checks.items()]
         for kind, pairs in self.unseen.items():
             lines += [f"  {kind}: {y} depends on {u} in the trace, and never did" for u, y in sorted(pairs)]
@@ -69,7 +69,7 @@ def check_block(
     sample_time: float = 0.01,
     ticks: int = 100,
     seed: int = 0,
-    frames: Iterable[str] = (),
+    kinds: Iterable[str] = (),
 ) -> BlockReport:
     """Check that a block keeps the contract of blocks, the library's or one of your own.
 
@@ -100,7 +100,7 @@ def check_block(
         Length of the runs in sample times, at least 4.
     seed : int
         Seed of points and signals.
-    frames : list of str, optional
+    kinds : list of str, optional
         "sampled", "continuous" or both: kinds of subsystems in which the block must stand. Without it, those that it
         doesn't refuse.
 
@@ -122,7 +122,7 @@ def check_block(
     >>> from loopwright.blocks import Saturation
     >>> from loopwright.diagrams import check_block
     >>> report = check_block(Saturation(limit=1.0), shapes={"u": (2,)})
-    >>> report.frames
+    >>> report.kinds
     {'sampled': 'checked', 'continuous': 'checked'}
     """
     if not isinstance(block, Block):
@@ -135,22 +135,22 @@ def check_block(
     announced = find_instants(block, exercise.duration)
     checks["next_instant"] = f"{len(announced)} within {exercise.duration:g} s"
     found = _Findings(exercise, announced, checks)
-    wanted = _choose_kinds(frames)
+    wanted = _choose_kinds(kinds)
     refused = [error for sampled in wanted if (error := found.check_in(sampled)) is not None]
-    if refused and (frames or len(refused) == len(wanted)):
+    if refused and (kinds or len(refused) == len(wanted)):
         raise refused[0]
     return found.report()
 
 
-def _choose_kinds(frames: Iterable[str]) -> list[bool]:
+def _choose_kinds(kinds: Iterable[str]) -> list[bool]:
     """Return the wanted kinds of subsystems: sampled True, continuous False."""
     names = [kind_text(sampled) for sampled in (True, False)]
-    for name in (given := list(frames)):
+    for name in (given := list(kinds)):
         if name not in names:
             raise OptionError(
                 f"found {name!r}; expected 'sampled' or 'continuous'. {near(name, names)}",
                 block="check_block",
-                port="frames",
+                port="kinds",
             )
     return [sampled for sampled in (True, False) if not given or kind_text(sampled) in given]
 
@@ -160,7 +160,7 @@ class _Findings:
 
     def __init__(self, exercise: Exercise, announced: list[float], checks: dict[str, str]):
         self.exercise, self.announced, self.checks = exercise, announced, checks
-        self.frames: dict[str, str] = {}
+        self.kinds: dict[str, str] = {}
         self.feedthrough: dict[str, frozenset[tuple[str, str]]] = {}
         self.unseen: dict[str, frozenset[tuple[str, str]]] = {}
         self.swallowed: dict[str, frozenset[tuple[str, str]]] = {}
@@ -181,7 +181,7 @@ class _Findings:
             vector = any(exercise.shapes.values())
             if isinstance(error, ShapeError) and (sampled or not block.events or not vector):
                 raise
-            self.frames[kind] = str(error)
+            self.kinds[kind] = str(error)
             return error
         bench = Bench(exercise, sampled, traced)
         checks[f"{kind}: purity"] = f"{equations} equations"
@@ -207,13 +207,13 @@ class _Findings:
         kind = kind_text(sampled)
         text, fired = check_run(self.exercise, sampled)
         self.quiet -= fired
-        self.checks[f"{kind}: run"], self.frames[kind] = text, "checked"
+        self.checks[f"{kind}: run"], self.kinds[kind] = text, "checked"
 
     def report(self) -> BlockReport:
         """Return the findings as a report."""
         return BlockReport(
             self.exercise.block.label,
-            self.frames,
+            self.kinds,
             self.checks,
             self.feedthrough,
             self.unseen,

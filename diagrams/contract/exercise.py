@@ -222,7 +222,7 @@ def _read_rows(run: Run, name: str, times: np.ndarray, kept: np.ndarray) -> np.n
 def _make_diagram(name: str, roots: Sequence[Call | Signal], sample_time: float | None) -> Diagram:
     table = Collector(roots).structure()
     if sample_time is not None:
-        table.frames[""] = replace_fields(table.frames[""], sample_time=exact_time(sample_time))
+        table.subsystems[""] = replace_fields(table.subsystems[""], sample_time=exact_time(sample_time))
     return Diagram._of(name, table)
 
 

@@ -40,7 +40,9 @@ def definition(path: str, more: Mapping[str, str] = MappingProxyType({})) -> tup
         Further definitions, which come first.
     """
     parts = path.split(".")
-    if parts[0] == "subject" and parts[-1] != "sample_time":  # boxes, blocks and parameters have names of their own
+    if (
+        parts[0] == "subject" and parts[-1] != "sample_time"
+    ):  # subsystems, blocks and parameters have names of their own
         parts = ["subject"]
     elif parts[0] == "inner" and parts[3:4] == ["control"]:  # inner.WIRE.VARIANT.control.NUMBER
         parts = ["control"]

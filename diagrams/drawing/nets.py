@@ -57,7 +57,7 @@ class Nets:
 
     def __init__(self, table: Structure):
         self.table = table
-        self.of: dict[str, dict[PlacedPin, list[PlacedPin]]] = {path: {} for path in table.frames}
+        self.of: dict[str, dict[PlacedPin, list[PlacedPin]]] = {path: {} for path in table.subsystems}
         self.parts: dict[tuple[str, Pin], int | slice] = {}
         self.ins: dict[str, list[Pin]] = {}
         self.outs: dict[str, list[Pin]] = {}
@@ -67,11 +67,11 @@ class Nets:
             if short not in self.names.setdefault((wire.block, wire.port), []):
                 self.names[wire.block, wire.port].append(short)
         for (path, port), wire in table.wires.items():
-            self._thread(wire, table.frame_of[path], path, Pin(port))
+            self._thread(wire, table.subsystem_of[path], path, Pin(port))
         for path, wire in table.controls.items():
             self._thread(wire, path.rpartition(".")[0], path, Pin(wire.port, wire.block, control=True))
         for block, port in self.names:
-            self.of[table.frame_of[block]].setdefault((Place(block), Pin(port)), [])
+            self.of[table.subsystem_of[block]].setdefault((Place(block), Pin(port)), [])
             _add(self.outs, block, Pin(port))
 
     def name_of(self, path: str, pin: Pin) -> str:
@@ -92,7 +92,7 @@ class Nets:
     def _thread(self, wire: Wire, subsystem: str, item: str, pin: Pin) -> None:
         """Lead a wire from its block across borders to a consumer in a subsystem."""
         crossing = Pin(wire.port, wire.block)
-        here = self.table.frame_of[wire.block]
+        here = self.table.subsystem_of[wire.block]
         end = (Place(wire.block), Pin(wire.port))
         _add(self.outs, wire.block, end[1])
         while not (here == subsystem or not here or subsystem.startswith(here + ".")):

@@ -57,14 +57,14 @@ class Drawing:
         return file
 
 
-def draw(diagram: CheckedDiagram, *, box: str = "", closed: bool | Iterable[str] | None = None) -> str:
+def draw(diagram: CheckedDiagram, *, subsystem: str = "", closed: bool | Iterable[str] | None = None) -> str:
     """Return the drawing of a diagram, or of the inside of one of its subsystems, as SVG.
 
     Parameters
     ----------
     diagram : CheckedDiagram
         The diagram.
-    box : str
+    subsystem : str
         Path of the subsystem whose inside is drawn; the whole diagram without it.
     closed : bool or list of str, optional
         Subsystems that are drawn closed, all or some; by default all of them in a diagram of more than 40 blocks.
@@ -75,20 +75,22 @@ def draw(diagram: CheckedDiagram, *, box: str = "", closed: bool | Iterable[str]
         If a path stands for no subsystem.
     """
     table = diagram.structure
-    paths = [path for path in table.frames if path]
-    shut = _find_closed(table, box, closed, diagram=diagram.name)
-    if box not in table.frames:
-        raise OptionError(f"there is no subsystem {box!r}. {near(box, paths)}", block=diagram.name, port="box")
-    return _Picture(table, shut - {box}).page(box, box or diagram.name)
+    paths = [path for path in table.subsystems if path]
+    shut = _find_closed(table, subsystem, closed, diagram=diagram.name)
+    if subsystem not in table.subsystems:
+        raise OptionError(
+            f"there is no subsystem {subsystem!r}. {near(subsystem, paths)}", block=diagram.name, port="subsystem"
+        )
+    return _Picture(table, shut - {subsystem}).page(subsystem, subsystem or diagram.name)
 
 
-def _find_closed(table: Structure, box: str, closed: bool | Iterable[str] | None, *, diagram: str) -> set[str]:
-    known = {path for path in table.frames if path}
+def _find_closed(table: Structure, subsystem: str, closed: bool | Iterable[str] | None, *, diagram: str) -> set[str]:
+    known = {path for path in table.subsystems if path}
     if closed is None:
         inside = [
             p
-            for p, subsystem in table.frame_of.items()
-            if not box or subsystem == box or subsystem.startswith(box + ".")
+            for p, subsystem in table.subsystem_of.items()
+            if not subsystem or subsystem == subsystem or subsystem.startswith(subsystem + ".")
         ]
         closed = len(inside) > MANY
     if isinstance(closed, bool):
@@ -105,7 +107,7 @@ class _Picture:
     def __init__(self, table: Structure, closed: set[str]):
         self.table = table
         self.closed = closed
-        rates = sorted({f.sample_time for f in table.frames.values() if f.sample_time is not None})
+        rates = sorted({f.sample_time for f in table.subsystems.values() if f.sample_time is not None})
         self.tints = {rate: TINTS[i % len(TINTS)] for i, rate in enumerate(rates)}
         self.nets = Nets(table)
 
@@ -140,8 +142,8 @@ class _Picture:
     def _lay_out(self, subsystem: str) -> tuple[str, float, float, list[Node]]:
         """Lay out the inside of a subsystem; return its drawing, its width and height, and the pins on its border."""
         table = self.table
-        items = [p for p, f in table.frame_of.items() if f == subsystem]
-        inner = [p for p in table.frames if p and p.rpartition(".")[0] == subsystem]
+        items = [p for p, f in table.subsystem_of.items() if f == subsystem]
+        inner = [p for p in table.subsystems if p and p.rpartition(".")[0] == subsystem]
         drawn: dict[str, tuple[str, list[Node]]] = {}
         nodes = []
         for path in [*items, *inner]:
@@ -195,7 +197,7 @@ class _Picture:
 
             def text(pin: Pin) -> str:
                 if pin.control:
-                    return {"enabled": "enable", "triggered": "trigger"}[self.table.frames[path].control]
+                    return {"enabled": "enable", "triggered": "trigger"}[self.table.subsystems[path].control]
                 alone = len(self.table.blocks[pin.maker].outputs) == 1
                 return self.nets.name_of(path, pin) or (pin.maker.rpartition(".")[2] if alone else pin.port)
 
@@ -247,7 +249,7 @@ class _Picture:
 
     def _headings(self, path: str) -> list[str]:
         """Return the texts at a subsystem's upper edge: its name, its rate, its conditions."""
-        settings = self.table.frames[path]
+        settings = self.table.subsystems[path]
         texts = [path.rpartition(".")[2]]
         if settings.sample_time is not None:
             texts.append(f"every {seconds(settings.sample_time)}")
@@ -283,7 +285,7 @@ class _Picture:
         tint = self.tints[rate] if rate is not None else "#f5f6f7"
         name, *rest = self._headings(path)
         more = f'<tspan fill="{GREY}" font-weight="normal"> · {escape(" · ".join(rest))}</tspan>' if rest else ""
-        dash = ' stroke-dasharray="5 3"' if self.table.frames[path].control else ""
+        dash = ' stroke-dasharray="5 3"' if self.table.subsystems[path].control else ""
         return (
             f'<g><title>{escape(path)}</title><rect x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" rx="5" '
             f'fill="{tint}" stroke="{BORDER}"{dash}/>\n'

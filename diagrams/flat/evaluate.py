@@ -20,7 +20,7 @@ from ...blocks.tracing.symbols import size
 from ..wiring.evaluation_order import Step
 from ..wiring.structure import Wire, join
 from .block_functions import BlockFunctions
-from .layout import Clock, FlatLayout
+from .layout import FlatLayout, TickPattern
 from .logic import choose, is_true, logic_and, logic_not, logic_or, to_number
 
 INDICATORS, JUMP = "indicators", "jump"
@@ -34,7 +34,7 @@ wanted, its states and its inputs as columns, it returns a column for each name.
 def evaluate(
     layout: FlatLayout,
     functions: BlockFunctions,
-    acting: frozenset[Clock],
+    acting: frozenset[TickPattern],
     t: Any,
     x: Any,
     w: Any,
@@ -56,7 +56,7 @@ def evaluate(
         Where everything stands.
     functions : BlockFunctions
         The functions of the blocks.
-    acting : frozenset of Clock
+    acting : frozenset of TickPattern
         The clocks that tick; without any it is an instant between ticks.
     t, x, w, p : columns
         CasADi's symbols, or NumPy's numbers.
@@ -106,7 +106,7 @@ class Instant:
         self,
         layout: FlatLayout,
         functions: BlockFunctions,
-        acting: frozenset[Clock],
+        acting: frozenset[TickPattern],
         t: Any,
         x: Any,
         w: Any,
@@ -140,7 +140,7 @@ class Instant:
         layout, table, traced = self.layout, self.layout.table, self.functions.traced
         for name, where in layout.plant_outputs.slices.items():
             self._put(layout.ports[name], rows(self.w, where))
-        acts = {path: self._acts(table.frame_of[path]) for path in traced}
+        acts = {path: self._acts(table.subsystem_of[path]) for path in traced}
         for name, where in layout.held.slices.items():
             path, port = layout.ports[name]
             if not acts[path]:
@@ -169,15 +169,15 @@ class Instant:
                     self.guards += [choose(gate, column, np.ones(len(trace.guards)))] if trace.guards else []
                 else:
                     self._output(path, name, column, gate, torn)
-        for box in layout.gates.slices:
-            if self._acts(box):
-                self.is_open(box)  # one without blocks of its own remembers, too
+        for subsystem in layout.gates.slices:
+            if self._acts(subsystem):
+                self.is_open(subsystem)  # one without blocks of its own remembers, too
         for path in layout.starts.slices:  # blocks of another rate than the subsystem that resets them
-            if not acts[path] and any(self._resets(box) for box in table.gates(table.frame_of[path])):
+            if not acts[path] and any(self._resets(subsystem) for subsystem in table.gates(table.subsystem_of[path])):
                 self.new[path] = self._state(path)
 
-    def _acts(self, frame: str) -> bool:
-        clock = self.layout.clocks.get(frame)
+    def _acts(self, subsystem: str) -> bool:
+        clock = self.layout.clocks.get(subsystem)
         return clock is None or self.opened or clock in self.acting
 
     # --- one block ---------------------------------------------------------------------------------------------------
@@ -278,41 +278,41 @@ class Instant:
     def gate_of(self, path: str) -> Any:
         """Whether all subsystems around a block are open at this instant: True, or a number or symbol."""
         gate: Any = True
-        for box in self.layout.table.gates(self.layout.table.frame_of[path]):
-            gate = logic_and(gate, self.is_open(box))
+        for subsystem in self.layout.table.gates(self.layout.table.subsystem_of[path]):
+            gate = logic_and(gate, self.is_open(subsystem))
         return gate
 
-    def control(self, box: str) -> Any:
+    def control(self, subsystem: str) -> Any:
         """Return the signal that enables or triggers a subsystem."""
-        return self.part(self.layout.table.controls[box])
+        return self.part(self.layout.table.controls[subsystem])
 
-    def is_open(self, box: str) -> Any:
+    def is_open(self, subsystem: str) -> Any:
         """Whether a subsystem itself is open; takes note of what it remembers of its control."""
         if self.opened:
             return True
-        if box in self._open:
-            return self._open[box]
-        table, frame = self.layout.table, self.layout.table.frames[box]
-        last = rows(self.x, self.layout.gates.slices[box])
-        if (box, "enable") in self._events or not self._acts(box):
+        if subsystem in self._open:
+            return self._open[subsystem]
+        table, settings = self.layout.table, self.layout.table.subsystems[subsystem]
+        last = rows(self.x, self.layout.gates.slices[subsystem])
+        if (subsystem, "enable") in self._events or not self._acts(subsystem):
             gate = is_true(last)  # blocks of another rate in it go by its last tick
-        elif (box, "trigger") in self._events:
-            i = self._events[box, "trigger"]
+        elif (subsystem, "trigger") in self._events:
+            i = self._events[subsystem, "trigger"]
             gate = False if self.fired is None else is_true(self.fired[i : i + 1])
         else:
             outer: Any = True
-            for around in table.gates(box.rpartition(".")[0]):
+            for around in table.gates(subsystem.rpartition(".")[0]):
                 outer = logic_and(outer, self.is_open(around))
-            now = is_true(self.control(box))
-            if frame.control == "enabled":
+            now = is_true(self.control(subsystem))
+            if settings.control == "enabled":
                 gate, remembered = now, logic_and(outer, now)
             else:
                 was = is_true(last)
                 rising, falling = logic_and(now, logic_not(was)), logic_and(logic_not(now), was)
-                gate = {"rising": rising, "falling": falling, "both": logic_or(rising, falling)}[frame.when]
+                gate = {"rising": rising, "falling": falling, "both": logic_or(rising, falling)}[settings.when]
                 remembered = now
-            self.gates[box] = choose(outer, to_number(remembered), last)
-        self._open[box] = gate
+            self.gates[subsystem] = choose(outer, to_number(remembered), last)
+        self._open[subsystem] = gate
         return gate
 
     def _state(self, path: str) -> Any:
@@ -322,17 +322,17 @@ class Instant:
         if path not in layout.starts.slices or self.opened:
             return state
         outer: Any = True
-        for box in layout.table.gates(layout.table.frame_of[path]):
-            outer = logic_and(outer, self.is_open(box))
-            if self._resets(box):
-                entering = logic_and(outer, logic_not(is_true(rows(self.x, layout.gates.slices[box]))))
+        for subsystem in layout.table.gates(layout.table.subsystem_of[path]):
+            outer = logic_and(outer, self.is_open(subsystem))
+            if self._resets(subsystem):
+                entering = logic_and(outer, logic_not(is_true(rows(self.x, layout.gates.slices[subsystem]))))
                 state = choose(entering, rows(self.x, layout.starts.slices[path]), state)
         return state
 
-    def _resets(self, box: str) -> bool:
+    def _resets(self, subsystem: str) -> bool:
         """Whether states may start anew at this instant because a subsystem, not by an event, is enabled."""
-        frame = self.layout.table.frames[box]
-        return frame.when == "reset" and (box, "enable") not in self._events and self._acts(box)
+        settings = self.layout.table.subsystems[subsystem]
+        return settings.when == "reset" and (subsystem, "enable") not in self._events and self._acts(subsystem)
 
     # --- stages -------------------------------------------------------------------------------------------------------
 

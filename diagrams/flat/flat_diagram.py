@@ -17,7 +17,7 @@ from ...blocks.core.block import Block
 from ..wiring.check import Checked
 from . import functions
 from .block_functions import BlockFunctions
-from .layout import Clock, FlatLayout, sample_time_of
+from .layout import FlatLayout, TickPattern, sample_time_of
 from .stages import Schedule
 from .total_derivative import Derivative
 
@@ -58,7 +58,7 @@ class FlatDiagram(FlatLayout):
         """The CasADi function ``(t, x, w, p) -> (x_next, z, log, ok)`` of a tick at which all clocks act."""
         return self.at_tick(frozenset(self.clocks.values())).function
 
-    def at_tick(self, acting: frozenset[Clock]) -> Schedule:
+    def at_tick(self, acting: frozenset[TickPattern]) -> Schedule:
         """Return what happens at a tick at which the given clocks act, with the blocks of continuous subsystems.
 
         See `loopwright.diagrams.flat.functions.trace_tick`. Without any clock it is an instant between ticks, and gives
@@ -69,7 +69,7 @@ class FlatDiagram(FlatLayout):
         return self._ticks[acting]
 
     @cached_property
-    def _ticks(self) -> dict[frozenset[Clock], Schedule]:
+    def _ticks(self) -> dict[frozenset[TickPattern], Schedule]:
         return {}
 
     @cached_property
@@ -106,7 +106,7 @@ class FlatDiagram(FlatLayout):
         """Return ``(t, x, w, p) -> y``: an output between ticks, without entries where nothing evaluates it then."""
         return functions.trace_output(self, self.blocks, port)
 
-    def loop_equations(self, acting: frozenset[Clock]) -> Derivative | None:
+    def loop_equations(self, acting: frozenset[TickPattern]) -> Derivative | None:
         """Return ``(t, x, w, p) -> (r, J)``: the mismatch of the algebraic loops at the values in x, and ∂r/∂values.
 
         None where no torn port acts.
@@ -116,7 +116,7 @@ class FlatDiagram(FlatLayout):
         return self._loops[acting]
 
     @cached_property
-    def _loops(self) -> dict[frozenset[Clock], Derivative | None]:
+    def _loops(self) -> dict[frozenset[TickPattern], Derivative | None]:
         return {}
 
     def pack(self, path: str, block: Block) -> np.ndarray:

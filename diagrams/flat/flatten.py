@@ -15,7 +15,7 @@ from ..wiring.check import Checked
 from ..wiring.evaluation_order import evaluation_order
 from ..wiring.structure import Structure, join
 from .flat_diagram import FlatDiagram
-from .layout import Clock, FlatEvent, StateLayout, sample_time_of
+from .layout import FlatEvent, StateLayout, TickPattern, sample_time_of
 
 
 def flatten(
@@ -47,7 +47,7 @@ def flatten(
     events = tuple(_events(table, checked))
     between = bool(events) or any(traced[path].advance == "derivative" for path in paths)
     between = between or any(block.transport and path not in traced for path, block in blocks.items())
-    gated = {path: table.gates(table.frame_of[path]) for path in paths}
+    gated = {path: table.gates(table.subsystem_of[path]) for path in paths}
 
     states = StateLayout.of_blocks({path: traced[path].states for path in paths})
     position = states.total
@@ -59,12 +59,12 @@ def flatten(
         return layout
 
     def is_held(path: str) -> bool:
-        clock = clocks.get(table.frame_of[path])
-        return bool(gated[path]) or (clock is not None and (between or clock != Clock()))
+        clock = clocks.get(table.subsystem_of[path])
+        return bool(gated[path]) or (clock is not None and (between or clock != TickPattern()))
 
     held = lay({join(p, q): s for p in paths if is_held(p) for q, s in traced[p].outputs.items()})
     gates = lay(dict.fromkeys(sorted(table.controls), ()))
-    resets = [p for p in paths if any(table.frames[g].when == "reset" for g in gated[p]) and states.shapes[p][0]]
+    resets = [p for p in paths if any(table.subsystems[g].when == "reset" for g in gated[p]) and states.shapes[p][0]]
     starts = lay({path: states.shapes[path] for path in resets})
     torn = dict.fromkeys(sorted({*order.torn, *start_order.torn}))
     loops = lay({join(*port): traced[port[0]].outputs[port[1]] for port in torn})
@@ -131,13 +131,13 @@ def _continuous(checked: Checked, table: Structure, states: StateLayout) -> np.n
 
 
 def _events(table: Structure, checked: Checked) -> Iterator[FlatEvent]:
-    """Yield the events of all blocks and boxes in continuous frames, by path."""
+    """Yield the events of all blocks and subsystems in continuous subsystems, by path."""
     for path in sorted([*checked.traced, *table.controls]):
         if path in table.controls:
             if table.is_event(path):
-                frame = table.frames[path]
-                edge = "both" if frame.control == "enabled" else frame.when
-                yield FlatEvent(path, {"enabled": "enable", "triggered": "trigger"}[frame.control], edge, 0.0, True)
+                subsystem = table.subsystems[path]
+                edge = "both" if subsystem.control == "enabled" else subsystem.when
+                yield FlatEvent(path, {"enabled": "enable", "triggered": "trigger"}[subsystem.control], edge, 0.0, True)
             continue
         trace = checked.traced[path]
         if trace.indicators is not None:
@@ -145,9 +145,9 @@ def _events(table: Structure, checked: Checked) -> Iterator[FlatEvent]:
                 yield FlatEvent(path, name, event.direction, getattr(event, "hysteresis", 0.0), False)
 
 
-def _clocks(table: Structure, step: Fraction | None, name: str) -> tuple[Fraction, dict[str, Clock]]:
-    """Return the seconds between two ticks, and the ticks of every frame that is sampled."""
-    found = {path: clock for path in table.frames if (clock := table.clock(path)) is not None}
+def _clocks(table: Structure, step: Fraction | None, name: str) -> tuple[Fraction, dict[str, TickPattern]]:
+    """Return the seconds between two ticks, and the ticks of every subsystem that is sampled."""
+    found = {path: clock for path in table.subsystems if (clock := table.clock(path)) is not None}
     used = {c.path: c for c in found.values()}
     base = step
     if base is None:
@@ -159,16 +159,16 @@ def _clocks(table: Structure, step: Fraction | None, name: str) -> tuple[Fractio
             )
         times = [t for c in used.values() for t in (c.sample_time, c.offset) if t]
         base = Fraction(math.gcd(*(r.numerator * (10**9 // r.denominator) for r in times)), 10**9)
-    for frame in used.values():
-        for what, time in (("sample time", frame.sample_time), ("offset", frame.offset)):
+    for subsystem in used.values():
+        for what, time in (("sample time", subsystem.sample_time), ("offset", subsystem.offset)):
             if time is not None and (time / base).denominator != 1:
                 raise SampleTimeError(
                     f"its {what} {float(time):g} s is no multiple of the step {float(base):g} s; choose a step that "
                     f"divides it.",
-                    block=frame.path or name or None,
+                    block=subsystem.path or name or None,
                 )
     return base, {
-        path: Clock(int(c.sample_time / base), int(c.offset / base))
+        path: TickPattern(int(c.sample_time / base), int(c.offset / base))
         for path, c in found.items()
         if c.sample_time is not None
     }

@@ -18,7 +18,7 @@ import numpy as np
 
 from .block_functions import BlockFunctions
 from .evaluate import INDICATORS, JUMP, Apart, evaluate, rows
-from .layout import NONE, Clock, FlatLayout
+from .layout import NONE, FlatLayout, TickPattern
 from .logic import choose, is_true, logic_and, logic_not
 from .stages import Schedule
 from .total_derivative import Derivative
@@ -34,7 +34,7 @@ def make_symbols(layout: FlatLayout) -> dict[str, Any]:
     return {name: ca.MX.sym(name, size) for name, size in sizes.items()}
 
 
-def trace_tick(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[Clock]) -> Schedule:
+def trace_tick(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[TickPattern]) -> Schedule:
     """Return ``(t, x, w, p) -> (x_next, z, log, ok)``: a tick at which the given clocks act."""
     symbols = make_symbols(layout)
 
@@ -86,11 +86,11 @@ def trace_indicators(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
         instant = evaluate(layout, functions, NONE, **symbols, apart=apart)
         g, opened, blocks = [], [], dict[str, Any]()
         for event in layout.events:
-            if event.box:
+            if event.subsystem:
                 g.append(instant.control(event.path) - 0.5)
                 gate: Any = True
-                for box in layout.table.gates(event.path.rpartition(".")[0]):
-                    gate = logic_and(gate, instant.is_open(box))
+                for subsystem in layout.table.gates(event.path.rpartition(".")[0]):
+                    gate = logic_and(gate, instant.is_open(subsystem))
             else:
                 path = event.path
                 if path not in blocks:
@@ -122,14 +122,14 @@ def trace_jump(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
             acts = logic_and(instant.gate_of(path), ca.sum1(mine) > 0.5)
             instant.new[path] = choose(acts, ca.densify(after), rows(x, states[path]))
         for i, event in enumerate(layout.events):
-            if event.box and event.name == "enable":
+            if event.subsystem and event.name == "enable":
                 mode = rows(x, layout.gates.slices[event.path])
                 turned = is_true(fired[i : i + 1])
                 instant.gates[event.path] = choose(turned, 1 - mode, mode)
-                if layout.table.frames[event.path].when == "reset":
+                if layout.table.subsystems[event.path].when == "reset":
                     opens = logic_and(turned, logic_not(is_true(mode)))
                     for path, where in starts.items():
-                        if event.path in layout.table.gates(layout.table.frame_of[path]):
+                        if event.path in layout.table.gates(layout.table.subsystem_of[path]):
                             old = instant.new.get(path, rows(x, states[path]))
                             instant.new[path] = choose(opens, rows(x, where), old)
         return {"x_next": next_x(instant)}
@@ -137,7 +137,7 @@ def trace_jump(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
     return trace_schedule("jump", {**symbols, "fired": fired}, results)
 
 
-def trace_loops(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[Clock]) -> Derivative | None:
+def trace_loops(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[TickPattern]) -> Derivative | None:
     """Return ``(t, x, w, p) -> (r, ∂r/∂v)``: what came round the algebraic loops less what was taken, v.
 
     The values v are the entries `FlatLayout.active_loops` of x. None where no torn port acts.

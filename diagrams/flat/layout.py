@@ -60,7 +60,7 @@ class StateLayout(Layout):
 
 
 @dataclass(frozen=True)
-class Clock:
+class TickPattern:
     """The ticks at which a sampled subsystem acts: ``offset``, ``offset + every``, …, on the common base."""
 
     every: int = 1
@@ -75,7 +75,7 @@ class Clock:
         return self.offset if k < self.offset else k + self.every - (k - self.offset) % self.every
 
 
-NONE: frozenset[Clock] = frozenset()
+NONE: frozenset[TickPattern] = frozenset()
 """The clocks that act between two ticks."""
 
 
@@ -87,7 +87,7 @@ class FlatEvent:
     name: str
     direction: str
     hysteresis: float
-    box: bool
+    subsystem: bool
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,7 +125,7 @@ class FlatLayout:
 
     table: Structure
     base: Fraction
-    clocks: dict[str, Clock]
+    clocks: dict[str, TickPattern]
     states: StateLayout
     held: Layout
     gates: Layout
@@ -165,7 +165,7 @@ class FlatLayout:
         return [self.labels[i] for i in self.continuous]
 
     @cached_property
-    def distinct(self) -> tuple[Clock, ...]:
+    def distinct(self) -> tuple[TickPattern, ...]:
         """The different clocks."""
         return tuple(sorted(set(self.clocks.values()), key=lambda c: (c.every, c.offset)))
 
@@ -175,39 +175,39 @@ class FlatLayout:
         delayed = any(self.table.blocks[self.ports[name][0]].transport for name in self.plant_inputs.slices)
         return bool(self.continuous.size or self.events or delayed)
 
-    def acting(self, k: int) -> frozenset[Clock]:
+    def acting(self, k: int) -> frozenset[TickPattern]:
         """Return the clocks that tick at tick ``k``."""
         return frozenset(c for c in self.distinct if c.acts(k))
 
     def ticks(self, k: int, last: int, *, every: bool) -> Iterator[int]:
         """Yield the ticks to visit after tick ``k``: all, or those at which something acts, and the last one."""
-        if every or not self.distinct or Clock() in self.distinct:
+        if every or not self.distinct or TickPattern() in self.distinct:
             yield from range(k + 1, last + 1)
             return
         while (k := min(c.after(k) for c in self.distinct)) < last:
             yield k
         yield last
 
-    def taken_at(self, acting: frozenset[Clock]) -> np.ndarray:
+    def taken_at(self, acting: frozenset[TickPattern]) -> np.ndarray:
         """Return the entries of x that a tick renews at which the given clocks act: what sampled subsystems keep."""
         if acting not in self._taken:
             owners = [(where, name) for part in (self.states, self.starts) for name, where in part.slices.items()]
             owners += [(where, self.ports[name][0]) for name, where in self.held.slices.items()]
-            frames = [(where, self.table.frame_of[path]) for where, path in owners]
-            frames += [(where, box) for box, where in self.gates.slices.items()]
-            found = [np.arange(w.start, w.stop) for w, frame in frames if self.clocks.get(frame) in acting]
+            subsystems = [(where, self.table.subsystem_of[path]) for where, path in owners]
+            subsystems += [(where, subsystem) for subsystem, where in self.gates.slices.items()]
+            found = [np.arange(w.start, w.stop) for w, settings in subsystems if self.clocks.get(settings) in acting]
             self._taken[acting] = np.concatenate([*found, np.zeros(0, dtype=int)])
         return self._taken[acting]
 
     @cached_property
-    def _taken(self) -> dict[frozenset[Clock], np.ndarray]:
+    def _taken(self) -> dict[frozenset[TickPattern], np.ndarray]:
         return {}
 
-    def active_loops(self, acting: frozenset[Clock]) -> list[int]:
+    def active_loops(self, acting: frozenset[TickPattern]) -> list[int]:
         """Return the entries of x that hold the torn ports that act, in the order in which they come round."""
         found: list[int] = []
         for path, names in self.order.steps:
-            clock = self.clocks.get(self.table.frame_of[path])
+            clock = self.clocks.get(self.table.subsystem_of[path])
             if clock is None or clock in acting:
                 found += self.loops.entries(full for name in names if (full := join(path, name)) in self.loops.slices)
         return found
@@ -215,6 +215,6 @@ class FlatLayout:
 
 def sample_time_of(table: Structure, path: str) -> float:
     """Return the sample time of a block in s; NaN in continuous time, and where a trigger says when it acts."""
-    frame = table.frame_of[path]
-    rate = table.rate(frame)
-    return math.nan if rate is None or table.triggered_around(frame) is not None else float(rate)
+    subsystem = table.subsystem_of[path]
+    rate = table.rate(subsystem)
+    return math.nan if rate is None or table.triggered_around(subsystem) is not None else float(rate)

@@ -18,7 +18,7 @@ from ...blocks.tracing.symbols import size
 from ...blocks.tracing.trace import Traced
 from ..flat.evaluate import Apart, Instant, evaluate
 from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import Clock
+from ..flat.layout import TickPattern
 from ..flat.stages import Evaluators, Schedule
 from ..flat.total_derivative import Derivative
 from ..flat.trace_stages import trace_schedule
@@ -114,8 +114,8 @@ class Parts:
         for s in openings:
             self.cut.setdefault(s.port, set()).update(s.entries)
         self.evaluators = evaluators
-        self._schedules: dict[frozenset[Clock], Schedule] = {}
-        self._derivatives: dict[frozenset[Clock], Derivative] = {}
+        self._schedules: dict[frozenset[TickPattern], Schedule] = {}
+        self._derivatives: dict[frozenset[TickPattern], Derivative] = {}
         self._workspace = Workspace(flat, evaluators) if flat.loops.slices else None
 
     @cached_property
@@ -156,7 +156,7 @@ class Parts:
             )
         return ca.vertcat(*columns) if columns else ca.MX(0, 1)
 
-    def _closed(self, acting: frozenset[Clock]) -> Schedule:
+    def _closed(self, acting: frozenset[TickPattern]) -> Schedule:
         """Return ``(t, x, w, p) -> c``: what the ports that are cut put out in the closed diagram."""
         if acting not in self._schedules:
             flat, symbols = self.flat, self.flat.symbols()
@@ -168,7 +168,7 @@ class Parts:
             self._schedules[acting] = trace_schedule("closed", symbols, results)
         return self._schedules[acting]
 
-    def _derivative(self, acting: frozenset[Clock]) -> Derivative:
+    def _derivative(self, acting: frozenset[TickPattern]) -> Derivative:
         """Return values and derivatives by (x, w, d) at an instant; ``NONE`` is one between ticks."""
         if acting not in self._derivatives:
             flat, symbols = self.flat, self.flat.symbols()
@@ -184,11 +184,11 @@ class Parts:
             self._derivatives[acting] = Derivative(schedule, [(name, None) for name in _ARGUMENTS])
         return self._derivatives[acting]
 
-    def _solved(self, acting: frozenset[Clock], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def _solved(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return x with the algebraic loops solved at an instant."""
         return x if self._workspace is None else self._workspace.solve_loops(acting, t, x, w)
 
-    def at(self, acting: frozenset[Clock], t: float, x: np.ndarray, w: np.ndarray) -> dict[Any, Any]:
+    def at(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> dict[Any, Any]:
         """Return the values x⁺, z, y, dx and, by name and argument, their derivatives at an instant.
 
         ``found["z"]`` is a value, ``found["z", "w"]`` the derivative of z by w. Algebraic loops are solved, and

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...blocks.core.errors import ConfirmationError, WiringError
 from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import Clock
+from ..flat.layout import TickPattern
 from ..results.operating_point import OperatingPoint
 from .derivatives import Parts
 from .over_a_period import Chain, Model, needed, own_states, ticks
@@ -39,7 +39,7 @@ def ticks_to_renewal(flat: FlatDiagram, ports: Iterable[tuple[str, str]], tick: 
     clock of those acts that read it.
     """
     for reading in (False, True):
-        found: set[Clock] | None = set()
+        found: set[TickPattern] | None = set()
         for port in ports:
             clocks = _clocks(flat, port, reading=reading)
             found = None if clocks is None or found is None else found | clocks
@@ -49,19 +49,19 @@ def ticks_to_renewal(flat: FlatDiagram, ports: Iterable[tuple[str, str]], tick: 
     return 0
 
 
-def _clocks(flat: FlatDiagram, port: tuple[str, str], *, reading: bool) -> set[Clock] | None:
+def _clocks(flat: FlatDiagram, port: tuple[str, str], *, reading: bool) -> set[TickPattern] | None:
     """Return the clocks behind a port, through blocks in continuous time that have no states; None with others."""
     table = flat.table
-    found: set[Clock] = set()
+    found: set[TickPattern] = set()
     todo, seen = [port[0]] if not reading else _readers(flat, port), set[str]()
     while todo:
         path = todo.pop()
         if path in seen:
             continue
         seen.add(path)
-        frame = table.frame_of[path]
-        if table.is_sampled(frame) and frame in flat.clocks:
-            found.add(flat.clocks[frame])
+        subsystem = table.subsystem_of[path]
+        if table.is_sampled(subsystem) and subsystem in flat.clocks:
+            found.add(flat.clocks[subsystem])
             continue
         where = flat.states.slices.get(path)
         if path not in flat.checked.traced or (where is not None and where.stop > where.start):

@@ -1,8 +1,8 @@
 """The linear model of a diagram with sampled parts: over one base period, or the least common one of several rates.
 
-The state of a discrete model is that of all blocks and FMUs just before a tick, what boxes hold, and for an FMU the
-inputs that still act on its outputs: a co-simulation FMU's outputs are those at the end of its last step. A tick is the
-derivative of the tick's function, the time to the next one that of the flow over it, an FMU's that of its step. The
+The state of a discrete model is that of all blocks and FMUs just before a tick, what subsystems hold, and for an FMU
+the inputs that still act on its outputs: a co-simulation FMU's outputs are those at the end of its last step. A tick is
+the derivative of the tick's function, the time to the next one that of the flow over it, an FMU's that of its step. The
 operating point goes along: every tick of a period is linearized where the diagram is then.
 """
 
@@ -275,7 +275,7 @@ def _pieces(flat: FlatDiagram, t: float, end: float) -> Iterator[tuple[float, fl
     sources = [
         flat.table.blocks[path]
         for path in flat.checked.traced
-        if not flat.table.is_sampled(flat.table.frame_of[path])
+        if not flat.table.is_sampled(flat.table.subsystem_of[path])
         and type(flat.table.blocks[path]).next_instant is not Block.next_instant
     ]
     while t < end:
@@ -308,7 +308,7 @@ def own_states(flat: FlatDiagram) -> set[int]:
     """
     found = set(flat.continuous.tolist())
     for path, where in flat.states.slices.items():
-        if flat.table.is_sampled(flat.table.frame_of[path]):
+        if flat.table.is_sampled(flat.table.subsystem_of[path]):
             found |= set(range(where.start, where.stop))
     return found
 

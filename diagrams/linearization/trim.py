@@ -98,7 +98,7 @@ class _Equations:
         traced = flat.checked.traced
         period = np.ones(flat.width)
         for path, where in flat.states.slices.items():
-            rate = flat.table.rate(flat.table.frame_of[path]) if path in traced else None
+            rate = flat.table.rate(flat.table.subsystem_of[path]) if path in traced else None
             period[where] = 1.0 if rate is None else float(rate)
         groups = [
             asked(flat.continuous, np.ones(flat.continuous.size)),
@@ -315,7 +315,7 @@ def _completed(
     plants: Mapping[str, Any],
     more: dict[str, Any],
 ) -> OperatingPoint:
-    """Return the operating point with all its signals: the boxes hold what they put out there."""
+    """Return the operating point with all its signals: the subsystems hold what they put out there."""
     flat = diagram.flatten(guess.base)
     at_tick = flat.at_tick(frozenset(flat.clocks.values()))
     x_next, z, log, _ = at_tick(guess.t, x, w, flat.p)

@@ -21,7 +21,7 @@ from ..results.operating_point import OperatingPoint
 from ..simulation.run_options import RunOptions
 from ..simulation.simulation import Simulation
 from ..simulation.start_at_point import copy_states
-from ..wiring.structure import Frame, Wire
+from ..wiring.structure import SubsystemSettings, Wire
 
 NEVER = 1e12
 """Time in s that no run reaches."""
@@ -106,8 +106,8 @@ def inject_signal(
     """
     lowered = diagram.scheduled
     table = lowered.copy()
-    for path, frame in table.frames.items():
-        table.frames[path] = replace(frame, delay=0)  # the delays have become blocks
+    for path, subsystem in table.subsystems.items():
+        table.subsystems[path] = replace(subsystem, delay=0)  # the delays have become blocks
     block, port = signal.port
     consumers = [(group, key) for group in (table.wires, table.controls) for key, w in group.items()
                  if (w.block, w.port) == (block, port)]  # fmt: skip
@@ -118,7 +118,7 @@ def inject_signal(
             block=block,
             port=port,
         )
-    taken = {*table.blocks, *table.frames}
+    taken = {*table.blocks, *table.subsystems}
     frame_path, total = _find_free_name("injection", taken), _find_free_name("injection_sum", taken)
     source = f"{frame_path}.signal"
     shape = diagram.checked.shapes[signal.port]
@@ -127,11 +127,11 @@ def inject_signal(
         direction=np.ones(shape) if shape else 1.0, amplitude=ones, frequency=ones, sweep=ones, phase=ones,
         start_time=NEVER, ramp=1.0, period=1.0, name="signal",
     )  # fmt: skip
-    table.frames[frame_path] = Frame(frame_path, None, "exact", outputs=("y",))
+    table.subsystems[frame_path] = SubsystemSettings(frame_path, None, "exact", outputs=("y",))
     if held is not None:
-        table.frames[frame_path] = replace(table.frames[frame_path], sample_time=held[0], offset=held[1])
-    table.frame_of[source] = frame_path
-    table.blocks[total], table.frame_of[total] = Sum(name=total), ""
+        table.subsystems[frame_path] = replace(table.subsystems[frame_path], sample_time=held[0], offset=held[1])
+    table.subsystem_of[source] = frame_path
+    table.blocks[total], table.subsystem_of[total] = Sum(name=total), ""
     for group, key in consumers:
         wire: Wire = group[key]  # type: ignore[index]
         group[key] = Wire(total, "y", wire.index)  # type: ignore[index]

@@ -166,20 +166,20 @@ def _implementations(diagram: WiredDiagram) -> Iterator[tuple[Implementation, Ca
         return
     if diagram.is_continuous or diagram.has_fmu:
         yield Implementation.CONTINUOUS, diagram.continuous
-    boxes = delayed_boxes(diagram)
-    if not boxes:
+    subsystems = delayed_subsystems(diagram)
+    if not subsystems:
         yield Implementation.SAMPLED, lambda: diagram
         return
     for kind in (Implementation.SAMPLED, Implementation.DELAYED):
-        yield kind, lambda n=kind.delay: diagram.replace({f"{box}.delay": n for box in boxes})  # type: ignore[misc]
+        yield kind, lambda n=kind.delay: diagram.replace({f"{subsystem}.delay": n for subsystem in subsystems})  # type: ignore[misc]
 
 
-def delayed_boxes(diagram: WiredDiagram) -> list[str]:
+def delayed_subsystems(diagram: WiredDiagram) -> list[str]:
     """Return the sampled subsystems that act on what is continuous: a delay of the computation is a delay of theirs."""
     table = diagram.structure
     found: set[str] = set()
     for (block, _), wire in table.wires.items():
-        clock = table.clock(table.frame_of[wire.block])
-        if clock is not None and clock.path and table.clock(table.frame_of[block]) is None:
+        clock = table.clock(table.subsystem_of[wire.block])
+        if clock is not None and clock.path and table.clock(table.subsystem_of[block]) is None:
             found.add(clock.path)
     return sorted(found)

@@ -21,7 +21,7 @@ ACROSS = 1200.0
 def with_drawing(report: Report, diagram: WiredDiagram) -> Report:
     """Return a report with the drawing of its diagram in its first section.
 
-    A large one is drawn with closed boxes, and the inside of each box by itself.
+    A large one is drawn with closed subsystems, and the inside of each subsystem by itself.
     """
     if not report.sections:
         return report
@@ -33,11 +33,11 @@ def with_drawing(report: Report, diagram: WiredDiagram) -> Report:
 def _drawings(diagram: WiredDiagram) -> Iterator[Plot]:
     whole = draw(diagram, closed=False)
     found = re.search(r'width="([\d.]+)"', whole)
-    boxes = [path for path in diagram.frames if path]
-    if not boxes or (found is not None and float(found[1]) <= ACROSS):
+    subsystems = [path for path in diagram.subsystems if path]
+    if not subsystems or (found is not None and float(found[1]) <= ACROSS):
         yield Plot("diagram", TEXTS.line("diagram", closed=False), whole, ahead=True)
         return
     yield Plot("diagram", TEXTS.line("diagram", closed=True), draw(diagram, closed=True), ahead=True)
-    for box in boxes:
-        inside = draw(diagram, box=box, closed=True)
-        yield Plot(f"diagram.{box}", TEXTS.line("inside", subsystem=box), inside, ahead=True)
+    for subsystem in subsystems:
+        inside = draw(diagram, subsystem=subsystem, closed=True)
+        yield Plot(f"diagram.{subsystem}", TEXTS.line("inside", subsystem=subsystem), inside, ahead=True)

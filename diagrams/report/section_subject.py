@@ -42,15 +42,21 @@ def subject(case: Case) -> Section:
     """Return the section about the diagram itself."""
     diagram = case.diagram
     numbers: dict[str, Number] = {}
-    frames, parameters, plants = [], [], []
-    for path, frame in sorted(diagram.frames.items()):
+    subsystems, parameters, plants = [], [], []
+    for path, subsystem in sorted(diagram.subsystems.items()):
         rate = diagram.structure.rate(path)
         name = path or diagram.name
-        if rate is not None and frame.sample_time is not None:
+        if rate is not None and subsystem.sample_time is not None:
             numbers[f"{path or 'diagram'}.sample_time"] = Number(float(rate), "s", 0.0, "given, exact", given=True)
         rated = "continuous" if rate is None else f"{float(rate):g} s"
-        frames.append(
-            (name, rated, frame.method if rate is not None else "", frame.delay, f"{float(frame.offset):g} s")
+        subsystems.append(
+            (
+                name,
+                rated,
+                subsystem.method if rate is not None else "",
+                subsystem.delay,
+                f"{float(subsystem.offset):g} s",
+            )
         )
     for path, block in sorted(diagram.blocks.items()):
         rows = list(_parameters(block))
@@ -66,7 +72,7 @@ def subject(case: Case) -> Section:
         Table(
             "Subsystems and their rates",
             ("subsystem", "sample time", "discretization", "delay [samples]", "offset"),
-            tuple(frames),
+            tuple(subsystems),
         ),
     ]
     if plants:

@@ -213,5 +213,5 @@ def limit_time(ax: Axes, run: RecordedSignals) -> None:
 
     ax.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10]))
     if len(run.t) > 1:
-        margin = 0.015 * float(run.t[-1] - run.t[0])  # the frame must not hide the first tick
+        margin = 0.015 * float(run.t[-1] - run.t[0])  # the border of the axes must not hide the first tick
         ax.set_xlim(float(run.t[0]) - margin, float(run.t[-1]) + margin)

@@ -103,7 +103,7 @@ class Continuous:
         self.sources = [
             (path, flat.table.blocks[path])
             for path in sorted(flat.checked.traced)
-            if not flat.table.is_sampled(flat.table.frame_of[path])
+            if not flat.table.is_sampled(flat.table.subsystem_of[path])
             and type(flat.table.blocks[path]).next_instant is not Block.next_instant
         ]
 
@@ -233,14 +233,16 @@ class Continuous:
 
     def _reset_domains(self, event: Any) -> None:
         """Let the domains of a subsystem's events start anew where it has just been enabled and its states do so."""
-        if not event.box or self.flat.table.frames[event.path].when != "reset":
+        if not event.subsystem or self.flat.table.subsystems[event.path].when != "reset":
             return
         if self.workspace.here.x[self.flat.gates.slices[event.path]][0] > 0.5:
             assert self.domains is not None
             self.domains.reset(event.path)
 
     def _tell(self, t: float, event: Any, before: np.ndarray) -> None:
-        states = [{} if event.box else state_values(self.flat, event.path, x) for x in (before, self.workspace.here.x)]
+        states = [
+            {} if event.subsystem else state_values(self.flat, event.path, x) for x in (before, self.workspace.here.x)
+        ]
         self.on_event(Occurrence(t, event.path, event.name, *states))
 
     # --- from tick to tick -------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from ...blocks.tracing.opaque_equations import raise_failure
 from ...blocks.tracing.symbols import bundle
 from ..flat.evaluate import Instant, evaluate
 from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import Clock
+from ..flat.layout import TickPattern
 from ..flat.stages import Evaluators, evaluate_apart
 from .vectors import Vectors
 
@@ -21,7 +21,7 @@ def failure(
     flat: FlatDiagram,
     here: Vectors,
     log: np.ndarray,
-    acting: frozenset[Clock],
+    acting: frozenset[TickPattern],
     evaluators: Evaluators | None = None,
 ) -> SimulationError:
     """Return the error of the first block that made a value that is not finite, or whose guard fails.
@@ -34,7 +34,7 @@ def failure(
         The instant.
     log : ndarray
         The outputs of all blocks there.
-    acting : frozenset of Clock
+    acting : frozenset of TickPattern
         The clocks that act there.
     evaluators : mapping, optional
         What evaluates blocks from outside, by path.

@@ -65,7 +65,7 @@ class Domains:
 
     def reset(self, subsystem: str) -> None:
         """Go back to the domains of the start for the blocks in a subsystem whose states have done so."""
-        inside = np.array([e.path.startswith(f"{subsystem}.") and not e.box for e in self.events])
+        inside = np.array([e.path.startswith(f"{subsystem}.") and not e.subsystem for e in self.events])
         self.above = np.where(inside, self._first, self.above)
 
     def update(self, t: float, x: np.ndarray) -> np.ndarray:

@@ -13,14 +13,14 @@ from ..flat.flat_diagram import FlatDiagram
 def time_scale_of(flat: FlatDiagram) -> float:
     """Return the shortest time within which a source in a continuous subsystem changes."""
     table = flat.table
-    paths = (p for p in flat.checked.traced if not table.is_sampled(table.frame_of[p]))
+    paths = (p for p in flat.checked.traced if not table.is_sampled(table.subsystem_of[p]))
     return min((float(table.blocks[p].time_scale()) for p in paths), default=math.inf)
 
 
 def remembers(flat: FlatDiagram) -> bool:
     """Whether a block in a continuous subsystem has a memory, such as a projection's last foot point."""
     table = flat.table
-    return any(table.blocks[p].memory and not table.is_sampled(table.frame_of[p]) for p in flat.checked.traced)
+    return any(table.blocks[p].memory and not table.is_sampled(table.subsystem_of[p]) for p in flat.checked.traced)
 
 
 def absolute_tolerances(flat: FlatDiagram, atol: float) -> Any:

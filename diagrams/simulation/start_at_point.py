@@ -8,7 +8,7 @@ import numpy as np
 
 from ...blocks.core.errors import FmuError, LoopwrightError, OptionError
 from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import Clock
+from ..flat.layout import TickPattern
 from ..flat.wired_diagram import WiredDiagram
 from ..results.operating_point import OperatingPoint
 from .workspace import Workspace
@@ -83,7 +83,7 @@ def start_at(workspace: Workspace, point: OperatingPoint, name: str) -> int:
     return int(tick)
 
 
-def take_over(workspace: Workspace, x: np.ndarray, of: FlatDiagram, acting: frozenset[Clock]) -> None:
+def take_over(workspace: Workspace, x: np.ndarray, of: FlatDiagram, acting: frozenset[TickPattern]) -> None:
     """Put a run to the states of another diagram, whatever stands under the same name in both, and go through a tick.
 
     States that only this diagram has, such as those of a delay, take the values that they settle at while the others
@@ -95,7 +95,7 @@ def take_over(workspace: Workspace, x: np.ndarray, of: FlatDiagram, acting: froz
         The states, laid out as ``of`` says.
     of : FlatDiagram
         The other diagram.
-    acting : frozenset of Clock
+    acting : frozenset of TickPattern
         The clocks that act.
     """
     flat, here = workspace.flat, workspace.here

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core.errors import SimulationError
-from ..flat.layout import Clock
+from ..flat.layout import TickPattern
 from .continuous import Continuous
 from .plants import Plant
 from .view import Position
@@ -48,7 +48,7 @@ def run_ticks(
     t, log = workspace.here.t, workspace.log
     only = plants[0].step if len(plants) == 1 else None
     n, d, h = flat.base.numerator, flat.base.denominator, float(flat.base)
-    always = workspace.bind_tick(flat.acting(0)) if all(c == Clock() for c in flat.distinct) else None
+    always = workspace.bind_tick(flat.acting(0)) if all(c == TickPattern() for c in flat.distinct) else None
     count, now = 0, k * n / d
     for k in flat.ticks(k, last, every=every):  # noqa: B020
         try:
@@ -137,7 +137,7 @@ def take_tick(
     continuous: Continuous | None,
     plants: Mapping[str, Plant],
     now: float,
-    acting: frozenset[Clock],
+    acting: frozenset[TickPattern],
     *,
     first: bool = False,
 ) -> None:
@@ -147,7 +147,7 @@ def take_tick(
     ----------
     now : float
         Its time in s.
-    acting : frozenset of Clock
+    acting : frozenset of TickPattern
         The clocks that act at it.
     first : bool
         Whether it is tick 0, before which nothing fires.

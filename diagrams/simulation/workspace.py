@@ -12,7 +12,7 @@ from ...blocks.core.block import Block
 from ...blocks.core.errors import ParameterError, SimulationError
 from ...blocks.tracing.structure import is_traced_by
 from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import NONE, Clock
+from ..flat.layout import NONE, TickPattern
 from ..flat.stages import Bound, Evaluators, Schedule
 from ..flat.total_derivative import Derivative
 from .diagnosis import failure
@@ -57,8 +57,8 @@ class Workspace:
         self.log = np.zeros(flat.log.total + flat.width + bool(flat.loops.slices))
         self.ok = np.zeros(1)
         self.looped = bool(flat.loops.slices)
-        self._evaluations: dict[frozenset[Clock], Callable[[], None]] = {}
-        self._ticks: dict[frozenset[Clock], Callable[[], None]] = {}
+        self._evaluations: dict[frozenset[TickPattern], Callable[[], None]] = {}
+        self._ticks: dict[frozenset[TickPattern], Callable[[], None]] = {}
         self._kept: list[Bound] = []
         self._solved: dict[Any, Callable[[], None]] = {}
 
@@ -85,11 +85,11 @@ class Workspace:
         self.put(t, x, w)
         self.z[:], self.log[:] = z, log
 
-    def evaluate(self, acting: frozenset[Clock] = NONE) -> None:
+    def evaluate(self, acting: frozenset[TickPattern] = NONE) -> None:
         """Evaluate everything at ``here``, where some clocks act: into x_next, z, log and ok."""
         self._evaluation(acting)()
 
-    def check(self, acting: frozenset[Clock] = NONE) -> None:
+    def check(self, acting: frozenset[TickPattern] = NONE) -> None:
         """Raise the error of the first block that is to blame, if what was evaluated last is not ok.
 
         Raises
@@ -100,11 +100,11 @@ class Workspace:
         if not self.ok[0]:
             raise failure(self.flat, self.here, self.log, acting, self.evaluators).at(t=float(self.here.t[0]))
 
-    def tick(self, acting: frozenset[Clock] = NONE) -> None:
+    def tick(self, acting: frozenset[TickPattern] = NONE) -> None:
         """Go through a tick at ``here``: evaluate everything, `check` it, and take over the next states."""
         self.bind_tick(acting)()
 
-    def bind_tick(self, acting: frozenset[Clock]) -> Callable[[], None]:
+    def bind_tick(self, acting: frozenset[TickPattern]) -> Callable[[], None]:
         """Return `tick` for some clocks as a call without arguments, for a loop over many ticks."""
         if acting not in self._ticks:
             evaluate, ok, x, x_next = self._evaluation(acting), self.ok, self.here.x, self.x_next
@@ -118,7 +118,7 @@ class Workspace:
             self._ticks[acting] = tick
         return self._ticks[acting]
 
-    def _evaluation(self, acting: frozenset[Clock]) -> Callable[[], None]:
+    def _evaluation(self, acting: frozenset[TickPattern]) -> Callable[[], None]:
         if acting not in self._evaluations:
             results = [self.x_next, self.z, self.log, self.ok]
             call = self._bind(self.flat.at_tick(acting), self.here, results).call
@@ -159,7 +159,7 @@ class Workspace:
                 "the same shape, and none in the place of a zero. Start a run of diagram.replace(…).",
                 block=path,
             )
-        if not flat.table.is_sampled(flat.table.frame_of[path]) and _plans_ahead(block):
+        if not flat.table.is_sampled(flat.table.subsystem_of[path]) and _plans_ahead(block):
             raise ParameterError(
                 "a solver plans ahead with the times at which it is not smooth, so its parameters can't change in a "
                 "run. Start a run of diagram.replace(…).",
@@ -224,7 +224,7 @@ class Workspace:
 
     # --- algebraic loops ---------------------------------------------------------------------------------------------
 
-    def loop_solver(self, acting: frozenset[Clock], vectors: Vectors) -> Callable[[], None] | None:
+    def loop_solver(self, acting: frozenset[TickPattern], vectors: Vectors) -> Callable[[], None] | None:
         """Return the call that solves the algebraic loops at some of its vectors; None where there are none.
 
         Newton's method with the exact derivative, started from the last solution; a step that makes the residual larger
@@ -284,7 +284,7 @@ class Workspace:
         self._solved[key] = solve
         return solve
 
-    def solve_loops(self, acting: frozenset[Clock], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def solve_loops(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return x with the algebraic loops solved at an instant; they are sought from the values in x on."""
         solve = self.loop_solver(acting, self.here)
         if solve is None:

@@ -183,7 +183,7 @@ def _check_shapes(
 def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[Port, Shape]) -> None:
     """Check the signals that control subsystems, and the blocks in them."""
     for gated, wire in sorted(table.controls.items()):
-        kind = table.frames[gated].control
+        kind = table.subsystems[gated].control
         port = {"enabled": "enable", "triggered": "trigger"}[kind]
         found = part_shape(shapes[wire.block, wire.port], wire, gated, port)
         if found != ():
@@ -192,7 +192,7 @@ def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[
             )
     for (path, port), handed in sorted(table.handed.items()):
         for passing, output in handed:
-            settings, clock = table.frames[passing], table.clock(table.frame_of[path])
+            settings, clock = table.subsystems[passing], table.clock(table.subsystem_of[path])
             same = clock is not None and (clock.sample_time, clock.offset) == (settings.sample_time, settings.offset)
             if not (settings.control or settings.delay) and (settings.sample_time is None or same):
                 continue
@@ -205,15 +205,15 @@ def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[
                 port=port,
             )
     for path in sorted(table.blocks):
-        gates = table.gates(table.frame_of[path])
+        gates = table.gates(table.subsystem_of[path])
         if gates and path not in traced:
             kind = "a transport delay" if table.blocks[path].transport else "a block that is stepped, such as an FMU,"
             raise WiringError(
-                f"{kind} can't stand in a subsystem that is {table.frames[gates[-1]].control} ({gates[-1]}): its time "
-                "goes on while the subsystem waits. Put it outside, and wire its outputs in.",
+                f"{kind} can't stand in a subsystem that is {table.subsystems[gates[-1]].control} ({gates[-1]}): its "
+                "time goes on while the subsystem waits. Put it outside, and wire its outputs in.",
                 block=path,
             )
-        triggered = table.triggered_around(table.frame_of[path])
+        triggered = table.triggered_around(table.subsystem_of[path])
         if triggered is None:
             continue
         trace = traced[path]
@@ -223,7 +223,7 @@ def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[
                 "triggered. Put the block outside, or take one that counts samples.",
                 block=path,
             )
-        inner = table.clock(table.frame_of[path])
+        inner = table.clock(table.subsystem_of[path])
         outer = table.clock(triggered)
         if inner is not outer:
             raise SampleTimeError(
@@ -260,7 +260,7 @@ def _reads_sample_time(block: Block, trace: Traced) -> bool:
 
 
 def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, shared: dict[Any, Traced]) -> Traced:
-    subsystem = table.frame_of[path]
+    subsystem = table.subsystem_of[path]
     sampled, method, rate = table.is_sampled(subsystem), table.method(subsystem), table.rate(subsystem)
     try:
         if rate is not None and isinstance(block, FixedSampleTime):

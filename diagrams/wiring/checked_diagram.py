@@ -14,7 +14,7 @@ from ...blocks.tracing.discretization import check_method
 from .check import Checked, check
 from .delay_blocks import add_delay_blocks
 from .evaluation_order import evaluation_order
-from .structure import Collector, Frame, Structure, Wire, stepped_blocks
+from .structure import Collector, Structure, SubsystemSettings, Wire, stepped_blocks
 from .subsystem import exact_time
 from .variants import apply_changes, find_path
 
@@ -87,7 +87,7 @@ class CheckedDiagram:
         return type(self)._of, (self.name, self.structure, self.loops)
 
     def __repr__(self) -> str:
-        paths = [path for path in self.structure.frames if path]
+        paths = [path for path in self.structure.subsystems if path]
         return f"<diagram {self.name}: {len(self.blocks)} blocks{', in ' + ', '.join(paths) if paths else ''}>"
 
     @property
@@ -96,9 +96,9 @@ class CheckedDiagram:
         return dict(self.structure.blocks)
 
     @property
-    def frames(self) -> Mapping[str, Frame]:
+    def subsystems(self) -> Mapping[str, SubsystemSettings]:
         """Every subsystem by its dotted path; the diagram itself is ""."""
-        return dict(self.structure.frames)
+        return dict(self.structure.subsystems)
 
     @property
     def wires(self) -> Mapping[tuple[str, str], Wire]:
@@ -148,8 +148,8 @@ class CheckedDiagram:
             A block that is defined at samples only, such as a `UnitDelay`.
         """
         table = self.structure.copy()
-        for path, settings in table.frames.items():
-            table.frames[path] = replace_fields(settings, sample_time=None, offset=Fraction(0), delay=0)
+        for path, settings in table.subsystems.items():
+            table.subsystems[path] = replace_fields(settings, sample_time=None, offset=Fraction(0), delay=0)
         return self.with_structure(table)
 
     def sampled(self, sample_time: float | Fraction, method: str = "exact") -> Self:
@@ -174,11 +174,11 @@ class CheckedDiagram:
         """
         check_method(method)
         table = self.structure.copy()
-        for path, settings in sorted(table.frames.items()):
+        for path, settings in sorted(table.subsystems.items()):
             if self.structure.clock(path) is None:
-                table.frames[path] = replace_fields(settings, method=method)
-        top = replace_fields(table.frames[""], sample_time=exact_time(sample_time, block=self.name))
-        table.frames[""] = top
+                table.subsystems[path] = replace_fields(settings, method=method)
+        top = replace_fields(table.subsystems[""], sample_time=exact_time(sample_time, block=self.name))
+        table.subsystems[""] = top
         return self.with_structure(table)
 
     @property
@@ -195,7 +195,7 @@ class CheckedDiagram:
     @property
     def has_clock(self) -> bool:
         """Whether a subsystem, or the diagram itself, has a sample time."""
-        return any(settings.sample_time is not None for settings in self.scheduled.frames.values())
+        return any(settings.sample_time is not None for settings in self.scheduled.subsystems.values())
 
     @property
     def has_fmu(self) -> bool:

@@ -21,14 +21,14 @@ def add_delay_blocks(table: Structure) -> Structure:
     """
     sampled = {}
     for path, block in sorted(table.blocks.items()):
-        rate = table.rate(table.frame_of[path])
+        rate = table.rate(table.subsystem_of[path])
         if block.transport and rate is not None:
             try:
                 sampled[path] = block.discretize(rate)
             except LoopwrightError as error:
                 error.blame(path)
                 raise
-    late = [path for path in sorted(table.frames, key=lambda p: (-p.count("."), p)) if table.frames[path].delay]
+    late = [path for path in sorted(table.subsystems, key=lambda p: (-p.count("."), p)) if table.subsystems[path].delay]
     if not late and not sampled:
         return table
     table = table.copy()
@@ -53,16 +53,16 @@ def _delay_outputs(table: Structure, subsystem: str) -> None:
             while path in table.blocks:
                 path, count = f"{base}_{count}", count + 1
             made[key] = path
-            table.blocks[path] = Delay(steps=table.frames[subsystem].delay, name=path.rpartition(".")[2])
-            table.frame_of[path] = subsystem
+            table.blocks[path] = Delay(steps=table.subsystems[subsystem].delay, name=path.rpartition(".")[2])
+            table.subsystem_of[path] = subsystem
             table.wires[path, "u"] = replace(wire, index=None)
         return Wire(made[key], "y", wire.index)
 
     def leaves(wire: Wire, consumer_subsystem: str) -> bool:
-        return _is_inside(subsystem, table.frame_of[wire.block]) and not _is_inside(subsystem, consumer_subsystem)
+        return _is_inside(subsystem, table.subsystem_of[wire.block]) and not _is_inside(subsystem, consumer_subsystem)
 
     for key, wire in sorted(table.wires.items()):
-        if leaves(wire, table.frame_of[key[0]]):
+        if leaves(wire, table.subsystem_of[key[0]]):
             table.wires[key] = delay(wire)
     for path, wire in sorted(table.controls.items()):
         if leaves(wire, path.rpartition(".")[0]):

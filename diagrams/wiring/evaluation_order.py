@@ -35,7 +35,7 @@ def dependencies(table: Structure, traced: Mapping[str, Traced], *, start: bool 
     waits: dict[Port, set[Port]] = {}
     for path, trace in traced.items():
         all_inputs = start and table.blocks[path].starts_from_inputs
-        controls = [table.controls[gate] for gate in table.gates(table.frame_of[path])]
+        controls = [table.controls[gate] for gate in table.gates(table.subsystem_of[path])]
         for name in (*trace.outputs, NEXT, GUARDS):
             inputs = trace.inputs if all_inputs else trace.depends[name]
             wires = (table.wires.get((path, port)) for port in trace.inputs if port in inputs)
@@ -186,7 +186,7 @@ def _write_loop(table: Structure, traced: Mapping[str, Traced], loop: list[Port]
             lines.append(f"  {path}.{name} is wired to {consumer_path}.{through[0]}")
             lines.append(f"  {consumer_path}.{through[0]} feeds through to {consumer_path}.{source[1]}")
             continue
-        gates = table.gates(table.frame_of[consumer_path])
+        gates = table.gates(table.subsystem_of[consumer_path])
         gate = next((g for g in gates if (table.controls[g].block, table.controls[g].port) == (path, name)), "?")
         lines.append(f"  {path}.{name} controls the subsystem {gate}")
         lines.append(f"  {gate} acts on {consumer_path}.{source[1]}")

@@ -17,7 +17,7 @@ from .subsystem import SubsystemCall, SubsystemInput
 
 
 @dataclass(frozen=True)
-class Frame:
+class SubsystemSettings:
     """Settings of a subsystem, or of the diagram itself (path "").
 
     Attributes
@@ -70,9 +70,9 @@ class Structure:
     ----------
     blocks : dict
         Every block by its path.
-    frame_of : dict
+    subsystem_of : dict
         Path of the subsystem that a block stands in, by the block's path.
-    frames : dict
+    subsystems : dict
         Settings of every subsystem by its path, the diagram's own under "".
     wires : dict
         The source of every wired input, by (block path, input).
@@ -85,8 +85,8 @@ class Structure:
     """
 
     blocks: dict[str, Block] = field(default_factory=dict)
-    frame_of: dict[str, str] = field(default_factory=dict)
-    frames: dict[str, Frame] = field(default_factory=dict)
+    subsystem_of: dict[str, str] = field(default_factory=dict)
+    subsystems: dict[str, SubsystemSettings] = field(default_factory=dict)
     wires: dict[tuple[str, str], Wire] = field(default_factory=dict)
     names: dict[str, Wire] = field(default_factory=dict)
     controls: dict[str, Wire] = field(default_factory=dict)
@@ -96,36 +96,36 @@ class Structure:
         """Return a structure with dictionaries of its own."""
         return Structure(
             dict(self.blocks),
-            dict(self.frame_of),
-            dict(self.frames),
+            dict(self.subsystem_of),
+            dict(self.subsystems),
             dict(self.wires),
             dict(self.names),
             dict(self.controls),
             dict(self.handed),
         )
 
-    def clock(self, subsystem: str) -> Frame | None:
+    def clock(self, subsystem: str) -> SubsystemSettings | None:
         """Return the subsystem whose sample time holds in one: itself, or the nearest around it; None without any."""
-        while subsystem and self.frames[subsystem].sample_time is None:
+        while subsystem and self.subsystems[subsystem].sample_time is None:
             subsystem = subsystem.rpartition(".")[0]
-        found = self.frames[subsystem]
+        found = self.subsystems[subsystem]
         return None if found.sample_time is None else found
 
     def method(self, subsystem: str) -> str:
         """Return the discretization of continuous blocks in a subsystem: its own, or that of the nearest around it."""
-        while subsystem and self.frames[subsystem].method is None:
+        while subsystem and self.subsystems[subsystem].method is None:
             subsystem = subsystem.rpartition(".")[0]
-        return self.frames[subsystem].method or "exact"
+        return self.subsystems[subsystem].method or "exact"
 
     def rate(self, subsystem: str) -> Fraction | None:
         """Return the sample time that holds in a subsystem, None where it is continuous."""
         found = self.clock(subsystem)
         return None if found is None else found.sample_time
 
-    def subsystems_around(self, subsystem: str) -> list[Frame]:
+    def subsystems_around(self, subsystem: str) -> list[SubsystemSettings]:
         """Return a subsystem and all those around it, from outside in; the diagram itself is none."""
         parts = subsystem.split(".") if subsystem else []
-        return [self.frames[".".join(parts[: i + 1])] for i in range(len(parts))]
+        return [self.subsystems[".".join(parts[: i + 1])] for i in range(len(parts))]
 
     def gates(self, subsystem: str) -> tuple[str, ...]:
         """Return the paths of the enabled and triggered subsystems around a block in ``subsystem``, from outside in."""
@@ -142,7 +142,7 @@ class Structure:
     def is_traced(self, path: str) -> bool:
         """Whether a run evaluates a block's equations: a stepped block and a continuous transport delay have none."""
         block = self.blocks[path]
-        return not block.stepped and (not block.transport or self.is_sampled(self.frame_of[path]))
+        return not block.stepped and (not block.transport or self.is_sampled(self.subsystem_of[path]))
 
     def is_sampled(self, subsystem: str) -> bool:
         """Whether blocks in a subsystem act at instants only: at ticks, or when it is triggered."""
@@ -245,7 +245,7 @@ class Collector:
 
     def structure(self) -> Structure:
         """Return the structure."""
-        table = Structure(frames={"": Frame("", None, "exact")})
+        table = Structure(subsystems={"": SubsystemSettings("", None, "exact")})
         around = {id(c): outer for outer in self.subsystems.values() for c in outer.calls}
         subsystem_paths: dict[int, str] = {}
         taken: set[str] = set()
@@ -284,7 +284,7 @@ class Collector:
 
         for inner in sorted(self.subsystems.values(), key=lambda s: (subsystem_path(s).count("."), subsystem_path(s))):
             path, made = subsystem_path(inner), inner.subsystem
-            table.frames[path] = Frame(
+            table.subsystems[path] = SubsystemSettings(
                 path,
                 made.sample_time,
                 made.method,
@@ -296,11 +296,11 @@ class Collector:
                 made.when,
             )
         # the place of every block, then the given names, then the numbered ones
-        frames: dict[int, str] = {}
+        subsystems: dict[int, str] = {}
         for key, block in self.blocks.items():
             call = self.calls.get(key)
             if call is not None:
-                frames[key] = place_of(call) or ""
+                subsystems[key] = place_of(call) or ""
             else:
                 if any(port.default is None for port in block.inputs.values()):
                     needed = [n for n, port in block.inputs.items() if port.default is None]
@@ -312,22 +312,22 @@ class Collector:
                         port=needed[0],
                     )
                 users = [place_of(c) for c in self.consumers[key]]
-                frames[key] = _common_subsystem([u for u in users if u is not None])
+                subsystems[key] = _common_subsystem([u for u in users if u is not None])
             if block.name:
-                fixed.add(join(frames[key], block.name))
+                fixed.add(join(subsystems[key], block.name))
         paths: dict[int, str] = {}
         for given in (True, False):
             for key, block in self.blocks.items():
                 if bool(block.name) is given:
-                    paths[key] = place(frames[key], block.name, block.label)
+                    paths[key] = place(subsystems[key], block.name, block.label)
         for key, block in self.blocks.items():
             table.blocks[paths[key]] = block
-            table.frame_of[paths[key]] = frames[key]
+            table.subsystem_of[paths[key]] = subsystems[key]
         for key, call in self.calls.items():
             for port, signal in call.wires.items():
                 crossed: list[tuple[SubsystemCall, str]] = []
                 wire = table.wires[paths[key], port] = _resolve(signal, paths, crossed)
-                maker = f"{table.frame_of[wire.block]}."
+                maker = f"{table.subsystem_of[wire.block]}."
                 outputs = [(subsystem_path(passing), output) for passing, output in crossed]
                 handed = tuple((path_, output) for path_, output in outputs if not maker.startswith(f"{path_}."))
                 if handed:
@@ -338,7 +338,7 @@ class Collector:
         for name, signal, consumer in self.named:
             wire = _resolve(signal, paths)
             subsystem = place_of(consumer)
-            subsystem = table.frame_of[wire.block] if subsystem is None else subsystem
+            subsystem = table.subsystem_of[wire.block] if subsystem is None else subsystem
             if table.names.setdefault(join(subsystem, name), wire) != wire:
                 raise DuplicateNameError(
                     f"two wires are called {name!r} here: {table.names[join(subsystem, name)]} and {wire}. Rename one.",
@@ -348,11 +348,11 @@ class Collector:
         return table
 
 
-def _common_subsystem(frames: list[str]) -> str:
+def _common_subsystem(subsystems: list[str]) -> str:
     """Return the innermost subsystem that holds all the given ones."""
-    if not frames:
+    if not subsystems:
         return ""
-    parts = [f.split(".") if f else [] for f in frames]
+    parts = [f.split(".") if f else [] for f in subsystems]
     common: list[str] = []
     for level in zip(*parts, strict=False):
         if len(set(level)) > 1:

@@ -10,7 +10,7 @@ from ...blocks.core.block import Block
 from ...blocks.core.errors import UnknownNameError, WiringError, near
 from ...blocks.core.values import Value
 from ...blocks.tracing.discretization import check_method
-from .structure import Frame, Structure
+from .structure import Structure, SubsystemSettings
 from .subsystem import check_delay, exact_offset, exact_time
 
 V = TypeVar("V", bound=Value)
@@ -41,7 +41,7 @@ def _change(table: Structure, path: str, value: object, diagram: str) -> None:
         full = find_path(path, table.blocks, "block", diagram)
         table.blocks[full] = value.replace(name=full.rpartition(".")[2])
     elif last in _OF_A_SUBSYSTEM and (subsystem := _find_subsystem(table, head, last, diagram)) is not None:
-        table.frames[subsystem] = _change_subsystem(table.frames[subsystem], last, value)
+        table.subsystems[subsystem] = _change_subsystem(table.subsystems[subsystem], last, value)
     elif path in table.blocks:
         raise WiringError(
             f"found {value!r}; expected a block in its place, such as Fmu('other.fmu'), or the name of a parameter "
@@ -55,7 +55,7 @@ def _change(table: Structure, path: str, value: object, diagram: str) -> None:
 
 def _find_subsystem(table: Structure, path: str, key: str, diagram: str) -> str | None:
     """Return the path of the subsystem whose ``key`` is meant; None where it may be a block's parameter."""
-    known = {subsystem: None for subsystem in table.frames if subsystem}
+    known = {subsystem: None for subsystem in table.subsystems if subsystem}
     if path:
         found = [f for f in known if f == path or f.endswith("." + path)]
         return find_path(path, known, "subsystem", diagram) if found else None
@@ -85,7 +85,7 @@ def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str
     raise UnknownNameError(f"nothing is called {path!r} in diagram {diagram!r}. {near(path, known)}")
 
 
-def _change_subsystem(settings: Frame, key: str, value: Any) -> Frame:
+def _change_subsystem(settings: SubsystemSettings, key: str, value: Any) -> SubsystemSettings:
     """Return a subsystem's settings with another sample time, method, offset or delay."""
     new, path = value, settings.path
     if key == "sample_time" and value is not None:

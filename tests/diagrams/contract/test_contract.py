@@ -58,9 +58,9 @@ def public_blocks():
 @pytest.mark.parametrize(("block", "options", "frames"), CASES, ids=[named(case) for case in CASES])
 def test_the_library_keeps_the_contract(block, options, frames):
     report = check_block(block, **options)
-    assert {name for name, text in report.frames.items() if text == "checked"} == set(frames)
+    assert {name for name, text in report.kinds.items() if text == "checked"} == set(frames)
     assert not any(report.swallowed.values()), report  # NaN passes through
-    for name, text in report.frames.items():  # what it refuses it refuses with a reason and a next step
+    for name, text in report.kinds.items():  # what it refuses it refuses with a reason and a next step
         assert text == "checked" or "@subsystem(sample_time=…)" in text or "put it outside" in text, (name, text)
 
 
@@ -95,7 +95,7 @@ def test_the_code_of_the_page_of_the_library_runs():
 
 def test_the_report_tells_what_was_checked():
     report = check_block(Relay(on_point=0.5, off_point=-0.5))
-    assert report.frames == {"sampled": "checked", "continuous": "checked"}
+    assert report.kinds == {"sampled": "checked", "continuous": "checked"}
     assert report.feedthrough == {"sampled": {("u", "y")}, "continuous": frozenset()}
     assert report.unseen == {"sampled": frozenset(), "continuous": frozenset()}
     assert report.checks["values"] == "pickled; 5 of 5 parameters replaced"
@@ -133,22 +133,22 @@ def test_an_output_that_hides_a_nan_is_reported_and_no_error():
 
 def test_a_frame_that_a_block_refuses_is_reported_with_its_reason_and_an_error_where_it_is_asked_for():
     report = check_block(UnitDelay(), shapes={"u": (2,)})
-    assert report.frames["sampled"] == "checked"
-    assert "put it into a @subsystem(sample_time=…)" in report.frames["continuous"]
+    assert report.kinds["sampled"] == "checked"
+    assert "put it into a @subsystem(sample_time=…)" in report.kinds["continuous"]
     with pytest.raises(SampleTimeError, match="unit_delay: a sampled block is in a continuous subsystem"):
-        check_block(UnitDelay(), frames=["continuous"])
+        check_block(UnitDelay(), kinds=["continuous"])
 
 
 def test_a_vector_that_would_need_an_event_for_each_entry_is_refused_by_its_frame():
     report = check_block(Relay(on_point=0.5, off_point=-0.5), shapes={"u": (2,)})
-    assert report.frames["sampled"] == "checked"
-    assert "Index the signal" in report.frames["continuous"]
+    assert report.kinds["sampled"] == "checked"
+    assert "Index the signal" in report.kinds["continuous"]
 
 
 def test_inputs_are_ranges_or_signals():
     report = check_block(Saturation(limit=1.0), {"u": (-0.5, 0.5)})
     assert report.unseen["sampled"] == {("u", "excess")}  # it is never beyond the limit
-    assert check_block(Saturation(limit=1.0), {"u": (np.zeros(3), np.ones(3))}).frames["sampled"] == "checked"
+    assert check_block(Saturation(limit=1.0), {"u": (np.zeros(3), np.ones(3))}).kinds["sampled"] == "checked"
     stopped = check_block(StopCondition(), {"u": Step(times=0.7, values=1.0)})
     assert "stopped at 0.7 s" in stopped.checks["continuous: run"]
     assert check_block(Gain(gain=2.0), {"u": Sine(frequency=2.0, unit="m")}).feedthrough["sampled"] == {("u", "y")}
@@ -161,7 +161,7 @@ def test_a_function_without_a_name_in_a_module_is_not_pickled_and_no_error():
 
 def test_an_fmu_is_run_saved_and_restored():
     report = check_block(Fmu(mass_spring_damper.build(), name="plant"))
-    assert report.frames == {"sampled": "checked", "continuous": "checked"}
+    assert report.kinds == {"sampled": "checked", "continuous": "checked"}
     assert report.checks["sampled: run"].endswith("restored, it is the same")
     assert "sampled: trace" not in report.checks
 
@@ -169,8 +169,8 @@ def test_an_fmu_is_run_saved_and_restored():
 def test_wrong_arguments_are_errors():
     with pytest.raises(OptionError, match=r"check_block\.inputs: found 'v', which is no input of gain. Known: u"):
         check_block(Gain(gain=2.0), {"v": (0.0, 1.0)})
-    with pytest.raises(OptionError, match=r"check_block\.frames: found 'sample'; expected .* Did you mean 'sampled'"):
-        check_block(Gain(gain=2.0), frames=["sample"])
+    with pytest.raises(OptionError, match=r"check_block\.kinds: found 'sample'; expected .* Did you mean 'sampled'"):
+        check_block(Gain(gain=2.0), kinds=["sample"])
     with pytest.raises(ShapeError, match=r"gain\.u: found a range of shape \(2,\); expected \(3,\)"):
         check_block(Gain(gain=2.0), {"u": (np.zeros(2), np.ones(2))}, shapes={"u": (3,)})
     with pytest.raises(DefinitionError, match="expected a block, such as Gain"):
@@ -500,7 +500,7 @@ def test_a_broken_rule_is_named(cls):
 
 
 def test_what_the_broken_ones_are_made_from_keeps_the_contract():
-    assert set(check_block(Amplifier()).frames.values()) == {"checked"}
+    assert set(check_block(Amplifier()).kinds.values()) == {"checked"}
 
 
 def test_a_dependency_that_the_trace_does_not_show_is_found(monkeypatch):

@@ -177,12 +177,12 @@ def test_closed_boxes_hide_what_is_in_them():
     diagram = experiments.compliance().diagram
     assert "pid_par" not in texts(diagram.draw(closed=True).svg)
     assert "force_sensor" in texts(diagram.draw(closed="controller").svg)
-    assert "pid_par" in texts(diagram.draw(box="controller").svg)
-    assert "plant" not in texts(diagram.draw(box="controller").svg)
+    assert "pid_par" in texts(diagram.draw(subsystem="controller").svg)
+    assert "plant" not in texts(diagram.draw(subsystem="controller").svg)
 
 
 def test_the_inside_of_a_box_names_what_enters_and_leaves():
-    shown = texts(experiments.compliance().diagram.draw(box="controller").svg)
+    shown = texts(experiments.compliance().diagram.draw(subsystem="controller").svg)
     assert {"position", "eta_d", "motor_force"} <= set(shown)
 
 
@@ -257,7 +257,7 @@ def test_a_drawing_is_written_as_svg_only(tmp_path):
 
 def test_unknown_boxes_are_refused_with_a_near_name():
     diagram = experiments.compliance().diagram
-    for options in ({"box": "controler"}, {"closed": "controler"}):
+    for options in ({"subsystem": "controler"}, {"closed": "controler"}):
         with pytest.raises(OptionError, match="controller"):
             diagram.draw(**options)
 

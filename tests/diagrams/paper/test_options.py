@@ -87,7 +87,7 @@ def test_a_sample_time_that_is_no_positive_number(value):
 def test_an_exact_sample_time_is_the_same_run():
     exact = path_following(sample_time=Fraction(1, 1000))
     assert exact.options == path_following().options
-    assert exact.diagram.frames["controller"].sample_time == Fraction(1, 1000)
+    assert exact.diagram.subsystems["controller"].sample_time == Fraction(1, 1000)
 
 
 def test_a_wrong_sample_time_is_wrong_usage_and_leaves_earlier_files(tmp_path, capsys):

@@ -19,7 +19,7 @@ from loopwright.blocks import (
     TransferFunction,
 )
 from loopwright.diagrams import Diagram, analyse, experiments, subsystem
-from loopwright.diagrams.report.case import delayed_boxes
+from loopwright.diagrams.report.case import delayed_subsystems
 from loopwright.diagrams.report.points import point_of
 from loopwright.diagrams.report.wires import wires_on_loops
 from loopwright.fmus import Fmu, dc_motor
@@ -241,8 +241,8 @@ def test_a_diagram_without_a_loop_gets_a_report():
 
 
 def test_only_the_boxes_that_act_on_what_is_continuous_are_delayed():
-    assert delayed_boxes(experiments.compliance().diagram) == ["controller"]
-    assert delayed_boxes(speed_control()) == ["controller"]
+    assert delayed_subsystems(experiments.compliance().diagram) == ["controller"]
+    assert delayed_subsystems(speed_control()) == ["controller"]
 
 
 def test_wires_off_all_loops_are_left_out():

@@ -34,8 +34,8 @@ def test_an_inner_box_follows_the_rate_of_the_box_around_it():
 
 def test_a_box_is_found_by_the_end_of_its_path_and_given_back_its_inherited_rate():
     diagram = nested().replace({"inner.sample_time": 4e-3})
-    assert diagram.frames["outer.inner"].sample_time == Fraction(1, 250)
-    assert diagram.replace({"inner.sample_time": None}).frames["outer.inner"].sample_time is None
+    assert diagram.subsystems["outer.inner"].sample_time == Fraction(1, 250)
+    assert diagram.replace({"inner.sample_time": None}).subsystems["outer.inner"].sample_time is None
 
 
 def test_a_diagram_has_no_sample_time_of_its_own():

@@ -124,7 +124,7 @@ def test_sampled_leaves_boxes_with_a_rate_of_their_own_alone():
 def test_there_and_back():
     diagram = drive()
     again = diagram.continuous().sampled(0.02)
-    assert again.frames["control"].sample_time is None
+    assert again.subsystems["control"].sample_time is None
     assert np.array_equal(
         again.simulate(1.0, progress=False)["plant.y"], diagram.sampled(0.02).simulate(1.0, progress=False)["plant.y"]
     )
