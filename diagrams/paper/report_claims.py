@@ -13,7 +13,7 @@ from ..document.model import Section, Table
 from ..document.templating import Texts
 from ..frequency.number import Number
 from ..frequency.pole_placement import relative_difference
-from ..report.section_poles import TITLE, scatter, without_memory
+from ..report.section_poles import POLES_TITLE, scatter, without_memory
 from ..report.variant import Implementation, Variant, in_s
 from .report_case import COORDINATES, Fig3Case, linearization_of
 
@@ -96,7 +96,7 @@ class _Claims:
         columns = ("variant", "coupling", "between points", "from matched", "largest Re s", "points")
         table = Table("Claims", columns, tuple(self.rows), TEXTS.line("columns"))
         part = Section("claims", "The paper's claims", TEXTS.paragraphs("claims"), (table,), (), self.numbers)
-        return Section("poles", TITLE, sections=(part,))
+        return Section("poles", POLES_TITLE, sections=(part,))
 
 
 def polynomial(v: Variant) -> np.ndarray:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from ..document.definitions import DEFINITIONS, read_definitions
 from ..document.model import Section
 from ..document.templating import Texts
-from ..report import analyse as general
+from ..report.analyse import CLOSED_LOOPS, INJECTION, INNER_LOOPS, LIMITS, MEMORY, OPERATING_POINTS, REMARKS, SUBJECT
 from ..report.parts import ReportKind, ReportPart
-from ..report.section_limits import TITLE as LIMITS
-from ..report.section_subject import TITLE as SUBJECT
+from ..report.section_limits import LIMITS_TITLE
+from ..report.section_subject import SUBJECT_TITLE
 from .reduced_loops import ReducedLoops
 from .report_admittance import admittance, has_admittance
 from .report_case import Fig3Case
@@ -23,7 +23,7 @@ SUBJECT_TEXTS = Texts(__package__, "subject")
 
 def friction_in_keys(case: Fig3Case) -> Section:
     """Return the text on keys of variants with friction."""
-    return Section("subject", SUBJECT, SUBJECT_TEXTS.paragraphs("friction"))
+    return Section("subject", SUBJECT_TITLE, SUBJECT_TEXTS.paragraphs("friction"))
 
 
 def has_friction(case: Fig3Case) -> bool:
@@ -33,7 +33,7 @@ def has_friction(case: Fig3Case) -> bool:
 
 def reduced_not_modelled(case: Fig3Case) -> Section:
     """Return the text on what the reduced loops leave out."""
-    return Section("limits", LIMITS, TEXTS.paragraphs("reduced"))
+    return Section("limits", LIMITS_TITLE, TEXTS.paragraphs("reduced"))
 
 
 def is_reduced(case: Fig3Case) -> bool:
@@ -43,26 +43,26 @@ def is_reduced(case: Fig3Case) -> bool:
 
 def friction_not_modelled(case: Fig3Case) -> Section:
     """Return the text on what the law of friction leaves out."""
-    return Section("limits", LIMITS, TEXTS.paragraphs("friction"))
+    return Section("limits", LIMITS_TITLE, TEXTS.paragraphs("friction"))
 
 
 FIG3 = ReportKind(
     Fig3Case,
     (
-        general.SUBJECT,
+        SUBJECT,
         ReportPart("subject", friction_in_keys, has_friction),
-        general.REMARKS,
-        general.OPERATING_POINTS,
-        general.CLOSED_LOOPS,
+        REMARKS,
+        OPERATING_POINTS,
+        CLOSED_LOOPS,
         ReportPart("poles", poles_asked),
-        general.MEMORY,
+        MEMORY,
         ReportPart("poles", claims),
-        general.INNER_LOOPS,
+        INNER_LOOPS,
         ReportPart("inner", motor_forces),
         ReportPart("admittance", admittance, has_admittance),
         ReportPart("time_domain", limits_tried, is_tried),
-        general.INJECTION,
-        general.LIMITS,
+        INJECTION,
+        LIMITS,
         ReportPart("limits", reduced_not_modelled, is_reduced),
         ReportPart("limits", friction_not_modelled, has_friction),
     ),

@@ -14,7 +14,7 @@ from ..document.templating import Texts
 from ..frequency.number import Number
 from ..frequency.pole_placement import relative_difference, sampled_gains, sampled_poles
 from ..frequency.realization import Realization
-from ..report.section_poles import TITLE
+from ..report.section_poles import POLES_TITLE
 from ..report.variant import in_s
 from .report_case import Fig3Case
 
@@ -31,7 +31,7 @@ def poles_asked(case: Fig3Case) -> Section:
     for side, wire in case.loop_wires().items():
         block: Any = case.diagram.blocks[f"controller.pid_{side}"]
         tables += _asked(case, side, wire, block, numbers)
-    return Section("poles", TITLE, TEXTS.paragraphs("asked"), tuple(tables), (), numbers)
+    return Section("poles", POLES_TITLE, TEXTS.paragraphs("asked"), tuple(tables), (), numbers)
 
 
 def _asked(case: Fig3Case, side: str, wire: str, block: ErrorDynamics, numbers: dict[str, Number]) -> Iterator[Table]:

@@ -8,7 +8,7 @@ from ..document.templating import Texts
 from .case import Case
 
 TEXTS = Texts(__package__, "limits")
-TITLE = "What is not modelled"
+LIMITS_TITLE = "What is not modelled"
 NOT_SMOOTH = (Saturation, Encoder, Quantizer, DeadZone, Relay, Backlash, RateLimiter)
 """Blocks that a linear model knows by their slope only."""
 
@@ -30,4 +30,4 @@ def not_modelled(case: Case) -> Section:
     for v in case.usable():
         if v.model.uncertainty:
             text.append(TEXTS.line("differenced", variant=v.title, uncertainty=v.model.uncertainty))
-    return Section("limits", TITLE, tuple(dict.fromkeys(text)))
+    return Section("limits", LIMITS_TITLE, tuple(dict.fromkeys(text)))

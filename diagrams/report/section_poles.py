@@ -11,7 +11,7 @@ from .case import Case
 from .variant import Variant, in_s
 
 TEXTS = Texts(__package__, "poles")
-TITLE = "Poles asked and got"
+POLES_TITLE = "Poles asked and got"
 ON_THE_LIMIT = 1e-9
 """A pole no farther than that from the imaginary axis, relative to the fastest pole, is called neither way."""
 
@@ -32,13 +32,13 @@ def closed_loops(case: Case) -> Section:
             rows.append((v.title, len(s), stable, number, f"{fastest:.6g} 1/s"))
     columns = ("variant", "poles", "stable", "largest Re s", "smallest Re s")
     table = Table("Closed loop", columns, tuple(rows), TEXTS.line("closed_loop", limit=ON_THE_LIMIT))
-    return Section("poles", TITLE, (), (table,), (), numbers)
+    return Section("poles", POLES_TITLE, (), (table,), (), numbers)
 
 
 def memory(case: Case) -> Section | None:
     """Return the text on states that are only a warm start, None where there are none."""
     states = sorted({name for v in case.usable() for name in v.model.memory})
-    return Section("poles", TITLE, TEXTS.paragraphs("memory", states=states)) if states else None
+    return Section("poles", POLES_TITLE, TEXTS.paragraphs("memory", states=states)) if states else None
 
 
 def without_memory(v: Variant) -> np.ndarray:

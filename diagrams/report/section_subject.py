@@ -23,7 +23,7 @@ TEXTS = Texts(__package__, "subject")
 
 CONFIRMED = {PointOrigin.RUN: "the run's own next tick and rates", PointOrigin.TRIM: "the trim's equations"}
 """How the residual of an operating point is confirmed."""
-TITLE = "What was analysed"
+SUBJECT_TITLE = "What was analysed"
 PACKAGES = ("loopwright", "numpy", "scipy", "casadi", "control", "fmpy", "matplotlib")
 
 
@@ -84,12 +84,12 @@ def subject(case: Case) -> Section:
     if case.experiment is not None:
         name = case.experiment.diagram.name.replace("_", " ")
         text.append(TEXTS.line("experiment", letter=case.experiment.letter, name=name))
-    return Section("subject", TITLE, tuple(text), tuple(tables), (), numbers)
+    return Section("subject", SUBJECT_TITLE, tuple(text), tuple(tables), (), numbers)
 
 
 def remarks(case: Case) -> Section | None:
     """Return the remarks on how the variants were made, None where there are none."""
-    return Section("subject", TITLE, tuple(case.notes)) if case.notes else None
+    return Section("subject", SUBJECT_TITLE, tuple(case.notes)) if case.notes else None
 
 
 def _parameters(block: Block) -> Any:
