@@ -4,67 +4,123 @@ A block's equations are written once, as NumPy-style functions of (t, x, u); fro
 differentiated and compiled. Everything exported here is public; nothing here imports the rooms above.
 """
 
-from .core.arithmetic import Gain, Product, Sum
-from .core.block import Block
-from .core.errors import (
+from .core import (
     AlgebraicLoopError,
+    Array,
+    Block,
+    Call,
     CompilerError,
     ConfirmationError,
+    Constant,
     DefinitionError,
     DoubleDriveError,
     DuplicateNameError,
+    Event,
     FmuError,
     FmuFileError,
     FmuRuntimeError,
+    Gain,
     GuardError,
+    Input,
     LoopwrightError,
     NonFiniteError,
     OptionError,
+    Output,
     ParameterError,
     PathDomainError,
+    Product,
     SampleTimeError,
     ShapeError,
+    Signal,
     SimulationError,
+    State,
+    Sum,
     TraceError,
+    Unit,
     UnitError,
     UnknownNameError,
     UnwiredInputError,
+    Value,
     WiringError,
+    parameter,
+    parse_unit,
 )
-from .core.ports import Event, Input, Output, State
-from .core.signals import Call, Signal
-from .core.source import Constant
-from .core.units import Unit, parse_unit
-from .core.values import Array, Value, parameter
-from .library.algebra import DeadZone, Maximum, Minimum, Saturation
-from .library.contact import HandProfile, SpringDamper, Wall
-from .library.delays import Delay, PadeDelay, TransportDelay
-from .library.filters import FIR, IIR, DiscreteIntegrator, MovingAverage
-from .library.functions import Function, PythonFunction
-from .library.generators import BandLimitedNoise, Chirp, Clock, PiecewiseLinear, PulseTrain, Ramp, Recorded
-from .library.integrators import FilteredDerivative, Integrator, LimitedIntegrator, ResettableIntegrator
-from .library.linear import DiscreteStateSpace, DiscreteTransferFunction, StateSpace, TransferFunction
-from .library.logic import And, Compare, Counter, EdgeDetector, Latch, Not, Or, Switch
-from .library.lookup import Lookup1D, Lookup2D
-from .library.nonlinear import Backlash, Quantizer, RateLimiter, Relay
-from .library.pid import PID
-from .library.requirements import Requirement, StopCondition
-from .library.sampled import Encoder, ForceSensor, Hold, UnitDelay
-from .library.sources import Pulse, Reference, Sine, SmoothStep, Step
-from .library.state_machine import StateMachine
-from .library.zero_pole import DiscreteZeroPoleGain, ZeroPoleGain
-from .path_following.compliance import AdmittanceFilter, ErrorDynamics
-from .path_following.environment import HandForce, PathSpring
-from .path_following.planar_model import PlanarModel
-from .path_following.transverse import (
+from .library import (
+    FIR,
+    IIR,
+    PID,
+    And,
+    Backlash,
+    BandLimitedNoise,
+    Chirp,
+    Clock,
+    Compare,
+    Counter,
+    DeadZone,
+    Delay,
+    DiscreteIntegrator,
+    DiscreteStateSpace,
+    DiscreteTransferFunction,
+    DiscreteZeroPoleGain,
+    EdgeDetector,
+    Encoder,
+    FilteredDerivative,
+    ForceSensor,
+    Function,
+    HandProfile,
+    Hold,
+    Integrator,
+    Latch,
+    LimitedIntegrator,
+    Lookup1D,
+    Lookup2D,
+    Maximum,
+    Minimum,
+    MovingAverage,
+    Not,
+    Or,
+    PadeDelay,
+    PiecewiseLinear,
+    Pulse,
+    PulseTrain,
+    PythonFunction,
+    Quantizer,
+    Ramp,
+    RateLimiter,
+    Recorded,
+    Reference,
+    Relay,
+    Requirement,
+    ResettableIntegrator,
+    Saturation,
+    Sine,
+    SmoothStep,
+    SpringDamper,
+    StateMachine,
+    StateSpace,
+    Step,
+    StopCondition,
+    Switch,
+    TransferFunction,
+    TransportDelay,
+    UnitDelay,
+    Wall,
+    ZeroPoleGain,
+)
+from .path_following import (
+    AdmittanceFilter,
+    ErrorDynamics,
     FeedbackLinearization,
     ForceProjection,
+    HandForce,
     PathProjection,
+    PathSpring,
     PathTracking,
+    PlanarModel,
     TransverseTransform,
 )
 from .paths import Circle, CubicSpline, Ellipse, Frame, Line, Path
-from .tracing.discretization import hold
+from .tracing import hold
 
 __all__ = [  # noqa: RUF022 - as sorted() does, acronyms too
     "AdmittanceFilter",

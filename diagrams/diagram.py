@@ -6,20 +6,14 @@ import os
 from collections.abc import Iterable, Mapping
 from typing import Any, Unpack
 
-from .document.files import check_files, write_report
-from .document.report import Report
-from .drawing.svg import Drawing, draw
-from .flat.wired_diagram import WiredDiagram
-from .linearization.linearize import Linearization, batch, linearize
-from .linearization.operating_point import at_time
-from .linearization.trim import given, trim
-from .measure.frequency_response import FrequencyResponse, frequency_response
-from .report.analyse import analyse
-from .report.drawings import with_drawing
-from .results.operating_point import OperatingPoint
-from .results.run import Run
-from .simulation.run_options import RunKeywords, RunOptions
-from .simulation.simulation import Simulation, simulate
+from .document import Report, check_files, write_report
+from .drawing import Drawing, draw
+from .flat import WiredDiagram
+from .linearization import Linearization, at_time, batch, given, linearize, trim
+from .measure import FrequencyResponse, frequency_response
+from .report import analyse, with_drawing
+from .results import OperatingPoint, Run
+from .simulation import RunKeywords, RunOptions, Simulation, simulate
 
 
 class Diagram(WiredDiagram):
@@ -53,8 +47,6 @@ class Diagram(WiredDiagram):
     >>> [round(float(v), 6) for v in run["wave"]]
     [0.0, 1.414214, 2.0, 1.414214, 0.0]
     """
-
-    # --- simulation ---------------------------------------------------------------------------------------------------
 
     def simulate(self, duration: float, *, progress: bool | None = None, **options: Unpack[RunKeywords]) -> Run:
         """Run the diagram and return what it recorded: from t = 0, or from a saved state.
@@ -101,8 +93,6 @@ class Diagram(WiredDiagram):
             An unknown option or solver, a tolerance out of range.
         """
         return Simulation(self, RunOptions.of(options, block=self.name))
-
-    # --- analysis -----------------------------------------------------------------------------------------------------
 
     def operating_point(
         self, t: float = 0.0, *, states: Mapping[str, Any] | None = None, **options: Any
@@ -243,18 +233,15 @@ class Diagram(WiredDiagram):
         return linearize(self, point, inputs=inputs, outputs=outputs, openings=openings, plants=plants, **options)
 
     def linearize_batch(
-        self,
-        points: Iterable[Any] = (None,),
-        variants: Iterable[Mapping[str, Any]] = ({},),
-        **options: Any,
+        self, points: Iterable[Any] = (None,), variants: Iterable[Mapping[str, Any]] = ({},), **options: Any
     ) -> list[Linearization]:
         """Return the linear models at several operating points and with several parameters.
 
         Parameters
         ----------
         points : iterable
-            Operating points, as `linearize` takes them. A time, or an instant of a run, is run to with each variant
-            anew; an `OperatingPoint` is taken as it is, with the variant's parameters.
+            As `linearize` takes them. Each variant runs to a time or an instant of a run anew; an `OperatingPoint` is
+            taken as it is, with the variant's parameters.
         variants : iterable of mapping
             What `replace` changes: ``[{"controller.pid_par.poles": (-30, -30, -30)}, …]``.
         **options
@@ -338,13 +325,6 @@ class Diagram(WiredDiagram):
         ------
         OptionError
             No such subsystem, or a file that is no ``.svg``.
-
-        Examples
-        --------
-        >>> from loopwright.blocks import Gain, Sine
-        >>> from loopwright.diagrams import Diagram
-        >>> Diagram("demo", Gain(gain=2)(Sine(frequency=1))).draw().svg[:4]
-        '<svg'
         """
         drawing = Drawing(draw(self, subsystem=subsystem, closed=closed))
         if path is not None:
@@ -369,15 +349,11 @@ class Diagram(WiredDiagram):
     ) -> FrequencyResponse:
         """Measure a frequency response on the running diagram: a test signal d is added at a wire.
 
-        With v what the wire's port puts out, and u = v + d what all its consumers get, S = u/d, T = −v/d and L = −v/u,
-        which is what `Linearization.sensitivity`, `complementary` and `loop` say of the same wire. All are sampled
-        where the linear model is, at the ticks of the least common period of what is sampled, and d is held between
-        them; in a diagram that is continuous throughout, d is continuous. So the phasors are those of what is sampled:
-        a plant's velocity, read at 1 kHz, holds the aliased ripple of the controller's hold, and its fundamental in
-        continuous time is another by 1e-4 to 1e-3.
+        With v the output of the wire's port and u = v + d the signal that all its consumers get, S = u/d, T = −v/d and
+        L = −v/u, as of `Linearization`. They are sampled where the linear model is; see docs/frequency.md.
 
-        The signal is ramped in; then windows of whole periods follow until two agree. Sources go on meanwhile: take a
-        diagram whose references stand still, or a time from which on they do, and look at ``moved``.
+        The signal is ramped in; then windows of whole periods follow until two agree. Sources go on meanwhile: let the
+        references stand still, and look at ``moved``.
 
         Parameters
         ----------

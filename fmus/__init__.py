@@ -1,11 +1,8 @@
 """FMUs: plants that are written as Python equations and exported, and FMUs of any tool as blocks."""
 
-from .archive.description import FmuDescription, FmuVariable, read_description
-from .calls.instance import FmuInstance, FmuState
-from .export.build import build_fmu, clear_cache
-from .export.from_block import build, model_spec
-from .export.model import ModelSpec, Variable
-from .export.python_fmu import build_python
+from .archive import FmuDescription, FmuVariable, read_description
+from .calls import FmuInstance, FmuState
+from .export import ModelSpec, Variable, build, build_fmu, build_python, clear_cache, model_spec
 from .models import (
     bouncing_ball,
     dc_motor,
@@ -16,8 +13,7 @@ from .models import (
     mass_spring_damper,
     scara,
 )
-from .running.fmu import Fmu
-from .running.linearization import FmuLinearization
+from .running import Fmu, FmuLinearization
 
 __all__ = [
     "Fmu",

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import platformdirs
 
-from ..blocks.core.errors import FmuError
+from ..blocks.core import FmuError
 
 
 def native_platform() -> str:

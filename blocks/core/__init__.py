@@ -1,7 +1,117 @@
 """The base of all blocks: ports, signals, values, units and errors."""
 
-from . import arithmetic, moved, source  # arithmetic and source register the blocks that operators make
+from . import arithmetic, moved, source
+from .arithmetic import Gain, Product, Sum, check_shapes, shape_of
+from .block import SOLVED, Block
+from .errors import (
+    AlgebraicLoopError,
+    CompilerError,
+    ConfirmationError,
+    DefinitionError,
+    DoubleDriveError,
+    DuplicateNameError,
+    FmuError,
+    FmuFileError,
+    FmuRuntimeError,
+    GuardError,
+    LoopwrightError,
+    NonFiniteError,
+    OptionError,
+    ParameterError,
+    PathDomainError,
+    SampleTimeError,
+    ShapeError,
+    SimulationError,
+    TraceError,
+    UnitError,
+    UnknownNameError,
+    UnwiredInputError,
+    WiringError,
+    close_names,
+    near,
+)
+from .frozen import FrozenMapping
+from .instants import is_before, left_of, move_earlier, next_edge, period_of
+from .layout import Layout, elements
+from .parameters import ParameterSpec
+from .ports import Event, Input, Output, Port, PortUnit, Shape, State
+from .signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, recorder
+from .source import Constant, Source
+from .units import BASE_UNITS, Unit, describe_mismatch, parse_unit, rate_of, same_unit
+from .values import Array, Value, identity, parameter, shorten
 
-__all__ = ["arithmetic", "moved", "source"]
+__all__ = [
+    "BASE_UNITS",
+    "SOLVED",
+    "AlgebraicLoopError",
+    "Array",
+    "Block",
+    "Call",
+    "CompilerError",
+    "ConfirmationError",
+    "Constant",
+    "DefinitionError",
+    "DoubleDriveError",
+    "DuplicateNameError",
+    "Event",
+    "FmuError",
+    "FmuFileError",
+    "FmuRuntimeError",
+    "FrozenMapping",
+    "Gain",
+    "GuardError",
+    "Input",
+    "Layout",
+    "LoopwrightError",
+    "NonFiniteError",
+    "OptionError",
+    "Output",
+    "ParameterError",
+    "ParameterSpec",
+    "PathDomainError",
+    "Port",
+    "PortUnit",
+    "Product",
+    "SampleTimeError",
+    "Shape",
+    "ShapeError",
+    "Signal",
+    "SimulationError",
+    "Source",
+    "State",
+    "Sum",
+    "TraceError",
+    "Unit",
+    "UnitError",
+    "UnknownAttributeError",
+    "UnknownNameError",
+    "UnwiredInputError",
+    "Value",
+    "Wireable",
+    "WiringError",
+    "arithmetic",
+    "as_signal",
+    "check_name",
+    "check_shapes",
+    "close_names",
+    "describe_mismatch",
+    "elements",
+    "identity",
+    "is_before",
+    "left_of",
+    "move_earlier",
+    "moved",
+    "near",
+    "next_edge",
+    "parameter",
+    "parse_unit",
+    "period_of",
+    "rate_of",
+    "recorder",
+    "same_unit",
+    "shape_of",
+    "shorten",
+    "source",
+]
 
 moved.explain_moved_modules()

@@ -6,11 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arithmetic import check_shapes
-from ..core.block import Block
-from ..core.errors import ParameterError
-from ..core.ports import Input, Output
-from ..core.values import Array, parameter, shorten
+from ..core import Array, Block, Input, Output, ParameterError, check_shapes, parameter, shorten
 from .branching import NumberedInputs
 
 

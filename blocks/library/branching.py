@@ -7,11 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arithmetic import check_shapes, shape_of
-from ..core.block import Block
-from ..core.errors import ShapeError
-from ..core.ports import Input
-from ..core.values import Array, parameter
+from ..core import Array, Block, Input, ShapeError, check_shapes, parameter, shape_of
 
 
 def check_fits(value: Array, port: str, main: Array, main_port: str) -> None:

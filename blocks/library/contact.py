@@ -8,11 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arithmetic import shape_of
-from ..core.block import Block
-from ..core.errors import ParameterError, ShapeError
-from ..core.ports import Event, Input, Output, State
-from ..core.values import Array, parameter, shorten
+from ..core import Array, Block, Event, Input, Output, ParameterError, ShapeError, State, parameter, shape_of, shorten
 from .branching import check_fits
 from .sources import smooth_step
 

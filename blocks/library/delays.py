@@ -11,10 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import SampleTimeError, ShapeError
-from ..core.ports import Input, Output, Shape, State
-from ..core.values import Array, parameter
+from ..core import Array, Block, Input, Output, SampleTimeError, Shape, ShapeError, State, parameter
 
 
 class History(State):

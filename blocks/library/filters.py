@@ -7,10 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import ParameterError
-from ..core.ports import Input, Output, State
-from ..core.values import Array, parameter
+from ..core import Array, Block, Input, Output, ParameterError, State, parameter
 from .branching import truth
 from .delays import History, push
 from .integrators import check_limits, clip

@@ -9,11 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import ParameterError
-from ..core.ports import Input, Output, Shape
-from ..core.signals import Signal
-from ..core.values import Array, parameter
+from ..core import Array, Block, Input, Output, ParameterError, Shape, Signal, parameter
 
 
 class Function(Block):

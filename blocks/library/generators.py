@@ -15,12 +15,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core.errors import ParameterError
-from ..core.instants import move_earlier, next_edge, period_of
-from ..core.ports import Output
-from ..core.source import Source
-from ..core.values import Array, parameter
-from .piecewise import piecewise
+from ..core import Array, Output, ParameterError, Source, move_earlier, next_edge, parameter, period_of
+from .piecewise_functions import piecewise
 
 _HALF = 2.0**24  # counters are mixed in two halves, since products of two such numbers are exact
 _ROUNDS = 10

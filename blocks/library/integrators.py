@@ -7,10 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import ParameterError, ShapeError
-from ..core.ports import Event, Input, Output, State
-from ..core.values import Array, parameter
+from ..core import Array, Block, Event, Input, Output, ParameterError, ShapeError, State, parameter
 from .branching import truth
 
 

@@ -12,11 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arithmetic import check_shapes
-from ..core.block import Block
-from ..core.errors import ParameterError, near
-from ..core.ports import Event, Input, Output, State
-from ..core.values import Array, parameter
+from ..core import Array, Block, Event, Input, Output, ParameterError, State, check_shapes, near, parameter
 from .branching import NumberedInputs, check_fits, expect_scalar, truth
 
 _OPERATORS = {">": (1.0, 1.0), "<": (-1.0, 1.0), "<=": (1.0, 0.0), ">=": (-1.0, 0.0)}

@@ -7,12 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core.arithmetic import shape_of
-from ..core.block import Block
-from ..core.errors import GuardError, ParameterError, ShapeError, near
-from ..core.ports import Input, Output
-from ..core.values import Array, parameter
-from .piecewise import bilinear, piecewise
+from ..core import Array, Block, GuardError, Input, Output, ParameterError, ShapeError, near, parameter, shape_of
+from .piecewise_functions import bilinear, piecewise
 
 _BEYOND = ("hold", "extrapolate", "error")
 _SLACK = 1e-9  # part of the table's range by which rounding may put an input outside

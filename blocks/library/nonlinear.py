@@ -11,11 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from ..core.arithmetic import check_shapes
-from ..core.block import Block
-from ..core.errors import ParameterError, SampleTimeError
-from ..core.ports import Event, Input, Output, State
-from ..core.values import Array, parameter, shorten
+from ..core import (
+    Array,
+    Block,
+    Event,
+    Input,
+    Output,
+    ParameterError,
+    SampleTimeError,
+    State,
+    check_shapes,
+    parameter,
+    shorten,
+)
 from .branching import expect_scalar
 
 

@@ -7,11 +7,8 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import ParameterError
-from ..core.ports import Event, Input, Output, State
-from ..core.values import Array, parameter
-from ..tracing.discretization import hold
+from ..core import Array, Block, Event, Input, Output, ParameterError, State, parameter
+from ..tracing import hold
 from .integrators import check_limits, clip
 
 _WAYS = ("back_calculation", "clamping", "none")

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import ParameterError, SampleTimeError
+from ..core import Block, ParameterError, SampleTimeError
 
 
 def check_system(cls: type[Block], system: Any, kind: str, *, discrete: bool) -> float | None:
@@ -143,7 +142,7 @@ class FixedSampleTime:
 
     def guard_error(self, name: str, value: float, u: Any, y: Any, x: Any = None) -> Any:
         """Return the error of sample times that differ."""
-        from ..core.errors import GuardError
+        from ..core import GuardError
 
         return GuardError(self._message(None), block=self.label, port="dt")
 

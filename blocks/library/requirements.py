@@ -7,10 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import GuardError, ParameterError, near
-from ..core.ports import Event, Input, Output, State
-from ..core.values import Array, parameter
+from ..core import Array, Block, Event, GuardError, Input, Output, ParameterError, State, near, parameter
 from .branching import expect_scalar, truth
 
 

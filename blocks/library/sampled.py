@@ -6,9 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.ports import Input, Output, State
-from ..core.values import Array, parameter
+from ..core import Array, Block, Input, Output, State, parameter
 
 
 class UnitDelay(Block):

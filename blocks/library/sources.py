@@ -11,11 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import ParameterError
-from ..core.instants import move_earlier
-from ..core.ports import Output
-from ..core.source import Source
-from ..core.values import Array, parameter
+from ..core import Array, Output, ParameterError, Source, move_earlier, parameter
 
 
 def smooth_step(

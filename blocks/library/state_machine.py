@@ -8,11 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import ParameterError, near
-from ..core.ports import Event, Input, Output, State
-from ..core.signals import Call, Signal
-from ..core.values import Array, parameter
+from ..core import Array, Block, Call, Event, Input, Output, ParameterError, Signal, State, near, parameter
 from .branching import truth
 
 

@@ -7,10 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import ParameterError
-from ..core.ports import Input, Output, State
-from ..core.values import Array, parameter
+from ..core import Array, Block, Input, Output, ParameterError, State, parameter
 from .linear import Names, section
 from .python_control import (
     FixedSampleTime,

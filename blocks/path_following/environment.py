@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.ports import Input, Output
-from ..core.values import Array, parameter
+from ..core import Array, Input, Output, parameter
 from .transverse import PathTracking
 
 

@@ -6,9 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import DefinitionError
-from ..core.values import Array
+from ..core import Array, Block, DefinitionError
 
 
 class PlanarModel(Block):

@@ -12,10 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import GuardError, ParameterError, PathDomainError
-from ..core.ports import Input, Output, State
-from ..core.values import Array, parameter, shorten
+from ..core import Array, Block, GuardError, Input, Output, ParameterError, PathDomainError, State, parameter, shorten
 from ..paths import Path, replace_unlimited
 from .planar_model import PlanarModel
 
@@ -296,7 +293,7 @@ class FeedbackLinearization(Block):
     @property
     def motor_force(self) -> Any:
         """The motor force as a signal."""
-        from ..core.signals import Signal
+        from ..core import Signal
 
         return Signal(self, "motor_force")
 

@@ -1,10 +1,17 @@
 """Planar paths: ellipse, circle, line, cubic spline, and the base of users' own paths."""
 
-from __future__ import annotations
-
 from .path import UNLIMITED, Frame, Path
 from .shapes import Circle, Ellipse, Line
 from .spline import CubicSpline
 from .tables import replace_unlimited
 
-__all__ = ["UNLIMITED", "Circle", "CubicSpline", "Ellipse", "Frame", "Line", "Path", "replace_unlimited"]
+__all__ = [
+    "UNLIMITED",
+    "Circle",
+    "CubicSpline",
+    "Ellipse",
+    "Frame",
+    "Line",
+    "Path",
+    "replace_unlimited",
+]

@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..core.errors import DefinitionError, ParameterError, PathDomainError
-from ..core.values import Array, Value
-from ..library.piecewise import piecewise, wrap
+from ..core import Array, DefinitionError, ParameterError, PathDomainError, Value
+from ..library import piecewise, wrap
 from . import tables
 from .tables import UNLIMITED
 

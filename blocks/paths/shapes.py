@@ -6,8 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..core.errors import ParameterError
-from ..core.values import Array, parameter
+from ..core import Array, ParameterError, parameter
 from .path import UNLIMITED, Path, check_order
 from .tables import as_positions
 

@@ -6,9 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ..core.errors import ParameterError
-from ..core.values import Array, parameter
-from ..library.piecewise import jet, wrap
+from ..core import Array, ParameterError, parameter
+from ..library import jet, wrap
 from .path import Path, check_order
 
 __all__ = ["CubicSpline"]

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.polynomial import chebyshev, polynomial
 
-from ..core.errors import ParameterError
+from ..core import ParameterError
 
 UNLIMITED = 1e6
 """Reach of a path without a limit, m: a finite number, so that equations can be traced and compared."""

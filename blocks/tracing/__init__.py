@@ -1,1 +1,31 @@
 """Equations of blocks as CasADi functions, and their discretization."""
+
+from .discretization import check_method, hold
+from .equations import initial_state, start_shapes, start_values
+from .numpy_check import GUARDS, NEXT, evaluate
+from .opaque_equations import raise_failure
+from .structure import is_traced_by, traced_parameters
+from .symbols import bundle, flat_column, size, with_values, wrap
+from .traced import Traced, constants_of, trace
+
+__all__ = [
+    "GUARDS",
+    "NEXT",
+    "Traced",
+    "bundle",
+    "check_method",
+    "constants_of",
+    "evaluate",
+    "flat_column",
+    "hold",
+    "initial_state",
+    "is_traced_by",
+    "raise_failure",
+    "size",
+    "start_shapes",
+    "start_values",
+    "trace",
+    "traced_parameters",
+    "with_values",
+    "wrap",
+]

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..core.errors import SampleTimeError
+from ..core import SampleTimeError
 
 Method = Literal["exact", "forward", "semi_implicit", "trapezoidal"]
 METHODS = ("exact", "forward", "semi_implicit", "trapezoidal")

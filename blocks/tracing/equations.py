@@ -12,9 +12,7 @@ import casadi as ca
 import numpy as np
 from casadi import ArrayInterface
 
-from ..core.block import Block
-from ..core.errors import DefinitionError, LoopwrightError, ShapeError, TraceError
-from ..core.ports import Port, Shape, State
+from ..core import Block, DefinitionError, LoopwrightError, Port, Shape, ShapeError, State, TraceError
 from .symbols import flat_column, size
 
 _ARGUMENTS = {

@@ -9,9 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import LoopwrightError, TraceError
-from ..core.ports import Shape
+from ..core import Block, LoopwrightError, Shape, TraceError
 from .equations import parts_of, takes_update
 from .rounding import record_rounding, watch
 from .symbols import bundle, with_values

@@ -13,10 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..core.block import Block
-from ..core.errors import LoopwrightError, ShapeError, SimulationError, TraceError
-from ..core.layout import Layout
-from ..core.ports import Shape
+from ..core import Block, Layout, LoopwrightError, Shape, ShapeError, SimulationError, TraceError
 from .equations import parts_of
 from .symbols import bundle, size, with_values, wrap
 

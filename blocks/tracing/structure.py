@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.block import Block
-from ..core.values import Value, identity
+from ..core import Block, Value, identity
 
 
 def traced_parameters(block: Value, prefix: str = "") -> Iterator[tuple[str, Any]]:

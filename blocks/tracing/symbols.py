@@ -11,8 +11,7 @@ import casadi as ca
 import numpy as np
 from casadi import ArrayInterface
 
-from ..core.errors import ShapeError
-from ..core.ports import Shape
+from ..core import Shape, ShapeError
 
 
 def size(shape: Shape) -> int:

@@ -1,1 +1,37 @@
 """Admittance that an environment feels, and coupled stability."""
+
+from .compliance_loop import SIDES, AdmittanceLoop, control_rate
+from .coupled import crossing_frequency, growth_rate, poles
+from .rendered import Passivity, passivity, rendered_admittance, rendered_response, rendered_system, target_admittance
+from .shown_plant import check_plant, is_discrete
+from .stability_limits import (
+    StabilityLimit,
+    StabilityMap,
+    rule_of_thumb,
+    stability_limit,
+    stability_map,
+    stiffness_limits,
+)
+
+__all__ = [
+    "SIDES",
+    "AdmittanceLoop",
+    "Passivity",
+    "StabilityLimit",
+    "StabilityMap",
+    "check_plant",
+    "control_rate",
+    "crossing_frequency",
+    "growth_rate",
+    "is_discrete",
+    "passivity",
+    "poles",
+    "rendered_admittance",
+    "rendered_response",
+    "rendered_system",
+    "rule_of_thumb",
+    "stability_limit",
+    "stability_map",
+    "stiffness_limits",
+    "target_admittance",
+]

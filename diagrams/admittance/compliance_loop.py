@@ -46,12 +46,11 @@ from typing import Any, NamedTuple, Self, cast
 import numpy as np
 
 from ...blocks import AdmittanceFilter, ErrorDynamics, FeedbackLinearization, ForceSensor, Frame, Path, PlanarModel
-from ...blocks.core.errors import ParameterError, UnknownNameError
-from ...blocks.core.values import Array, Value, parameter
-from ...blocks.path_following.transverse import expect_model, expect_path
-from ...blocks.tracing.discretization import check_method
-from ..flat.wired_diagram import WiredDiagram
-from ..results.operating_point import OperatingPoint
+from ...blocks.core import Array, ParameterError, UnknownNameError, Value, parameter
+from ...blocks.path_following import expect_model, expect_path
+from ...blocks.tracing import check_method
+from ..flat import WiredDiagram
+from ..results import OperatingPoint
 from .fig3_parts import check_wires, delay_of, plant_path
 from .planar import compute_slopes
 from .shown_plant import check_plant

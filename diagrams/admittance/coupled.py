@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...blocks.core.values import Array
+from ...blocks.core import Array
 from .compliance_loop import AdmittanceLoop, StateMatrices, check_environment, hold_force
 
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks import Gain, Saturation, UnitDelay
-from ...blocks.core.errors import ParameterError, UnknownNameError
+from ...blocks.core import ParameterError, UnknownNameError
 
 if TYPE_CHECKING:
-    from ..flat.wired_diagram import WiredDiagram
+    from ..flat import WiredDiagram
 
 SENSOR = "sensors.force_sensor"
 _CONTROLLER = "controller"

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...blocks import PlanarModel
-from ...blocks.core.values import Array
-from ...blocks.tracing.symbols import flat_column, wrap
+from ...blocks.core import Array
+from ...blocks.tracing import flat_column, wrap
 
 
 class Slopes(NamedTuple):

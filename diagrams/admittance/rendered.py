@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core.errors import OptionError
-from ...blocks.core.values import Array
-from ..frequency.state_space import read_matrices
+from ...blocks.core import Array, OptionError
+from ..frequency import read_matrices
 from .compliance_loop import AdmittanceLoop, hold_force
 from .coupled import close_loop
 

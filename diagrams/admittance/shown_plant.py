@@ -18,17 +18,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, cast
 import numpy as np
 
 from ...blocks import PlanarModel
-from ...blocks.core.errors import LoopwrightError, ParameterError
-from ...blocks.core.values import Array
-from ...fmus.running.derivation import Derivation, DerivativeMethod
-from ...fmus.running.linearization import FmuLinearization
-from ..linearization.operating_point import operating_point
+from ...blocks.core import Array, LoopwrightError, ParameterError
+from ...fmus.running import Derivation, DerivativeMethod, FmuLinearization
+from ..linearization import operating_point
 from .planar import Slopes, compute_slopes
 
 if TYPE_CHECKING:
-    from ...fmus.running.fmu import Fmu
-    from ..flat.wired_diagram import WiredDiagram
-    from ..results.operating_point import OperatingPoint
+    from ...fmus.running import Fmu
+    from ..flat import WiredDiagram
+    from ..results import OperatingPoint
 
 STATES = 4
 """Number of states of the reduced model: position and velocity, two axes each."""

@@ -13,10 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import ConfirmationError, OptionError, near
-from ...blocks.core.values import Array
-from ..frequency.number import Number
-from ..frequency.one_thread import on_one_thread
+from ...blocks.core import Array, ConfirmationError, OptionError, near
+from ..frequency import Number, on_one_thread
 from .compliance_loop import AdmittanceLoop
 from .coupled import crossing_frequency, growth_rate, growth_rate_by_control
 

@@ -14,13 +14,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import FmuFileError, LoopwrightError, OptionError, TraceError, close_names, near
-from ...fmus.checks.summary import INTERFACES, summarize
-from ...fmus.checks.validation import validate
-from ...fmus.export.compiler import TARGETS
-from ...fmus.export.from_block import build as build_model
-from ...fmus.export.python_fmu import build_python
+from ...blocks.core import Block, FmuFileError, LoopwrightError, OptionError, TraceError, close_names, near
+from ...fmus.checks import INTERFACES, summarize, validate
+from ...fmus.export import TARGETS, build_python
+from ...fmus.export import build as build_model
 from ...fmus.models import gantry
 from ...fmus.platform import native_platform
 from .text import fit, say

@@ -10,8 +10,8 @@ from inspect import signature
 from types import MappingProxyType
 from typing import Any
 
-from ...blocks.core.errors import OptionError, near
-from ..paper.experiments import DEFAULTS, EXPERIMENTS
+from ...blocks.core import OptionError, near
+from ..paper import DEFAULTS, EXPERIMENTS
 from .text import say
 
 _WORDS: Mapping[str, bool | None] = MappingProxyType(

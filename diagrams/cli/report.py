@@ -8,11 +8,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 
-from ...blocks.core.errors import DefinitionError, FmuError, FmuFileError, LoopwrightError, OptionError, near
+from ...blocks.core import DefinitionError, FmuError, FmuFileError, LoopwrightError, OptionError, near
 from ...fmus.models import gantry
 from ..diagram import Diagram
-from ..document.report import Report
-from ..paper.experiments import EXPERIMENTS, Experiment
+from ..document import Report
+from ..paper import EXPERIMENTS, Experiment
 from .options import parse_options, share
 from .text import say
 from .user_models import load_user_file
@@ -52,7 +52,7 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def report_command(arguments: argparse.Namespace) -> int:
     """Make the diagram, analyse it, write the files; return the exit status."""
-    from ..document.files import check_files, write_report
+    from ..document import check_files, write_report
 
     subject = arguments.diagram or DEFAULT
     with contextlib.ExitStack() as open_file:
@@ -86,8 +86,7 @@ def report_command(arguments: argparse.Namespace) -> int:
 
 
 def _analyse(diagram: Diagram, experiment: Experiment | None, tell: Callable[[str], None]) -> Report:
-    from ..report.analyse import analyse
-    from ..report.drawings import with_drawing
+    from ..report import analyse, with_drawing
 
     return with_drawing(analyse(diagram, experiment=experiment, progress=tell), diagram)
 

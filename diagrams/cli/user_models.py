@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import DefinitionError, LoopwrightError, OptionError, near
+from ...blocks.core import Block, DefinitionError, LoopwrightError, OptionError, near
 
 _MODULE = "loopwright_user_model"
 

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 import casadi as ca
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.tracing.symbols import bundle
+from ...blocks.core import Block
+from ...blocks.tracing import bundle
 from .exercise import Bench, Columns, Point
 from .values import rule_error
 

@@ -11,22 +11,37 @@ from typing import Any, TypeGuard
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core.arithmetic import shape_of
-from ...blocks.core.block import Block
-from ...blocks.core.errors import OptionError, ShapeError, near
-from ...blocks.core.layout import Layout
-from ...blocks.core.ports import Output, PortUnit, Shape, State
-from ...blocks.core.signals import Call, Signal, as_signal
-from ...blocks.core.values import Array, parameter
-from ...blocks.tracing.equations import initial_state, start_values
-from ...blocks.tracing.numpy_check import GUARDS, NEXT, evaluate
-from ...blocks.tracing.structure import traced_parameters
-from ...blocks.tracing.symbols import bundle
-from ...blocks.tracing.trace import Traced, constants_of
+from ...blocks.core import (
+    Array,
+    Block,
+    Call,
+    Layout,
+    OptionError,
+    Output,
+    PortUnit,
+    Shape,
+    ShapeError,
+    Signal,
+    State,
+    as_signal,
+    near,
+    parameter,
+    shape_of,
+)
+from ...blocks.tracing import (
+    GUARDS,
+    NEXT,
+    Traced,
+    bundle,
+    constants_of,
+    evaluate,
+    initial_state,
+    start_values,
+    traced_parameters,
+)
 from ..diagram import Diagram
-from ..results.run import Run
-from ..wiring.structure import Collector
-from ..wiring.subsystem import exact_time
+from ..results import Run
+from ..wiring import Collector, exact_time
 
 _SAMPLES = 400  # of the exercise, over its duration
 

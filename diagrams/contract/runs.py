@@ -6,9 +6,8 @@ import pickle
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import SimulationError
-from ..results.run import Run
+from ...blocks.core import Block, SimulationError
+from ..results import Run
 from .exercise import Exercise, kind_text
 from .values import rule_error
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from ...blocks.core.errors import GuardError, ShapeError, TraceError
-from ...blocks.tracing.numpy_check import GUARDS, NEXT
-from ...blocks.tracing.symbols import bundle
+from ...blocks.core import GuardError, ShapeError, TraceError
+from ...blocks.tracing import GUARDS, NEXT, bundle
 from .exercise import Bench, Point
 from .values import rule_error
 

@@ -9,10 +9,8 @@ import pickle
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import DefinitionError, LoopwrightError, UnitError
-from ...blocks.core.units import parse_unit
-from ...blocks.tracing.symbols import bundle, size, with_values
+from ...blocks.core import Block, DefinitionError, LoopwrightError, UnitError, parse_unit
+from ...blocks.tracing import bundle, size, with_values
 from .exercise import Exercise, Point, Values, numbers_of
 
 

@@ -1,1 +1,21 @@
 """A report as a document: sections, tables and numbers, written as HTML, PDF and JSON."""
+
+from .definitions import DEFINITIONS, read_definitions
+from .files import check_files, write_report
+from .model import Plot, Section, Table
+from .report import Report
+from .templating import Texts
+from .values import symbol
+
+__all__ = [
+    "DEFINITIONS",
+    "Plot",
+    "Report",
+    "Section",
+    "Table",
+    "Texts",
+    "check_files",
+    "read_definitions",
+    "symbol",
+    "write_report",
+]

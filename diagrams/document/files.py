@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from ...blocks.core.errors import OptionError
+from ...blocks.core import OptionError
 from .html import to_html
 from .json import to_json
 from .model import Document

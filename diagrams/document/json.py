@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
 
-from ...blocks.core.errors import DefinitionError
-from ..frequency.number import Number
+from ...blocks.core import DefinitionError
+from ..frequency import Number
 from .model import Document
 
 

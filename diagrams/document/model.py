@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..frequency.number import Number
+from ..frequency import Number
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
-from ..frequency.number import Number
+from ..frequency import Number
 from .definitions import LOOP_TERMS, definition
 from .figures import Picture, embedded
 from .model import Document, Plot, Section

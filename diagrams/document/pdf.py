@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from ...blocks.core.errors import OptionError
+from ...blocks.core import OptionError
 
 
 def printer() -> Any:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..frequency.number import Number
+from ..frequency import Number
 from .model import Table
 from .values import cell, is_numeric, quantity, symbol, tolerance_text, value_text
 

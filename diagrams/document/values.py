@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..frequency.number import Number
+from ..frequency import Number
 
 _POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _UNITS = {"1": "", "deg": "°"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import NamedTuple
 
-from ..wiring.structure import Structure, Wire
+from ..wiring import Structure, Wire
 from .order import Pin
 
 

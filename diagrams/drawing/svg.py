@@ -7,10 +7,8 @@ from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 
-from ...blocks.core.arithmetic import Sum
-from ...blocks.core.errors import OptionError, near
-from ..wiring.checked_diagram import CheckedDiagram
-from ..wiring.structure import Structure, stepped_blocks
+from ...blocks.core import OptionError, Sum, near
+from ..wiring import CheckedDiagram, Structure, stepped_blocks
 from .layout import Net, arrange
 from .nets import Border, Nets, Place
 from .order import Node, Pin

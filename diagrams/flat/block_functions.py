@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ...blocks.tracing.numpy_check import GUARDS, NEXT
-from ...blocks.tracing.trace import Traced
+from ...blocks.tracing import GUARDS, NEXT, Traced
 
 
 class BlockFunctions:

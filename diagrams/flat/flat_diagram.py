@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ..wiring.check import Checked
+from ...blocks.core import Block
+from ..wiring import Checked
 from . import functions
 from .block_functions import BlockFunctions
 from .layout import FlatLayout, TickPattern, sample_time_of

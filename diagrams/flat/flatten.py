@@ -8,12 +8,8 @@ from fractions import Fraction
 
 import numpy as np
 
-from ...blocks.core.errors import SampleTimeError
-from ...blocks.core.layout import Layout
-from ...blocks.core.ports import Shape
-from ..wiring.check import Checked
-from ..wiring.evaluation_order import evaluation_order
-from ..wiring.structure import Structure, join
+from ...blocks.core import Layout, SampleTimeError, Shape
+from ..wiring import Checked, Structure, evaluation_order, join
 from .flat_diagram import FlatDiagram
 from .layout import FlatEvent, StateLayout, TickPattern, sample_time_of
 

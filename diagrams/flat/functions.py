@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from .block_functions import BlockFunctions
-from .evaluate import INDICATORS, JUMP, Apart, evaluate, rows
+from .evaluation import INDICATORS, JUMP, Apart, evaluate, rows
 from .layout import NONE, FlatLayout, TickPattern
 from .logic import choose, is_true, logic_and, logic_not
 from .stages import Schedule

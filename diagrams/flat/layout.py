@@ -17,10 +17,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ...blocks.core.layout import Layout
-from ...blocks.core.ports import Shape
-from ..wiring.evaluation_order import Order
-from ..wiring.structure import Structure, join
+from ...blocks.core import Layout, Shape
+from ..wiring import Order, Structure, join
 
 
 @dataclass(frozen=True)

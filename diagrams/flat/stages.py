@@ -39,8 +39,8 @@ from typing import Any, Protocol
 import casadi as ca
 import numpy as np
 
-from ...blocks.core.layout import Layout
-from .evaluate import Apart, Instant, no_evaluator
+from ...blocks.core import Layout
+from .evaluation import Apart, Instant, no_evaluator
 
 
 class Evaluator(Protocol):

@@ -9,8 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core.errors import ParameterError
-from ...blocks.core.layout import Layout
+from ...blocks.core import Layout, ParameterError
 from .stages import Bound, Evaluator, Evaluators, OpaqueStage, Schedule, TracedStage, bind_function, speed_up
 
 By = tuple[str, Sequence[int] | None]

@@ -8,7 +8,7 @@ from typing import Any
 
 import casadi as ca
 
-from .evaluate import Apart, Instant
+from .evaluation import Apart, Instant
 from .stages import OpaqueStage, Schedule, TracedStage
 from .vectors import join_columns
 

@@ -8,8 +8,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core.layout import Layout
-from .evaluate import Instant, rows
+from ...blocks.core import Layout
+from .evaluation import Instant, rows
 
 
 def next_x(instant: Instant) -> Any:

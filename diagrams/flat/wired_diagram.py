@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 
-from ..wiring.checked_diagram import CheckedDiagram
-from ..wiring.structure import Structure
-from ..wiring.subsystem import exact_time
+from ..wiring import CheckedDiagram, Structure, exact_time
 from .flat_diagram import FlatDiagram
 from .flatten import flatten
 

@@ -1,1 +1,44 @@
 """Margins, Nyquist, disks and pole placement of linear systems."""
+
+from .disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
+from .loop_margins import GainCrossover, Margins, PhaseCrossover, margins
+from .number import Number
+from .nyquist import NyquistCount, nyquist_count
+from .one_thread import on_one_thread
+from .pole_placement import SampledDesign, place, sampled_gains, sampled_poles
+from .polynomials import relative_difference
+from .python_control import Comparison, compare_margins, compare_with_control
+from .realization import Realization
+from .sensitivities import GangOfFour, complementary, delayed_hold, delayed_hold_margin, gang_of_four, sensitivity
+from .state_space import read_matrices
+
+__all__ = [
+    "Comparison",
+    "DiskMargin",
+    "GainCrossover",
+    "GangOfFour",
+    "Margins",
+    "Number",
+    "NyquistCount",
+    "PhaseCrossover",
+    "Realization",
+    "SampledDesign",
+    "compare_margins",
+    "compare_with_control",
+    "complementary",
+    "delayed_hold",
+    "delayed_hold_margin",
+    "disk_margin",
+    "gang_of_four",
+    "loop_at",
+    "margins",
+    "mimo_disk_margin",
+    "nyquist_count",
+    "on_one_thread",
+    "place",
+    "read_matrices",
+    "relative_difference",
+    "sampled_gains",
+    "sampled_poles",
+    "sensitivity",
+]

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ...blocks.core.errors import ConfirmationError
+from ...blocks.core import ConfirmationError
 from .crossings import Crossing
 from .features import Features
 from .nyquist import winding_number

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core.errors import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError, ParameterError
 from .confirm import confirm_limit, confirm_peak
 from .features import Features, scan
-from .margins import EIGENVALUES
+from .loop_margins import EIGENVALUES
 from .number import Number
 from .realization import Realization
 from .state_space import make_state_space, read_matrices

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core.errors import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError, ParameterError
 from .features import Features, scan
 from .realization import Realization
 

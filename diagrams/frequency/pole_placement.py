@@ -5,13 +5,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import factorial
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core.errors import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError, ParameterError
+from .polynomials import divide, eulerian_polynomial, real_polynomial, relative_difference, remainder
 
 Integral = Literal["forward", "backward", "trapezoidal"]
 AGREE = 1e-6
@@ -68,7 +68,7 @@ def _place(A: np.ndarray, B: np.ndarray, wanted: np.ndarray) -> np.ndarray:
                 block="place",
                 port=name,
             )
-    polynomial = _real_polynomial(wanted)
+    polynomial = real_polynomial(wanted)
     rank = int(np.linalg.matrix_rank(B))
     multiplicity = max(int(np.sum(np.abs(wanted - p) < 1e-9 * (1 + abs(p)))) for p in wanted)
     if rank > 1 and multiplicity <= rank:
@@ -88,19 +88,6 @@ def _place(A: np.ndarray, B: np.ndarray, wanted: np.ndarray) -> np.ndarray:
             K = _place_by_heymann(A, B, polynomial)
     _confirm_polynomial(np.poly(A - B @ K), polynomial, "place", float(np.linalg.norm(A)))
     return np.asarray(K)
-
-
-def _real_polynomial(poles: np.ndarray) -> np.ndarray:
-    """Return the coefficients of the polynomial with these roots, multiplied out pairwise so that they are real."""
-    c = np.poly(poles)
-    size = np.poly(-np.abs(poles))
-    if np.any(np.abs(np.imag(c)) > 1e-9 * np.abs(size) + 1e-300):
-        raise ParameterError(
-            f"found the poles {list(poles)!r}; expected complex ones in conjugate pairs. Add the missing conjugates.",
-            block="place",
-            port="poles",
-        )
-    return np.asarray(np.real(c))
 
 
 def _check_controllable(A: np.ndarray, B: np.ndarray) -> None:
@@ -160,7 +147,7 @@ def _place_in_chains(A: np.ndarray, B: np.ndarray, poles: np.ndarray) -> np.ndar
     reach, feedback = [], []
     for q, k, group in zip(ends, lengths, shared, strict=True):
         value = np.zeros((n, n))
-        for c in _real_polynomial(np.array(group)):
+        for c in real_polynomial(np.array(group)):
             value = value @ A + c * np.eye(n)
         reach.append(q @ np.linalg.matrix_power(A, k - 1) @ B)
         feedback.append(q @ value)
@@ -206,17 +193,6 @@ def _place_by_heymann(A: np.ndarray, B: np.ndarray, polynomial: np.ndarray) -> n
             block="place",
         )
     return best[1]
-
-
-def relative_difference(found: np.ndarray, wanted: np.ndarray, size: float = 0.0) -> float:
-    """Return the largest difference of two monic polynomials' coefficients, relative to the largest wanted one.
-
-    Time is scaled by the size of the wanted roots, or by ``size`` where all of them are zero.
-    """
-    n = len(wanted) - 1
-    roots = float(np.max(np.abs(wanted[1:]) ** (1 / np.arange(1, n + 1)), initial=0.0))
-    scale = (roots or size or 1.0) ** np.arange(n + 1)
-    return float(np.max(np.abs(found - wanted) / scale) / np.max(np.abs(wanted) / scale))
 
 
 def _confirm_polynomial(found: np.ndarray, wanted: np.ndarray, caller: str, size: float = 0.0) -> None:
@@ -335,14 +311,14 @@ def sampled_gains(
             port="poles",
         )
     w = np.expm1(wanted * sample_time) / sample_time
-    asked = _real_polynomial(w)
+    asked = real_polynomial(w)
     base, parts = _affine_polynomial(len(w), sample_time, delay, integral)
     # a vanishing remainder covers multiple poles, too
     size = float(np.max(np.abs(w)))
-    columns = [_remainder(part, asked, size) for part in parts]
-    gains = np.linalg.solve(np.array(columns).T, -_remainder(base, asked, size))
+    columns = [remainder(part, asked, size) for part in parts]
+    gains = np.linalg.solve(np.array(columns).T, -remainder(base, asked, size))
     design = sampled_poles([float(a) for a in gains], sample_time, delay=delay, integral=integral)
-    quotient, _ = _divide(np.array(design.polynomial), asked)
+    quotient, _ = divide(np.array(design.polynomial), asked)
     _confirm_polynomial(np.array(design.polynomial), np.polymul(quotient, asked), "sampled_gains")
     others = 1 + sample_time * np.roots(quotient)
     if np.any(np.abs(others) >= 1):
@@ -353,23 +329,6 @@ def sampled_gains(
             port="poles",
         )
     return design
-
-
-def _remainder(polynomial: np.ndarray, divisor: np.ndarray, size: float) -> np.ndarray:
-    """Return the remainder of a division of polynomials in w, computed in w/size to keep its digits."""
-    scaled = polynomial * size ** np.arange(len(polynomial) - 1, -1, -1.0)
-    by = divisor * size ** np.arange(len(divisor) - 1, -1, -1.0)
-    return _divide(np.append(np.zeros(max(0, len(by) - len(scaled))), scaled), by)[1]
-
-
-def _divide(polynomial: np.ndarray, divisor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return quotient and remainder; the remainder has one coefficient for each root of the divisor."""
-    rest, steps = np.array(polynomial, dtype=float), len(polynomial) - len(divisor) + 1
-    quotient = np.zeros(steps)
-    for k in range(steps):
-        quotient[k] = rest[k] / divisor[0]
-        rest[k : k + len(divisor)] -= quotient[k] * divisor
-    return quotient, rest[steps:]
 
 
 def _affine_polynomial(gains: int, T: float, delay: int, integral: Integral) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -395,19 +354,5 @@ def _affine_polynomial(gains: int, T: float, delay: int, integral: Integral) -> 
     for _ in range(int(delay)):
         base = np.polymul(base, [T, 1.0])
     # a₁ multiplies the output of the whole chain, the last gain that of its first integrator
-    parts = [np.polymul(_eulerian_polynomial(k, T), [1.0] + [0.0] * (chain + 1 - k)) for k in range(chain, 0, -1)]
-    return base, [np.polymul(sums[integral], _eulerian_polynomial(chain, T)), *parts]
-
-
-def _eulerian_polynomial(k: int, T: float) -> np.ndarray:
-    """Return the Eulerian polynomial E_k(z)/k! in w, where z = 1 + T w."""
-    eulerian = [1.0]
-    for n in range(2, k + 1):
-        longer = [0.0] * n
-        for j in range(n):
-            longer[j] = (j + 1) * (eulerian[j] if j < n - 1 else 0.0) + (n - j) * (eulerian[j - 1] if j else 0.0)
-        eulerian = longer
-    out: np.ndarray = np.zeros(1)
-    for c in eulerian:
-        out = np.polyadd(np.polymul(out, [T, 1.0]), [c])
-    return np.asarray(np.trim_zeros(out, "f")) / factorial(k)
+    parts = [np.polymul(eulerian_polynomial(k, T), [1.0] + [0.0] * (chain + 1 - k)) for k in range(chain, 0, -1)]
+    return base, [np.polymul(sums[integral], eulerian_polynomial(chain, T)), *parts]

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from ...blocks.core.errors import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError, ParameterError
 from .confirm import confirm_limit, pick_test_values
 from .crossings import Scan
-from .margins import Margins, margins
+from .loop_margins import Margins, margins
 from .one_thread import on_one_thread
 from .realization import Realization
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core.errors import ParameterError
+from ...blocks.core import ParameterError
 from .state_space import read_matrices
 
 if TYPE_CHECKING:

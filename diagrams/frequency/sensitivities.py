@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core.errors import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError, ParameterError
 from .number import Number
 from .state_space import Matrices, make_state_space, read_matrices
 

@@ -12,20 +12,26 @@ from weakref import WeakKeyDictionary
 import casadi as ca
 import numpy as np
 
-from ...blocks.core.errors import NonFiniteError, UnknownNameError, near
-from ...blocks.core.layout import Layout, elements
-from ...blocks.tracing.symbols import size
-from ...blocks.tracing.trace import Traced
-from ..flat.evaluate import Apart, Instant, evaluate
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import TickPattern
-from ..flat.stages import Evaluators, Schedule
-from ..flat.total_derivative import Derivative
-from ..flat.trace_stages import trace_schedule
-from ..flat.vectors import loop_mismatch, next_x, plant_inputs, rates
-from ..results.signal_names import resolve
-from ..simulation.workspace import Workspace
-from ..wiring.structure import Wire, join
+from ...blocks.core import Layout, NonFiniteError, UnknownNameError, elements, near
+from ...blocks.tracing import Traced, size
+from ..flat import (
+    Apart,
+    Derivative,
+    Evaluators,
+    FlatDiagram,
+    Instant,
+    Schedule,
+    TickPattern,
+    evaluate,
+    loop_mismatch,
+    next_x,
+    plant_inputs,
+    rates,
+    trace_schedule,
+)
+from ..results import resolve
+from ..simulation import Workspace
+from ..wiring import Wire, join
 from .findings import Finding, StepsOnly
 
 _RESULTS, _ARGUMENTS = ("x", "z", "y", "dx", "r"), ("x", "w", "d")

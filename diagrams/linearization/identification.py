@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import FmuError
-from ...fmus.calls.loaded_library import LoadedFmu
-from ...fmus.running.derivation import Derivation, DerivativeMethod
+from ...blocks.core import FmuError
+from ...fmus.calls import LoadedFmu
+from ...fmus.running import Derivation, DerivativeMethod
 
 SAMPLES = 1000
 """Steps of a response."""

@@ -14,10 +14,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ...blocks.core.errors import ConfirmationError, WiringError
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import TickPattern
-from ..results.operating_point import OperatingPoint
+from ...blocks.core import ConfirmationError, WiringError
+from ..flat import FlatDiagram, TickPattern
+from ..results import OperatingPoint
 from .derivatives import Parts
 from .over_a_period import Chain, Model, needed, own_states, ticks
 

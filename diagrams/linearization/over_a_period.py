@@ -15,12 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.instants import left_of
-from ...fmus.running.derivation import Derivation
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import NONE
-from ..results.operating_point import OperatingPoint
+from ...blocks.core import Block, left_of
+from ...fmus.running import Derivation
+from ..flat import NONE, FlatDiagram
+from ..results import OperatingPoint
 from .derivatives import Parts, Signal
 from .findings import EventWithinPeriod, Finding, MemoryActs, UnusualStart
 from .plant_models import PlantModel, inputs_before, joined, states_of, step_models

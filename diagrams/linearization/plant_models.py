@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import FmuError, LoopwrightError, OptionError
-from ...blocks.core.layout import Layout
-from ...fmus.running.derivation import Derivation
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import StateLayout
-from ..results.operating_point import OperatingPoint
-from ..wiring.structure import join, stepped_blocks
+from ...blocks.core import FmuError, Layout, LoopwrightError, OptionError
+from ...fmus.running import Derivation
+from ..flat import FlatDiagram, StateLayout
+from ..results import OperatingPoint
+from ..wiring import join, stepped_blocks
 from .identification import identified
 
 WAYS = ("equations", "step", "identified")

@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core.errors import FmuError
-from ...blocks.core.layout import elements
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.wired_diagram import WiredDiagram
-from ..results.operating_point import OperatingPoint
-from ..wiring.structure import join
+from ...blocks.core import FmuError, elements
+from ..flat import FlatDiagram, WiredDiagram
+from ..results import OperatingPoint
+from ..wiring import join
 from .plant_models import entries, plant_layout
 
 if TYPE_CHECKING:
@@ -102,7 +100,7 @@ class Plants:
 
     def changed(self, free: list[Free], q: list[np.ndarray]) -> dict[str, Any]:
         """Return the FMUs whose parameters are free, with these values."""
-        from ..wiring.variants import change_parameter
+        from ..wiring import change_parameter
 
         found: dict[str, Any] = {}
         for f, value in zip(free, q, strict=True):

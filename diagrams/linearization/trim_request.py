@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import OptionError, ParameterError, UnknownNameError, near
-from ...blocks.core.values import Value
-from ...blocks.tracing.structure import traced_parameters
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.wired_diagram import WiredDiagram
-from ..results.operating_point import OperatingPoint, PointOrigin
-from ..wiring.variants import change_parameter, split_path
+from ...blocks.core import OptionError, ParameterError, UnknownNameError, Value, near
+from ...blocks.tracing import traced_parameters
+from ..flat import FlatDiagram, WiredDiagram
+from ..results import OperatingPoint, PointOrigin
+from ..wiring import change_parameter, split_path
 from .derivatives import find_signal
 from .plant_models import plant_layout
 

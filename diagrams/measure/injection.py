@@ -9,19 +9,12 @@ from typing import Any, cast
 
 import numpy as np
 
-from ...blocks.core.arithmetic import Sum
-from ...blocks.core.block import Block
-from ...blocks.core.errors import WiringError
-from ...blocks.core.ports import Output
-from ...blocks.core.values import Array, parameter
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.wired_diagram import WiredDiagram
-from ..linearization.derivatives import Signal
-from ..results.operating_point import OperatingPoint
-from ..simulation.run_options import RunOptions
-from ..simulation.simulation import Simulation
-from ..simulation.start_at_point import copy_states
-from ..wiring.structure import SubsystemSettings, Wire
+from ...blocks.core import Array, Block, Output, Sum, WiringError, parameter
+from ..flat import FlatDiagram, WiredDiagram
+from ..linearization import Signal
+from ..results import OperatingPoint
+from ..simulation import RunOptions, Simulation, copy_states
+from ..wiring import SubsystemSettings, Wire
 
 NEVER = 1e12
 """Time in s that no run reaches."""

@@ -30,10 +30,9 @@ from ...blocks import (
 from ...fmus import Fmu
 from ...fmus.models import gantry
 from ..diagram import Diagram
-from ..results.run import Run
-from ..simulation.run_options import RunKeywords, RunOptions
-from ..simulation.simulation import simulate
-from .fig3 import fig3
+from ..results import Run
+from ..simulation import RunKeywords, RunOptions, simulate
+from .fig3_diagram import fig3
 from .options import DEFAULTS, ELLIPSE, merge
 from .wires import IMPEDANCE_PAR, IMPEDANCE_PERP, Channel, Rig, check_plant
 

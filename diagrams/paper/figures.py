@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..results.plots import BLUE, DARK, GREEN, GREY, VERMILION, WIDTH, limit_time, marker_of, new_figure, style
+from ..results import BLUE, DARK, GREEN, GREY, VERMILION, WIDTH, limit_time, marker_of, new_figure, style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from ..results.run import Run
+    from ..results import Run
     from .experiments import Experiment
 
 # --- the plane ------------------------------------------------------------------------------------------------------

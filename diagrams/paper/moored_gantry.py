@@ -9,8 +9,8 @@ import numpy as np
 
 from ...blocks import Array, Output, Reference, parameter
 from ...fmus import Fmu, build
-from ...fmus.models.gantry import Gantry
-from ..admittance.compliance_loop import SIDES, AdmittanceLoop
+from ...fmus.models import Gantry
+from ..admittance import SIDES, AdmittanceLoop
 from ..diagram import Diagram
 from .wires import Channel, Rig, wire
 

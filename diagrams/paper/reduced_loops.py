@@ -9,12 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...blocks import Path
-from ...fmus.models.gantry import Gantry
-from ..admittance.compliance_loop import SIDES, AdmittanceLoop
-from ..admittance.stability_limits import StabilityLimit, stability_limit
-from ..flat.wired_diagram import WiredDiagram
-from ..report.variant import Implementation
-from ..results.operating_point import OperatingPoint
+from ...fmus.models import Gantry
+from ..admittance import SIDES, AdmittanceLoop, StabilityLimit, stability_limit
+from ..flat import WiredDiagram
+from ..report import Implementation
+from ..results import OperatingPoint
 
 FRICTION = "_friction"
 """End of the keys of what has the plant's friction, where it is told apart from the same without it."""

@@ -8,14 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from ..admittance.compliance_loop import SIDES, AdmittanceLoop
-from ..admittance.coupled import growth_rate
-from ..admittance.rendered import passivity, rendered_admittance, target_admittance
-from ..admittance.stability_limits import StabilityLimit, stability_limit
-from ..document.model import Plot, Section, Table
-from ..document.templating import Texts
-from ..frequency.number import Number
-from ..report.variant import Implementation
+from ..admittance import (
+    SIDES,
+    AdmittanceLoop,
+    StabilityLimit,
+    growth_rate,
+    passivity,
+    rendered_admittance,
+    stability_limit,
+    target_admittance,
+)
+from ..document import Plot, Section, Table, Texts
+from ..frequency import Number
+from ..report import Implementation
 from .reduced_loops import ReducedLoops, each_implementation
 from .report_case import Fig3Case
 from .report_figures import RULE, TARGET, WITH_FRICTION, draw_admittances, draw_stability

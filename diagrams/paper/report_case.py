@@ -10,17 +10,14 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ...blocks import Constant, ErrorDynamics, FeedbackLinearization, Gain, Path, PlanarModel, Reference, Step
-from ...blocks.core.errors import LoopwrightError
-from ...fmus.models.gantry import Gantry
-from ...fmus.running.fmu import Fmu
-from ..admittance.compliance_loop import control_rate
-from ..admittance.shown_plant import check_plant, is_discrete
-from ..document.templating import Texts
-from ..flat.wired_diagram import WiredDiagram
-from ..report.case import Basis, Case, Excitation
-from ..report.points import point_of
-from ..report.variant import Implementation, Variant
-from ..results.operating_point import OperatingPoint
+from ...blocks.core import LoopwrightError
+from ...fmus.models import Gantry
+from ...fmus.running import Fmu
+from ..admittance import check_plant, control_rate, is_discrete
+from ..document import Texts
+from ..flat import WiredDiagram
+from ..report import Basis, Case, Excitation, Implementation, Variant, point_of
+from ..results import OperatingPoint
 from .reduced_loops import FRICTION, NO_FRICTION, ReducedLoops
 
 TEXTS = Texts(__package__, "subject")

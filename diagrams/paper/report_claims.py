@@ -7,14 +7,11 @@ from typing import Any
 import numpy as np
 
 from ...blocks import PlanarModel
-from ...blocks.core.errors import LoopwrightError
-from ...fmus.models.gantry import Gantry
-from ..document.model import Section, Table
-from ..document.templating import Texts
-from ..frequency.number import Number
-from ..frequency.pole_placement import relative_difference
-from ..report.section_poles import POLES_TITLE, scatter, without_memory
-from ..report.variant import Implementation, Variant, in_s
+from ...blocks.core import LoopwrightError
+from ...fmus.models import Gantry
+from ..document import Section, Table, Texts
+from ..frequency import Number, relative_difference
+from ..report import POLES_TITLE, Implementation, Variant, in_s, scatter, without_memory
 from .report_case import COORDINATES, Fig3Case, linearization_of
 
 TEXTS = Texts(__package__, "poles")

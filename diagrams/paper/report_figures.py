@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ..document.model import Plot
-from ..document.templating import Texts
-from ..report.plots import look_of
-from ..report.variant import Implementation
-from ..results.plots import BLUE, DARK, GREEN, VERMILION, new_figure, style
+from ..document import Plot, Texts
+from ..report import Implementation, look_of
+from ..results import BLUE, DARK, GREEN, VERMILION, new_figure, style
 
 TEXTS = Texts(__package__, "admittance")
 TARGET, WITH_FRICTION, RULE = "target", "friction", "rule_of_thumb"

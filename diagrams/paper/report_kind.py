@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from ..document.definitions import DEFINITIONS, read_definitions
-from ..document.model import Section
-from ..document.templating import Texts
-from ..report.analyse import CLOSED_LOOPS, INJECTION, INNER_LOOPS, LIMITS, MEMORY, OPERATING_POINTS, REMARKS, SUBJECT
-from ..report.parts import ReportKind, ReportPart
-from ..report.section_limits import LIMITS_TITLE
-from ..report.section_subject import SUBJECT_TITLE
+from ..document import DEFINITIONS, Section, Texts, read_definitions
+from ..report import (
+    CLOSED_LOOPS,
+    INJECTION,
+    INNER_LOOPS,
+    LIMITS,
+    LIMITS_TITLE,
+    MEMORY,
+    OPERATING_POINTS,
+    REMARKS,
+    SUBJECT,
+    SUBJECT_TITLE,
+    ReportKind,
+    ReportPart,
+)
 from .reduced_loops import ReducedLoops
 from .report_admittance import admittance, has_admittance
 from .report_case import Fig3Case

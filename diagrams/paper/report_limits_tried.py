@@ -6,13 +6,11 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from ...blocks.core.errors import ConfirmationError, LoopwrightError
-from ..admittance.compliance_loop import AdmittanceLoop
-from ..admittance.coupled import growth_rate
-from ..document.model import Section, Table
-from ..document.templating import Texts
-from ..frequency.number import Number
-from ..report.variant import Implementation
+from ...blocks.core import ConfirmationError, LoopwrightError
+from ..admittance import AdmittanceLoop, growth_rate
+from ..document import Section, Table, Texts
+from ..frequency import Number
+from ..report import Implementation
 from .moored_gantry import deviation, measured_growth, moored_diagram
 from .reduced_loops import FRICTION, ReducedLoops, each_implementation
 from .report_admittance import not_shown

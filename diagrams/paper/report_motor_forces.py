@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...blocks.core.errors import LoopwrightError
-from ..document.model import Section, Table
-from ..document.templating import Texts
-from ..frequency.disk import mimo_disk_margin
-from ..frequency.number import Number
-from ..report.disks import disk_numbers, disk_range
-from ..report.variant import Implementation
+from ...blocks.core import LoopwrightError
+from ..document import Section, Table, Texts
+from ..frequency import Number, mimo_disk_margin
+from ..report import Implementation, disk_numbers, disk_range
 from .report_case import Fig3Case
 
 TEXTS = Texts(__package__, "motor_forces")

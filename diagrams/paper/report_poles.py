@@ -8,14 +8,10 @@ from typing import Any
 import numpy as np
 
 from ...blocks import ErrorDynamics
-from ...blocks.core.errors import LoopwrightError
-from ..document.model import Section, Table
-from ..document.templating import Texts
-from ..frequency.number import Number
-from ..frequency.pole_placement import relative_difference, sampled_gains, sampled_poles
-from ..frequency.realization import Realization
-from ..report.section_poles import POLES_TITLE
-from ..report.variant import in_s
+from ...blocks.core import LoopwrightError
+from ..document import Section, Table, Texts
+from ..frequency import Number, Realization, relative_difference, sampled_gains, sampled_poles
+from ..report import POLES_TITLE, in_s
 from .report_case import Fig3Case
 
 TEXTS = Texts(__package__, "poles")

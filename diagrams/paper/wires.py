@@ -24,10 +24,10 @@ from ...blocks import (
     TransverseTransform,
     UnitDelay,
 )
-from ...blocks.core.errors import ShapeError, UnknownNameError
+from ...blocks.core import ShapeError, UnknownNameError
 from ...fmus import Fmu
 from ...fmus.models import gantry
-from ..wiring.subsystem import subsystem
+from ..wiring import subsystem
 
 POLES_PAR, POLES_PERP = (-20.0,) * 3, (-40.0,) * 3
 """Poles of the error dynamics in 1/s (section V)."""

@@ -1,1 +1,56 @@
 """The general design report."""
+
+from .analysis import (
+    ANY_DIAGRAM,
+    CLOSED_LOOPS,
+    INJECTION,
+    INNER_LOOPS,
+    LIMITS,
+    MEMORY,
+    OPERATING_POINTS,
+    REMARKS,
+    SUBJECT,
+    analyse,
+)
+from .case import Basis, Case, Excitation
+from .disks import disk_numbers, disk_range
+from .drawings import with_drawing
+from .parts import MakesSections, ReportKind, ReportPart
+from .plots import look_of
+from .points import point_of
+from .section_limits import LIMITS_TITLE
+from .section_poles import POLES_TITLE, scatter, without_memory
+from .section_subject import SUBJECT_TITLE
+from .variant import Implementation, Variant, in_s
+
+__all__ = [
+    "ANY_DIAGRAM",
+    "CLOSED_LOOPS",
+    "INJECTION",
+    "INNER_LOOPS",
+    "LIMITS",
+    "LIMITS_TITLE",
+    "MEMORY",
+    "OPERATING_POINTS",
+    "POLES_TITLE",
+    "REMARKS",
+    "SUBJECT",
+    "SUBJECT_TITLE",
+    "Basis",
+    "Case",
+    "Excitation",
+    "Implementation",
+    "MakesSections",
+    "ReportKind",
+    "ReportPart",
+    "Variant",
+    "analyse",
+    "disk_numbers",
+    "disk_range",
+    "in_s",
+    "look_of",
+    "point_of",
+    "scatter",
+    "with_drawing",
+    "without_memory",
+]

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ...blocks.core.errors import LoopwrightError
-from ..document.templating import Texts
-from ..flat.wired_diagram import WiredDiagram
-from ..linearization.findings import UnusualStart
+from ...blocks.core import LoopwrightError
+from ..document import Texts
+from ..flat import WiredDiagram
+from ..linearization import UnusualStart
 from .variant import Implementation, Variant, in_s
 from .wires import wires_on_loops
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from ...blocks.core.errors import LoopwrightError
-from ..document.model import Section, Table
-from ..frequency.disk import DiskMargin, mimo_disk_margin
-from ..frequency.number import Number
+from ...blocks.core import LoopwrightError
+from ..document import Section, Table
+from ..frequency import DiskMargin, Number, mimo_disk_margin
 from .case import Case
 
 

@@ -6,11 +6,9 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 
-from ..document.model import Plot
-from ..document.report import Report
-from ..document.templating import Texts
-from ..drawing.svg import draw
-from ..flat.wired_diagram import WiredDiagram
+from ..document import Plot, Report, Texts
+from ..drawing import draw
+from ..flat import WiredDiagram
 
 TEXTS = Texts(__package__, "figures")
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
-from ...blocks.core.errors import OptionError
-from ..document.model import Section
-from ..flat.wired_diagram import WiredDiagram
+from ...blocks.core import OptionError
+from ..document import Section
+from ..flat import WiredDiagram
 from .case import Case, ReportedExperiment
 
 C = TypeVar("C", bound=Case)

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..document.model import Plot
-from ..document.templating import Texts
-from ..results.plots import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, new_figure, style
+from ..document import Plot, Texts
+from ..results import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, new_figure, style
 from .variant import Implementation
 
 if TYPE_CHECKING:
-    from ..frequency.margins import Margins
+    from ..frequency import Margins
 
 TEXTS = Texts(__package__, "figures")
 LOOKS: Mapping[str, tuple[str, Any]] = {
@@ -42,7 +41,7 @@ def _span(loops: Mapping[str, Any], found: Mapping[str, Margins]) -> tuple[float
 
 
 def _response(L: Any, low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-    from ..frequency.realization import Realization
+    from ..frequency import Realization
 
     top = min(high, np.pi / L.dt * (1 - 1e-6)) if L.dt else high
     w = np.geomspace(low, top, 600)
@@ -147,7 +146,7 @@ def sensitivities(
 
 def response(L: Any, w: np.ndarray) -> np.ndarray:
     """Return the response of a loop with one channel at frequencies."""
-    from ..frequency.realization import Realization
+    from ..frequency import Realization
 
     return Realization.of(L).response(w)[0]
 

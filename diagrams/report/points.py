@@ -6,12 +6,11 @@ from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
-from ...blocks.core.errors import OptionError
-from ..flat.wired_diagram import WiredDiagram
-from ..linearization.operating_point import capture, operating_point
-from ..results.operating_point import OperatingPoint, PointOrigin
-from ..results.run import Snapshot
-from ..simulation.start_at_point import apply_point
+from ...blocks.core import OptionError
+from ..flat import WiredDiagram
+from ..linearization import capture, operating_point
+from ..results import OperatingPoint, PointOrigin, Snapshot
+from ..simulation import apply_point
 
 STEP = Fraction(1, 1000)
 """Communication step in s at which a diagram without a clock is run to its operating point."""
@@ -52,8 +51,7 @@ def taken_over(
     States that only this diagram has, such as those of a delay, take the values that they settle at while all others
     are held.
     """
-    from ..simulation.run_options import RunOptions
-    from ..simulation.simulation import Simulation
+    from ..simulation import RunOptions, Simulation
 
     old = source.flatten(point.base)
     if not diagram.has_clock:

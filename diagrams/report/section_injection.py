@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import LoopwrightError
-from ..document.model import Plot, Section, Table
-from ..document.templating import Texts
-from ..frequency.number import Number
-from ..linearization.linearize import Linearization
-from ..measure.frequency_response import FrequencyResponse, frequency_response
+from ...blocks.core import LoopwrightError
+from ..document import Plot, Section, Table, Texts
+from ..frequency import Number
+from ..linearization import Linearization
+from ..measure import FrequencyResponse, frequency_response
 from . import plots as figures
 from .case import Case
 from .variant import Implementation, Variant

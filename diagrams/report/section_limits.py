@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from ...blocks import AdmittanceFilter, Backlash, DeadZone, Encoder, Quantizer, RateLimiter, Relay, Saturation
-from ..document.model import Section
-from ..document.templating import Texts
+from ..document import Section, Texts
 from .case import Case
 
 TEXTS = Texts(__package__, "limits")

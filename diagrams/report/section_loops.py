@@ -7,13 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import LoopwrightError
-from ..document.model import Section, Table
-from ..document.templating import Texts
-from ..frequency.margins import Margins, margins
-from ..frequency.number import Number
-from ..frequency.python_control import Comparison, compare_margins
-from ..frequency.realization import Realization
+from ...blocks.core import LoopwrightError
+from ..document import Section, Table, Texts
+from ..frequency import Comparison, Margins, Number, Realization, compare_margins, margins
 from . import plots as figures
 from .case import Case
 from .disks import several

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..document.model import Section, Table
-from ..document.templating import Texts
-from ..frequency.number import Number
+from ..document import Section, Table, Texts
+from ..frequency import Number
 from .case import Case
 from .variant import Variant, in_s
 

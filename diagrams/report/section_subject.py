@@ -8,14 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...fmus.running.fmu import Fmu
-from ..document.model import Section, Table
-from ..document.templating import Texts
-from ..document.values import symbol
-from ..frequency.number import Number
-from ..results.operating_point import PointOrigin
-from ..wiring.structure import Wire
+from ...blocks.core import Block
+from ...fmus.running import Fmu
+from ..document import Section, Table, Texts, symbol
+from ..frequency import Number
+from ..results import PointOrigin
+from ..wiring import Wire
 from .case import Case
 from .variant import AT_REST, Variant
 

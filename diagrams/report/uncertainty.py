@@ -9,14 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import LoopwrightError
-from ...fmus.running.derivation import DerivativeMethod
-from ..document.model import Section, Table
-from ..document.templating import Texts
-from ..frequency.margins import margins
-from ..frequency.number import Number
-from ..linearization.findings import StepsOnly
-from ..linearization.linearize import linearize
+from ...blocks.core import LoopwrightError
+from ...fmus.running import DerivativeMethod
+from ..document import Section, Table, Texts
+from ..frequency import Number, margins
+from ..linearization import StepsOnly, linearize
 from .case import Case
 from .variant import Variant
 

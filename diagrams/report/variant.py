@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import LoopwrightError
-from ..flat.wired_diagram import WiredDiagram
-from ..linearization.linearize import Linearization, linearize
-from ..results.operating_point import OperatingPoint
+from ...blocks.core import LoopwrightError
+from ..flat import WiredDiagram
+from ..linearization import Linearization, linearize
+from ..results import OperatingPoint
 from .points import point_of
 
 AT_REST = 1e-6

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..wiring.checked_diagram import CheckedDiagram
+from ..wiring import CheckedDiagram
 
 MOST = 4
 """Wires at which loops are looked at where none has a name."""

@@ -1,1 +1,53 @@
 """Results of runs: recording, storage, plots and exports."""
+
+from .operating_point import OperatingPoint, PointOrigin
+from .plots import (
+    BLUE,
+    DARK,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+    WIDTH,
+    limit_time,
+    marker_of,
+    new_figure,
+    save,
+    style,
+)
+from .recorder import Recorder
+from .recording import Recording
+from .run import Run, Snapshot
+from .saved_state import RunState, check_fits, layout_of, not_open_error
+from .signal_names import resolve
+from .stored import Occurrence, Stopped
+
+__all__ = [
+    "BLUE",
+    "DARK",
+    "GREEN",
+    "GREY",
+    "ORANGE",
+    "PURPLE",
+    "VERMILION",
+    "WIDTH",
+    "Occurrence",
+    "OperatingPoint",
+    "PointOrigin",
+    "Recorder",
+    "Recording",
+    "Run",
+    "RunState",
+    "Snapshot",
+    "Stopped",
+    "check_fits",
+    "layout_of",
+    "limit_time",
+    "marker_of",
+    "new_figure",
+    "not_open_error",
+    "resolve",
+    "save",
+    "style",
+]

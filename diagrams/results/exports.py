@@ -9,7 +9,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core.errors import OptionError
+from ...blocks.core import OptionError
 from .stored import PathLike
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import shutil
 from fractions import Fraction
 from pathlib import Path
 
-from ...blocks.core.errors import OptionError
+from ...blocks.core import OptionError
 
 
 def memory() -> int:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import OptionError
-from ..flat.flat_diagram import FlatDiagram
+from ...blocks.core import OptionError
+from ..flat import FlatDiagram
 from .saved_state import StateLayout, layout_of
 
 

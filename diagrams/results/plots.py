@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core.errors import OptionError
+from ...blocks.core import OptionError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

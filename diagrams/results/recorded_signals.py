@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..wiring.structure import Wire
+from ..wiring import Wire
 
 
 class RecordedSignals(Protocol):

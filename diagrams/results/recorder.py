@@ -11,9 +11,8 @@ from typing import TextIO
 
 import numpy as np
 
-from ...blocks.core.errors import OptionError, SimulationError, UnknownNameError
-from ...blocks.core.layout import Layout
-from ..wiring.structure import Wire
+from ...blocks.core import Layout, OptionError, SimulationError, UnknownNameError
+from ..wiring import Wire
 from .memory import memory
 from .signal_names import entries, resolve
 from .stored import END, Occurrence, PathLike, create, event_line, prepare, read, split, write_json

@@ -9,10 +9,9 @@ from functools import cached_property
 
 import numpy as np
 
-from ...blocks.core.errors import OptionError
-from ...blocks.core.ports import PortUnit
-from ..flat.flat_diagram import FlatDiagram
-from ..wiring.structure import join
+from ...blocks.core import OptionError, PortUnit
+from ..flat import FlatDiagram
+from ..wiring import join
 from .memory import check_memory
 from .recorder import Recorder, check_every, select
 from .stored import PathLike, header

@@ -10,11 +10,8 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core.errors import OptionError, UnknownNameError
-from ...blocks.core.layout import Layout
-from ...blocks.core.ports import PortUnit
-from ..wiring.checked_diagram import CheckedDiagram
-from ..wiring.structure import Wire
+from ...blocks.core import Layout, OptionError, PortUnit, UnknownNameError
+from ..wiring import CheckedDiagram, Wire
 from .signal_names import entries, resolve
 from .stored import Occurrence, PathLike, Stopped, header, prepare, read, write
 

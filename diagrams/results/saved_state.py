@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import OptionError
-from ..flat.flat_diagram import FlatDiagram
+from ...blocks.core import OptionError
+from ..flat import FlatDiagram
 from .stored import Stopped, own_version
 
 VERSION = 2

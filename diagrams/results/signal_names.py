@@ -6,9 +6,8 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from ...blocks.core.errors import UnknownNameError, near
-from ...blocks.core.layout import Layout
-from ..wiring.structure import Wire
+from ...blocks.core import Layout, UnknownNameError, near
+from ..wiring import Wire
 
 
 def resolve(name: str, wires: Mapping[str, Wire], ports: Collection[str]) -> str:

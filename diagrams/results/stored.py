@@ -28,10 +28,8 @@ from typing import Any, TextIO, TypedDict, overload
 
 import numpy as np
 
-from ...blocks.core.errors import OptionError
-from ...blocks.core.layout import Layout
-from ...blocks.core.ports import PortUnit
-from ..wiring.structure import Wire
+from ...blocks.core import Layout, OptionError, PortUnit
+from ..wiring import Wire
 
 FORMAT, VERSION = "loopwright run", 1
 HEADER, ROWS, EVENTS, END = "header.json", "rows.f64", "events.jsonl", "end.json"

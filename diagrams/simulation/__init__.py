@@ -1,1 +1,18 @@
 """The loop over ticks, and between them."""
+
+from .run_options import RunKeywords, RunOptions
+from .simulation import Simulation, simulate
+from .start_at_point import apply_point, copy_states
+from .view import SimulationView
+from .workspace import Workspace
+
+__all__ = [
+    "RunKeywords",
+    "RunOptions",
+    "Simulation",
+    "SimulationView",
+    "Workspace",
+    "apply_point",
+    "copy_states",
+    "simulate",
+]

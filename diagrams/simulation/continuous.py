@@ -8,12 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import NonFiniteError, OptionError, SimulationError
-from ...blocks.core.instants import is_before, left_of
-from ..results.stored import Occurrence
-from ..solvers.base import Problem, Step
-from ..solvers.choose import make_solver
+from ...blocks.core import Block, NonFiniteError, OptionError, SimulationError, is_before, left_of
+from ..results import Occurrence
+from ..solvers import Problem, Step, make_solver
 from .diagnosis import forget_trials, opaque_failure, state_values
 from .events import Domains
 from .solver_setup import absolute_tolerances, remembers, time_scale_of

@@ -6,14 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import NonFiniteError, SimulationError
-from ...blocks.tracing.numpy_check import GUARDS, NEXT
-from ...blocks.tracing.opaque_equations import raise_failure
-from ...blocks.tracing.symbols import bundle
-from ..flat.evaluate import Instant, evaluate
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import TickPattern
-from ..flat.stages import Evaluators, evaluate_apart
+from ...blocks.core import NonFiniteError, SimulationError
+from ...blocks.tracing import GUARDS, NEXT, bundle, raise_failure
+from ..flat import Evaluators, FlatDiagram, Instant, TickPattern, evaluate, evaluate_apart
 from .vectors import Vectors
 
 

@@ -6,8 +6,8 @@ import math
 from fractions import Fraction
 from typing import Any
 
-from ...blocks.core.errors import OptionError
-from ..flat.wired_diagram import WiredDiagram
+from ...blocks.core import OptionError
+from ..flat import WiredDiagram
 
 FIXED_STEP = ("euler", "heun", "rk4")
 
@@ -43,7 +43,7 @@ def default_step(diagram: WiredDiagram, step: Any, duration: float | None, solve
         return start.base
     if duration is None:
         return step
-    from ..solvers.base import solver_name
+    from ..solvers import solver_name
 
     if diagram.has_fmu or solver_name(solver) in FIXED_STEP:
         return step

@@ -8,12 +8,10 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import SimulationError, UnknownNameError, near
-from ..flat.flat_diagram import FlatDiagram
-from ..results.operating_point import OperatingPoint
-from ..results.stored import Occurrence
-from ..solvers.base import solver_name
+from ...blocks.core import Block, SimulationError, UnknownNameError, near
+from ..flat import FlatDiagram
+from ..results import Occurrence, OperatingPoint
+from ..solvers import solver_name
 from .continuous import Continuous
 from .diagnosis import opaque_failure
 from .initialize import initialize

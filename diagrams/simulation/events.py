@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import SimulationError
-from ..flat.flat_diagram import FlatDiagram
+from ...blocks.core import SimulationError
+from ..flat import FlatDiagram
 
 _SAMPLES = 4
 _HALVINGS = 40

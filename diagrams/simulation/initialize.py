@@ -7,14 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import LoopwrightError, NonFiniteError, SimulationError
-from ...blocks.tracing.equations import initial_state
-from ...blocks.tracing.symbols import bundle
-from ..flat.evaluate import Instant, evaluate
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import NONE
-from ..flat.logic import is_true
-from ..flat.stages import evaluate_apart
+from ...blocks.core import LoopwrightError, NonFiniteError, SimulationError
+from ...blocks.tracing import bundle, initial_state
+from ..flat import NONE, FlatDiagram, Instant, evaluate, evaluate_apart, is_true
 from .diagnosis import inputs_text, shaped_inputs
 from .plants import Plant
 from .transport_delays import Delays

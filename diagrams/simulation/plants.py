@@ -8,10 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...blocks.core.errors import LoopwrightError, SimulationError
-from ...blocks.core.layout import Layout
-from ..flat.flat_diagram import FlatDiagram
-from ..wiring.structure import stepped_blocks
+from ...blocks.core import Layout, LoopwrightError, SimulationError
+from ..flat import FlatDiagram
+from ..wiring import stepped_blocks
 from .workspace import Workspace
 
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from typing import Any, Self, TypedDict
 
-from ...blocks.core.errors import OptionError, near
-from ..results.operating_point import OperatingPoint
-from ..results.saved_state import RunState
+from ...blocks.core import OptionError, near
+from ..results import OperatingPoint, RunState
 
 
 class RunKeywords(TypedDict, total=False):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..results.saved_state import RunState, layout_of
+from ..results import RunState, layout_of
 from .engine import Engine
 
 

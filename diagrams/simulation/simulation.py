@@ -49,16 +49,19 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import SimulationError
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.wired_diagram import WiredDiagram
-from ..results.operating_point import OperatingPoint
-from ..results.recorder import Recorder
-from ..results.recording import Recording
-from ..results.run import Run
-from ..results.saved_state import RunState, check_fits, not_open_error
-from ..results.stored import Occurrence, Stopped
+from ...blocks.core import Block, SimulationError
+from ..flat import FlatDiagram, WiredDiagram
+from ..results import (
+    Occurrence,
+    OperatingPoint,
+    Recorder,
+    Recording,
+    Run,
+    RunState,
+    Stopped,
+    check_fits,
+    not_open_error,
+)
 from .duration import default_step, ticks_in
 from .engine import Engine
 from .plants import has_plants

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..flat.flat_diagram import FlatDiagram
+from ..flat import FlatDiagram
 
 
 def time_scale_of(flat: FlatDiagram) -> float:

@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import FmuError, LoopwrightError, OptionError
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import TickPattern
-from ..flat.wired_diagram import WiredDiagram
-from ..results.operating_point import OperatingPoint
+from ...blocks.core import FmuError, LoopwrightError, OptionError
+from ..flat import FlatDiagram, TickPattern, WiredDiagram
+from ..results import OperatingPoint
 from .workspace import Workspace
 
 PASSES = 120

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.logic import TRUE
-from ..results.stored import Stopped
-from ..wiring.structure import join
+from ..flat import TRUE, FlatDiagram
+from ..results import Stopped
+from ..wiring import join
 
 
 class StopConditions:

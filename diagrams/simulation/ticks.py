@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import SimulationError
-from ..flat.layout import TickPattern
+from ...blocks.core import SimulationError
+from ..flat import TickPattern
 from .continuous import Continuous
 from .plants import Plant
 from .view import Position

@@ -17,10 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import ShapeError
-from ...blocks.core.instants import is_before
-from ..flat.flat_diagram import FlatDiagram
-from ..wiring.structure import join
+from ...blocks.core import ShapeError, is_before
+from ..flat import FlatDiagram
+from ..wiring import join
 
 _NODES = 9
 _BETWEEN = (0.0211, 0.2671, 0.5837, 0.9113)  # where the polynomial is compared with the input, parts of a step

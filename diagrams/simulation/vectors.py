@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..flat.flat_diagram import FlatDiagram
+from ..flat import FlatDiagram
 
 
 class Vectors:

@@ -8,7 +8,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from ..results.stored import Occurrence, Stopped
+from ..results import Occurrence, Stopped
 from .plants import Plant
 from .workspace import Workspace
 

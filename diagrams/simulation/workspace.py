@@ -8,13 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import ParameterError, SimulationError
-from ...blocks.tracing.structure import is_traced_by
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import NONE, TickPattern
-from ..flat.stages import Bound, Evaluators, Schedule
-from ..flat.total_derivative import Derivative
+from ...blocks.core import Block, ParameterError, SimulationError
+from ...blocks.tracing import is_traced_by
+from ..flat import NONE, Bound, Derivative, Evaluators, FlatDiagram, Schedule, TickPattern
 from .diagnosis import failure
 from .vectors import Vectors
 

@@ -35,7 +35,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import NonFiniteError, OptionError, SimulationError, near
+from ...blocks.core import NonFiniteError, OptionError, SimulationError, near
 
 Dense = Callable[[float], np.ndarray]
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ...blocks.core.errors import OptionError
+from ...blocks.core import OptionError
 from .base import FIXED, SUNDIALS, FixedStep, NoStates, Problem, Solver, euler, solver_name
 from .cvode import Cvode
 from .scipy_methods import AutoSolver, SciPySolver

@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import NonFiniteError, OptionError
+from ...blocks.core import NonFiniteError, OptionError
 from .base import Dense, Problem, Statistics, Step, VariableStep
 
 _ADAMS, _BDF, _ONE_STEP = 1, 2, 2

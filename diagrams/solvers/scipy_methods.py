@@ -23,7 +23,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...blocks.core.errors import SimulationError
+from ...blocks.core import SimulationError
 from .base import Dense, Problem, Step, VariableStep
 
 _ATTEMPT = {"RK23": 3, "RK45": 6, "DOP853": 12}  # evaluations of the rates per attempted step

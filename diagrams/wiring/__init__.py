@@ -1,1 +1,28 @@
 """Structure of a diagram: blocks, wires, subsystems, checks and the order of evaluation."""
+
+from .check import Checked
+from .checked_diagram import CheckedDiagram
+from .order import Order, Step, evaluation_order
+from .structure import Collector, Structure, SubsystemSettings, Wire, join, stepped_blocks
+from .subsystems import FINEST, Subsystem, exact_time, subsystem
+from .variants import change_parameter, split_path
+
+__all__ = [
+    "FINEST",
+    "Checked",
+    "CheckedDiagram",
+    "Collector",
+    "Order",
+    "Step",
+    "Structure",
+    "Subsystem",
+    "SubsystemSettings",
+    "Wire",
+    "change_parameter",
+    "evaluation_order",
+    "exact_time",
+    "join",
+    "split_path",
+    "stepped_blocks",
+    "subsystem",
+]

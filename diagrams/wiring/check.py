@@ -8,23 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import (
+from ...blocks.core import (
+    Block,
     LoopwrightError,
     SampleTimeError,
+    Shape,
     ShapeError,
     UnitError,
     UnknownNameError,
     UnwiredInputError,
     WiringError,
+    describe_mismatch,
     near,
+    same_unit,
 )
-from ...blocks.core.ports import Shape
-from ...blocks.core.units import describe_mismatch, same_unit
-from ...blocks.library.python_control import FixedSampleTime
-from ...blocks.tracing.equations import start_shapes
-from ...blocks.tracing.structure import traced_parameters
-from ...blocks.tracing.trace import Traced, trace
+from ...blocks.library import FixedSampleTime
+from ...blocks.tracing import Traced, start_shapes, trace, traced_parameters
 from .structure import Structure, Wire
 
 Unit = str | tuple[str, ...] | None

@@ -7,15 +7,13 @@ from dataclasses import replace as replace_fields
 from fractions import Fraction
 from typing import Self
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import OptionError, WiringError
-from ...blocks.core.signals import check_name
-from ...blocks.tracing.discretization import check_method
+from ...blocks.core import Block, OptionError, WiringError, check_name
+from ...blocks.tracing import check_method
 from .check import Checked, check
 from .delay_blocks import add_delay_blocks
-from .evaluation_order import evaluation_order
+from .order import evaluation_order
 from .structure import Collector, Structure, SubsystemSettings, Wire, stepped_blocks
-from .subsystem import exact_time
+from .subsystems import exact_time
 from .variants import apply_changes, find_path
 
 LOOPS = ("error", "solve")

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ...blocks.core.errors import LoopwrightError
-from ...blocks.library.delays import Delay
+from ...blocks.core import LoopwrightError
+from ...blocks.library import Delay
 from .structure import Structure, Wire, join
 
 

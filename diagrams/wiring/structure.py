@@ -10,10 +10,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import DoubleDriveError, DuplicateNameError, UnwiredInputError, WiringError
-from ...blocks.core.signals import Call, Signal, Wireable
-from .subsystem import SubsystemCall, SubsystemInput
+from ...blocks.core import (
+    Block,
+    Call,
+    DoubleDriveError,
+    DuplicateNameError,
+    Signal,
+    UnwiredInputError,
+    Wireable,
+    WiringError,
+)
+from .subsystems import SubsystemCall, SubsystemInput
 
 
 @dataclass(frozen=True)

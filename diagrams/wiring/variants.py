@@ -6,12 +6,10 @@ from collections.abc import Mapping
 from dataclasses import replace as replace_fields
 from typing import Any, TypeVar
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import UnknownNameError, WiringError, near
-from ...blocks.core.values import Value
-from ...blocks.tracing.discretization import check_method
+from ...blocks.core import Block, UnknownNameError, Value, WiringError, near
+from ...blocks.tracing import check_method
 from .structure import Structure, SubsystemSettings
-from .subsystem import check_delay, exact_offset, exact_time
+from .subsystems import check_delay, exact_offset, exact_time
 
 V = TypeVar("V", bound=Value)
 

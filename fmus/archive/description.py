@@ -13,8 +13,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from ...blocks.core.errors import FmuFileError, UnitError
-from ...blocks.core.units import parse_unit
+from ...blocks.core import FmuFileError, UnitError, parse_unit
 from ..platform import native_platform
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from ..archive.description import FmuDescription
+from ..archive import FmuDescription
 
 
 class FmuBlock(Protocol):

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import FmuError, FmuRuntimeError
+from ...blocks.core import FmuError, FmuRuntimeError
 from ..platform import native_platform
 from .fmu_block import FmuBlock
 from .loaded_library import LoadedFmu, status_of

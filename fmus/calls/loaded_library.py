@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import FmuError, FmuFileError, FmuRuntimeError, UnknownNameError, near
-from ..archive.description import FmuDescription
+from ...blocks.core import FmuError, FmuFileError, FmuRuntimeError, UnknownNameError, near
+from ..archive import FmuDescription
 from ..platform import cache_folder, check_cache
 from .fmu_block import FmuBlock
 

@@ -18,8 +18,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from ...blocks.core.errors import FmuFileError
-from ..export.compiler import SUFFIXES
+from ...blocks.core import FmuFileError
+from ..export import SUFFIXES
 from ..platform import native_platform
 
 INTERFACES = {

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...blocks.core.errors import FmuFileError
+from ...blocks.core import FmuFileError
 from ..platform import native_platform
 from .summary import INTERFACES, binaries_of, library_name, platforms_of_binary, read_archive, tuple_of
 from .trial import STAGES

@@ -1,1 +1,20 @@
 """Export of a block as an FMU: equations, C code, model description, binaries."""
+
+from .compiler import SUFFIXES, TARGETS
+from .from_block import build, model_spec
+from .model import Integrator, ModelSpec, Variable
+from .package import build_fmu, clear_cache
+from .python_fmu import build_python
+
+__all__ = [
+    "SUFFIXES",
+    "TARGETS",
+    "Integrator",
+    "ModelSpec",
+    "Variable",
+    "build",
+    "build_fmu",
+    "build_python",
+    "clear_cache",
+    "model_spec",
+]

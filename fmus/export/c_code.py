@@ -15,8 +15,7 @@ from typing import Any, Literal
 
 import casadi as ca
 
-from ...blocks.core.errors import DefinitionError
-from ...blocks.core.units import rate_of
+from ...blocks.core import DefinitionError, rate_of
 from .model import DIRECTIONS, INTEGRATORS, ModelSpec, Variable
 
 Kind = Literal["time", "fixed", "tunable", "input", "state", "discrete", "derivative", "output", "indicator"]

@@ -22,7 +22,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from ...blocks.core.errors import CompilerError, near
+from ...blocks.core import CompilerError, near
 from ..platform import cache_folder, check_cache, native_platform
 
 #: FMI 3.0 platform tuples (2.5.1.4) of the platforms to build for, and zig's name of each with the oldest system:

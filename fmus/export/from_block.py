@@ -9,17 +9,11 @@ from typing import Any, cast
 import casadi as ca
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import DefinitionError, LoopwrightError
-from ...blocks.core.layout import Layout
-from ...blocks.core.parameters import ParameterSpec
-from ...blocks.core.ports import Port, Shape
-from ...blocks.tracing.numpy_check import GUARDS, NEXT
-from ...blocks.tracing.structure import traced_parameters
-from ...blocks.tracing.trace import Traced, trace
-from .build import build_fmu
+from ...blocks.core import Block, DefinitionError, Layout, LoopwrightError, ParameterSpec, Port, Shape
+from ...blocks.tracing import GUARDS, NEXT, Traced, trace, traced_parameters
 from .html_page import block_text
 from .model import EventSpec, Integrator, ModelSpec, Variable
+from .package import build_fmu
 
 _TINY = float(np.finfo(float).tiny)  # the least positive number that is not denormal
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.block import Block
+from ...blocks.core import Block
 from .c_code import Entry, layout
 from .equation_text import equations, number
 from .model import ModelSpec, Variable

@@ -15,8 +15,7 @@ from typing import Any, Literal
 import casadi as ca
 import numpy as np
 
-from ...blocks.core.errors import DefinitionError, ParameterError
-from ...blocks.core.units import parse_unit
+from ...blocks.core import DefinitionError, ParameterError, parse_unit
 
 Causality = Literal["input", "output", "parameter", "local"]
 Variability = Literal["continuous", "discrete", "fixed", "tunable"]

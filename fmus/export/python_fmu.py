@@ -25,13 +25,10 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import DefinitionError, FmuError
-from ...blocks.core.ports import Port
-from ...blocks.tracing.structure import traced_parameters
-from ...blocks.tracing.symbols import bundle
-from .build import _zip, write_atomically
+from ...blocks.core import Block, DefinitionError, FmuError, Port
+from ...blocks.tracing import bundle, traced_parameters
 from .html_page import block_text
+from .package import _zip, write_atomically
 from .xml_fmi3 import _unit, package_version
 
 NEEDS = "Needs Python where it runs, with NumPy and Loopwright {version}: its equations are Python code."

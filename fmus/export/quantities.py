@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from ...blocks.core.units import parse_unit
+from ...blocks.core import parse_unit
 from .c_code import Entry
 
 _QUANTITIES = {

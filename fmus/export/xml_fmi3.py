@@ -14,8 +14,7 @@ from xml.sax.saxutils import quoteattr
 
 import casadi as ca
 
-from ...blocks.core.layout import Layout
-from ...blocks.core.units import BASE_UNITS, parse_unit
+from ...blocks.core import BASE_UNITS, Layout, parse_unit
 from .c_code import Entry, expand_scalar, layout, to_symbols
 from .model import ModelSpec
 from .quantities import quantity, type_names

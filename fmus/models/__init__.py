@@ -1,1 +1,7 @@
 """Plants of the library."""
+
+from .gantry import Gantry
+
+__all__ = [
+    "Gantry",
+]

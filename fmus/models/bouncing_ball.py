@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.ports import Event, State
-from ...blocks.core.values import Array, parameter
-from ..export.from_block import build as _build
+from ...blocks.core import Array, Block, Event, State, parameter
+from ..export import build as _build
 
 
 class BouncingBall(Block):

@@ -25,9 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.ports import Event, Output, State
-from ...blocks.core.values import Array, parameter
-from ..export.from_block import build as _build
+from ...blocks.core import Array, Event, Output, State, parameter
+from ..export import build as _build
 from .gantry import INTERNAL_STEP, Gantry
 
 

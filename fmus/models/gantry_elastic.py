@@ -23,9 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.ports import Output, State
-from ...blocks.core.values import Array, parameter
-from ..export.from_block import build as _build
+from ...blocks.core import Array, Output, State, parameter
+from ..export import build as _build
 from .gantry import Gantry
 
 INTERNAL_STEP = 1.0 / 10000.0

@@ -23,12 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import ParameterError
-from ...blocks.core.ports import Input, Output, State
-from ...blocks.core.values import Array, parameter
-from ..export.from_block import build as _build
-from ..export.model import Integrator
+from ...blocks.core import Array, Block, Input, Output, ParameterError, State, parameter
+from ..export import Integrator
+from ..export import build as _build
 
 INTERNAL_STEP = 1e-3
 """Start value of the FMU's longest internal step in s; Runge-Kutta 4 needs 5e-5 s to be stable up to 1.7 m/s."""

@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ...blocks.core.block import Block
-from ...blocks.core.ports import Input, Output, State
-from ...blocks.core.values import Array, parameter
-from ..export.from_block import build as _build
+from ...blocks.core import Array, Block, Input, Output, State, parameter
+from ..export import build as _build
 
 
 class MassSpringDamper(Block):

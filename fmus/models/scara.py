@@ -28,11 +28,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import ParameterError
-from ...blocks.core.ports import Input, Output, State
-from ...blocks.core.values import Array, parameter
-from ...blocks.path_following.planar_model import PlanarModel
-from ..export.from_block import build as _build
+from ...blocks.core import Array, Input, Output, ParameterError, State, parameter
+from ...blocks.path_following import PlanarModel
+from ..export import build as _build
 
 INTERNAL_STEP = 1.0 / 5000.0
 """Start value of the FMU's internal Runge-Kutta step in s; the joints' friction has a rate of 200 1/s at rest."""

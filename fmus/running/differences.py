@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from ...blocks.core.layout import Layout
-from ..archive.description import FmuDescription
+from ...blocks.core import Layout
+from ..archive import FmuDescription
 
 _EPS = float(np.finfo(float).eps)
 

@@ -10,14 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import FmuError, FmuFileError, ParameterError, UnknownNameError, near
-from ...blocks.core.frozen import FrozenMapping
-from ...blocks.core.ports import Input, Output
-from ...blocks.core.signals import Signal, UnknownAttributeError
-from ...blocks.core.values import parameter
-from ..archive.description import FmuDescription, FmuVariable, read_description
-from ..calls.instance import FmuInstance
+from ...blocks.core import (
+    Block,
+    FmuError,
+    FmuFileError,
+    FrozenMapping,
+    Input,
+    Output,
+    ParameterError,
+    Signal,
+    UnknownAttributeError,
+    UnknownNameError,
+    near,
+    parameter,
+)
+from ..archive import FmuDescription, FmuVariable, read_description
+from ..calls import FmuInstance
 from .linearization import STEP, FmuLinearization, linear_model, step_difference
 
 _STATUS = ("OK", "warning", "discard", "error", "fatal")

@@ -10,11 +10,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ...blocks.core.errors import FmuError, ParameterError, UnknownNameError, near
-from ...blocks.core.layout import Layout, elements
-from ..archive.description import FmuDescription
-from ..calls.fmu_block import FmuBlock
-from ..calls.loaded_library import LoadedFmu
+from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, elements, near
+from ..archive import FmuDescription
+from ..calls import FmuBlock, LoadedFmu
 from .derivation import Derivation, DerivativeMethod
 from .differences import Column, differentiate
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.package import build_fmu
 from support.exported import Instance, mass_spring_damper, pendulums
 from support.exported2 import Instance2
 

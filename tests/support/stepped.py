@@ -5,7 +5,7 @@ from scipy.integrate import solve_ivp
 
 from loopwright.blocks.tracing.equations import initial_state, start_values
 from loopwright.blocks.tracing.symbols import bundle
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 
 
 class Alone:

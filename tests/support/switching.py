@@ -8,7 +8,7 @@ import numpy as np
 
 from loopwright.blocks.tracing.equations import initial_state, start_values
 from loopwright.blocks.tracing.symbols import bundle
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 
 
 class Driven:

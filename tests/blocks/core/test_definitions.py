@@ -28,7 +28,7 @@ from loopwright.blocks import (
     Sum,
     TransverseTransform,
 )
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import gantry
 

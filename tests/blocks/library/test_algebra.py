@@ -16,7 +16,7 @@ from loopwright.blocks import (
     Saturation,
     Sum,
 )
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 from loopwright.diagrams import Diagram
 
 RNG = np.random.default_rng(7)

@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import solve_continuous_lyapunov
 
 from loopwright.blocks import Delay, Hold, PadeDelay, ParameterError, SampleTimeError, ShapeError, TransportDelay
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 from support.stepped import Alone, response
 
 RNG = np.random.default_rng(5)

@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 from loopwright.blocks import FIR, IIR, DiscreteIntegrator, MovingAverage, ParameterError, SampleTimeError
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 from support.stepped import Alone
 
 RNG = np.random.default_rng(9)

@@ -25,7 +25,7 @@ from loopwright.blocks import (
     parameter,
 )
 from loopwright.blocks.tracing.opaque_equations import raise_failure
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 from loopwright.diagrams import Diagram, subsystem
 
 

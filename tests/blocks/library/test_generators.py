@@ -26,7 +26,7 @@ from loopwright.blocks import (
     Step,
 )
 from loopwright.blocks.core.instants import left_of
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 from loopwright.diagrams import Diagram, subsystem
 
 

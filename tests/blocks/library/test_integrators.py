@@ -12,7 +12,7 @@ from loopwright.blocks import (
     ResettableIntegrator,
     ShapeError,
 )
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 from support.stepped import Alone
 
 RNG = np.random.default_rng(3)

@@ -17,7 +17,7 @@ from loopwright.blocks import (
     TransferFunction,
     hold,
 )
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 from support.stepped import Alone, response
 
 RNG = np.random.default_rng(11)

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm
 
 from loopwright.blocks import PID, ParameterError
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 from support.stepped import Alone, response
 
 RNG = np.random.default_rng(21)

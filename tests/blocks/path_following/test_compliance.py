@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from loopwright.blocks import AdmittanceFilter, Block, Constant, Output, ParameterError
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 from loopwright.diagrams import Diagram, subsystem
 
 LIMITS = {

@@ -36,7 +36,7 @@ from loopwright.blocks import (
     TransverseTransform,
     parameter,
 )
-from loopwright.blocks.tracing.trace import GUARDS, NEXT, bundle, trace
+from loopwright.blocks.tracing.traced import GUARDS, NEXT, bundle, trace
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import gantry
 

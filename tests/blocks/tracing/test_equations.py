@@ -23,7 +23,7 @@ from loopwright.blocks import (
 )
 from loopwright.blocks.tracing.equations import initial_state, start_shapes
 from loopwright.blocks.tracing.symbols import bundle
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 from loopwright.diagrams import Diagram
 
 

@@ -16,7 +16,7 @@ from loopwright.blocks import (
     TraceError,
     parameter,
 )
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.tracing.traced import trace
 
 
 class Thermostat(Block):

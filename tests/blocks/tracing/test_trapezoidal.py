@@ -5,8 +5,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from loopwright.blocks import Block, Constant, GuardError, Input, NonFiniteError, SampleTimeError, State, hold
-from loopwright.blocks.library.piecewise import piecewise
-from loopwright.blocks.tracing.trace import trace
+from loopwright.blocks.library.piecewise_functions import piecewise
+from loopwright.blocks.tracing.traced import trace
 from support.sampled import TICKS, Pendulum, Rotor, T, Wave, network, run_of, states, wave
 
 

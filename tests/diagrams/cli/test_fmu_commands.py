@@ -15,11 +15,11 @@ import pytest
 from lxml import etree
 
 from loopwright.diagrams.cli import fmu as _cli_fmu
-from loopwright.diagrams.cli.main import main
+from loopwright.diagrams.cli.command_line import main
 from loopwright.fmus.checks import summary as _summary
 from loopwright.fmus.checks import validation as _validation
-from loopwright.fmus.export.build import _zip
 from loopwright.fmus.export.compiler import find_compiler
+from loopwright.fmus.export.package import _zip
 from loopwright.fmus.platform import native_platform
 
 LINUX = pytest.mark.skipif(

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from loopwright.blocks import ConfirmationError
-from loopwright.diagrams.cli.main import _make_parser, main
+from loopwright.diagrams.cli.command_line import _make_parser, main
 from loopwright.diagrams.document.model import Section
 from loopwright.diagrams.document.report import Report
 from loopwright.diagrams.frequency.number import Number
-from loopwright.diagrams.report import analyse as _report_analysis
+from loopwright.diagrams.report import analysis as _report_analysis
 
 LOOP = """
 from loopwright.blocks import Gain, Integrator, Sine, Sum

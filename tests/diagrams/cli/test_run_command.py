@@ -12,11 +12,11 @@ import pytest
 
 from loopwright.blocks import OptionError, PathDomainError
 from loopwright.diagrams import experiments
-from loopwright.diagrams.cli import main as _cli
+from loopwright.diagrams.cli import command_line as _cli
 from loopwright.diagrams.cli import options as _cli_options
-from loopwright.diagrams.cli.main import main
+from loopwright.diagrams.cli.command_line import main
+from loopwright.diagrams.paper.experiment_numbers import DEFINITIONS, key_numbers
 from loopwright.diagrams.paper.figures import plot_experiment, plot_path
-from loopwright.diagrams.paper.key_numbers import DEFINITIONS, key_numbers
 from loopwright.diagrams.results.plots import STYLE, save
 
 HEADER = (

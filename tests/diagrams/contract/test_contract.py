@@ -504,7 +504,7 @@ def test_what_the_broken_ones_are_made_from_keeps_the_contract():
 
 
 def test_a_dependency_that_the_trace_does_not_show_is_found(monkeypatch):
-    import loopwright.diagrams.contract.check_block as contract
+    import loopwright.diagrams.contract.contract as contract
 
     made = contract.trace
 

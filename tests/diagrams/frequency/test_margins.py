@@ -286,7 +286,7 @@ def test_a_wrong_peak_is_not_confirmed(wrong):
 @pytest.mark.parametrize("what", ["gain", "phase", "delay", "peak", "bandwidth"])
 def test_a_scan_that_goes_wrong_is_an_error(what, monkeypatch):
     from loopwright.diagrams.frequency import crossings as _crossings
-    from loopwright.diagrams.frequency import margins as _margins
+    from loopwright.diagrams.frequency import loop_margins as _margins
 
     def off(self):
         return [_crossings.Crossing(c.omega * 1.05, c.L * 1.05, c.slope, c.error) for c in real(self)]

@@ -9,7 +9,7 @@ import scipy.linalg  # noqa: F401 - its BLAS must be loaded to be seen
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from loopwright.diagrams import margins
-from loopwright.diagrams.frequency import margins as _margins
+from loopwright.diagrams.frequency import loop_margins as _margins
 from loopwright.diagrams.frequency.one_thread import on_one_thread, one_thread
 
 

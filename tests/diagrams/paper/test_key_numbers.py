@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from loopwright.diagrams import experiments
-from loopwright.diagrams.paper.key_numbers import DEFINITIONS, key_numbers
+from loopwright.diagrams.paper.experiment_numbers import DEFINITIONS, key_numbers
 
 TANGENTIAL, TRANSVERSAL = (0.5, 10.0, 0.6), (2.0, 200.0, 0.3)  # m, k, ζ of Table III
 

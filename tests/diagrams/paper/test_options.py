@@ -13,7 +13,7 @@ import pytest
 from loopwright.blocks import OptionError
 from loopwright.diagrams import experiments
 from loopwright.diagrams.cli import options as _cli_options
-from loopwright.diagrams.cli.main import main
+from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.paper.experiments import EXPERIMENTS, compliance, force_tracking, path_following
 from loopwright.diagrams.paper.options import LIMITS
 

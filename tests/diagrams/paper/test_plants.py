@@ -18,7 +18,7 @@ from loopwright.blocks import (
     parameter,
 )
 from loopwright.diagrams import experiments
-from loopwright.diagrams.cli.main import main
+from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.paper.experiments import path_following
 from loopwright.fmus import Fmu, build, gantry
 

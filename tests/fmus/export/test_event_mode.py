@@ -3,7 +3,7 @@
 import fmpy
 import pytest
 
-from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.package import build_fmu
 from support.exported import E, ball, bounces, bouncing_ball, counter, enter, fails
 
 INTEGRATORS = (1, 2, 3)

@@ -17,10 +17,10 @@ from fmpy.validation import validate_fmu
 
 from loopwright.blocks.core.errors import DefinitionError, FmuError
 from loopwright.fmus import gantry
-from loopwright.fmus.export import build as _build
-from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export import package as _build
 from loopwright.fmus.export.from_block import build
 from loopwright.fmus.export.model import Variable
+from loopwright.fmus.export.package import build_fmu
 from loopwright.fmus.platform import native_platform
 from support.exported import explosive, mass_spring_damper, pendulums, run
 

@@ -14,8 +14,8 @@ from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from loopwright.fmus.export.build import build_fmu
 from loopwright.fmus.export.model import ModelSpec, Variable
+from loopwright.fmus.export.package import build_fmu
 from support.exported import D, Instance, K, M, bouncing_ball, mass_spring_damper, pendulums, thermostat
 from support.exported2 import E, G, Model, ball, fails2, flight, stiff
 

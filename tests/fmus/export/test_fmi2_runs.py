@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.package import build_fmu
 from support.exported import D, K, M, explosive, pendulums, run
 from support.exported2 import Instance2, fails2
 

@@ -19,12 +19,12 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from loopwright.blocks.core.errors import CompilerError, DefinitionError, FmuError, ParameterError, UnitError
-from loopwright.fmus.export import build as _build
 from loopwright.fmus.export import compiler as _compiler
-from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export import package as _build
 from loopwright.fmus.export.c_code import runtime
 from loopwright.fmus.export.compiler import TARGETS, compile_shared, find_compiler
 from loopwright.fmus.export.model import Variable
+from loopwright.fmus.export.package import build_fmu
 from loopwright.fmus.platform import native_platform
 from support.exported import mass_spring_damper, pendulums, run
 

@@ -10,7 +10,7 @@ import pytest
 from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
 
-from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.package import build_fmu
 from support.exported import (
     D,
     E,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.package import build_fmu
 from support.exported import D, Instance, K, M, exact, explosive, fails, mass_spring_damper, pendulums, run
 
 # ---- the numbers ----

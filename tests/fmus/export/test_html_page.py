@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from loopwright.fmus import gantry
-from loopwright.fmus.export.build import build_fmu
 from loopwright.fmus.export.equation_text import equations, number
 from loopwright.fmus.export.from_block import build
 from loopwright.fmus.export.html_page import block_text, index_html
 from loopwright.fmus.export.model import ModelSpec, Variable
+from loopwright.fmus.export.package import build_fmu
 from support.exported import bouncing_ball, mass_spring_damper, pendulums, thermostat
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from loopwright.fmus.export.build import build_fmu
 from loopwright.fmus.export.model import Variable
+from loopwright.fmus.export.package import build_fmu
 from support.exported import counter, driven, make_model, mass_spring_damper, unbound, van_der_pol
 from support.exported2 import fails2
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from loopwright.blocks.core.errors import DefinitionError, ParameterError
-from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.package import build_fmu
 from support.exported import D, K, M, driven, exact, explosive, fails, mass_spring_damper, unbound, van_der_pol
 
 RK4, DOPRI5, RODAS = 1, 2, 3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.package import build_fmu
 from support.exported import (
     D,
     Instance,

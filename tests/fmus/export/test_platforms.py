@@ -11,8 +11,8 @@ import fmpy
 import pytest
 from fmpy.validation import validate_fmu
 
-from loopwright.fmus.export.build import build_fmu
 from loopwright.fmus.export.compiler import TARGETS
+from loopwright.fmus.export.package import build_fmu
 from loopwright.fmus.platform import native_platform
 from support import TESTS
 from support.exported import pendulums
@@ -117,7 +117,7 @@ def test_the_native_binary_is_the_same_alone_and_among_others(everywhere):
 BUILD = """
 import sys
 from support import exported
-from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.package import build_fmu
 for fmi, arrays in ((3, True), (3, False), (2, True)):
     for make in (exported.mass_spring_damper, exported.pendulums):
         out = f"{sys.argv[1]}/{make.__name__}-{fmi}-{arrays}.fmu"

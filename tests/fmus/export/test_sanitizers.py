@@ -16,7 +16,7 @@ import ctypes, pathlib, sys
 import fmpy, fmpy.fmi2, fmpy.fmi3
 from support.exported import Instance, bouncing_ball, mass_spring_damper, pendulums, thermostat, van_der_pol
 from support.exported2 import Instance2
-from loopwright.fmus.export.build import build_fmu
+from loopwright.fmus.export.package import build_fmu
 
 folder = pathlib.Path(sys.argv[1])
 

@@ -9,12 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import OptionError, UnknownNameError, near
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.wired_diagram import WiredDiagram
-from ..results.operating_point import OperatingPoint, PointOrigin
-from ..results.run import Snapshot
-from ..results.saved_state import layout_of
+from ...blocks.core import OptionError, UnknownNameError, near
+from ..flat import FlatDiagram, WiredDiagram
+from ..results import OperatingPoint, PointOrigin, Snapshot, layout_of
 
 OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start")
 """How to run to an operating point."""
@@ -142,8 +139,7 @@ def _check_found_again(diagram: WiredDiagram, given: Snapshot, found: OperatingP
 
 def at_time(diagram: WiredDiagram, t: float, options: Mapping[str, Any]) -> OperatingPoint:
     """Run a diagram to a time, and return the operating point there."""
-    from ..simulation.run_options import RunOptions
-    from ..simulation.simulation import Simulation
+    from ..simulation import RunOptions, Simulation
 
     check_options(diagram, options, "operating_point")
     options = dict(options)

@@ -9,8 +9,7 @@ from ...blocks import Path, PlanarModel
 from ...fmus import Fmu
 from ...fmus.models import gantry
 from ..diagram import Diagram
-from ..report.analyse import ANY_DIAGRAM
-from ..report.parts import MakesSections
+from ..report import ANY_DIAGRAM, MakesSections
 from .report_case import has_parts
 from .report_kind import FIG3
 from .wires import IDEAL, Channel, Rig, wire

@@ -13,12 +13,9 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core.errors import SimulationError
-from ...blocks.core.layout import Layout
-from ...blocks.tracing.numpy_check import GUARDS, NEXT
-from ...blocks.tracing.symbols import size
-from ..wiring.evaluation_order import Step
-from ..wiring.structure import Wire, join
+from ...blocks.core import Layout, SimulationError
+from ...blocks.tracing import GUARDS, NEXT, size
+from ..wiring import Step, Wire, join
 from .block_functions import BlockFunctions
 from .layout import FlatLayout, TickPattern
 from .logic import choose, is_true, logic_and, logic_not, logic_or, to_number

@@ -16,9 +16,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from ...blocks.core.errors import AlgebraicLoopError
-from ...blocks.tracing.numpy_check import GUARDS, NEXT
-from ...blocks.tracing.trace import Traced
+from ...blocks.core import AlgebraicLoopError
+from ...blocks.tracing import GUARDS, NEXT, Traced
 from .structure import Structure
 
 Port = tuple[str, str]

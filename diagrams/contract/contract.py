@@ -7,10 +7,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...blocks.core.block import Block
-from ...blocks.core.errors import DefinitionError, LoopwrightError, OptionError, SampleTimeError, ShapeError, near
-from ...blocks.core.ports import Shape
-from ...blocks.tracing.trace import trace
+from ...blocks.core import (
+    Block,
+    DefinitionError,
+    LoopwrightError,
+    OptionError,
+    SampleTimeError,
+    Shape,
+    ShapeError,
+    near,
+)
+from ...blocks.tracing import trace
 from .events import check_events, check_smooth, find_instants
 from .exercise import Bench, Exercise, kind_text, points
 from .runs import check_run

@@ -13,17 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core.errors import LoopwrightError, OptionError, WiringError
-from ...fmus.running.derivation import Derivation, DerivativeMethod
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.layout import NONE
-from ..flat.wired_diagram import WiredDiagram
-from ..results.operating_point import OperatingPoint
-from ..wiring.subsystem import exact_time
+from ...blocks.core import LoopwrightError, OptionError, WiringError
+from ...fmus.running import Derivation, DerivativeMethod
+from ..flat import NONE, FlatDiagram, WiredDiagram
+from ..results import OperatingPoint
+from ..wiring import exact_time
 from .derivatives import Parts, Signal, find_signal, steps_only
 from .findings import Finding
 from .loops_over_a_period import confirm_closed, loop_model, moved, period_of, ticks_to_renewal
-from .operating_point import check_options, operating_point
+from .operating_points import check_options, operating_point
 from .over_a_period import EQUILIBRIUM, Model, discrete, moves_between
 from .plant_models import continuous_models, joined, states_of
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from ..results.run import Run
+    from ..results import Run
     from .experiments import Experiment
 
 BAND = 0.02

@@ -23,11 +23,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ..core.block import SOLVED, Block
-from ..core.errors import LoopwrightError, SampleTimeError, TraceError
-from ..core.layout import Layout
-from ..core.ports import Shape
-from ..core.values import Value
+from ..core import SOLVED, Block, Layout, LoopwrightError, SampleTimeError, Shape, TraceError, Value
 from .discretization import hold
 from .equations import check_definition, guards_of, match_ports, start_values, takes_update, trace_error
 from .numpy_check import GUARDS, NEXT, compare

@@ -23,7 +23,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core.errors import FmuError
+from ...blocks.core import FmuError
 from ..platform import cache_folder, native_platform
 from .c_code import generate, runtime
 from .compiler import SUFFIXES, TARGETS, Compiler, check_platform, compile_shared, find_compiler, flags
@@ -92,7 +92,7 @@ def _text(value: Any) -> str:
 def _code_parts(fmi: int) -> list[str]:
     """Return the text of the modules that write the files, so that a change of them builds anew."""
     folder = Path(__file__).parent
-    written = ("build", "c_code", "html_page", "quantities", "scalars", "xml_fmi2", "xml_fmi3")
+    written = ("c_code", "html_page", "package", "quantities", "scalars", "xml_fmi2", "xml_fmi3")
     modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
     return [package_version(), *(text for _, text in sorted(runtime(fmi).items())), *modules]
 

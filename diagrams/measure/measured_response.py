@@ -30,21 +30,17 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core.errors import OptionError
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.wired_diagram import WiredDiagram
-from ..linearization.derivatives import find_signal
-from ..linearization.loops_over_a_period import ticks_to_renewal
-from ..linearization.operating_point import operating_point
-from ..results.operating_point import OperatingPoint, PointOrigin
-from ..results.run import Snapshot
+from ...blocks.core import OptionError
+from ..flat import FlatDiagram, WiredDiagram
+from ..linearization import find_signal, operating_point, ticks_to_renewal
+from ..results import OperatingPoint, PointOrigin, Snapshot
 from .injection import InjectionRun, inject_signal
 from .waveforms import KINDS, Part, choose_step, compute_phasors, plan_signal
 
 if TYPE_CHECKING:
     from control import FrequencyResponseData
 
-    from ..linearization.linearize import Linearization
+    from ..linearization import Linearization
 
 Beginning: TypeAlias = OperatingPoint | Snapshot | float | None
 

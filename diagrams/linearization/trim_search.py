@@ -15,16 +15,22 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from ...blocks.core.errors import OptionError, SimulationError
-from ...blocks.core.layout import Layout
-from ..flat.evaluate import Apart, evaluate
-from ..flat.flat_diagram import FlatDiagram
-from ..flat.total_derivative import Derivative
-from ..flat.trace_stages import trace_schedule
-from ..flat.vectors import join_columns, loop_mismatch, next_x, plant_inputs, rates
-from ..flat.wired_diagram import WiredDiagram
-from ..results.operating_point import OperatingPoint, PointOrigin
-from .operating_point import judged, operating_point
+from ...blocks.core import Layout, OptionError, SimulationError
+from ..flat import (
+    Apart,
+    Derivative,
+    FlatDiagram,
+    WiredDiagram,
+    evaluate,
+    join_columns,
+    loop_mismatch,
+    next_x,
+    plant_inputs,
+    rates,
+    trace_schedule,
+)
+from ..results import OperatingPoint, PointOrigin
+from .operating_points import judged, operating_point
 from .trim_plants import Plants
 from .trim_request import Free, Target, free_parameters, known_states, named_states, targets_of
 

@@ -7,16 +7,22 @@ from collections.abc import Callable, Iterator
 from fractions import Fraction
 from typing import SupportsFloat, TypedDict, Unpack, overload
 
-from ...blocks.core.errors import (
+from ...blocks.core import (
+    Call,
     DoubleDriveError,
     SampleTimeError,
+    Signal,
+    UnknownAttributeError,
     UnknownNameError,
     UnwiredInputError,
+    Wireable,
     WiringError,
+    as_signal,
+    check_name,
     near,
+    recorder,
 )
-from ...blocks.core.signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, recorder
-from ...blocks.tracing.discretization import check_method
+from ...blocks.tracing import check_method
 
 FINEST = Fraction(1, 10**9)
 ENABLED, TRIGGERED = ("held", "reset"), ("rising", "falling", "both")

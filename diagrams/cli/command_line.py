@@ -17,11 +17,10 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
-from ...blocks.core.errors import FmuError, FmuFileError, LoopwrightError, OptionError
+from ...blocks.core import FmuError, FmuFileError, LoopwrightError, OptionError
 from ...fmus.models import gantry
-from ..paper.experiments import EXPERIMENTS, Experiment
-from ..paper.key_numbers import DEFINITIONS, key_numbers
-from ..results.run import Run
+from ..paper import DEFINITIONS, EXPERIMENTS, Experiment, key_numbers
+from ..results import Run
 from .fmu import COMMANDS, add_commands
 from .options import option_lines, parse_letters, parse_options, share
 from .report import add_report, report_command
@@ -202,8 +201,8 @@ def _write(
     experiment: Experiment, run: Run, problem: str | None, folder: Path
 ) -> tuple[dict[str, float | None], list[str]]:
     """Write all files of a run; return its key numbers and the files' names. Older files of the experiment go."""
-    from ..paper.figures import plot_experiment, plot_path
-    from ..results.plots import save
+    from ..paper import plot_experiment, plot_path
+    from ..results import save
 
     letter = experiment.letter
     for file in _files(letter, folder):

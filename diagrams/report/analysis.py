@@ -6,12 +6,11 @@ from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from typing import Any
 
-from ...fmus.running.fmu import Fmu
-from ..document.definitions import DEFINITIONS
-from ..document.report import Report
-from ..flat.wired_diagram import WiredDiagram
-from ..frequency.one_thread import on_one_thread
-from ..linearization.derivatives import find_signal
+from ...fmus.running import Fmu
+from ..document import DEFINITIONS, Report
+from ..flat import WiredDiagram
+from ..frequency import on_one_thread
+from ..linearization import find_signal
 from .case import Case, ReportedExperiment
 from .parts import HasReportKind, MakesSections, ReportKind, ReportPart
 from .points import STEP

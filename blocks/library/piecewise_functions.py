@@ -13,8 +13,7 @@ import casadi as ca
 import numpy as np
 from casadi import ArrayInterface
 
-from ..core.errors import TraceError
-from ..core.values import Array
+from ..core import Array, TraceError
 
 __all__ = ["bilinear", "is_traced", "jet", "piecewise", "wrap"]
 

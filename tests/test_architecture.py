@@ -1,0 +1,234 @@
+"""The architecture: arrows between sub-packages and files, sizes, public names, and the page that tells of them."""
+
+import ast
+import importlib
+import re
+from collections import defaultdict
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PAGE = ROOT / "docs" / "architecture.md"
+ROOMS = ("blocks", "fmus", "diagrams")
+FILES = sorted(p.relative_to(ROOT) for room in ROOMS for p in (ROOT / room).rglob("*.py"))
+
+
+def place_of(path):
+    """Name the sub-package that a file belongs to; a file that stands in a room itself is a place of its own."""
+    parts = Path(path).with_suffix("").parts
+    return parts[0] if parts[1:] == ("__init__",) else "/".join(parts[:2])
+
+
+@cache
+def imports():
+    """List every relative import, lazy ones and those for annotations too: file, line, imported file, imported name."""
+    found = []
+    for path in FILES:
+        for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                assert not any(a.name.startswith("loopwright") for a in node.names), f"{path}: rooms import relatively"
+            if not isinstance(node, ast.ImportFrom):
+                continue
+            assert not (node.module or "").startswith("loopwright"), f"{path}: rooms import relatively"
+            if not node.level:
+                continue
+            package = path.parts[:-1]
+            base = (*package[: len(package) - node.level + 1], *(node.module or "").split("."))
+            base = Path(*[part for part in base if part])
+            for name in (a.name for a in node.names):
+                candidates = (
+                    base / f"{name}.py",
+                    base / name / "__init__.py",
+                    base.with_suffix(".py"),
+                    base / "__init__.py",
+                )
+                target = next(c for c in candidates if (ROOT / c).is_file())
+                found.append((path, node.lineno, target, name))
+    return found
+
+
+@cache
+def table():
+    """Read the table of the page: place → the places that it may import."""
+    rows = re.findall(r"^\| `([\w/.]+)` \|[^|]*\| ([^|]*) \|$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
+    names = [name.removesuffix(".py") for name, _ in rows]
+    allowed = {}
+    for (name, cell), key in zip(rows, names, strict=True):
+        room = key.split("/")[0]
+        found = set()
+        for word in re.findall(r"`([\w/.]+)`|(all above)", cell):
+            if word[1]:
+                found |= {n for n in names[: names.index(key)] if n.split("/")[0] == room}
+            elif word[0] in ROOMS:
+                found |= {word[0], *(n for n in names if n.startswith(f"{word[0]}/"))}
+            else:
+                full = word[0].removesuffix(".py")
+                found.add(full if "/" in full else f"{room}/{full}")
+        assert found <= {*names, *ROOMS}, f"{name}: {found - set(names)} stand in no row"
+        allowed[key] = found
+    return allowed
+
+
+def test_the_table_has_a_row_for_every_place():
+    places = {place_of(path) for path in FILES} - set(ROOMS)
+    assert places == set(table())
+
+
+def test_imports_run_along_the_arrows_of_the_table():
+    wrong = []
+    for path, line, target, name in imports():
+        here, there = place_of(path), place_of(target)
+        if here in ROOMS or here == there:  # the front door of a room opens on all of it
+            continue
+        if there not in table()[here]:
+            wrong.append(f"{path}:{line}: {here} imports {name} of {there}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_arrow_of_the_table_is_used():
+    """An arrow that nobody needs is an invitation; arrows to a whole room, or to all above, are not counted."""
+    used = defaultdict(set)
+    for path, _, target, _ in imports():
+        used[place_of(path)].add(place_of(target))
+    text = PAGE.read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([\w/.]+)` \|[^|]*\| ([^|]*) \|$", text, re.MULTILINE)
+    idle = []
+    for name, cell in rows:
+        key = name.removesuffix(".py")
+        for word in re.findall(r"`([\w/.]+)`", cell):
+            full = (
+                word.removesuffix(".py")
+                if "/" in word or word in ROOMS
+                else f"{key.split('/')[0]}/{word.removesuffix('.py')}"
+            )
+            if word not in ROOMS and full not in used[key]:
+                idle.append(f"{key} never imports {full}")
+    assert not idle, "\n".join(idle)
+
+
+def circle(arrows):
+    """Return the nodes of a circle, or an empty list."""
+    state, stack = {}, []
+
+    def visit(node):
+        state[node] = "open"
+        stack.append(node)
+        for following in sorted(arrows.get(node, ())):
+            if state.get(following) == "open":
+                return stack[stack.index(following) :]
+            if following not in state and (found := visit(following)):
+                return found
+        stack.pop()
+        state[node] = "done"
+        return []
+
+    for node in sorted(arrows):
+        if node not in state and (found := visit(node)):
+            return found
+    return []
+
+
+def arrows(key):
+    found = defaultdict(set)
+    for path, _, target, _ in imports():
+        here, there = key(path), key(target)
+        if here != there:
+            found[here].add(there)
+    return found
+
+
+def test_no_circle_among_sub_packages():
+    assert circle(arrows(place_of)) == []
+
+
+def test_no_circle_among_files():
+    assert circle(arrows(str)) == []
+
+
+def test_the_search_for_circles_finds_one():
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c"]
+    assert circle({"a": {"b", "c"}, "b": {"c"}}) == []
+
+
+def test_neighbours_import_from_the_sub_package_and_nothing_private():
+    wrong = []
+    for path, line, target, name in imports():
+        if place_of(path) == place_of(target):
+            continue
+        if name.startswith("_"):
+            wrong.append(f"{path}:{line}: {name} is private to {target}")
+        if len(target.parts) > 2 and target.name != "__init__.py" and target.stem != name:
+            wrong.append(f"{path}:{line}: imports from {target}, and not from {place_of(target)}")
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("folder", sorted({str(p.parent) for p in FILES}))
+def test_folders_and_files_stay_small(folder):
+    here = [p for p in FILES if str(p.parent) == folder]
+    assert len(here) <= 24, f"{folder} holds {len(here)} files"
+    for path in here:
+        lines = len((ROOT / path).read_text(encoding="utf-8").splitlines())
+        assert lines <= 400, f"{path} has {lines} lines"
+
+
+def test_the_page_names_what_exists():
+    text = PAGE.read_text(encoding="utf-8")
+    named = set(re.findall(r"`((?:blocks|fmus|diagrams|tests|docs|benchmarks|notebooks)/[\w/.-]*)`", text))
+    assert len(named) > 30
+    assert not [name for name in named if not (ROOT / name).exists() and not (ROOT / f"{name}.py").exists()]
+    calls = re.findall(r"`([\w/]+\.py)`:? `([\w.]+)`", text)
+    assert len(calls) > 15
+    for file, function in calls:
+        tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+        found = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                found |= {f"{node.name}.{n.name}" for n in node.body if isinstance(n, ast.FunctionDef)} | {node.name}
+            elif isinstance(node, ast.FunctionDef):
+                found.add(node.name)
+        assert function in found, f"{file} has no {function}"
+
+
+# --- public names -------------------------------------------------------------------------------------------------------
+
+PUBLIC = {
+    "blocks": """
+        AdmittanceFilter AlgebraicLoopError And Array Backlash BandLimitedNoise Block Call Chirp Circle Clock
+        Compare CompilerError ConfirmationError Constant Counter CubicSpline DeadZone DefinitionError Delay
+        DiscreteIntegrator DiscreteStateSpace DiscreteTransferFunction DiscreteZeroPoleGain DoubleDriveError
+        DuplicateNameError EdgeDetector Ellipse Encoder ErrorDynamics Event FIR FeedbackLinearization
+        FilteredDerivative FmuError FmuFileError FmuRuntimeError ForceProjection ForceSensor Frame Function Gain
+        GuardError HandForce HandProfile Hold IIR Input Integrator Latch LimitedIntegrator Line Lookup1D
+        Lookup2D LoopwrightError Maximum Minimum MovingAverage NonFiniteError Not OptionError Or Output PID
+        PadeDelay ParameterError Path PathDomainError PathProjection PathSpring PathTracking PiecewiseLinear
+        PlanarModel Product Pulse PulseTrain PythonFunction Quantizer Ramp RateLimiter Recorded Reference Relay
+        Requirement ResettableIntegrator SampleTimeError Saturation ShapeError Signal SimulationError Sine
+        SmoothStep SpringDamper State StateMachine StateSpace Step StopCondition Sum Switch TraceError
+        TransferFunction TransportDelay TransverseTransform Unit UnitDelay UnitError UnknownNameError
+        UnwiredInputError Value Wall WiringError ZeroPoleGain hold parameter parse_unit
+    """,
+    "fmus": """
+        Fmu FmuDescription FmuInstance FmuLinearization FmuState FmuVariable ModelSpec Variable bouncing_ball
+        build build_fmu build_python clear_cache dc_motor gantry gantry_contact gantry_elastic gantry_stiction
+        mass_spring_damper model_spec read_description scara
+    """,
+    "diagrams": """
+        AdmittanceLoop BlockReport Channel Comparison Diagram DiskMargin Drawing Fig3Diagram FlatDiagram
+        FrequencyResponse GainCrossover GangOfFour Layout Linearization Margins Number NyquistCount Occurrence
+        OperatingPoint Passivity PhaseCrossover Plot Report Rig Run RunOptions RunState SampledDesign Section
+        Simulation SimulationView Snapshot StabilityLimit StabilityMap Stopped Subsystem SubsystemSettings Table
+        Wire analyse check_block compare_with_control complementary crossing_frequency delayed_hold
+        delayed_hold_margin disk_margin experiments fig3 gang_of_four growth_rate loop_at margins
+        mimo_disk_margin nyquist_count passivity place poles rendered_admittance rendered_response
+        rendered_system rule_of_thumb sampled_gains sampled_poles sensitivity stability_limit stability_map
+        stiffness_limits subsystem target_admittance
+    """,
+}
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_public_names_are_those_that_users_know(room):
+    """A name that goes, comes or changes stands in the changelog, and then here."""
+    assert importlib.import_module(f"loopwright.{room}").__all__ == PUBLIC[room].split()
