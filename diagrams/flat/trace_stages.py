@@ -76,12 +76,12 @@ class _Cuts:
                 carried[key] = ca.MX.sym("carried", column.numel()), column
             return carried[key][0]
 
-        own = instant.layout.parameters.slices[path]
+        own = instant.layout.parameters.slices[path]  # its sample time, and its parameters
         outputs = [ca.MX.sym(f"{path}.{name}", instant.size_of(path, name)) for name in names]
         columns = [ca.MX(ca.DM(u)) if not isinstance(u, ca.MX) else u for u in inputs]
         instant.replace_columns(carry)
         self.made.append(
-            _Cut(path, names, states, join_columns(columns), own.stop > own.start, [*carried.values()], outputs)
+            _Cut(path, names, states, join_columns(columns), own.stop > own.start + 1, [*carried.values()], outputs)
         )
         return outputs
 

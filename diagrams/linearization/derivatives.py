@@ -214,12 +214,9 @@ class Parts:
             through_all = np.linalg.solve(
                 found["r", "x"][:, where].T, np.vstack([found[n, "x"][:, where] for n in names[:4]]).T
             ).T
-            row = 0
-            for n in names[:4]:
-                through = through_all[row : row + len(found[n])]
-                row += len(found[n])
+            for n, rows in Layout.of({n: (len(found[n]),) for n in names[:4]}).slices.items():
                 for a in arguments:
-                    found[n, a] = found[n, a] - through @ found["r", a]
+                    found[n, a] = found[n, a] - through_all[rows] @ found["r", a]
                 found[n, "x"][:, where] = 0.0
         return found
 

@@ -304,11 +304,9 @@ def own_states(flat: FlatDiagram) -> set[int]:
 
     Nor what a block in continuous time only starts its search from.
     """
-    found = set(flat.continuous.tolist())
-    for path, where in flat.states.slices.items():
-        if flat.table.is_sampled(flat.table.subsystem_of[path]):
-            found |= set(range(where.start, where.stop))
-    return found
+    table = flat.table
+    sampled = flat.states.entries(path for path in flat.states.slices if table.is_sampled(table.subsystem_of[path]))
+    return {*flat.continuous.tolist(), *sampled}
 
 
 def needed(A: np.ndarray, C: np.ndarray, own: set[int], plants: set[int]) -> list[int]:

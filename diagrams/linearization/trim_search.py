@@ -48,13 +48,9 @@ class _Equations:
     def __init__(self, diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, free: list[Free], target: Target):
         self.diagram, self.flat, self.at, self.parameters, self.target = diagram, flat, at, free, target
         self.plants = Plants(flat, at, diagram)
-        steady = {path: flat.checked.traced[path].advance for path in flat.states.slices}
-        discrete = set(range(flat.states.total)) - set(flat.continuous.tolist())
-        self.sampled = [
-            i for path, where in flat.states.slices.items() for i in range(where.start, where.stop)
-            if i in discrete and steady[path] != "derivative"
-        ]  # fmt: skip
-        loops = [i for where in flat.loops.slices.values() for i in range(where.start, where.stop)]
+        traced = flat.checked.traced
+        self.sampled = flat.states.entries(p for p in flat.states.slices if traced[p].advance != "derivative")
+        loops = flat.loops.entries(flat.loops.slices)
         movable = sorted({*flat.continuous.tolist(), *self.sampled})
         self.free_x = np.array([i for i in movable if i not in target.fixed] + loops, dtype=int)
         n = self.plants.total
