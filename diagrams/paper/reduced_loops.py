@@ -26,11 +26,17 @@ OPTIONS: Mapping[Implementation, Mapping[str, Any]] = {
 """Parameters of a reduced loop that make it one of an implementation."""
 
 
-class TitledLoop(NamedTuple):
-    """A loop with its title."""
+class LoopKind(NamedTuple):
+    """A loop with its title, and what stands around the names of its numbers in their keys."""
 
     title: str
     loop: AdmittanceLoop
+    prefix: str = ""
+    suffix: str = ""
+
+    def key_of(self, name: str) -> str:
+        """Return the key of a number, such as ``force_tracking.ke_limit_friction``."""
+        return f"{self.prefix}{name}{self.suffix}"
 
 
 @dataclass(frozen=True)
@@ -90,18 +96,17 @@ class ReducedLoops:
         """Return the loops of a direction by the end of their keys: none, and that of friction."""
         return {"": self.plain[side]} | ({FRICTION: self.rough[side]} if side in self.rough else {})
 
-    def kinds(self, side: str) -> dict[str, TitledLoop]:
+    def kinds(self, side: str) -> dict[str, LoopKind]:
         """Return the loops of a direction, with impedance control and with force tracking, by the keys of limits."""
-        found: dict[str, TitledLoop] = {}
+        found: list[LoopKind] = []
         for suffix, loop in self.suffixed(side).items():
             title = ", friction slope at rest" if suffix else ""
             kind = "impedance control" if loop.admittance.stiffness > 0 else "force tracking"
-            found[f"ke_limit{suffix}"] = TitledLoop(kind + title, loop)
+            found.append(LoopKind(kind + title, loop, suffix=suffix))
             if loop.admittance.stiffness > 0:
-                found[f"force_tracking.ke_limit{suffix}"] = TitledLoop(
-                    "force tracking, k = 0" + title, with_tracking(loop)
-                )
-        return found
+                tracking = "force tracking, k = 0" + title
+                found.append(LoopKind(tracking, with_tracking(loop), "force_tracking.", suffix))
+        return {kind.key_of("ke_limit"): kind for kind in found}
 
     def limit(self, side: str, key: str, implementation: Implementation, damping: float) -> StabilityLimit:
         """Return the largest stiffness of an environment with a damping in N s/m, computed once."""

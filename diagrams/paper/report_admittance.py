@@ -93,22 +93,21 @@ def _passivity(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Ta
 
 
 def _limits(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Iterator[Table]:
-    for key, (title, _) in loops.kinds(side).items():
+    for key, kind in loops.kinds(side).items():
         rows = []
         for name in Implementation:
             for b in DAMPINGS:
                 found = loops.limit(side, key, name, b)
-                path = f"{key}.{name}.be_{b:g}"
-                numbers[path] = found.number
-                rule, frequency = (path.replace("ke_limit", other) for other in ("rule_of_thumb", "ke_frequency"))
-                numbers[rule] = Number(found.rule_of_thumb, "N/m", 0.0, "closed form (d + b_e)/T_d")
+                rule = Number(found.rule_of_thumb, "N/m", 0.0, "closed form (d + b_e)/T_d")
+                frequency = None
                 if math.isfinite(found.frequency):
-                    numbers[frequency] = Number(found.frequency, "rad/s", 1e-6 * found.frequency, found.confirmed_by)
-                rows.append(
-                    (name, f"{b:g} N s/m", numbers[path], numbers[rule], numbers.get(frequency, "–"), _again(found))
-                )
+                    frequency = Number(found.frequency, "rad/s", 1e-6 * found.frequency, found.confirmed_by)
+                shown = {"ke_limit": found.number, "rule_of_thumb": rule, "ke_frequency": frequency}
+                place = f"{name}.be_{b:g}"
+                numbers |= {f"{kind.key_of(of)}.{place}": n for of, n in shown.items() if n is not None}
+                rows.append((name, f"{b:g} N s/m", *shown.values(), _again(found)))
         columns = ("variant", "b_e", "largest k_e", "rule of thumb", "oscillates at", "stable again")
-        yield Table(f"Largest stiffness of the environment, {title}", columns, tuple(rows))
+        yield Table(f"Largest stiffness of the environment, {kind.title}", columns, tuple(rows))
 
 
 def _again(found: StabilityLimit) -> str:

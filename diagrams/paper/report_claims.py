@@ -85,7 +85,7 @@ class _Claims:
             away = max(relative_difference(p, q) for p, q in zip(polynomials, self.matched[base], strict=True))
             found["from_matched"] = Number(away, "1", 1e-9, "characteristic polynomials at all the points")
         self.numbers |= {f"{key}.{name}": number for name, number in found.items()}
-        shown = (found.get(name, "–") for name in ("coupling", "polynomial_spread", "from_matched", "slowest"))
+        shown = (found.get(name) for name in ("coupling", "polynomial_spread", "from_matched", "slowest"))
         self.rows.append((title, *shown, len(at)))
 
     def section(self) -> Section:
@@ -105,7 +105,7 @@ def polynomial(v: Variant) -> np.ndarray:
 def coupling(v: Variant) -> float:
     """Return how much of a virtual input appears in the other direction's coordinate, relative to its own one's."""
     model = v.model
-    rows = [next(i for i, n in enumerate(model.outputs) if n.startswith(name)) for name in COORDINATES]
+    rows = [model.outputs.index(f"{name}[0]") for name in COORDINATES]
     w = np.geomspace(1.0, min(1e3, 0.99 * np.pi / model.dt) if model.dt else 1e3, 60)
     p = np.exp(1j * w * model.dt) if model.dt else 1j * w
     eye = np.eye(len(model.A))

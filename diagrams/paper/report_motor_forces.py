@@ -30,7 +30,7 @@ def motor_forces(case: Fig3Case) -> Section | None:
             except LoopwrightError as error:
                 notes.append(f"{v.title} at {place}: {error.message}")
                 continue
-            numbers |= disk_numbers(f"{v.key}.{place}", disk)
+            numbers |= {f"{v.key}.{place}.{name}": number for name, number in disk_numbers(disk).items()}
             rows.append((v.title, f"{eta:.3f} m", f"{xi:.3f} m", disk.alpha, disk.frequency, disk_range(disk)))
     if not rows:
         return None

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from ...blocks.core import LoopwrightError
 from ..document import Section, Table
 from ..frequency import DiskMargin, Number, mimo_disk_margin
 from .case import Case
+from .uncertainty import LoopPart
+from .variant import Variant
 
 
-def several(case: Case, key: str, wire: str) -> Section | None:
+def several(case: Case, key: str, wire: str) -> LoopPart | None:
     """Return the section about a wire with several entries: its MIMO disk margin; None where it has none."""
-    numbers: dict[str, Number] = {}
+    own: dict[Variant, Mapping[str, Number]] = {}
     rows, notes = [], []
     for v in case.usable():
         try:
@@ -18,25 +22,26 @@ def several(case: Case, key: str, wire: str) -> Section | None:
         except LoopwrightError as error:
             notes.append(f"{v.title}: {error.message}")
             continue
-        numbers |= disk_numbers(v.key, disk)
+        own[v] = disk_numbers(disk)
         rows.append((v.title, disk.alpha, disk.frequency, disk_range(disk)))
     if not rows:
         return None
     table = Table(
         f"MIMO disk margin at {wire}", ("variant", "α", "at", "gains and phase of all entries at once"), tuple(rows)
     )
-    return Section(key, f"Loops at {wire}", tuple(notes), (table,), (), numbers)
+    numbers = {f"{v.key}.{name}": number for v, mine in own.items() for name, number in mine.items()}
+    return LoopPart(Section(key, f"Loops at {wire}", tuple(notes), (table,), (), numbers), own)
 
 
-def disk_numbers(start: str, disk: DiskMargin) -> dict[str, Number]:
-    """Return the numbers of a disk margin; their paths begin with ``start``."""
+def disk_numbers(disk: DiskMargin) -> dict[str, Number]:
+    """Return the numbers of a disk margin by the ends of their paths."""
     how = disk.alpha.confirmed_by
     return {
-        f"{start}.disk_margin": disk.alpha,
-        f"{start}.frequency": disk.frequency,
-        f"{start}.gain_low": Number(disk.gain_low, "1", disk.alpha.tolerance, how),
-        f"{start}.gain_high": Number(disk.gain_high, "1", disk.alpha.tolerance * disk.gain_high**2, how),
-        f"{start}.phase_deg": Number(disk.phase_deg, "deg", 60 * disk.alpha.tolerance, how),
+        "disk_margin": disk.alpha,
+        "frequency": disk.frequency,
+        "gain_low": Number(disk.gain_low, "1", disk.alpha.tolerance, how),
+        "gain_high": Number(disk.gain_high, "1", disk.alpha.tolerance * disk.gain_high**2, how),
+        "phase_deg": Number(disk.phase_deg, "deg", 60 * disk.alpha.tolerance, how),
     }
 
 

@@ -13,8 +13,8 @@ from ..frequency import Comparison, Margins, Number, Realization, compare_margin
 from . import plots as figures
 from .case import Case
 from .disks import several
-from .uncertainty import left_out, widened
-from .variant import in_s
+from .uncertainty import LoopPart, left_out, widened
+from .variant import Variant, in_s
 from .wires import blocks_on_loops
 
 TEXTS = Texts(__package__, "loops")
@@ -42,13 +42,14 @@ def inner(case: Case) -> Section:
         if part is None:
             text += left_out(case, wire, blocks_on_loops(case.diagram))
         else:
-            parts.append(widened(case, wire, part))
+            parts.append(widened(wire, part))
     if not parts and len(text) == 1:
         text.append(TEXTS.line("no_loop"))
     return Section("inner", "Inner loops", tuple(text), sections=tuple(parts))
 
 
-def _wire(case: Case, key: str, wire: str) -> Section | None:
+def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
+    own: dict[Variant, Mapping[str, Number]] = {}
     found: dict[str, Margins] = {}
     loops: dict[str, Any] = {}
     notes: list[str] = []
@@ -64,7 +65,8 @@ def _wire(case: Case, key: str, wire: str) -> Section | None:
             notes.append(f"{v.title}: {error.message}")
             continue
         found[v.key], loops[v.key] = m, L
-        numbers |= {f"{v.key}.{name}": number for name, number in _numbers(m).items()}
+        own[v] = _numbers(m)
+        numbers |= {f"{v.key}.{name}": number for name, number in own[v].items()}
         if m.hidden_unstable:
             shown = _poles(m.hidden_unstable, L.dt)
             notes.append(TEXTS.line("hidden_unstable", variant=v.title, poles=shown))
@@ -110,7 +112,7 @@ def _wire(case: Case, key: str, wire: str) -> Section | None:
         figures.nyquist(f"inner_{key}_nyquist", wire, plain, found, titles),
         figures.sensitivities(f"inner_{key}_sensitivities", wire, plain, found, titles),
     )
-    return Section(key, f"Loop at {wire}", tuple(notes), tuple(tables), plots, numbers)
+    return LoopPart(Section(key, f"Loop at {wire}", tuple(notes), tuple(tables), plots, numbers), own)
 
 
 def _numbers(m: Margins) -> dict[str, Number]:

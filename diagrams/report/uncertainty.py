@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
-from dataclasses import replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,8 @@ from ..linearization import StepsOnly, linearize
 from .case import Case
 from .variant import Variant
 
+PEAKS = ("ms", "mt")
+"""The numbers that say how much an error of L is amplified."""
 LINEAR = 1e-3
 """A difference between an FMU's step and its equations beyond which it is not the solver's: it moves as it steps."""
 NOTHING = 1e-12
@@ -53,7 +55,23 @@ def _zero(v: Variant, wire: str, on_cycles: Collection[str]) -> str:
     return TEXTS.line("slope_is_zero", wire=wire, steps=steps)
 
 
-def widened(case: Case, wire: str, part: Section) -> Section:
+@dataclass(frozen=True)
+class LoopPart:
+    """The section of a loop.
+
+    Attributes
+    ----------
+    section : Section
+        The section.
+    numbers : mapping of Variant to mapping of str to Number
+        Those of its numbers that come from each variant's linear model, by path behind the variant's key.
+    """
+
+    section: Section
+    numbers: Mapping[Variant, Mapping[str, Number]]
+
+
+def widened(wire: str, part: LoopPart) -> Section:
     """Return the section of a loop with tolerances that know how far the linear models of its FMUs are right.
 
     The error of a response is found at the frequencies of the section: by moving the model's entries by the
@@ -61,25 +79,25 @@ def widened(case: Case, wire: str, part: Section) -> Section:
     makes, where it tells them.
     """
     changed: dict[int, Number] = {}
-    numbers, text = dict(part.numbers), list(part.text)
-    for v in case.usable():
+    numbers, text = dict(part.section.numbers), list(part.section.text)
+    for v, own in part.numbers.items():
         if all(derivation.is_exact for derivation in v.model.derivations.values()):
             continue
-        own = {path: n for path, n in numbers.items() if path.startswith(f"{v.key}.") and ".control." not in path}
         w = [n.value for n in own.values() if n.unit == "rad/s" and 0 < n.value < math.inf]
         if not w:
             continue
         error, said = _relative_error(v, wire, np.unique(w))
         text += [f"{v.title}: {said}"] if said else []
-        peaks = [n.value for path, n in own.items() if path.endswith((".ms", ".mt")) and math.isfinite(n.value)]
+        peaks = [own[name].value for name in PEAKS if name in own and math.isfinite(own[name].value)]
         slopes = 1.0 + 2.0 * max([1.0, *peaks])
-        for path, n in own.items():
+        for name, n in own.items():
             more = _floor(n, error * slopes)
             if more > n.tolerance:
                 why = f"{n.confirmed_by}; tolerance: its FMUs' linear models are right to {error:.1e} of L"
-                changed[id(n)] = numbers[path] = replace(n, tolerance=more, confirmed_by=why)
-    tables = tuple(_renewed(table, changed) for table in part.tables)
-    return replace(part, numbers=numbers, tables=tables, text=tuple(text))
+                new = replace(n, tolerance=more, confirmed_by=why)
+                changed[id(n)] = numbers[f"{v.key}.{name}"] = new
+    tables = tuple(_renewed(table, changed) for table in part.section.tables)
+    return replace(part.section, numbers=numbers, tables=tables, text=tuple(text))
 
 
 def _floor(n: Number, error: float) -> float:
