@@ -1,4 +1,4 @@
-"""What a diagram does at a tick, between ticks, and at events: schedules of stages, traced from its blocks.
+"""The functions of a diagram at a tick, between ticks, and at events: schedules of stages, traced from its blocks.
 
     (x_next, z, log, ok) = F(t, x, w, p)    at a tick, for every set of clocks that act
     dx = f(t, x, w, p)                      between ticks: the rates of the continuous states

@@ -1,7 +1,7 @@
 """Staged schedules: a function of the whole diagram as a sequence of stages.
 
-What a diagram does at an instant is one function of ``(t, x, w, p)``. Some blocks can't be part of a traced function:
-they are evaluated from outside, by a library in C or by Python. Such a block splits the function into *stages*:
+At an instant a diagram is one function of ``(t, x, w, p)``. Some blocks can't be part of a traced function: they are
+evaluated from outside, by a library in C or by Python. Such a block splits the function into *stages*:
 
     traced stage       one CasADi function of (t, x, w, p, c): everything between two blocks that are evaluated from
                        outside. It writes a part of c, the last one the results.
@@ -68,7 +68,7 @@ class Evaluator(Protocol):
 
 
 Evaluators = Mapping[str, Evaluator]
-"""What evaluates the blocks of opaque stages, by their paths. They belong to one run."""
+"""Evaluators of the blocks of opaque stages, by path; they belong to one run."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class OpaqueStage:
     path : str
         The block.
     names : tuple of str
-        What is evaluated of it; see `Evaluator.evaluate`.
+        The equations that are wanted of it; see `Evaluator.evaluate`.
     states, inputs : slice
         Where its states and inputs stand in c.
     makes : slice
@@ -198,7 +198,7 @@ class Schedule:
         *arguments : array_like
             One column for each argument.
         evaluators : mapping, optional
-            What evaluates the blocks of opaque stages, by path.
+            Evaluators of the blocks of opaque stages, by path.
         """
         c, t = np.zeros(self.width), np.ravel(arguments[0])
         made: list[np.ndarray] = []
@@ -227,7 +227,7 @@ class Schedule:
         results : sequence of ndarray, optional
             The vectors into which it is evaluated; new ones without them.
         evaluators : mapping, optional
-            What evaluates the blocks of opaque stages, by path.
+            Evaluators of the blocks of opaque stages, by path.
         """
         if len(self.stages) == 1:
             return bind_function(self.last.fast, arguments, results)

@@ -29,7 +29,7 @@ class Derivative:
     Parameters
     ----------
     schedule : Schedule
-        What is differentiated.
+        The function that is differentiated.
     by : sequence of (str, sequence of int or None)
         By which arguments, and which entries of them.
     values : bool, default: True
@@ -81,7 +81,7 @@ class Derivative:
         *arguments : array_like
             One column for each argument of the schedule.
         evaluators : mapping, optional
-            What evaluates the blocks of opaque stages, by path.
+            Evaluators of the blocks of opaque stages, by path.
         """
         schedule = self.schedule
         count = len(schedule.results)

@@ -43,7 +43,7 @@ class _Cut:
     Attributes
     ----------
     carried : list of (symbol, expression)
-        What was made since the cut before; behind the cut the symbol stands for it.
+        Columns that were made since the cut before; behind the cut the symbols stand for them.
     outputs : list of MX
         Symbols of what the block makes.
     """

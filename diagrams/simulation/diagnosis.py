@@ -32,7 +32,7 @@ def failure(
     acting : frozenset of TickPattern
         The clocks that act there.
     evaluators : mapping, optional
-        What evaluates blocks from outside, by path.
+        Evaluators of blocks that are evaluated from outside, by path.
     """
     forget_trials(flat)
     for name, where in flat.plant_outputs.slices.items():

@@ -28,7 +28,7 @@ class Workspace:
     Attributes
     ----------
     evaluators : mapping or None
-        What evaluates the blocks of opaque stages, by path.
+        Evaluators of the blocks of opaque stages, by path.
     here, trial : Vectors
         The instant that the run has reached, and the one that a solver tries.
     p : ndarray
