@@ -1,6 +1,6 @@
 """The command line, ``loopwright``.
 
-Exit status: 0 done, 1 a run or a build failed (what a run recorded is written) or an FMU has problems, 2 wrong usage,
+Exit status: 0 done, 1 a run or a build failed (its record is written) or an FMU has problems, 2 wrong usage,
 130 interrupted.
 """
 
@@ -118,7 +118,7 @@ def _version() -> str:
         return "(not installed)"
 
 
-# --- what is asked for ----------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------------------------
 
 
 def _make_folder(name: str) -> Path:

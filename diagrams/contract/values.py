@@ -112,7 +112,9 @@ def check_ports(block: Block) -> str:
     for kind, ports in kinds.items():
         if [*ports] != [*getattr(block, kind)]:
             raise rule_error(
-                "ports", f"its {kind} are {[*ports]}, then {[*getattr(block, kind)]}; expected the same.", block
+                "ports",
+                f"its {kind} are {[*ports]}, then {[*getattr(block, kind)]}; expected the same. Use parameters alone.",
+                block,
             )
         for name, port in ports.items():
             count += 1

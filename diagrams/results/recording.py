@@ -39,11 +39,11 @@ class Recording:
             raise OptionError(f"found to={self.to!r}; expected the path of a folder.", block=self.name)
 
     def stay_in_memory(self) -> None:
-        """Let the next recorder keep its samples in memory: what is on disk stays."""
+        """Let the next recorder keep its samples in memory: the run on disk stays."""
         self.to = None
 
     def allow_overwriting(self) -> None:
-        """Let the next recorder replace what is on disk."""
+        """Let the next recorder replace the run on disk."""
         self.overwrite = True
 
     @property

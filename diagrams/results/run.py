@@ -270,7 +270,7 @@ class Run:
         """
         if not (len(self.t) and self.t[0] <= t <= self.t[-1] * (1 + 1e-12) + 1e-12):
             span = f"{self.t[0]:g} s to {self.t[-1]:g} s" if len(self.t) else "nothing"
-            raise OptionError(f"found t = {t!r}; the run holds {span}.")
+            raise OptionError(f"found t = {t!r}; the run holds {span}. Choose a time within.")
         k = int(np.searchsorted(self.t, t * (1 + 1e-12) + 1e-12, side="right")) - 1
         if not self.has_states:
             raise OptionError(

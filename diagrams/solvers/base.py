@@ -16,7 +16,7 @@ CVODE_BDF      multistep, 1 to 5        as BDF, in compiled code (also called CV
 CVODE_Adams    multistep, 1 to 12       non-stiff, rates that are costly to evaluate, few discontinuities
 rk4            Runge-Kutta 4, fixed     a fixed step: real-time code, or a result that must be smooth in parameters
 heun           Runge-Kutta 2, fixed     as rk4, half its cost per step
-euler          Runge-Kutta 1, fixed     to see what a controller's forward Euler does
+euler          Runge-Kutta 1, fixed     to see the effect of a controller's forward Euler
 ============== ======================== ====================================================================
 
 The multistep methods start again at order 1 after every discontinuity, so that a sampled controller costs them most.
@@ -309,5 +309,5 @@ def solver_name(name: str) -> str:
         hint = near(str(name).lower(), spelled)
         for lower, known in spelled.items():
             hint = hint.replace(repr(lower), repr(known))
-        raise OptionError(f"There is no solver {name!r}; expected one of {', '.join(SOLVERS)}. {hint}")
+        raise OptionError(f"there is no solver {name!r}; expected one of {', '.join(SOLVERS)}. {hint}")
     return spelled[name.lower()]

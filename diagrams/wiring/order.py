@@ -170,7 +170,7 @@ def _find_loop(waits: Mapping[Port, set[Port]], port: Port) -> list[Port]:
 
 
 def _write_loop(table: Structure, traced: Mapping[str, Traced], loop: list[Port]) -> list[str]:
-    """Print a loop port by port."""
+    """Write a loop port by port, as lines."""
     lines = []
     for i, (path, name) in enumerate(reversed(loop)):
         source = loop[-i - 2] if i + 2 <= len(loop) else loop[-1]

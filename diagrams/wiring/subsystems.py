@@ -181,13 +181,20 @@ class Subsystem:
         if self.control_input and self.control_input not in names:
             names.append(self.control_input)
         if len(args) > len(names):
-            raise WiringError(f"{len(args)} signals for {len(names)} inputs ({', '.join(names)}).", block=self.name)
+            raise WiringError(
+                f"found {len(args)} signals for {len(names)} inputs ({', '.join(names)}); give one each.",
+                block=self.name,
+            )
         given = dict(zip(names, args, strict=False))
         for key, value in kwargs.items():
             if key not in names and not self.open_ended:
                 raise UnknownNameError(f"it has no input {key!r}. {near(key, names)}", block=self.name)
             if key in given:
-                raise DoubleDriveError("it is driven twice in one call.", block=self.name, port=key)
+                raise DoubleDriveError(
+                    "it is driven twice in one call, by position and by keyword; give it once.",
+                    block=self.name,
+                    port=key,
+                )
             given[key] = value
         optional = {p.name for p in self.parameters if p.default is not inspect.Parameter.empty}
         missing = [name for name in names if name not in given and name not in optional - {self.control_input}]
