@@ -9,7 +9,7 @@ from typing import Any, Unpack
 from .document import Report, check_files, write_report
 from .drawing import Drawing, draw
 from .flat import WiredDiagram
-from .linearization import Linearization, at_time, batch, given, linearize, trim
+from .linearization import Linearization, linearize, linearize_batch, point_from_states, run_to, trim
 from .measure import FrequencyResponse, frequency_response
 from .report import analyse, with_drawing
 from .results import OperatingPoint, Run
@@ -115,8 +115,8 @@ class Diagram(WiredDiagram):
             A state that isn't there.
         """
         if states:
-            return given(self, t, states, options)
-        return at_time(self, t, options)
+            return point_from_states(self, t, states, options)
+        return run_to(self, t, options)
 
     def trim(
         self,
@@ -257,7 +257,7 @@ class Diagram(WiredDiagram):
         LoopwrightError
             As `linearize` and `replace`; the message says with which variant, and at which point.
         """
-        return batch(self, points, variants, **options)
+        return linearize_batch(self, points, variants, **options)
 
     def report(
         self,

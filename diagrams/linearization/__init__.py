@@ -2,23 +2,23 @@
 
 from .derivatives import Signal, find_signal
 from .findings import StepsOnly, UnusualStart
-from .linear_model import Linearization, batch, linearize
+from .linear_model import Linearization, linearize, linearize_batch
 from .loops_over_a_period import ticks_to_renewal
-from .operating_points import at_time, capture, operating_point
-from .trim_search import given, trim
+from .operating_points import capture, operating_point, run_to
+from .trim_search import point_from_states, trim
 
 __all__ = [
     "Linearization",
     "Signal",
     "StepsOnly",
     "UnusualStart",
-    "at_time",
-    "batch",
     "capture",
     "find_signal",
-    "given",
     "linearize",
+    "linearize_batch",
     "operating_point",
+    "point_from_states",
+    "run_to",
     "ticks_to_renewal",
     "trim",
 ]

@@ -1,12 +1,12 @@
-"""Derivatives of a diagram's functions at an instant, with signals injected and wires cut."""
+"""Derivatives of a diagram's functions at an instant, with injected signals and cut wires."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
 import casadi as ca
@@ -35,11 +35,25 @@ from ..wiring import Wire, join
 from .findings import Finding, StepsOnly
 
 _RESULTS, _ARGUMENTS = ("x", "z", "y", "dx", "r"), ("x", "w", "d")
+Numbers: TypeAlias = dict[str | tuple[str, str], np.ndarray]
+"""Values by name, ``found["z"]``, and derivatives by name and argument, ``found["z", "w"]``."""
 
 
 @dataclass(frozen=True)
 class Signal:
-    """A place in a diagram: an output port, or entries of it."""
+    """An output port of a diagram, or entries of it.
+
+    Attributes
+    ----------
+    name : str
+        Name of the wire or port.
+    port : (str, str)
+        Path of the block, and name of its port.
+    entries : tuple of int
+        Numbers of the entries in the flat port.
+    labels : tuple of str
+        Names of the entries.
+    """
 
     name: str
     port: tuple[str, str]
@@ -48,17 +62,17 @@ class Signal:
 
 
 def find_signal(flat: FlatDiagram, name: str) -> Signal:
-    """Return the place that a wire's or port's name stands for.
+    """Return the port, or entries of one, that a name of a wire or port denotes.
 
     Raises
     ------
     UnknownNameError
-        If there is none, or several.
+        If the name denotes none, or several.
     """
     wires, ports = flat.table.names, flat.log.slices
     if not isinstance(name, str):
-        raise UnknownNameError(f"found {name!r}; expected the name of a wire, or the path of a port.")
-    name, entry = _split(name, {*wires, *ports})
+        raise UnknownNameError(f"found {name!r}; expected the name of a wire, or the path of a port. Give a text.")
+    name, entry = _split_entry(name, {*wires, *ports})
     try:
         full = resolve(name, wires, ports)
     except UnknownNameError as error:
@@ -74,35 +88,37 @@ def find_signal(flat: FlatDiagram, name: str) -> Signal:
     if entry:
         if len(entry) != part.ndim or any(not i < n for i, n in zip(entry, part.shape, strict=False)):
             raise UnknownNameError(
-                f"{full!r} has the shape {part.shape}, and no entry {list(entry)}; entries are counted from 0."
+                f"{full!r} has no entry {list(entry)}; expected one within its shape {part.shape}, counted from 0."
             )
         part, labels = part[entry], labels[entry]
     flat_labels = tuple(str(e) for e in np.ravel(labels))
     return Signal(name, (wire.block, wire.port), tuple(np.ravel(part).tolist()), flat_labels)
 
 
-def _split(name: str, known: set[str]) -> tuple[str, tuple[int, ...]]:
-    """Return the name of a signal, and the entry behind it: ``q[1]`` is entry 1 of ``q``."""
+def _split_entry(name: str, known: set[str]) -> tuple[str, tuple[int, ...]]:
+    """Return the name of a signal and the entry after it: ``q[1]`` is entry 1 of ``q``."""
     found = re.fullmatch(r"(.+)\[(\d+(?:,\d+)*)\]", name)
     if found is None or name in known:
         return name, ()
     return found[1], tuple(int(i) for i in found[2].split(","))
 
 
-class Parts:
-    """Exact derivatives of what a diagram does at a tick and between ticks.
+class LocalDerivatives:
+    """Exact derivatives of a diagram's functions at a tick and between ticks.
 
     Parameters
     ----------
     flat : FlatDiagram
-        The diagram.
+        Diagram to differentiate.
     inputs : sequence of Signal
-        Where signals d are injected: added to what the consumers of the port get.
+        Ports at which signals d are injected: d is added to the signal of all consumers.
     outputs : sequence of Signal
-        What is measured: what the block puts out, ahead of the injection.
+        Ports whose signals are measured, ahead of the injection.
     openings : sequence of Signal
-        Where the wire is cut: consumers get what the port puts out in the closed diagram, as a given value, and what is
-        injected. So the motion stays that of the closed diagram, whatever is cut.
+        Ports behind which the wire is cut. Consumers get the port's value in the closed diagram, as a constant, plus
+        the injected signal. The motion therefore stays that of the closed diagram.
+    evaluators : mapping, optional
+        Evaluators of opaque stages; see `Schedule`.
     """
 
     def __init__(
@@ -126,10 +142,11 @@ class Parts:
 
     @cached_property
     def varies(self) -> bool:
-        """Whether the flow between ticks depends on time."""
+        """Whether the flow between ticks depends on time, or on algebraic loops."""
         return bool(self.flat.flow.depends("dx", "t").any()) or self._workspace is not None
 
-    def _taps(self, d: Any, c: Any) -> dict[tuple[str, str], Any]:
+    def _make_taps(self, d: ca.MX, c: ca.MX) -> dict[tuple[str, str], Any]:
+        """Return a function for each port with an injection or a cut, from its signal to that of the consumers."""
         injected: dict[tuple[str, str], list[tuple[int, int]]] = {}
         for signal, where in zip(self.inputs, self.injected, strict=True):
             places = range(where.start, where.stop)
@@ -137,7 +154,7 @@ class Parts:
         cut = Layout.of({join(*port): self.flat.checked.shapes[port] for port in self.cut})
         kept = {port: c[cut.slices[join(*port)]] for port in self.cut}
 
-        def tap(port: tuple[str, str]) -> Any:
+        def make_tap(port: tuple[str, str]) -> Any:
             def change(column: Any) -> Any:
                 column = column if isinstance(column, ca.MX) else ca.MX(ca.DM(column))
                 parts = [kept[port][i] if i in self.cut.get(port, ()) else column[i] for i in range(column.numel())]
@@ -147,9 +164,10 @@ class Parts:
 
             return change
 
-        return {port: tap(port) for port in {*injected, *self.cut}}
+        return {port: make_tap(port) for port in {*injected, *self.cut}}
 
-    def _measured(self, done: Instant) -> Any:
+    def _read_outputs(self, done: Instant) -> ca.MX:
+        """Return the measured signals, one after the other."""
         columns = []
         for signal in self.outputs:
             column = done.returned.get(signal.port)
@@ -162,8 +180,8 @@ class Parts:
             )
         return ca.vertcat(*columns) if columns else ca.MX(0, 1)
 
-    def _closed(self, acting: frozenset[TickPattern]) -> Schedule:
-        """Return ``(t, x, w, p) -> c``: what the ports that are cut put out in the closed diagram."""
+    def _trace_closed(self, acting: frozenset[TickPattern]) -> Schedule:
+        """Return ``(t, x, w, p) -> c``, the values of the cut ports in the closed diagram."""
         if acting not in self._schedules:
             flat, symbols = self.flat, self.flat.symbols()
 
@@ -174,7 +192,7 @@ class Parts:
             self._schedules[acting] = trace_schedule("closed", symbols, results)
         return self._schedules[acting]
 
-    def _derivative(self, acting: frozenset[TickPattern]) -> Derivative:
+    def _trace_derivative(self, acting: frozenset[TickPattern]) -> Derivative:
         """Return values and derivatives by (x, w, d) at an instant; ``NONE`` is one between ticks."""
         if acting not in self._derivatives:
             flat, symbols = self.flat, self.flat.symbols()
@@ -182,33 +200,38 @@ class Parts:
             c = ca.MX.sym("c", sum(size(flat.checked.shapes[port]) for port in self.cut))
 
             def results(apart: Apart) -> Mapping[str, Any]:
-                instant = evaluate(flat, flat.blocks, acting, **symbols, taps=self._taps(d, c), apart=apart)
-                found = {"x_next": next_x(instant), "z": plant_inputs(instant), "y": self._measured(instant)}
+                instant = evaluate(flat, flat.blocks, acting, **symbols, taps=self._make_taps(d, c), apart=apart)
+                found = {"x_next": next_x(instant), "z": plant_inputs(instant), "y": self._read_outputs(instant)}
                 return {**found, "dx": rates(instant), "r": loop_mismatch(instant)}
 
             schedule = trace_schedule("parts", {**symbols, "d": d, "c": c}, results)
             self._derivatives[acting] = Derivative(schedule, [(name, None) for name in _ARGUMENTS])
         return self._derivatives[acting]
 
-    def _solved(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
+    def _solve_loops(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return x with the algebraic loops solved at an instant."""
         return x if self._workspace is None else self._workspace.solve_loops(acting, t, x, w)
 
-    def at(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> dict[Any, Any]:
-        """Return the values x⁺, z, y, dx and, by name and argument, their derivatives at an instant.
+    def differentiate(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> Numbers:
+        """Return the values x⁺ ("x"), z, y and dx at an instant, and their derivatives by x, w and d.
 
         ``found["z"]`` is a value, ``found["z", "w"]`` the derivative of z by w. Algebraic loops are solved, and
         eliminated by the implicit function theorem.
+
+        Raises
+        ------
+        NonFiniteError
+            If a derivative is not finite, such as that of a square root at zero.
         """
         flat = self.flat
-        x = self._solved(acting, t, x, w)
+        x = self._solve_loops(acting, t, x, w)
         at = t, x, w, flat.p
-        c = self._closed(acting)(*at, evaluators=self.evaluators)[0] if self.cut else np.zeros(0)
-        numbers = self._derivative(acting)(*at, np.zeros(self.n_inputs), c, evaluators=self.evaluators)
+        c = self._trace_closed(acting)(*at, evaluators=self.evaluators)[0] if self.cut else np.zeros(0)
+        numbers = self._trace_derivative(acting)(*at, np.zeros(self.n_inputs), c, evaluators=self.evaluators)
         names, arguments = _RESULTS, _ARGUMENTS
         keys = [(n, a) for n in names for a in arguments]
-        found: dict[Any, Any] = dict(zip([*names, *keys], numbers, strict=True))
-        self._check_finite(found, keys, t)
+        found: Numbers = dict(zip([*names, *keys], numbers, strict=True))
+        _check_finite([found[key] for key in keys], t)
         if found["r"].size:
             where = flat.active_loops(acting)
             through_all = np.linalg.solve(
@@ -220,39 +243,42 @@ class Parts:
                 found[n, "x"][:, where] = 0.0
         return found
 
-    def _check_finite(self, found: Any, keys: Any, t: float) -> None:
-        """Refuse a point at which something has no derivative, such as a square root at zero."""
-        for key in keys:
-            if not np.all(np.isfinite(found[key])):
-                raise NonFiniteError(
-                    "the derivative of what the diagram does is not finite here. Linearize at another "
-                    "instant, or take a block that is smooth there.",
-                    t=t,
-                )
+
+def _check_finite(derivatives: Iterable[np.ndarray], t: float) -> None:
+    """Refuse an instant at which a derivative is not finite, such as that of a square root at zero."""
+    for derivative in derivatives:
+        if not np.all(np.isfinite(derivative)):
+            raise NonFiniteError(
+                "found a derivative of the diagram's functions that is not finite; expected finite numbers. Linearize "
+                "at another instant, or take a block that is smooth there.",
+                t=t,
+            )
 
 
-def steps_only(flat: FlatDiagram) -> tuple[Finding, ...]:
-    """Return what the linear model does not follow: outputs that depend on an input only by steps.
+def find_steps_only(flat: FlatDiagram) -> tuple[Finding, ...]:
+    """Return the outputs that depend on an input only in steps, as findings.
 
-    A quantizer, an encoder, a comparison: their derivative is zero everywhere, and it is known as such.
+    Quantizers, encoders and comparisons have such outputs: their symbolic derivative is zero everywhere.
     """
     return tuple(
         StepsOnly(path, port, source)
         for path, trace in flat.checked.traced.items()
-        for port, source in _steps_of(trace)
+        for port, source in _recall_steps(trace)
     )
 
 
-_STEPS: WeakKeyDictionary[Traced, list[tuple[str, str]]] = WeakKeyDictionary()  # traces are shared, and looked at once
+_STEPS: WeakKeyDictionary[Traced, list[tuple[str, str]]] = WeakKeyDictionary()  # diagrams share traces
 
 
-def _steps_of(trace: Traced) -> list[tuple[str, str]]:
+def _recall_steps(trace: Traced) -> list[tuple[str, str]]:
+    """Return the (output, input) pairs of `_find_steps`, found once for each trace."""
     if trace not in _STEPS:
-        _STEPS[trace] = _steps(trace)
+        _STEPS[trace] = _find_steps(trace)
     return _STEPS[trace]
 
 
-def _steps(trace: Traced) -> list[tuple[str, str]]:
+def _find_steps(trace: Traced) -> list[tuple[str, str]]:
+    """Return the outputs that depend on an input, with a derivative that is zero everywhere."""
     try:
         f = trace.function.expand()
     except RuntimeError:  # a table, or an opaque block

@@ -1,6 +1,6 @@
-"""Findings about a linear model: the things that it does not follow.
+"""Findings about a linear model: the effects that it leaves out.
 
-Each finding has its facts as fields, and its text as ``str(…)``. `Linearization.findings` has them all; ask for a kind
+A finding has its facts as fields, and its text as ``str(…)``. `Linearization.findings` holds all of them; select a kind
 by its class: ``[f for f in model.findings if isinstance(f, StepsOnly)]``.
 """
 
@@ -11,19 +11,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Finding:
-    """A limit of a linear model that its reader has to know; its kinds are the classes below."""
+    """A limit of a linear model; the classes below are its kinds."""
 
 
 @dataclass(frozen=True)
 class StepsOnly(Finding):
-    """An output that depends on an input only by steps, such as a quantizer's: its slope is zero.
+    """An output that depends on an input only in steps, such as a quantizer's: its slope is zero.
 
     Attributes
     ----------
     block, port : str
         Path of the block, and its output.
     source : str
-        The input that the output follows, or ``"t"``.
+        Input that the output depends on.
     """
 
     block: str
@@ -36,12 +36,12 @@ class StepsOnly(Finding):
 
 @dataclass(frozen=True)
 class EventWithinPeriod(Finding):
-    """An event within the period of the model, which is that of the motion without it.
+    """An event within the period of the model; the model is that of the motion without it.
 
     Attributes
     ----------
     block, event : str
-        Path of the block, and the name of its event.
+        Path of the block, and name of its event.
     t : float
         Start of the period in s.
     """
@@ -52,14 +52,14 @@ class EventWithinPeriod(Finding):
 
     def __str__(self) -> str:
         return (
-            f"{self.block}: its event {self.event!r} comes within the period from t = {self.t:.9g} s; the model is "
+            f"{self.block}: its event {self.event!r} fires within the period from t = {self.t:.9g} s; the model is "
             "that of the motion without it"
         )
 
 
 @dataclass(frozen=True)
 class MemoryActs(Finding):
-    """A block's memory that acts on the motion, so that it counts as a state.
+    """A block's memory that affects the motion, so that it counts as a state.
 
     Attributes
     ----------
@@ -73,15 +73,12 @@ class MemoryActs(Finding):
     slope: float
 
     def __str__(self) -> str:
-        return f"{self.block}: its memory acts on what follows ({self.slope:.3g}): it counts as a state"
+        return f"{self.block}: its memory affects the motion (slope {self.slope:.3g}): it counts as a state"
 
 
 @dataclass(frozen=True)
 class UnusualStart(Finding):
-    """A start at which the diagram acts in another way than at every later tick."""
+    """A start at which the diagram behaves in another way than at every later tick."""
 
     def __str__(self) -> str:
-        return (
-            "the start is unlike every later tick (a block does something else at its first one); linearize at a later "
-            "time"
-        )
+        return "the start is unlike every later tick, as a block has a first tick of its own; linearize at a later time"

@@ -1,11 +1,13 @@
-"""A linear model of an FMU's step from responses alone, where it gives neither derivatives nor its state.
+"""Identification of an FMU's step from its responses alone, for an FMU that gives neither derivatives nor its state.
 
-Each input gets a pulse of one step, up and down, in runs of their own from the same rest; half the differences of the
-outputs are the Markov parameters G₁, G₂, … of the step. Pulses of two sizes take away what is quadratic in them, and
-show what is left. The model x⁺ = A x + B z, w = C x with C Aᵏ⁻¹ B = Gₖ is found by the eigensystem realization
-algorithm (Juang and Pappa, J. Guidance 8 (1985) 620-627): the singular value decomposition of the block Hankel matrix
-H[i, j] = G(1 + rᵢ + cⱼ), and of the one shifted by a step. The offsets rᵢ, cⱼ are spaced by powers, so that slow and
-fast motion are in a small matrix; the order is the number of singular values above what noise explains.
+Each input gets a pulse of one step, up and down, in separate runs from the same rest. Half the differences of the
+outputs, relative to the pulse, are the Markov parameters G₁, G₂, … of the step. Pulses of two sizes cancel the errors
+that grow with the square of the pulse, and estimate the others.
+
+The model x⁺ = A x + B z, w = C x with C Aᵏ⁻¹ B = Gₖ is found by the eigensystem realization algorithm (Juang and
+Pappa, J. Guidance 8 (1985) 620-627): by singular values of the block Hankel matrix H[i, j] = G(1 + rᵢ + cⱼ) and of the
+same matrix shifted by a step. The offsets rᵢ, cⱼ are spaced by powers, so that a small matrix shows slow and fast
+motion. The order is the number of singular values above the noise.
 
 A feedthrough of the FMU acts on its outputs at the end of the step; it becomes a pole at z = 0.
 """
@@ -14,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,29 +24,36 @@ from ...blocks.core import FmuError
 from ...fmus.calls import LoadedFmu
 from ...fmus.running import Derivation, DerivativeMethod
 
+if TYPE_CHECKING:
+    from ...fmus.running import Fmu
+
 SAMPLES = 1000
 """Steps of a response."""
 SETTLING = 20_000
-"""Most steps that are waited for until the outputs stand still."""
+"""Largest number of steps until the outputs are constant."""
 PULSE = 1e-2
-"""Size of a pulse, relative to an input's nominal value, or its value where that is larger."""
+"""Size of a pulse, relative to the larger of an input's nominal value and its value."""
 STILL = 1e-10
-"""Change of an output over a step that counts as standing still, relative to 1 + its size."""
+"""Change over a step below which an output is constant, relative to 1 + its size."""
 _NOISE = 1e-10
+"""Smallest noise of the singular values, relative to the largest."""
 
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedStep:
-    """x⁺ = A x + B (z − z0), y = y0 + C x for the outputs y after a step; x is zero at the operating point.
+    """Model x⁺ = A x + B (z − z0), y = y0 + C x of an FMU's step.
+
+    y are the outputs after the step; x is zero at the operating point.
 
     Attributes
     ----------
     states : tuple of str
-        Made up: the FMU's own are not known.
+        Names of the model's states, "mode[i]": those of the FMU are not known.
     singular_values : ndarray
-        Of the scaled Hankel matrix, all of them; the order is how many were taken.
+        All singular values of the scaled Hankel matrix; the order is the number that the model uses.
     uncertainty : float
-        Largest difference between a Markov parameter of the model and the measured one, plus the latter's own error.
+        Largest difference between a Markov parameter of the model and the measured one, plus the largest error of the
+        measured ones.
     """
 
     A: np.ndarray
@@ -57,28 +66,29 @@ class IdentifiedStep:
     uncertainty: float
 
 
-def identified(
-    block: Any, point: Mapping[str, Any], h: float, outputs: np.ndarray | None = None, samples: int = SAMPLES
+def identify_step(
+    block: Fmu, point: Mapping[str, Any], h: float, outputs: np.ndarray | None = None, samples: int = SAMPLES
 ) -> IdentifiedStep:
     """Identify a linear model of an FMU's communication step at rest.
 
     Parameters
     ----------
     block : Fmu
-        The FMU.
+        FMU to identify.
     point : mapping
-        Its operating point: ``t`` in s, ``inputs`` by their ports, ``state`` by name, which is set as far as it can be.
+        Operating point of the FMU: ``t`` in s, ``inputs`` by port, ``state`` by name; states that can't be set are left
+        out.
     h : float
         Length of a step in s.
     outputs : ndarray, optional
-        Its outputs there; where it comes to rest elsewhere, that is an error.
+        Outputs at the operating point; the FMU must come to rest there.
     samples : int
         Steps of a response.
 
     Raises
     ------
     FmuError
-        If with these inputs it comes to no rest, or not to that one.
+        If the FMU does not come to rest with these inputs, or rests at other outputs, or its responses are noise.
     """
     runner = _Runner(block, point, h)
     try:
@@ -87,16 +97,16 @@ def identified(
             y0, outputs, rtol=1e-6, atol=1e-9 * (1.0 + np.max(np.abs(y0), initial=0.0))
         ):
             raise FmuError(
-                f"by its responses alone it can be linearized only where it comes to "
-                f"rest by itself from its start values: there its outputs are {y0.tolist()}, at the operating point "
-                f"{np.ravel(outputs).tolist()}. Give it start values of that point, or an operating point at rest.",
+                f"by its responses alone it can be linearized only where it comes to rest by itself from its start "
+                f"values: found the outputs {y0.tolist()} there; expected those of the operating point, "
+                f"{np.ravel(outputs).tolist()}. Give the FMU start values of that point, or choose a point at rest.",
                 block=block.label,
             )
-        G, noise = _markov(runner, samples)
+        G, noise = _measure_markov(runner, samples)
     finally:
         runner.close()
-    A, B, C, sigma = realization(G, noise)
-    model = predicted(A, B, C, len(G))
+    A, B, C, sigma = realize(G, noise)
+    model = predict_markov(A, B, C, len(G))
     error = float(np.max(np.abs(model - G), initial=0.0) + np.max(noise, initial=0.0))
     states, derivation = (
         tuple(f"mode[{i}]" for i in range(len(A))),
@@ -106,9 +116,9 @@ def identified(
 
 
 class _Runner:
-    """Runs of an FMU from one rest."""
+    """Runs of an FMU from the same rest."""
 
-    def __init__(self, block: Any, point: Mapping[str, Any], h: float):
+    def __init__(self, block: Fmu, point: Mapping[str, Any], h: float):
         self.block, self.about, self.h, self.t0 = block, block.description, h, float(point["t"])
         back = {new: old for old, new in block.rename.items()}
         self.inputs = {back.get(port, port): np.array(v, dtype=float) for port, v in point["inputs"].items()}
@@ -120,7 +130,7 @@ class _Runner:
         self._begin()
 
     def close(self) -> None:
-        """Free it."""
+        """Free the instance."""
         if self._saved is not None:
             self.instance._fmu.freeFMUState(self._saved)
         self.instance.close()
@@ -140,22 +150,21 @@ class _Runner:
         )
         if terminate or early:
             raise FmuError(
-                "it ends a step early, so that no linear model of it can be identified. Take a smaller step.",
+                f"found a step of {self.h:g} s that it ends early; expected whole steps. Take a smaller step.",
                 block=self.block.label,
             )
         self._k += 1
         return self.instance.values(self.outputs)
 
     def settle(self) -> np.ndarray:
-        """Step until the outputs stand still for 10 steps, and return them; `rest` then comes back to this."""
+        """Step until the outputs are constant for 10 steps, and return them; `return_to_rest` comes back to this."""
         last, still = self.instance.values(self.outputs), 0
         while still < 10:
             if self._k >= SETTLING:
                 raise FmuError(
-                    f"it can be identified from its responses at rest only, and with "
-                    f"the inputs of the operating point held it still moves after {SETTLING * self.h:g} s. Choose an "
-                    "operating point at which it rests, or plants=None where it gives derivatives, or takes "
-                    "its state.",
+                    f"it can be identified from its responses only at rest; with the inputs of the operating point "
+                    f"held, it still moves after {SETTLING * self.h:g} s. Choose an operating point at which it rests, "
+                    "or plants=None if it gives derivatives or its state can be set.",
                     block=self.block.label,
                 )
             y = self.step()
@@ -166,8 +175,8 @@ class _Runner:
             self._saved = self.instance.call("saving its state", "getFMUState")
         return last
 
-    def rest(self) -> None:
-        """Go back to the rest."""
+    def return_to_rest(self) -> None:
+        """Go back to the rest that `settle` has found."""
         if self._saved is not None:
             self.instance.call("restoring its state", "setFMUState", self._saved)
             self._k = self._steps
@@ -176,9 +185,9 @@ class _Runner:
             while self._k < self._steps:
                 self.step()
 
-    def response(self, name: str, change: np.ndarray, samples: int) -> np.ndarray:
-        """Return the outputs after each step, with an input changed during the first one."""
-        self.rest()
+    def measure_response(self, name: str, change: np.ndarray, samples: int) -> np.ndarray:
+        """Return the outputs after each step, with one input changed during the first step."""
+        self.return_to_rest()
         self.instance.set_values({name: self.inputs[name] + change})
         y = [self.step()]
         self.instance.set_values({name: self.inputs[name]})
@@ -186,8 +195,8 @@ class _Runner:
         return np.array(y)
 
 
-def _markov(runner: _Runner, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return G, (step, output, input), and the estimated error of each output by each input."""
+def _measure_markov(runner: _Runner, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the Markov parameters G, by step, output and input, and their estimated error by output and input."""
     found, errors = [], []
     for name, value in runner.inputs.items():
         nominal = abs(runner.about.variables[name].nominal or 1.0)
@@ -196,7 +205,8 @@ def _markov(runner: _Runner, samples: int) -> tuple[np.ndarray, np.ndarray]:
             pulse = np.zeros(value.shape)
             pulse[index] = d
             one, two = (
-                (runner.response(name, k * pulse, samples) - runner.response(name, -k * pulse, samples)) / (2 * k * d)
+                (runner.measure_response(name, k * pulse, samples) - runner.measure_response(name, -k * pulse, samples))
+                / (2 * k * d)
                 for k in (1, 2)
             )
             found.append((4.0 * one - two) / 3.0)
@@ -207,22 +217,27 @@ def _markov(runner: _Runner, samples: int) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(found, axis=2), np.stack(errors, axis=1)
 
 
-def _offsets(most: int) -> np.ndarray:
-    """Return 0, 1, 2, … and then ever wider ones up to ``most``."""
+def _space_offsets(most: int) -> np.ndarray:
+    """Return the offsets 0, 1, 2, …, then with growing distances, up to ``most``."""
     wide = np.round(np.geomspace(1, most, 40)).astype(int)
     found: np.ndarray = np.unique(np.concatenate([np.arange(min(8, most + 1)), wide]))
     return found
 
 
-def realization(G: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return A, B, C with C Aᵏ⁻¹ B = Gₖ, of the lowest order that explains G, and the singular values.
+def realize(G: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return A, B, C with C Aᵏ⁻¹ B = Gₖ, of the lowest order that explains G, and all singular values.
 
     Parameters
     ----------
     G : (N, outputs, inputs) ndarray
         Markov parameters from k = 1 on.
     noise : (outputs, inputs) ndarray
-        Their estimated errors.
+        Estimated errors of G.
+
+    Raises
+    ------
+    FmuError
+        If G is noise.
     """
     samples, q, p = G.shape
     rows = np.max(np.abs(G), axis=(0, 2), initial=0.0)
@@ -231,7 +246,7 @@ def realization(G: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarra
     columns = np.max(np.abs(scaled), axis=(0, 1), initial=0.0)
     columns = np.where(columns > 0.0, columns, 1.0)
     scaled = scaled / columns
-    offsets = _offsets((samples - 2) // 2)
+    offsets = _space_offsets((samples - 2) // 2)
     where = offsets[:, None] + offsets[None, :]
     m = len(offsets)
 
@@ -244,24 +259,27 @@ def realization(G: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarra
         return np.zeros((0, 0)), np.zeros((0, p)), np.zeros((q, 0)), np.zeros(0)
     U, sigma, Vt = np.linalg.svd(H0, full_matrices=False)
     relative = float(np.max(noise / rows[:, None] / columns, initial=0.0))
-    # the largest singular value of a matrix of noise
+    # largest singular value of a matrix of noise
     floor = max(_NOISE * sigma[0], relative * (np.sqrt(m * q) + np.sqrt(m * p)))
-    best: Any = None
+    best: tuple[float, np.ndarray, np.ndarray, np.ndarray] | None = None
     for n in range(1, int(np.sum(sigma > floor)) + 1):
         half = np.sqrt(sigma[:n])
         A = (U[:, :n].T @ H1 @ Vt[:n].T) / np.outer(half, half)
         C = (U[:q, :n] * half) * rows[:, None]
         B = (half[:, None] * Vt[:n, :p]) * columns
-        error = float(np.max(np.abs(predicted(A, B, C, samples) - G) / (rows[:, None] * columns)))
-        if best is None or error < 0.3 * best[0]:  # a state has to earn its place
+        error = float(np.max(np.abs(predict_markov(A, B, C, samples) - G) / (rows[:, None] * columns)))
+        if best is None or error < 0.3 * best[0]:  # a further state must reduce the error clearly
             best = error, A, B, C
     if best is None:
-        raise FmuError("its responses are noise: no pulse shows at an output. Take a tighter tolerance of its solver.")
+        raise FmuError(
+            "found only noise in its responses; expected that a pulse shows at an output. Take a tighter tolerance of "
+            "its solver."
+        )
     return best[1], best[2], best[3], sigma
 
 
-def predicted(A: np.ndarray, B: np.ndarray, C: np.ndarray, samples: int) -> np.ndarray:
-    """Return the Markov parameters of a model, from k = 1 on."""
+def predict_markov(A: np.ndarray, B: np.ndarray, C: np.ndarray, samples: int) -> np.ndarray:
+    """Return the Markov parameters C Aᵏ⁻¹ B of a model, from k = 1 on."""
     found, x = np.zeros((samples, len(C), B.shape[1])), B
     with np.errstate(over="ignore", invalid="ignore"):
         for k in range(samples):

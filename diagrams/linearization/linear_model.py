@@ -1,15 +1,16 @@
-"""Linearization of a diagram: the very functions that are simulated, differentiated at an operating point.
+"""Linearization of a diagram: the simulated functions, differentiated at an operating point.
 
-Where all is continuous, dx/dt = A x + B d with the exact Jacobians of the flow, FMUs by their linear models. Where
-something is sampled, the model is discrete, over one base period or, with several rates, their least common period,
-and hold and delay are exact (`over_a_period`).
+A diagram without sampling gives a continuous model, dx/dt = A x + B d, with the exact Jacobians of the flow and the
+linear models of FMUs. Any other diagram gives a discrete model over one base period or, with several rates, over their
+least common period. Hold and delay are exact (`over_a_period`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,12 +19,15 @@ from ...fmus.running import Derivation, DerivativeMethod
 from ..flat import NONE, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import exact_time
-from .derivatives import Parts, Signal, find_signal, steps_only
+from .derivatives import LocalDerivatives, Signal, find_signal, find_steps_only
 from .findings import Finding
-from .loops_over_a_period import confirm_closed, loop_model, moved, period_of, ticks_to_renewal
-from .operating_points import check_options, operating_point
-from .over_a_period import EQUILIBRIUM, Model, discrete, moves_between
-from .plant_models import continuous_models, joined, states_of
+from .loops_over_a_period import advance_point, confirm_loop, model_loop, period_of, ticks_to_renewal
+from .operating_points import PointLike, check_options, operating_point
+from .over_a_period import EQUILIBRIUM, Model, find_moving, model_period
+from .plant_models import join_matrices, model_equations, states_of
+
+if TYPE_CHECKING:
+    from control import StateSpace
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,30 +36,34 @@ class Linearization:
 
     Attributes
     ----------
+    diagram : Diagram
+        Diagram of the model.
     A, B, C, D : ndarray
-        The model's matrices, from the injected signals to the measured ones.
+        Matrices of the model, from the injected signals to the measured ones.
     dt : float
-        Sample time of the model in s, 0 where it is continuous.
+        Sample time of the model in s, 0 of a continuous model.
     states, inputs, outputs : tuple of str
         Paths of the states, names of the signals.
     point : OperatingPoint
-        Where it was made.
+        Operating point of the model.
     affine : ndarray
-        What the model's states change by at the operating point itself, per second or over the period: zero at an
-        equilibrium.
+        Change of the states at the operating point itself, per second or over the period: zero at an equilibrium.
     derivations : mapping
-        The way in which the derivative of each FMU was found, by path, as a `Derivation`; of an opaque block as well.
+        Method by which each FMU and each opaque block was differentiated, by path, as a `Derivation`.
     uncertainty : float
-        Largest estimated error of an entry of an FMU's linear model, where it was differenced; 0 where it is exact.
+        Largest estimated error of an entry of an FMU's linear model; 0 if all are exact.
     memory : tuple of str
-        States that are only a warm start (a projection's last foot point): their poles at z = 0 are no design poles.
+        States that only start a search, such as a projection's last foot point: their poles at z = 0 are no design
+        poles.
     openings : tuple of str
-        The wires that were cut.
+        Wires that were cut.
     findings : tuple of Finding
-        The things that the model does not follow: outputs that move in steps only, events within the period, a start
-        that is unlike every later tick. Ask by class, ``isinstance(finding, StepsOnly)``; ``str(finding)`` is the text.
-    plants, step
-        How it was asked for; its loops are made in the same way.
+        Effects that the model leaves out: outputs that change in steps only, events within the period, a start that is
+        unlike every later tick. Select by class, ``isinstance(finding, StepsOnly)``; ``str(finding)`` is the text.
+    plants : str or None
+        Method for FMUs that was asked for; the loops of this model use it too.
+    step : float, Fraction or None
+        Communication step that was asked for; the loops of this model use it too.
     """
 
     diagram: WiredDiagram
@@ -75,30 +83,30 @@ class Linearization:
     openings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
     plants: str | None = field(default=None, repr=False)
-    step: Any = field(default=None, repr=False)
+    step: float | Fraction | None = field(default=None, repr=False)
 
     @property
     def how(self) -> dict[str, str]:
-        """The texts of `derivations`, by path."""
+        """Texts of `derivations`, by path."""
         return {path: str(derivation) for path, derivation in self.derivations.items()}
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """The texts of `findings`."""
+        """Texts of `findings`."""
         return tuple(str(finding) for finding in self.findings)
 
     @property
-    def system(self) -> Any:
+    def system(self) -> StateSpace:
         """The model as `control.StateSpace`, with the names of signals and states, underscores for dots.
 
         Raises
         ------
         OptionError
-            Without inputs or outputs.
+            If the model has no inputs or no outputs.
         """
         return self._state_space(self.C, self.D, self.diagram.name)
 
-    def _state_space(self, C: np.ndarray, D: np.ndarray, name: str) -> Any:
+    def _state_space(self, C: np.ndarray, D: np.ndarray, name: str) -> StateSpace:
         from control import StateSpace
 
         if not self.inputs or not self.outputs:
@@ -107,7 +115,7 @@ class Linearization:
                 "them: linearize(…, inputs=…, outputs=…), or take a loop, .loop(…).",
                 block=self.diagram.name,
             )
-        # python-control takes no dots in names
+        # python-control refuses dots in names
         names = {
             key: [e.replace(".", "_") for e in labels]
             for key, labels in (("inputs", self.inputs), ("outputs", self.outputs), ("states", self.states))
@@ -118,7 +126,7 @@ class Linearization:
 
     @property
     def poles(self) -> np.ndarray:
-        """Poles of the model, without those of `memory`, sorted by size."""
+        """Poles of the model without those of `memory`, the largest first."""
         keep = [i for i, name in enumerate(self.states) if name not in self.memory]
         poles = np.linalg.eigvals(self.A[np.ix_(keep, keep)]) if keep else np.zeros(0)
         return poles[np.lexsort((poles.imag, poles.real, -np.abs(poles)))]
@@ -128,12 +136,12 @@ class Linearization:
         """Whether the operating point is an equilibrium."""
         return bool(np.max(np.abs(self.affine), initial=0.0) <= EQUILIBRIUM)
 
-    def loop(self, *wires: str, lifted: bool = False) -> Any:
+    def loop(self, *wires: str, lifted: bool = False) -> StateSpace:
         """Return the loop transfer function L at a wire, all other loops closed: S = 1/(1 + L).
 
-        The wire is cut behind the port, for all its consumers; L = −(what comes back) / (what is injected). With
-        several wires, or a wire with several entries, L is the matrix of the loops cut all at once. Over a period of
-        several ticks it begins where the wire is renewed. Closing L is checked to give the diagram's poles.
+        The wire is cut behind the port, for all consumers: L = −(returning signal)/(injected signal). With several
+        wires, or a wire with several entries, L is the matrix of all loops cut at once. Over a period of several ticks,
+        L begins at the tick at which the wire is renewed. The closed L is compared with the diagram's poles.
 
         Parameters
         ----------
@@ -141,62 +149,66 @@ class Linearization:
             Names of wires, paths of ports, or entries of them: ``"motor_force"``, ``"motor_force[0]"``.
         lifted : bool, default: False
             Whether a wire that is renewed several times in the model's period gets one channel for each renewal:
-            ``"u@0"``, ``"u@1"``, …. A common factor of all of them is a gain in the wire.
+            ``"u@0"``, ``"u@1"``, …. A factor common to all of them is a gain in the wire.
 
         Returns
         -------
         control.StateSpace
+            L, with the names of the wires as inputs and outputs.
 
         Raises
         ------
         OptionError
-            In a model over a period, a wire that changes between ticks and is used there: a held injection, seen at
-            ticks, is not its loop.
+            If no wire is named or, in a discrete model, a wire changes between ticks and acts there: it has no loop at
+            ticks.
         WiringError
-            A wire that is renewed several times in the model's period, unless ``lifted``: its loop is periodic.
+            If a wire is renewed several times in the model's period, unless ``lifted``: its loop is periodic.
         ConfirmationError
-            If closing L does not give the diagram's own poles.
+            If the closed L does not have the diagram's poles.
         """
-        cut = self._at(wires, openings=wires, loop="lifted" if lifted else "one")
+        cut = self._make_at(wires, openings=wires, loop="lifted" if lifted else "one")
         return cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})")
 
-    def sensitivity(self, *wires: str) -> Any:
-        """Return S at a wire: from what is injected there to what its consumers get, all loops closed.
+    def sensitivity(self, *wires: str) -> StateSpace:
+        """Return S at a wire, from the injected signal to that of the consumers, with all loops closed.
 
-        Over a period of several ticks, the injected signal is held from where the wire is renewed to the next period.
-        At a wire that is renewed several times in it, this is not 1/(1 + L), as there is no L at one rate.
+        Over a period of several ticks, the injected signal is held from the tick at which the wire is renewed, for a
+        whole period. S of a wire that is renewed several times in the period is not 1/(1 + L): there is no L at one
+        rate.
         """
-        closed = self._at(wires)
+        closed = self._make_at(wires)
         return closed._state_space(closed.C, closed.D + np.eye(len(closed.D)), f"S({', '.join(wires)})")
 
-    def complementary(self, *wires: str) -> Any:
+    def complementary(self, *wires: str) -> StateSpace:
         """Return T = 1 − S at a wire."""
-        closed = self._at(wires)
+        closed = self._make_at(wires)
         return closed._state_space(-closed.C, -closed.D, f"T({', '.join(wires)})")
 
-    def _at(self, wires: tuple[str, ...], openings: tuple[str, ...] = (), loop: str = "") -> Linearization:
+    def _make_at(self, wires: tuple[str, ...], openings: tuple[str, ...] = (), loop: str = "") -> Linearization:
+        """Return the model at these wires; ``loop`` is "one", "lifted", or "" for the closed loops."""
         if not wires:
             raise OptionError(
-                "no wire was named. Name one, such as .loop('v_perp').", block=self.diagram.name, port="wires"
+                "found no name of a wire; expected one. Name it: .loop('v_perp').",
+                block=self.diagram.name,
+                port="wires",
             )
-        more: dict[str, Any] = {"plants": self.plants, "step": self.step}
         flat = self.diagram.flatten(self.point.base)
         at, shift = self.point, 0
         if self.dt and period_of(flat) > 1:
             shift = ticks_to_renewal(flat, [find_signal(flat, w).port for w in wires], at.tick)
-            at = moved(flat, at, self.plants, shift)
-        made = _linearize(self.diagram, at, wires, wires, openings, loop=loop, **more)
+            at = advance_point(flat, at, self.plants, shift)
+        made = _linearize(self.diagram, at, wires, wires, openings, plants=self.plants, step=self.step, loop=loop)
         if loop:
             own = not shift and not self.openings
-            closed = self if own else _linearize(self.diagram, at, (), (), (), **more)
+            closed = self if own else _linearize(self.diagram, at, (), (), (), plants=self.plants, step=self.step)
             cut = Model((made.A, made.B, made.C, made.D), made.dt, [], made.affine, uncertainty=made.uncertainty)
-            confirm_closed(cut, closed.A, wires, self.diagram.name)
+            confirm_loop(cut, closed.A, wires, self.diagram.name)
         return made
 
 
 def linearize(
     diagram: WiredDiagram,
-    point: Any = None,
+    point: PointLike = None,
     *,
     inputs: str | Iterable[str] = (),
     outputs: str | Iterable[str] = (),
@@ -207,7 +219,7 @@ def linearize(
     """Linearize a diagram; see `Diagram.linearize`."""
     check_options(diagram, options, "linearize")
     at = operating_point(diagram, point, options)
-    diagram = diagram.replace(at.parameters) if at.parameters else diagram  # what a trim has found belongs to it
+    diagram = diagram.replace(at.parameters) if at.parameters else diagram  # parameters that a trim has found
     return _linearize(diagram, at, inputs, outputs, openings, plants=plants, step=options.get("step"))
 
 
@@ -219,33 +231,33 @@ def _linearize(
     openings: str | Iterable[str],
     *,
     plants: str | None,
-    step: Any,
+    step: float | Fraction | None,
     loop: str = "",
 ) -> Linearization:
     if step is not None and exact_time(step, block=diagram.name) != at.base and (diagram.has_clock or diagram.has_fmu):
         raise OptionError(
-            f"found step={step!r}, but the operating point stands on ticks of {float(at.base):g} s. Make the operating "
-            "point with this step, or leave the step away.",
+            f"found step={step!r}; expected {float(at.base):g} s, the ticks of the operating point. Make the operating "
+            "point with this step, or leave the step out.",
             block=diagram.name,
             port="step",
         )
-    names = [_names(n) for n in (inputs, outputs, openings)]
+    names = [_as_list(n) for n in (inputs, outputs, openings)]
     flat = diagram.flatten(at.base)
     at.check_fits(flat, diagram.name)
-    _refuse(flat)
+    _refuse_transport_delays(flat)
     found = [[find_signal(flat, n) for n in group] for group in names]
     for signal in found[2]:
         _check_opening(flat, signal)
-    parts, channels = Parts(flat, found[0], found[1], found[2]), list[str]()
+    local, channels = LocalDerivatives(flat, found[0], found[1], found[2]), list[str]()
     if diagram.has_clock or (diagram.has_fmu and step is not None):
         if loop:
-            _check_loop(flat, parts, at)
+            _check_loop(flat, local, at)
         if loop and period_of(flat) > 1:
-            model, channels = loop_model(flat, parts, at, plants, lifted=loop == "lifted")
+            model, channels = model_loop(flat, local, at, plants, lifted=loop == "lifted")
         else:
-            model = discrete(flat, parts, at, plants)
+            model = model_period(flat, local, at, plants)
     else:
-        model = _continuous(diagram, flat, parts, at, plants)
+        model = _model_continuous(diagram, flat, local, at, plants)
     A, B, C, D = model.matrices
     n, ins, outs = len(A), *(tuple(e for s in group for e in s.labels) for group in found[:2])
     if channels:
@@ -267,62 +279,64 @@ def _linearize(
         uncertainty=model.uncertainty,
         memory=model.memory,
         openings=tuple(names[2]),
-        findings=(*steps_only(flat), *model.findings),
+        findings=(*find_steps_only(flat), *model.findings),
         plants=plants,
         step=step,
     )
 
 
-def _check_loop(flat: FlatDiagram, parts: Parts, at: OperatingPoint) -> None:
-    moving = moves_between(flat, parts, at)
+def _check_loop(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> None:
+    """Refuse the loop of a wire that changes between ticks and acts there."""
+    moving = find_moving(flat, local, at)
     if moving:
         raise OptionError(
-            f"{moving[0]!r} changes between ticks, and blocks in continuous time use it there, so that the loop is not "
-            "closed at ticks. Take the loop at a sampled signal, of the continuous parts alone, or of "
-            "diagram.continuous().",
-            block=parts.inputs[0].port[0],
-            port=parts.inputs[0].port[1],
+            f"{moving[0]!r} changes between ticks, and blocks in continuous time use it there; expected a loop that is "
+            "closed at ticks. Take the loop at a sampled signal, or that of diagram.continuous().",
+            block=local.inputs[0].port[0],
+            port=local.inputs[0].port[1],
         )
 
 
-def _names(given: str | Iterable[str]) -> list[str]:
+def _as_list(given: str | Iterable[str]) -> list[str]:
     return [given] if isinstance(given, str) else list(given)
 
 
-def _refuse(flat: FlatDiagram) -> None:
+def _refuse_transport_delays(flat: FlatDiagram) -> None:
+    """Refuse a diagram with transport delays in continuous time."""
     for path in sorted(flat.table.blocks):
         if flat.table.blocks[path].transport and path not in flat.checked.traced:
             raise WiringError(
-                "a transport delay in continuous time has no finite linear model. Put it into a sampled subsystem, "
-                "where it is a delay by whole samples, or take PadeDelay(delay=…, order=…) in its place.",
+                "found a transport delay in continuous time, which has no finite linear model; expected none. Put it "
+                "into a sampled subsystem, where it is a delay of whole samples, or take PadeDelay(delay=…, order=…).",
                 block=path,
             )
 
 
 def _check_opening(flat: FlatDiagram, signal: Signal) -> None:
+    """Refuse to cut a port without consumers."""
     if signal.port in {(w.block, w.port) for w in flat.table.wires.values()}:
         return
     raise WiringError(
-        f"nothing is wired to it, so there is nothing to cut at {signal.name!r}. Name a wire that closes a loop.",
+        f"found nothing wired to it; expected a wire to cut at {signal.name!r}. Name a wire that closes a loop.",
         block=signal.port[0],
         port=signal.port[1],
     )
 
 
-def _continuous(
-    diagram: WiredDiagram, flat: FlatDiagram, parts: Parts, at: OperatingPoint, plants: str | None
+def _model_continuous(
+    diagram: WiredDiagram, flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint, plants: str | None
 ) -> Model:
-    """Return the model of a diagram that is continuous throughout."""
-    J = parts.at(NONE, at.t, at.x, at.w)
-    models = continuous_models(flat, at, plants)
+    """Return the model of a diagram without sampling."""
+    J = local.differentiate(NONE, at.t, at.x, at.w)
+    models = model_equations(flat, at, plants)
     xc = flat.continuous
-    Ap, Bp, Cp, Dp = (joined(flat, models, which) for which in "ABCD")
+    Ap, Bp, Cp, Dp = (join_matrices(flat, models, which) for which in "ABCD")
     # w = Cp xp + Dp z, z = Zx x + Zw w + Zd d
     loop = np.eye(len(at.w)) - Dp @ J["z", "w"]
     if loop.size and not np.linalg.cond(loop) < 1e12:
         raise OptionError(
-            "the FMU's outputs depend on themselves through its feedthrough, and the linear loop has no unique "
-            "solution. Wire an output without feedthrough, or linearize at a step, step=….",
+            "found a loop through the FMU's feedthrough without a unique solution; expected one. Wire an output "
+            "without feedthrough, or linearize over a step, step=….",
             block=diagram.name,
         )
     zx = J["z", "x"][:, xc]
@@ -333,12 +347,12 @@ def _continuous(
         "d": J["z", "d"] + J["z", "w"] @ w_of["d"],
     }
 
-    def through(what: str) -> list[np.ndarray]:
-        by_w = J[what, "w"]
-        return [J[what, "x"][:, xc] + by_w @ w_of["x"], by_w @ w_of["p"], J[what, "d"] + by_w @ w_of["d"]]
+    def eliminate_w(quantity: str) -> list[np.ndarray]:
+        by_w = J[quantity, "w"]
+        return [J[quantity, "x"][:, xc] + by_w @ w_of["x"], by_w @ w_of["p"], J[quantity, "d"] + by_w @ w_of["d"]]
 
-    fx, fp, fd = through("dx")
-    yx, yp, yd = through("y")
+    fx, fp, fd = eliminate_w("dx")
+    yx, yp, yd = eliminate_w("y")
     A = np.block([[fx, fp], [Bp @ z_of["x"], Ap + Bp @ z_of["p"]]])
     B = np.vstack([fd, Bp @ z_of["d"]])
     return Model(
@@ -351,16 +365,16 @@ def _continuous(
     )
 
 
-def batch(
+def linearize_batch(
     diagram: WiredDiagram,
-    points: Iterable[Any] = (None,),
+    points: Iterable[PointLike] = (None,),
     variants: Iterable[Mapping[str, Any]] = ({},),
     **options: Any,
 ) -> list[Linearization]:
     """Linearize at several operating points, and with several parameters; see `Diagram.linearize_batch`."""
     made, points = [], list(points)
     for changes in variants:
-        point: Any = None
+        point: PointLike = None
         try:
             variant = diagram.replace(changes) if changes else diagram
             for point in points:

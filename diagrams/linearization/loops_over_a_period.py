@@ -1,10 +1,11 @@
-"""Loops cut in a model over a period of several ticks: where they begin, and what of a wire is renewed in the period.
+"""Loops cut in a model over a period of several ticks.
 
-A signal injected at a wire and held over the whole period cuts the wire's loop only where the wire is renewed once in
-the period, and at its beginning. So the period of a loop begins at a tick at which the wire's source acts. A signal of
-its own is injected at every tick; ticks between which the wire stays are one channel, and a channel that nothing on the
-loop uses is none. What is left is the loop: one channel, or with a wire that is renewed N times a periodic loop, which
-has no L at one rate, but lifted one of N × N.
+A signal that is injected at a wire and held over the whole period cuts the wire's loop only if the wire is renewed once
+in the period, at its beginning. The period of a loop therefore begins at a tick at which the wire's source acts.
+
+A signal of its own is injected at every tick. Ticks between which the wire stays the same make one channel; a channel
+that nothing on the loop uses is left out. A wire that is renewed once has one channel, and L. A wire that is renewed N
+times has a periodic loop: no L at one rate, but a lifted L of N × N.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import numpy as np
 from ...blocks.core import ConfirmationError, WiringError
 from ..flat import FlatDiagram, TickPattern
 from ..results import OperatingPoint
-from .derivatives import Parts
-from .over_a_period import Chain, Model, needed, own_states, ticks
+from .derivatives import LocalDerivatives
+from .over_a_period import Chain, Model, find_needed, own_states, ticks_of_period
 
 SAME_ROWS = 1e-12
 """Relative difference up to which a wire counts as unchanged from one tick to the next."""
@@ -32,15 +33,15 @@ def period_of(flat: FlatDiagram) -> int:
 
 
 def ticks_to_renewal(flat: FlatDiagram, ports: Iterable[tuple[str, str]], tick: int) -> int:
-    """Return how many ticks after ``tick`` the wires are renewed; 0 where this is at no one tick.
+    """Return the number of ticks after ``tick`` until the wires are renewed; 0 if they are not renewed together.
 
-    A wire is renewed where the clock behind its source acts; one that follows continuous states or an FMU, where the
-    clock of those acts that read it.
+    A wire is renewed at the ticks of the clock behind its source. A wire that follows continuous states or an FMU is
+    renewed at the ticks of the clock of its readers.
     """
     for reading in (False, True):
         found: set[TickPattern] | None = set()
         for port in ports:
-            clocks = _clocks(flat, port, reading=reading)
+            clocks = _find_clocks(flat, port, reading=reading)
             found = None if clocks is None or found is None else found | clocks
         if found is not None and len(found) == 1:
             (clock,) = found
@@ -48,8 +49,11 @@ def ticks_to_renewal(flat: FlatDiagram, ports: Iterable[tuple[str, str]], tick: 
     return 0
 
 
-def _clocks(flat: FlatDiagram, port: tuple[str, str], *, reading: bool) -> set[TickPattern] | None:
-    """Return the clocks behind a port, through blocks in continuous time that have no states; None with others."""
+def _find_clocks(flat: FlatDiagram, port: tuple[str, str], *, reading: bool) -> set[TickPattern] | None:
+    """Return the clocks behind a port, or with ``reading`` those of its readers.
+
+    Blocks in continuous time without states are passed through; with states, or an FMU, the result is None.
+    """
     table = flat.table
     found: set[TickPattern] = set()
     todo, seen = [port[0]] if not reading else _readers(flat, port), set[str]()
@@ -76,43 +80,43 @@ def _readers(flat: FlatDiagram, port: tuple[str, str]) -> list[str]:
     return [block for (block, _), w in flat.table.wires.items() if (w.block, w.port) == port]
 
 
-def moved(flat: FlatDiagram, at: OperatingPoint, way: str | None, count: int) -> OperatingPoint:
-    """Return the operating point after so many ticks."""
+def advance_point(flat: FlatDiagram, at: OperatingPoint, way: str | None, count: int) -> OperatingPoint:
+    """Return the operating point ``count`` ticks later."""
     if not count:
         return at
-    chain = Chain(flat, Parts(flat, (), (), ()), at, way)
-    for k, following in ticks(flat, at.tick, count):
+    chain = Chain(flat, LocalDerivatives(flat, (), (), ()), at, way)
+    for k, following in ticks_of_period(flat, at.tick, count):
         chain.go(k, following - k)
     return chain.here
 
 
-def loop_model(
-    flat: FlatDiagram, parts: Parts, at: OperatingPoint, way: str | None, *, lifted: bool
+def model_loop(
+    flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint, way: str | None, *, lifted: bool
 ) -> tuple[Model, list[str]]:
-    """Return the model from what is injected to what comes back at the same places, and the names of its channels.
+    """Return the model from the injected to the returning signals at the same wires, and the names of its channels.
 
     Raises
     ------
     WiringError
-        A wire that is renewed, and used, several times in the period, unless ``lifted``.
+        If a wire is renewed, and used, several times in the period, unless ``lifted``.
     """
-    period, m = period_of(flat), parts.n_inputs
-    chain = Chain(flat, parts, at, way)
-    for k, following in ticks(flat, at.tick, period):
+    period, m = period_of(flat), local.n_inputs
+    chain = Chain(flat, local, at, way)
+    for k, following in ticks_of_period(flat, at.tick, period):
         chain.go(k, following - k)
-    A, B, C, D = _each_tick(chain)
+    A, B, C, D = _model_each_tick(chain)
     plants = set(range(flat.width, flat.width + chain.n_p))
-    keep = needed(A, C, own_states(flat), plants)
-    names, labels = chain.labels, [e for s in parts.inputs for e in s.labels]
+    keep = find_needed(A, C, own_states(flat), plants)
+    names, labels = chain.labels, [e for s in local.inputs for e in s.labels]
     A, B, C = A[np.ix_(keep, keep)], B[keep], C[:, keep]
-    groups = _channels(A, B, C, D, m)
+    groups = _find_channels(A, B, C, D, m)
     many = [e for e in range(m) if len(groups[e]) > 1]
     if many and not lifted:
-        signal = next(s for s in parts.inputs if labels[many[0]] in s.labels)
+        signal = next(s for s in local.inputs if labels[many[0]] in s.labels)
         raise WiringError(
             f"{signal.name!r} is renewed {len(groups[many[0]])} times in the model's period of "
-            f"{float(flat.base * period):g} s, so that its loop is periodic and has no L at one rate. Take "
-            "loop(…, lifted=True), one channel for each renewal, or a wire that is renewed once in this time.",
+            f"{float(flat.base * period):g} s; expected once: its loop is periodic and has no L at one rate. Take "
+            "loop(…, lifted=True), with one channel for each renewal, or a wire that is renewed once.",
             block=signal.port[0],
             port=signal.port[1],
         )
@@ -132,8 +136,8 @@ def loop_model(
     return model, [f"{labels[e]}@{j}" if len(groups[e]) > 1 else labels[e] for e, j, _ in chosen]
 
 
-def _each_tick(chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the model over all steps of a chain, with inputs and outputs of each tick one after the other."""
+def _model_each_tick(chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the matrices over all steps of a chain, with the inputs and outputs of each tick one after the other."""
     n, count, m = len(chain.M), len(chain.steps), chain.N.shape[1]
     X, U = np.eye(n), np.zeros((n, count * m))
     C, D = [], []
@@ -147,11 +151,11 @@ def _each_tick(chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     return X, U, np.vstack(C), np.vstack(D)
 
 
-def _channels(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, m: int) -> list[list[list[int]]]:
-    """Return for each entry the groups of ticks between which it stays, those that act on anything that comes back."""
+def _find_channels(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, m: int) -> list[list[list[int]]]:
+    """Return the channels of each entry: groups of ticks between which it stays the same, if they act on an output."""
     count = len(C) // m if m else 0
     seen = np.any(C, axis=0)
-    while True:  # states that anything measured depends on
+    while True:  # states on which an output depends
         more = seen | np.any(A[seen], axis=0)
         if np.array_equal(more, seen):
             break
@@ -172,30 +176,30 @@ def _channels(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, m: int
     return found
 
 
-def confirm_closed(cut: Model, A: np.ndarray, wires: tuple[str, ...], name: str) -> None:
-    """Compare the poles of the loop, closed, with those of the diagram.
+def confirm_loop(cut: Model, A: np.ndarray, wires: tuple[str, ...], name: str) -> None:
+    """Compare the poles of the closed loop with those of the diagram.
 
     Raises
     ------
     ConfirmationError
-        If closing what was cut does not give the diagram.
+        If they differ.
     """
     Ac, B, C, D = cut.matrices
     back = np.eye(len(D)) - D
     if len(D) and not np.linalg.cond(back) < 1e12:
-        return  # the loop has no unique solution when closed; its margins say so
+        return  # the closed loop has no unique solution, which its margins say
     closed = Ac + B @ np.linalg.solve(back, C) if len(D) else Ac
     size = [float(np.max(np.abs(np.linalg.eigvals(a)), initial=0.0)) for a in (closed, A, 0.1 * Ac)]
-    radius = 1.5 * max(size) or 1.0  # that of the open loop counts, too: a deadbeat loop's poles are rounding alone
+    radius = 1.5 * max(size) or 1.0  # the open loop counts too: the poles of a deadbeat loop are rounding alone
     worst = 0.0
-    for angle in (0.3, 1.1, 2.0):  # det(I − A/z): states at zero, such as values held for later, do not count
+    for angle in (0.3, 1.1, 2.0):  # det(I − A/z) does not count states at zero, such as values held for later
         z = radius * np.exp(1j * angle)
         (s1, l1), (s2, l2) = (np.linalg.slogdet(np.eye(len(a)) - a / z) for a in (closed, A))
         worst = max(worst, float(abs(s1 / s2 * np.exp(l1 - l2) - 1.0)))
     if not worst <= SAME_POLES + 100 * cut.uncertainty / radius:
         raise ConfirmationError(
             f"the loop at {', '.join(map(repr, wires))}, closed, has the poles of another system than the diagram: "
-            f"the characteristic polynomials differ by {worst:.3g} of their size. Its margins "
-            "are not those of the diagram. Cut another wire.",
+            f"found characteristic polynomials that differ by {worst:.3g} of their size; expected the same. The "
+            "margins of this loop are not those of the diagram. Cut another wire.",
             block=name,
         )

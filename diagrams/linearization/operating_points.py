@@ -1,11 +1,11 @@
-"""Operating points: where a diagram is linearized."""
+"""Operating points of a diagram, found by runs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
 from fractions import Fraction
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -13,17 +13,22 @@ from ...blocks.core import OptionError, UnknownNameError, near
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin, Snapshot, layout_of
 
+if TYPE_CHECKING:
+    from ..simulation import Simulation
+
+PointLike: TypeAlias = OperatingPoint | Snapshot | float | None
+"""Values that give an operating point: one, a recorded instant, a time in s, or None for the start."""
 OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start")
-"""How to run to an operating point."""
+"""Options of a run to an operating point."""
 AGAIN = 1e-3
-"""How far a run may be from where it was the first time, as its solver takes other steps; relative to 1 + its size."""
+"""Largest deviation of a repeated run, whose solver takes other steps, relative to 1 + the size of a state."""
 MORE = {"linearize": ("inputs", "outputs", "openings", "plants"), "operating_point": ("t",)}
+"""Further arguments of methods that run to an operating point."""
 
 
-def capture(simulation: Any, how: PointOrigin = PointOrigin.RUN) -> OperatingPoint:
+def capture(simulation: Simulation, how: PointOrigin = PointOrigin.RUN) -> OperatingPoint:
     """Return the operating point at the tick that a simulation has reached."""
-    flat: FlatDiagram = simulation.flat
-    view = simulation.view
+    flat, view = simulation.flat, simulation.view
     plants = {path: plant.operating_point() for path, plant in view.plants.items()}
     values = {name: view.log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
     point = OperatingPoint(
@@ -38,11 +43,11 @@ def capture(simulation: Any, how: PointOrigin = PointOrigin.RUN) -> OperatingPoi
         values=values,
         layout=layout_of(flat),
     )
-    return judged(flat, point, view.x_next)
+    return with_residual(flat, point, view.x_next)
 
 
-def judged(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) -> OperatingPoint:
-    """Return an operating point with its residual: the largest relative change of a state, and whose it is."""
+def with_residual(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) -> OperatingPoint:
+    """Return an operating point with its residual, the largest relative change of a state, and that state's name."""
     from .plant_models import plant_changes
 
     x, found, who = point.x, 0.0, ""
@@ -62,83 +67,83 @@ def judged(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) -> Oper
     return replace(point, residual=found, largest=who)
 
 
-def check_options(diagram: WiredDiagram, options: Mapping[str, Any], what: str) -> None:
-    """Refuse what is no option of how to run to an operating point.
+def check_options(diagram: WiredDiagram, options: Mapping[str, Any], caller: str) -> None:
+    """Refuse options that a run to an operating point does not have; ``caller`` is the name of the method.
 
     Raises
     ------
     UnknownNameError
-        If something else is given.
+        If there is such an option.
     """
     for name in options:
         if name not in OPTIONS:
             raise UnknownNameError(
-                f"{what} takes no {name!r}. {near(name, (*OPTIONS, *MORE.get(what, ())))}", block=diagram.name
+                f"{caller} takes no {name!r}. {near(name, (*OPTIONS, *MORE.get(caller, ())))}", block=diagram.name
             )
 
 
-def operating_point(diagram: WiredDiagram, point: Any, options: Mapping[str, Any]) -> OperatingPoint:
-    """Return an operating point from what a user gives: one, a recorded instant, a time in s, or None for the start.
+def operating_point(diagram: WiredDiagram, point: PointLike, options: Mapping[str, Any]) -> OperatingPoint:
+    """Return an operating point: as it is, or by a run to a recorded instant, to a time in s or to the start (None).
 
     Raises
     ------
     OptionError
-        Anything else.
+        If the point is of another type, of another diagram, or can't be reached.
     """
     if isinstance(point, OperatingPoint):
         return point
     if isinstance(point, Snapshot):
-        _check_whose(diagram, point)
+        _check_run(diagram, point)
         recipe = dict(getattr(point.run, "recipe", {}) or {})
-        found = at_time(diagram, point.t, {**recipe, **options})
+        found = run_to(diagram, point.t, {**recipe, **options})
         _check_found_again(diagram, point, found)
         return found
     if point is None:
         start = options.get("start")
-        return at_time(diagram, 0.0 if start is None else start.t, options)
+        return run_to(diagram, 0.0 if start is None else start.t, options)
     if isinstance(point, int | float | np.floating | np.integer) and not isinstance(point, bool):
-        return at_time(diagram, float(point), options)
+        return run_to(diagram, float(point), options)
     raise OptionError(
-        f"found {point!r}; expected an operating point: run.at(t), a time in s, diagram.operating_point(…), "
+        f"found {point!r}; expected an operating point. Give run.at(t), a time in s, diagram.operating_point(…), "
         "diagram.trim(…), or None for the start.",
         block=diagram.name,
         port="operating point",
     )
 
 
-def _check_whose(diagram: WiredDiagram, given: Snapshot) -> None:
-    """Refuse an instant of a run of a diagram that has nothing to do with this one."""
+def _check_run(diagram: WiredDiagram, given: Snapshot) -> None:
+    """Refuse an instant of a run of another diagram."""
     whose = getattr(given.run, "diagram_name", diagram.name)
-    if whose != diagram.name and not {path.partition(".")[0] for path in given.values} <= _tops(diagram):
+    if whose != diagram.name and not {path.partition(".")[0] for path in given.values} <= _top_paths(diagram):
         raise OptionError(
-            f"found an instant of a run of the diagram {whose!r}, which has other blocks. Take one of a run of this "
-            "diagram, or a time in s.",
+            f"found an instant of a run of the diagram {whose!r}, which has other blocks; expected one of a run of "
+            "this diagram. Give that, or a time in s.",
             block=diagram.name,
             port="operating point",
         )
 
 
-def _tops(diagram: WiredDiagram) -> set[str]:
+def _top_paths(diagram: WiredDiagram) -> set[str]:
     return {path.partition(".")[0] for path in diagram.blocks}
 
 
 def _check_found_again(diagram: WiredDiagram, given: Snapshot, found: OperatingPoint) -> None:
-    """Refuse an instant of a run that does not come again: one that was restored from a state on the way."""
+    """Refuse an instant that a repeated run does not reach again: the first run was restored from a saved state."""
     if getattr(given.run, "diagram", None) is not diagram or given.state.shape != found.x.shape:
         return
     off = float(np.max(np.abs(found.x - given.state) / (1.0 + np.abs(found.x)), initial=0.0))
     if not off <= AGAIN:
         raise OptionError(
-            f"run again to t = {given.t:g} s, the diagram is not where it was in this run: a state is off by "
-            f"{off:.3g}. The run was restored from a state on its way, or an FMU does not repeat itself. Give "
-            "the state that it began with: linearize(t, start=…).",
+            f"run again to t = {given.t:g} s, the diagram is not where it was in this run: found a state off by "
+            f"{off:.3g}; expected at most {AGAIN:g}. The run was restored from a saved state, or an FMU does not "
+            "repeat itself. Give the state that the run began with: linearize(t, start=…).",
             block=diagram.name,
             port="operating point",
         )
 
 
-def at_time(diagram: WiredDiagram, t: float, options: Mapping[str, Any]) -> OperatingPoint:
-    """Run a diagram to a time, and return the operating point there."""
+def run_to(diagram: WiredDiagram, t: float, options: Mapping[str, Any]) -> OperatingPoint:
+    """Run a diagram to a time in s, and return the operating point there."""
     from ..simulation import RunOptions, Simulation
 
     check_options(diagram, options, "operating_point")
@@ -147,15 +152,15 @@ def at_time(diagram: WiredDiagram, t: float, options: Mapping[str, Any]) -> Oper
     first = 0.0 if start is None else float(start.t)
     if not first <= t < np.inf:
         raise OptionError(
-            f"found an operating point at t = {t!r} s; expected a time from {first:g} s on, where the run begins.",
+            f"found t = {t!r} s; expected a time from {first:g} s on, where the run begins. Choose a later one.",
             block=diagram.name,
             port="operating point",
         )
     if not diagram.has_clock:
         if start is not None:
             options.setdefault("step", start.base)
-        elif not _is_tick(options, t, diagram.has_fmu):
-            options["step"] = _any_step(diagram, t)
+        elif not _keeps_step(options, t, diagram.has_fmu):
+            options["step"] = _choose_step(diagram, t)
             t = 0.0 if t == 0 else float(options["step"])
     with Simulation(diagram, RunOptions.of(options, block=diagram.name)) as simulation:
         if t > first:
@@ -164,7 +169,7 @@ def at_time(diagram: WiredDiagram, t: float, options: Mapping[str, Any]) -> Oper
         if simulation.stopped is not None and simulation.t < t:
             raise OptionError(
                 f"the run is stopped at t = {simulation.t:.9g} s by {simulation.stopped.block!r}, before the operating "
-                f"point at t = {t:g} s. Choose an earlier one.",
+                f"point at t = {t:g} s. Choose an earlier time.",
                 block=diagram.name,
                 port="operating point",
             )
@@ -179,8 +184,8 @@ def at_time(diagram: WiredDiagram, t: float, options: Mapping[str, Any]) -> Oper
         return capture(simulation)
 
 
-def _is_tick(options: Mapping[str, Any], t: float, has_fmu: bool) -> bool:
-    """Whether the step that was given is kept: it is one of communication, or of the solver, or meets the time."""
+def _keeps_step(options: Mapping[str, Any], t: float, has_fmu: bool) -> bool:
+    """Whether the given step is kept: it is a communication step, a solver's step, or the time is a multiple of it."""
     if options.get("step") is None:
         return False
     steps = t / float(options["step"])
@@ -188,24 +193,24 @@ def _is_tick(options: Mapping[str, Any], t: float, has_fmu: bool) -> bool:
 
 
 def _check_tick(diagram: WiredDiagram, base: Fraction, t: float) -> None:
+    """Refuse a time between two ticks."""
     n = round(Fraction(t) / base)
     if abs(Fraction(t) - n * base) > Fraction(t) * Fraction(1, 10**12):
         raise OptionError(
-            f"t = {t!r} s is between two ticks, {float(base):g} s apart. Take {float(n * base)!r} s, or a step=… of "
-            "which both this time and all sample times are multiples.",
+            f"t = {t!r} s is between two ticks, which are {float(base):g} s apart. Take {float(n * base)!r} s, or a "
+            "step=… that divides this time and all sample times.",
             block=diagram.name,
             port="operating point",
         )
 
 
-def _any_step(diagram: WiredDiagram, t: float) -> Fraction:
-    """Return a step on which a time is a tick, where nothing else asks for one."""
+def _choose_step(diagram: WiredDiagram, t: float) -> Fraction:
+    """Return a step that has a tick at a time, for a diagram without sampling."""
     if not t > 0:
         return Fraction(1, 1000)
     if diagram.has_fmu:
         raise OptionError(
-            f"to run to t = {t:g} s the FMU needs a communication step. Give one, operating_point({t:g}, step=1e-3), "
-            "and linearize there.",
+            f"to run to t = {t:g} s the FMU needs a communication step. Give one: operating_point({t:g}, step=1e-3).",
             block=diagram.name,
             port="step",
         )

@@ -1,31 +1,35 @@
-"""Linear models of the FMUs of a diagram, as their descriptions allow, and how they were had."""
+"""Linear models of the FMUs of a diagram: of their equations or of their steps, as their descriptions allow."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ...blocks.core import FmuError, Layout, LoopwrightError, OptionError
-from ...fmus.running import Derivation
+from ...blocks.core import Block, FmuError, Layout, LoopwrightError, OptionError
+from ...fmus.running import Derivation, FmuLinearization
 from ..flat import FlatDiagram, StateLayout
 from ..results import OperatingPoint
 from ..wiring import join, stepped_blocks
-from .identification import identified
+from .identification import identify_step
+
+if TYPE_CHECKING:
+    from ...fmus.running import Fmu
 
 WAYS = ("equations", "step", "identified")
+"""Methods for the linear model of an FMU's step."""
 EQUILIBRIUM = 1e-9
-"""An FMU is at rest where no state changes faster than that in a second, relative to 1 + its size."""
+"""Largest rate of a state in 1/s, relative to 1 + its size, of an FMU at rest."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlantModel:
     """A linear model of one FMU: of its equations, or of one communication step.
 
-    x_p⁺ (or dx_p/dt) = f + A (x_p − x0) + B (z − z0), and its outputs at the instant w = C x_p + D z, with the inputs
-    that have acted until then. ``inputs`` and ``outputs`` are the entries of z and w that are its own.
+    x_p⁺ (or dx_p/dt) = f + A (x_p − x0) + B (z − z0). The outputs at the instant are w = C x_p + D z, with the inputs
+    that have acted until then. ``inputs`` and ``outputs`` are the numbers of the FMU's entries in z and w.
     """
 
     path: str
@@ -41,28 +45,35 @@ class PlantModel:
     derivation: Derivation
     uncertainty: float
     y_next: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """Its outputs after the step."""
+    """Outputs after the step."""
     next: Mapping[str, Any] = field(default_factory=dict)
-    """Its operating point after the step."""
+    """Operating point of the FMU after the step."""
     identified: bool = False
-    """Whether its states are made up, and only its outputs mean something."""
+    """Whether the states are those of an identified model, not the FMU's."""
 
 
-def plants(flat: FlatDiagram) -> list[str]:
+def plant_paths(flat: FlatDiagram) -> list[str]:
     """Return the paths of the FMUs."""
     return list(stepped_blocks(flat.table))
 
 
-def plant_layout(blocks: Mapping[str, Any], points: Mapping[str, Any], offset: int = 0) -> StateLayout:
-    """Return where the states of FMUs stand, one FMU after the other by path, from an operating point's ``plants``."""
-    states = {path: points[path]["state"] for path in sorted(points)}
-    shapes = {path: {n: np.shape(state[n]) for n in blocks[path].description.states} for path, state in states.items()}
+def fmu_at(flat: FlatDiagram, path: str) -> Fmu:
+    """Return the FMU with a path."""
+    return cast("Fmu", flat.table.blocks[path])
+
+
+def plant_layout(blocks: Mapping[str, Block], points: Mapping[str, Any], offset: int = 0) -> StateLayout:
+    """Return the layout of the FMUs' states, one FMU after the other by path, from an operating point's ``plants``."""
+    shapes = {
+        path: {n: np.shape(points[path]["state"][n]) for n in cast("Fmu", blocks[path]).description.states}
+        for path in sorted(points)
+    }
     return StateLayout.of_blocks(shapes, offset)
 
 
-def entries(flat: FlatDiagram, path: str) -> tuple[list[int], list[int], list[int]]:
-    """Return the entries of z and w that are an FMU's own, and the columns of its own inputs that are wired."""
-    block: Any = flat.table.blocks[path]
+def plant_entries(flat: FlatDiagram, path: str) -> tuple[list[int], list[int], list[int]]:
+    """Return the numbers of an FMU's entries in z and in w, and those of its wired inputs among all its inputs."""
+    block = flat.table.blocks[path]
     inputs = Layout.of({port: spec.shape or () for port, spec in block.inputs.items()})
     wired = [port for port in block.inputs if join(path, port) in flat.plant_inputs.slices]
     z = flat.plant_inputs.entries(join(path, port) for port in wired)
@@ -71,9 +82,9 @@ def entries(flat: FlatDiagram, path: str) -> tuple[list[int], list[int], list[in
 
 
 def inputs_before(flat: FlatDiagram, at: OperatingPoint) -> np.ndarray:
-    """Return z as it has acted until the operating point."""
+    """Return the inputs z that have acted until the operating point."""
     z = np.zeros(flat.plant_inputs.total)
-    for path in plants(flat):
+    for path in plant_paths(flat):
         for port, value in at.plants[path]["inputs"].items():
             where = flat.plant_inputs.slices.get(join(path, port))
             if where is not None:
@@ -81,15 +92,15 @@ def inputs_before(flat: FlatDiagram, at: OperatingPoint) -> np.ndarray:
     return z
 
 
-def joined(flat: FlatDiagram, models: Sequence[PlantModel], which: str) -> np.ndarray:
-    """Return one matrix of all FMUs side by side: rows and columns as x_p, z and w are ordered."""
+def join_matrices(flat: FlatDiagram, models: Sequence[PlantModel], which: str) -> np.ndarray:
+    """Return the matrix A, B, C or D of all FMUs, with rows and columns in the order of x_p, z and w."""
     states = Layout.of({m.path: (len(m.A),) for m in models})
     many = {"x": states.total, "z": flat.plant_inputs.total, "w": flat.plant_outputs.total}
     row_of, column_of = {"A": ("x", "x"), "B": ("x", "z"), "C": ("w", "x"), "D": ("w", "z")}[which]
     M = np.zeros((many[row_of], many[column_of]))
     for m in models:
         own = {"x": states.entries([m.path]), "z": m.inputs, "w": m.outputs}
-        M[np.ix_(own[row_of], own[column_of])] = getattr(m, which)
+        M[np.ix_(own[row_of], own[column_of])] = {"A": m.A, "B": m.B, "C": m.C, "D": m.D}[which]
     return M
 
 
@@ -99,13 +110,13 @@ def states_of(models: Sequence[PlantModel]) -> list[str]:
 
 
 def plant_changes(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray]:
-    """Return how fast the states of the FMUs change, relative to 1 + their size, by the states' names.
+    """Return the change of the FMUs' states in one second, relative to 1 + their size, by the states' names.
 
-    In one second, or over a step where the rates are not to be had; states that an FMU does not show don't count.
+    It is the change over a step if an FMU does not give its rates. States that an FMU does not show are left out.
     """
     found: dict[str, np.ndarray] = {}
-    for path in plants(flat):
-        block: Any = flat.table.blocks[path]
+    for path in plant_paths(flat):
+        block = fmu_at(flat, path)
         if not block.description.states:
             continue
         now = {**at.plants[path], "inputs": _inputs(flat, at, path, at.z)}
@@ -123,119 +134,142 @@ def plant_changes(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray
     return found
 
 
-def continuous_models(flat: FlatDiagram, at: OperatingPoint, way: str | None) -> list[PlantModel]:
+def model_equations(flat: FlatDiagram, at: OperatingPoint, way: str | None) -> list[PlantModel]:
     """Return the linear models of the equations of all FMUs.
 
     Raises
     ------
     OptionError
-        If the model of a step is asked for: there is none.
+        If the model of a step is asked for: a continuous model has none.
     """
     _check_way(way)
-    if way == "step" and plants(flat):
+    if way == "step" and plant_paths(flat):
         raise OptionError(
-            'found plants="step"; this model is continuous, so there is no step. Leave it away, or give the '
-            "communication step: linearize(…, step=…).",
-            block=plants(flat)[0],
+            'found plants="step" for a continuous model, which has no step; expected None, "equations" or a step. Give '
+            "the communication step: linearize(…, step=…).",
+            block=plant_paths(flat)[0],
             port="plants",
         )
     models = []
-    for path in plants(flat):
-        z, w, wired = entries(flat, path)
-        m = _of_equations(flat, at, path, at.z)
-        B, D, names = m.B[:, wired], m.D[:, wired], _named(path, m.states)
-        models.append(PlantModel(path, m.A, B, m.C, D, m.x0, m.f, names, z, w, m.derivation, _error(m)))
+    for path in plant_paths(flat):
+        z, w, wired = plant_entries(flat, path)
+        m = _linearize_equations(flat, at, path, at.z)
+        B, D, names = m.B[:, wired], m.D[:, wired], _prefix_names(path, m.states)
+        models.append(PlantModel(path, m.A, B, m.C, D, m.x0, m.f, names, z, w, m.derivation, _largest_error(m)))
     return models
 
 
-def step_models(flat: FlatDiagram, at: OperatingPoint, z: np.ndarray, h: float, way: str | None) -> list[PlantModel]:
+def model_steps(flat: FlatDiagram, at: OperatingPoint, z: np.ndarray, h: float, way: str | None) -> list[PlantModel]:
     """Return the linear models of one communication step of all FMUs.
 
     Parameters
     ----------
+    flat : FlatDiagram
+        Diagram.
+    at : OperatingPoint
+        Operating point at the beginning of the step.
     z : ndarray
         Inputs of all FMUs over the step.
+    h : float
+        Length of the step in s.
     way : {None, "equations", "step", "identified"}
-        "equations" takes the zero-order hold of the equations' Jacobians, by a matrix exponential, which is right at an
+        "equations" takes the matrix exponential of the equations' Jacobians under held inputs, which is exact at an
         equilibrium; "step" differences the step itself; "identified" takes pulse responses from rest. None takes the
-        first at an equilibrium, else the second, and the third where the FMU allows neither.
+        first at an equilibrium, else the second, and the third if the FMU allows neither.
 
     Raises
     ------
     OptionError
-        Another way.
+        If there is no such way.
     FmuError
-        An FMU that allows neither.
+        If an FMU can't be linearized in this way.
     """
     _check_way(way)
-    return [_step_model(flat, at, path, z, h, way) for path in plants(flat)]
+    return [_model_step(flat, at, path, z, h, way) for path in plant_paths(flat)]
 
 
 def _check_way(way: str | None) -> None:
     if way not in (None, *WAYS):
-        raise OptionError(f"found plants={way!r}; expected one of {', '.join(map(repr, WAYS))}, or None.")
+        raise OptionError(
+            f"found plants={way!r}; expected one of {', '.join(map(repr, WAYS))}, or None. Choose one of them."
+        )
 
 
-def _step_model(
+def _model_step(
     flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None
 ) -> PlantModel:
-    mine, w, wired = entries(flat, path)
-    block: Any = flat.table.blocks[path]
+    mine, w, wired = plant_entries(flat, path)
+    block = fmu_at(flat, path)
+    m: FmuLinearization | _HeldStep
+    equations: FmuLinearization | None
     try:
-        equations = _of_equations(flat, at, path, z)
+        equations = _linearize_equations(flat, at, path, z)
     except FmuError:
         if way == "equations":
             raise
         equations = None
-    if equations is not None and (way == "equations" or (way is None and _rests(equations))):
-        m, derivation = _held(equations, h), replace(equations.derivation, held=True)
+    if equations is not None and (way == "equations" or (way is None and _is_at_rest(equations))):
+        m, derivation = _hold_inputs(equations, h), replace(equations.derivation, held=True)
         C, D = equations.C, equations.D
-    elif way == "identified" or not block.description.states:  # it may have states that it doesn't show
-        return _identified_model(flat, at, path, z, h)
+    elif way == "identified" or not block.description.states:  # the FMU may have states that it doesn't show
+        return _identify_model(flat, at, path, z, h)
     else:
         try:
-            m = block.step_difference(
+            step = block.step_difference(
                 h, t=at.plants[path]["t"], state=at.plants[path]["state"], inputs=_inputs(flat, at, path, z)
             )
         except FmuError as error:
             if way == "step":
                 raise
             try:
-                return _identified_model(flat, at, path, z, h)
+                return _identify_model(flat, at, path, z, h)
             except FmuError as last:
                 raise last from error
-        derivation = m.derivation
-        C, D = _outputs_before(flat, at, path, equations, m, z)
-    names = _named(path, m.states)
+        m, derivation = step, step.derivation
+        C, D = _outputs_before(flat, at, path, equations, step, z)
+    names = _prefix_names(path, m.states)
     following = {
         "t": at.plants[path]["t"] + h,
-        "state": _after(block, at, path, m.f),
+        "state": _states_after(block, at, path, m.f),
         "inputs": _inputs(flat, at, path, z),
     }
     return PlantModel(
-        path, m.A, m.B[:, wired], C, D[:, wired], m.x0, m.f, names, mine, w, derivation, _error(m), m.y0, following
+        path,
+        m.A,
+        m.B[:, wired],
+        C,
+        D[:, wired],
+        m.x0,
+        m.f,
+        names,
+        mine,
+        w,
+        derivation,
+        _largest_error(m),
+        m.y0,
+        following,
     )
 
 
-def _identified_model(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float) -> PlantModel:
-    mine, w, wired = entries(flat, path)
+def _identify_model(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float) -> PlantModel:
+    mine, w, wired = plant_entries(flat, path)
     now = {**at.plants[path], "inputs": _inputs(flat, at, path, z)}
-    m = identified(flat.table.blocks[path], now, h, at.w[w])
-    n, rest = len(m.A), {**now, "t": now["t"] + h}
+    m = identify_step(fmu_at(flat, path), now, h, at.w[w])
+    n, rest, names = len(m.A), {**now, "t": now["t"] + h}, _prefix_names(path, m.states)
     D = np.zeros((len(w), len(wired)))
     return PlantModel(
-        path, m.A, m.B[:, wired], m.C, D, np.zeros(n), np.zeros(n), _named(path, m.states), mine, w, m.derivation,
-        m.uncertainty, m.y0, rest, True,
+        path, m.A, m.B[:, wired], m.C, D, np.zeros(n), np.zeros(n), names, mine, w, m.derivation, m.uncertainty, m.y0,
+        rest, True,
     )  # fmt: skip
 
 
-def _rests(m: Any) -> bool:
+def _is_at_rest(m: FmuLinearization) -> bool:
     return bool(np.max(np.abs(m.f) / (1.0 + np.abs(m.x0)), initial=0.0) <= EQUILIBRIUM)
 
 
 @dataclass(frozen=True, eq=False)
-class _Held:
-    """A model of a step, from that of the equations."""
+class _HeldStep:
+    """A model of a step, from the model of the equations."""
 
     A: np.ndarray
     B: np.ndarray
@@ -246,58 +280,59 @@ class _Held:
     uncertainty: np.ndarray
 
 
-def _held(m: Any, h: float) -> _Held:
-    """Hold the inputs over a step: a matrix exponential of [[A, B, f], [0, 0, 0]]."""
+def _hold_inputs(m: FmuLinearization, h: float) -> _HeldStep:
+    """Return the model of a step with held inputs: the matrix exponential of [[A, B, f], [0, 0, 0]]."""
     from scipy.linalg import expm
 
     n, k = m.B.shape
     big = np.zeros((n + k + 1, n + k + 1))
     big[:n] = np.hstack([m.A, m.B, m.f[:, None]])
-    whole = expm(big * h)[:n]
-    moved = whole[:, -1]
-    return _Held(whole[:, :n], whole[:, n:-1], m.x0, m.x0 + moved, m.y0 + m.C @ moved, m.states, m.uncertainty * h)
+    whole = np.asarray(expm(big * h))[:n]
+    change = whole[:, -1]
+    A, B, f, y = whole[:, :n], whole[:, n:-1], m.x0 + change, m.y0 + m.C @ change
+    return _HeldStep(A, B, m.x0, f, y, m.states, m.uncertainty * h)
 
 
 def _outputs_before(
-    flat: FlatDiagram, at: OperatingPoint, path: str, equations: Any, step: Any, z: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of the outputs at the beginning of a step, by the states and the inputs until then."""
+    flat: FlatDiagram, at: OperatingPoint, path: str, equations: FmuLinearization | None, step: FmuLinearization,
+    z: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return the derivatives of the outputs at the beginning of a step, by the states and by the inputs until then."""
     if equations is not None:
         before = inputs_before(flat, at)
-        mine = entries(flat, path)[0]
-        m = equations if np.array_equal(before[mine], z[mine]) else _of_equations(flat, at, path, before)
+        mine = plant_entries(flat, path)[0]
+        m = equations if np.array_equal(before[mine], z[mine]) else _linearize_equations(flat, at, path, before)
         return m.C, m.D
-    C = np.linalg.lstsq(step.A.T, step.C.T, rcond=None)[0].T  # of the step's end, from its beginning
+    C = np.linalg.lstsq(step.A.T, step.C.T, rcond=None)[0].T  # step.C is by the states before the step: step.C = C A
     D = step.D - C @ step.B
     D[np.abs(D) <= 1e-9 * (np.max(np.abs(step.D), initial=0.0) + 1e-300)] = 0.0
     return C, D
 
 
-def _of_equations(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> Any:
-    block: Any = flat.table.blocks[path]
-    return block.linear_model(t=at.plants[path]["t"], state=at.plants[path]["state"], inputs=_inputs(flat, at, path, z))
+def _linearize_equations(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> FmuLinearization:
+    point = at.plants[path]
+    return fmu_at(flat, path).linear_model(t=point["t"], state=point["state"], inputs=_inputs(flat, at, path, z))
 
 
 def _inputs(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> dict[str, Any]:
-    """Return an FMU's inputs by their ports: those that are wired from z, the others as they are."""
+    """Return an FMU's inputs by port: wired ones from z, the others from the operating point."""
     given = dict(at.plants[path]["inputs"])
-    block: Any = flat.table.blocks[path]
-    for port in block.inputs:
+    for port in flat.table.blocks[path].inputs:
         where = flat.plant_inputs.slices.get(join(path, port))
         if where is not None:
             given[port] = z[where].reshape(np.shape(given[port]))
     return given
 
 
-def _after(block: Any, at: OperatingPoint, path: str, f: np.ndarray) -> dict[str, Any]:
-    """Return an FMU's states after a step, discrete ones as they are."""
-    moved = plant_layout({path: block}, {path: at.plants[path]}).of_block[path].split(f)
-    return {**at.plants[path]["state"], **moved}
+def _states_after(block: Fmu, at: OperatingPoint, path: str, f: np.ndarray) -> dict[str, Any]:
+    """Return an FMU's states after a step; discrete states stay as they are."""
+    continuous = plant_layout({path: block}, {path: at.plants[path]}).of_block[path].split(f)
+    return {**at.plants[path]["state"], **continuous}
 
 
-def _named(path: str, states: Sequence[str]) -> tuple[str, ...]:
+def _prefix_names(path: str, states: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{path}.{name}" for name in states)
 
 
-def _error(m: Any) -> float:
+def _largest_error(m: FmuLinearization | _HeldStep) -> float:
     return float(np.max(m.uncertainty, initial=0.0))

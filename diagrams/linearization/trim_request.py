@@ -1,14 +1,14 @@
-"""What a trim is asked for, by names: states, parameters that are free, targets."""
+"""The request of a trim: states, free parameters and targets, by their names."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ...blocks.core import OptionError, ParameterError, UnknownNameError, Value, near
+from ...blocks.core import Block, OptionError, ParameterError, UnknownNameError, Value, near
 from ...blocks.tracing import traced_parameters
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin
@@ -16,12 +16,15 @@ from ..wiring import change_parameter, split_path
 from .derivatives import find_signal
 from .plant_models import plant_layout
 
+if TYPE_CHECKING:
+    from ...fmus.running import Fmu
+
 
 @dataclass(eq=False)
 class Target:
-    """What is asked of states and signals.
+    """Wanted values of states and signals.
 
-    States are numbered as in x, those of FMUs behind it.
+    States have their numbers in x; the numbers of FMUs' states follow those of x.
     """
 
     fixed: set[int]
@@ -30,9 +33,9 @@ class Target:
     labels: list[str]
     wanted: np.ndarray
     rates: dict[int, float]
-    """Asked rates of states per second; NaN where any will do."""
+    """Wanted rates of states per second; NaN for any rate."""
     rest: bool = True
-    """Whether states that no rate is asked of are to stay."""
+    """Whether states without a wanted rate stay the same."""
 
 
 @dataclass(eq=False)
@@ -41,58 +44,69 @@ class Free:
 
     Attributes
     ----------
+    name : str
+        Path of the block, and name of the parameter in it.
+    path : str
+        Path of the block.
+    keys : list of str
+        Name of the parameter, with the names in it.
+    start, low, high : ndarray
+        First value and bounds of the entries.
+    shape : tuple of int
+        Shape of the parameter.
     where : slice or None
-        Its block's place among the parameters of the flattened diagram; None for an FMU's.
+        The block's slice of the parameters of the flattened diagram; None for an FMU.
     """
 
     name: str
     path: str
     keys: list[str]
-    block: Any
+    block: Block
     start: np.ndarray
     low: np.ndarray
     high: np.ndarray
     shape: tuple[int, ...]
     where: slice | None = None
-    pack: Any = field(default=None, repr=False)
+    pack: Callable[[Block], np.ndarray] | None = field(default=None, repr=False)
 
-    def shaped(self, value: np.ndarray) -> Any:
+    def shape_value(self, value: np.ndarray) -> np.ndarray | float:
         """Return the parameter's value from its entries."""
         return value.reshape(self.shape).copy() if self.shape else float(value[0])
 
     def is_at_bound(self, value: np.ndarray) -> bool:
-        """Whether an entry has come to a bound, as near as the search goes."""
+        """Whether an entry is at a bound, within the accuracy of the search."""
         near = 1e-3 * np.where(np.isfinite(self.high - self.low), self.high - self.low, 0.0)
         return bool(np.any((value <= self.low + near) | (value >= self.high - near)))
 
-    def changed(self, value: np.ndarray) -> Any:
+    def change_block(self, value: np.ndarray) -> Block:
         """Return the block with another value."""
-        return change_parameter(self.block, self.keys, self.shaped(value))
+        return change_parameter(self.block, self.keys, self.shape_value(value))
 
-    def packed(self, value: np.ndarray) -> np.ndarray:
-        """Return the numbers of the block's parameters, as the traced functions take them."""
-        found: np.ndarray = self.pack(self.changed(value))
-        return found
+    def pack_value(self, value: np.ndarray) -> np.ndarray:
+        """Return the numbers of the block's parameters, an argument of the traced functions."""
+        assert self.pack is not None
+        return self.pack(self.change_block(value))
 
     def slope(self, value: np.ndarray) -> np.ndarray:
-        """Return the derivative of `packed`: exact where the numbers are the parameters themselves."""
+        """Return the derivative of `pack_value` by differences; it is exact if the numbers are the parameters."""
         columns = []
         for i in range(value.size):
             d = 2.0**-17 * max(1.0, 2.0 ** np.round(np.log2(abs(value[i]) or 1.0)))
             up, down = value.copy(), value.copy()
             up[i], down[i] = value[i] + d, value[i] - d
-            change = (self.packed(up) - self.packed(down)) / (up[i] - down[i])
-            columns.append(np.where(np.isnan(change), 0.0, change))  # a sample time that there is not
+            change = (self.pack_value(up) - self.pack_value(down)) / (up[i] - down[i])
+            columns.append(np.where(np.isnan(change), 0.0, change))  # NaN stands for no sample time
         return np.array(columns).T
 
 
-def known_states(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray]:
+def index_states(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray]:
     """Return the numbers of the entries of all states, by name, in the states' shapes."""
     states = (flat.states.each, plant_layout(flat.table.blocks, at.plants, flat.width).each)
     return {name: layout.index(name) for layout in states for name in layout.slices}
 
 
-def _state(name: str, known: Mapping[str, Any], what: str) -> str:
+def _find_state(name: str, known: Mapping[str, np.ndarray], argument: str) -> str:
+    """Return the full name of a state; ``argument`` is that of the user's call."""
     if name in known:
         return name
     found = sorted(n for n in known if isinstance(name, str) and n.endswith("." + name))
@@ -100,23 +114,24 @@ def _state(name: str, known: Mapping[str, Any], what: str) -> str:
         return found[0]
     if found:
         raise UnknownNameError(
-            f"{name!r} stands for several states: {', '.join(found)}. Write more of the path.", port=what
+            f"{name!r} stands for several states: {', '.join(found)}. Write more of the path.", port=argument
         )
-    raise UnknownNameError(f"there is no state {name!r}. {near(str(name), known)}", port=what)
+    raise UnknownNameError(f"there is no state {name!r}. {near(str(name), known)}", port=argument)
 
 
-def _entries(value: Any, where: np.ndarray, name: str, what: str) -> np.ndarray:
-    """Return a value for each entry; None is NaN."""
+def _spread_value(value: Any, where: np.ndarray, name: str, argument: str) -> np.ndarray:
+    """Return a value for each entry; None gives NaN."""
     try:
         numbers = np.asarray(np.nan if value is None else value, dtype=float)
         return np.ravel(np.broadcast_to(numbers, where.shape))
     except (TypeError, ValueError):
         raise OptionError(
-            f"found {value!r} for {name!r}; expected a number, or numbers of shape {where.shape}.", port=what
+            f"found {value!r} for {name!r}; expected a number, or numbers of shape {where.shape}. Give that.",
+            port=argument,
         ) from None
 
 
-def targets_of(
+def read_targets(
     flat: FlatDiagram,
     known: Mapping[str, np.ndarray],
     targets: Mapping[str, Any],
@@ -124,58 +139,60 @@ def targets_of(
     fixed: Iterable[str],
     bounds: Mapping[str, Any],
 ) -> Target:
-    """Return what is asked, from what a user gives.
+    """Return the wanted values from the arguments of `Diagram.trim`.
 
     Raises
     ------
     UnknownNameError
-        A state or signal that isn't there.
+        If a state or signal is unknown.
     OptionError
-        A value of another shape.
+        If a value has another shape.
     """
-    signals: list[Any] = []
+    signals: list[tuple[tuple[str, str], tuple[int, ...]]] = []
     labels: list[str] = []
     wanted: list[np.ndarray] = []
     for name, value in targets.items():
         signal = find_signal(flat, name)
         signals.append((signal.port, signal.entries))
         labels += signal.labels
-        wanted.append(_entries(value, np.zeros(len(signal.entries)), name, "targets"))
-    held = {int(i) for name in fixed for i in np.ravel(known[_state(name, known, "fixed")])}
+        wanted.append(_spread_value(value, np.zeros(len(signal.entries)), name, "targets"))
+    held = {int(i) for name in fixed for i in np.ravel(known[_find_state(name, known, "fixed")])}
     asked: dict[int, float] = {}
     for name, value in rates.items():
-        where = known[_state(name, known, "rates")]
-        asked |= zip(np.ravel(where).tolist(), _entries(value, where, name, "rates").tolist(), strict=True)
+        where = known[_find_state(name, known, "rates")]
+        asked |= zip(np.ravel(where).tolist(), _spread_value(value, where, name, "rates").tolist(), strict=True)
     within: dict[int, tuple[float, float]] = {}
     for name, given in bounds.items():
-        where = known[_state(name, known, "free")]
-        low, high = _bounds(given, where.shape, name)
+        where = known[_find_state(name, known, "free")]
+        low, high = _read_bounds(given, where.shape, name)
         within |= dict(zip(np.ravel(where).tolist(), zip(low.tolist(), high.tolist(), strict=True), strict=True))
     return Target(held, within, signals, labels, np.concatenate([*wanted, np.zeros(0)]), asked)
 
 
-def _bounds(given: Any, shape: tuple[int, ...], name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper bounds, flat."""
+def _read_bounds(given: Any, shape: tuple[int, ...], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper bounds of all entries, flat."""
     try:
         low, high = (-np.inf, np.inf) if given is None else given
         a, b = (np.ravel(np.broadcast_to(np.asarray(v, dtype=float), shape)).copy() for v in (low, high))
     except (TypeError, ValueError):
         raise OptionError(
-            f"found {given!r} for {name!r}; expected a pair (lowest, highest), or None where there are no bounds.",
+            f"found {given!r} for {name!r}; expected a pair (lowest, highest), or None for no bounds. Give that.",
             port="free",
         ) from None
     if not np.all(a <= b):
-        raise OptionError(f"found {given!r} for {name!r}; expected the lowest value first.", port="free")
+        raise OptionError(
+            f"found {given!r} for {name!r}; expected the lowest value first. Exchange the two.", port="free"
+        )
     return a, b
 
 
-def named_states(flat: FlatDiagram, at: OperatingPoint, states: Mapping[str, Any]) -> OperatingPoint:
-    """Return the operating point with other states, by name; what follows from them is not made anew."""
-    known, x = known_states(flat, at), at.x.copy()
+def set_states(flat: FlatDiagram, at: OperatingPoint, states: Mapping[str, Any]) -> OperatingPoint:
+    """Return the operating point with other states, given by name; its signals are not computed anew."""
+    known, x = index_states(flat, at), at.x.copy()
     plants = {path: {**point, "state": dict(point["state"])} for path, point in at.plants.items()}
     for name, value in states.items():
-        full = _state(name, known, "states")
-        where, numbers = known[full], _entries(value, known[full], name, "states")
+        full = _find_state(name, known, "states")
+        where, numbers = known[full], _spread_value(value, known[full], name, "states")
         if np.ravel(where)[0] < flat.width:
             x[np.ravel(where)] = numbers
             continue
@@ -188,81 +205,91 @@ def named_states(flat: FlatDiagram, at: OperatingPoint, states: Mapping[str, Any
 
 
 def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[list[Free], WiredDiagram]:
-    """Return the parameters that are free, and the diagram in which all of them are symbols.
+    """Return the free parameters, and a diagram in whose equations all of them are symbols.
 
-    An exact zero is structure in a trace, so a parameter that begins there is moved off it.
+    A trace takes an exact zero for structure, so a parameter that is zero starts beside it.
 
     Raises
     ------
     UnknownNameError
-        A parameter that isn't there.
+        If a parameter is unknown.
     ParameterError
-        One that is no number, or that can't change what has been traced.
+        If a parameter is no number, or the equations don't contain it.
     """
     found, moved = [], {}
     for name, given in asked.items():
         path, keys = split_path(diagram.structure, name, diagram.name)
-        block: Any = diagram.structure.blocks[path]
-        value = _value(block, keys)
-        low, high = _bounds(given, np.shape(value), name)
-        low, high = _declared(block, keys, low, high)
+        block = diagram.structure.blocks[path]
+        value = _read_value(block, keys, block.label)
+        low, high = _read_bounds(given, np.shape(value), name)
+        low, high = _limit_bounds(block, keys, low, high)
         start = np.clip(np.ravel(np.asarray(value, dtype=float)), low, high)
         free = Free(f"{path}.{'.'.join(keys)}", path, keys, block, start, low, high, np.shape(value))
         if not block.stepped:
-            start = np.where(start == 0.0, _away(low, high), start)
+            start = np.where(start == 0.0, _move_off_zero(low, high), start)
             free.start = start
-            moved[free.name] = free.shaped(start)
+            moved[free.name] = free.shape_value(start)
         found.append(free)
     diagram = diagram.replace(moved) if moved else diagram
     flat = diagram.flatten(None if diagram.has_clock else 1)
     for free in found:
         if free.path in flat.checked.traced:
-            _place(free, diagram, flat)
+            _locate(free, diagram, flat)
     return found, diagram
 
 
-def _place(free: Free, diagram: WiredDiagram, flat: FlatDiagram) -> None:
+def _locate(free: Free, diagram: WiredDiagram, flat: FlatDiagram) -> None:
+    """Set the block, slice and packing of a free parameter of a traced block."""
     free.block = diagram.structure.blocks[free.path]
     if ".".join(free.keys) not in dict(traced_parameters(free.block)):
         raise ParameterError(
-            "it is structure: the equations were traced with this value, so it can't be found by a trim. Try values "
-            "with diagram.replace(…), one after the other.",
+            "it is structure: the equations were traced with this value; expected a parameter that they contain. Try "
+            "values with diagram.replace(…), one after the other.",
             block=free.path,
             port=".".join(free.keys),
         )
-    free.where = flat.parameters.slices[free.path]
+    where = free.where = flat.parameters.slices[free.path]
 
-    def pack(block: Any) -> np.ndarray:
+    def pack(block: Block) -> np.ndarray:
         packed = flat.pack(free.path, block)
-        if packed.size != free.where.stop - free.where.start:  # type: ignore[union-attr]
-            raise ParameterError("its structure changes with this value.", block=free.path, port=".".join(free.keys))
+        if packed.size != where.stop - where.start:
+            raise ParameterError(
+                "found a value that changes the block's structure; expected the same structure. Try values with "
+                "diagram.replace(…), one after the other.",
+                block=free.path,
+                port=".".join(free.keys),
+            )
         return packed
 
     free.pack = pack
 
 
-def _value(block: Any, keys: list[str]) -> Any:
-    """Return a parameter's value; of an FMU its start value."""
-    specs = type(block).parameter_specs
+def _read_value(owner: Value, keys: list[str], label: str) -> float | np.ndarray:
+    """Return the value of a parameter, or an FMU's start value; ``label`` is the block's name in errors."""
+    specs = type(owner).parameter_specs
     if keys[0] not in specs:
-        raise UnknownNameError(f"it has no parameter {keys[0]!r}. {near(keys[0], specs)}", block=block.label)
-    value = block.__dict__[keys[0]]
+        raise UnknownNameError(f"it has no parameter {keys[0]!r}. {near(keys[0], specs)}", block=label)
+    value = owner.__dict__[keys[0]]
     if len(keys) > 1 and isinstance(value, Value):
-        return _value(value, keys[1:])
-    if len(keys) > 1 and block.stepped and keys[0] == "start":
-        name, variables = ".".join(keys[1:]), block.description.variables
+        return _read_value(value, keys[1:], label)
+    if len(keys) > 1 and isinstance(owner, Block) and owner.stepped and keys[0] == "start":
+        name, variables = ".".join(keys[1:]), cast("Fmu", owner).description.variables
         if name not in variables:
-            raise UnknownNameError(f"the FMU has no variable {name!r}. {near(name, variables)}", block=block.label)
+            raise UnknownNameError(f"the FMU has no variable {name!r}. {near(name, variables)}", block=label)
         start = variables[name].start
         value = value.get(name, np.zeros(variables[name].shape) if start is None else start)
         value = np.broadcast_to(np.asarray(value, dtype=float), variables[name].shape)
     if not isinstance(value, float | np.ndarray):
-        raise ParameterError(f"found {value!r}; a trim finds numbers alone.", block=block.label, port=".".join(keys))
+        raise ParameterError(
+            f"found {value!r}; expected numbers: a trim finds numbers alone. Free another parameter.",
+            block=label,
+            port=".".join(keys),
+        )
     return value
 
 
-def _declared(block: Any, keys: list[str], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounds within those that the parameter has by itself."""
+def _limit_bounds(block: Block, keys: list[str], low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the given bounds, limited by those of the parameter's declaration."""
     spec = type(block).parameter_specs[keys[0]] if len(keys) == 1 else None
     if spec is not None:
         least = spec.minimum if spec.above is None else np.nextafter(spec.above, np.inf)
@@ -271,7 +298,7 @@ def _declared(block: Any, keys: list[str], low: np.ndarray, high: np.ndarray) ->
     return low, high
 
 
-def _away(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def _move_off_zero(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return numbers within bounds that are not zero."""
     step = np.minimum(1.0, np.where(np.isfinite(high - low), 0.25 * (high - low), 1.0))
     return np.where(high >= -low, step, -step)

@@ -1,16 +1,17 @@
-"""Operating points by trim: the states and inputs at which a diagram is at rest, or does what was asked.
+"""Trim: operating points at which a diagram is at rest, or at which states and signals have wanted values.
 
-Unknown are the states of all blocks and FMUs, the FMUs' outputs, the values of algebraic loops, and the parameters that
-are free. The equations: every state stays (or changes as asked), the FMUs' outputs belong to their states, the signals
-have their targets. They are solved by least squares within bounds (a trust-region reflective method, then
-Gauss-Newton steps), with exact derivatives: of the traced functions, and of FMUs by their linear models.
+The unknowns are the states of all blocks and FMUs, the FMUs' outputs, the values of algebraic loops, and the free
+parameters. The equations say that every state stays the same, or has its wanted rate, that the FMUs' outputs follow
+from their states, and that the signals have their targets. They are solved by least squares within bounds, with a
+trust-region reflective method and then Gauss-Newton steps. The derivatives are exact: those of the traced functions,
+and the linear models of the FMUs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
@@ -30,19 +31,21 @@ from ..flat import (
     trace_schedule,
 )
 from ..results import OperatingPoint, PointOrigin
-from .operating_points import judged, operating_point
+from .operating_points import PointLike, operating_point, with_residual
 from .trim_plants import Plants
-from .trim_request import Free, Target, free_parameters, known_states, named_states, targets_of
+from .trim_request import Free, Target, free_parameters, index_states, read_targets, set_states
 
 TOLERANCE = 1e-9
-"""Largest residual that counts as solved, relative to 1 + the size of what it belongs to."""
+"""Largest residual of a solved equation, relative to 1 + the size of its quantity."""
+Residual: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Residual, its derivative by the unknowns, and the FMUs' inputs z."""
 
 
 class _Equations:
-    """The residual of a trim, and its exact derivative, by the unknowns.
+    """The residual of a trim as a function of the unknowns, with its exact derivative.
 
-    Unknowns, one after the other: entries of x (states that are free, values of algebraic loops), w, states of the FMUs
-    that are free, free parameters.
+    The unknowns are, one after the other, free entries of x (states, values of algebraic loops), w, free states of the
+    FMUs, and free parameters.
     """
 
     def __init__(self, diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, free: list[Free], target: Target):
@@ -56,17 +59,17 @@ class _Equations:
         n = self.plants.total
         self.free_p = np.array([i for i in range(n) if flat.width + i not in target.fixed], dtype=int)
         self.free_q = Layout.of({f.name: (f.start.size,) for f in free})
-        """Where the entries of each free parameter stand among those of all."""
+        """Layout of the free parameters among the unknowns."""
         sizes = {"x": len(self.free_x), "w": at.w.size, "plants": len(self.free_p), "q": self.free_q.total}
         self.unknowns = Layout.of({name: (size,) for name, size in sizes.items()})
         self.acting = frozenset(flat.clocks.values())
         self.loops = len(flat.active_loops(self.acting))
-        self.function = self._differentiated()
-        self._memory: tuple[bytes | None, Any] = (None, None)
-        self.names, self.wanted, self.keep = self._rows()
+        self.function = self._trace_residuals()
+        self._memory: tuple[bytes, Residual] | None = None
+        self.names, self.wanted, self.keep = self._list_rows()
 
-    def _differentiated(self) -> Derivative:
-        """Return the residuals of rates, ticks, loops and targets, then z, and their derivatives."""
+    def _trace_residuals(self) -> Derivative:
+        """Return the function of the residuals of rates, ticks, loops and targets, of z, and of their derivatives."""
         flat, symbols = self.flat, self.flat.symbols()
 
         def results(apart: Apart) -> Mapping[str, Any]:
@@ -79,8 +82,8 @@ class _Equations:
         by = ("x", "w", "p") if self.parameters else ("x", "w")
         return Derivative(trace_schedule("trim", symbols, results), [(name, None) for name in by])
 
-    def _rows(self) -> tuple[list[str], np.ndarray, np.ndarray]:
-        """Return for every equation its name, what is wanted, and whether it counts."""
+    def _list_rows(self) -> tuple[list[str], np.ndarray, np.ndarray]:
+        """Return for every equation its name, its wanted value, and whether it counts."""
         flat, states, target = self.flat, self.flat.labels, self.target
         loops = self.loops
         names = [
@@ -92,8 +95,8 @@ class _Equations:
             *self.plants.equations,
         ]
 
-        def asked(which: Any, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            rates = np.array([target.rates.get(int(i), 0.0 if target.rest else np.nan) for i in which])
+        def wanted_rates(states: Iterable[int], seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            rates = np.array([target.rates.get(int(i), 0.0 if target.rest else np.nan) for i in states])
             keep = np.isfinite(rates)
             return np.where(keep, rates, 0.0) * seconds, keep
 
@@ -103,18 +106,18 @@ class _Equations:
             rate = flat.table.rate(flat.table.subsystem_of[path]) if path in traced else None
             period[where] = 1.0 if rate is None else float(rate)
         groups = [
-            asked(flat.continuous, np.ones(flat.continuous.size)),
-            asked(self.sampled, period[self.sampled]),
+            wanted_rates(flat.continuous, np.ones(flat.continuous.size)),
+            wanted_rates(self.sampled, period[self.sampled]),
             (np.zeros(loops), np.ones(loops, bool)),
             (target.wanted, np.ones(target.wanted.size, bool)),
             (np.zeros(self.at.w.size), np.ones(self.at.w.size, bool)),
-            asked(flat.width + np.arange(self.plants.total), self.plants.seconds),
+            wanted_rates(flat.width + np.arange(self.plants.total), self.plants.seconds),
         ]
         wanted, keep = (np.concatenate([g[i] for g in groups]) for i in (0, 1))
         return names, wanted, keep.astype(bool)
 
     def start(self) -> np.ndarray:
-        """Return the unknowns at the point from which the search begins."""
+        """Return the unknowns at the beginning of the search."""
         q = [f.start for f in self.parameters]
         return np.concatenate([self.at.x[self.free_x], self.at.w, self.plants.x0[self.free_p], *q])
 
@@ -130,26 +133,25 @@ class _Equations:
         return low, high
 
     def split(self, unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Return x, w, states of the FMUs and values of the free parameters."""
+        """Return x, w, the FMUs' states and the values of the free parameters."""
         parts = self.unknowns.split(unknown)
         x, xp = self.at.x.copy(), self.plants.x0.copy()
         x[self.free_x], xp[self.free_p] = parts["x"], parts["plants"]
         return x, parts["w"], xp, [*self.free_q.split(parts["q"]).values()]
 
-    def at_unknown(self, unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the residual, its derivative, and z."""
+    def residual_at(self, unknown: np.ndarray) -> Residual:
+        """Return the residual, its derivative, and z; those of the last unknowns are kept."""
         key = unknown.tobytes()
-        if self._memory[0] != key:
+        if self._memory is None or self._memory[0] != key:
             self._memory = key, self._evaluate(unknown)
-        found: tuple[np.ndarray, np.ndarray, np.ndarray] = self._memory[1]
-        return found
+        return self._memory[1]
 
-    def _evaluate(self, unknown: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _evaluate(self, unknown: np.ndarray) -> Residual:
         flat, (x, w, xp, q) = self.flat, self.split(unknown)
         p, by_q = flat.p.copy(), np.zeros((flat.p.size, self.free_q.total))
         for f, value, columns in zip(self.parameters, q, self.free_q.slices.values(), strict=True):
             if f.where is not None:
-                p[f.where] = f.packed(value)
+                p[f.where] = f.pack_value(value)
                 by_q[f.where, columns] = f.slope(value)
         numbers = self.function(self.at.t, x, w, p)
         values, rest = numbers[:5], numbers[5:]
@@ -167,7 +169,7 @@ class _Equations:
 
         rows, slopes = values[:4], [derivative(i) for i in range(4)]
         z = values[4]
-        m = self.plants.at(xp, z, self.parameters, q)
+        m = self.plants.evaluate(xp, z, self.parameters, q)
         z_by = derivative(4)
         own = where["plants"]
         of_w = np.zeros((w.size, self.unknowns.total))
@@ -183,9 +185,9 @@ class _Equations:
         r, keep = np.concatenate(rows) - self.wanted, self.keep
         return np.where(keep, r, 0.0), np.where(keep[:, None], np.vstack(slopes), 0.0), z
 
-    def scaled(self, unknown: np.ndarray) -> np.ndarray:
-        """Return the residual relative to 1 + the size of what it belongs to."""
-        r, _, _ = self.at_unknown(unknown)
+    def scale_residual(self, unknown: np.ndarray) -> np.ndarray:
+        """Return the residual relative to 1 + the size of each equation's quantity."""
+        r, _, _ = self.residual_at(unknown)
         x, w, xp, _ = self.split(unknown)
         n = self.loops
         sizes = [x[self.flat.continuous], x[self.sampled], np.zeros(n), self.target.wanted, w, xp]
@@ -194,7 +196,7 @@ class _Equations:
 
 
 def solve(equations: _Equations) -> np.ndarray:
-    """Return the unknowns that the equations are nearest to being satisfied at."""
+    """Return the unknowns with the smallest residual within the bounds."""
     from scipy.optimize import least_squares
 
     low, high = equations.bounds()
@@ -205,17 +207,17 @@ def solve(equations: _Equations) -> np.ndarray:
     unknown = np.clip(unknown, low, high)
     moves = ~pinned
 
-    def full(part: np.ndarray) -> np.ndarray:
-        whole: np.ndarray = np.array(unknown)
-        whole[moves] = part
-        return whole
+    def fill_in(part: np.ndarray) -> np.ndarray:
+        every = np.array(unknown)
+        every[moves] = part
+        return every
 
     inside = np.where(np.isfinite(high - low), 1e-9 * (high - low), 0.0)[moves]
     begin = np.clip(unknown[moves], low[moves] + inside, high[moves] - inside)
     found = least_squares(
-        lambda v: equations.at_unknown(full(v))[0],
+        lambda v: equations.residual_at(fill_in(v))[0],
         begin,
-        jac=lambda v: equations.at_unknown(full(v))[1][:, moves],
+        jac=lambda v: equations.residual_at(fill_in(v))[1][:, moves],
         bounds=(low[moves], high[moves]),
         x_scale="jac",
         ftol=1e-15,
@@ -223,13 +225,15 @@ def solve(equations: _Equations) -> np.ndarray:
         gtol=1e-15,
         max_nfev=200,
     )
-    best = full(found.x)
-    for _ in range(5):  # to the last digits, and onto a bound
-        r, J, _ = equations.at_unknown(best)
+    best = fill_in(np.asarray(found.x))
+    for _ in range(5):  # Gauss-Newton steps give the last digits and reach a bound
+        r, J, _ = equations.residual_at(best)
         step = np.zeros(best.size)
         step[moves] = np.linalg.lstsq(J[:, moves], -r, rcond=1e-12)[0]
         trial = np.clip(best + step, low, high)
-        if not np.max(equations.scaled(trial), initial=0.0) < np.max(equations.scaled(best), initial=0.0):
+        if not np.max(equations.scale_residual(trial), initial=0.0) < np.max(
+            equations.scale_residual(best), initial=0.0
+        ):
             break
         best = trial
     return best
@@ -237,55 +241,60 @@ def solve(equations: _Equations) -> np.ndarray:
 
 def trim(
     diagram: WiredDiagram,
-    free: Any = None,
+    free: Mapping[str, Any] | Iterable[str] | None = None,
     targets: Mapping[str, Any] | None = None,
     *,
     rates: Mapping[str, Any] | None = None,
     fixed: Iterable[str] = (),
-    at: Any = None,
+    at: PointLike = None,
     tolerance: float = TOLERANCE,
     **options: Any,
 ) -> OperatingPoint:
     """Find an operating point; see `Diagram.trim`."""
     if isinstance(free, str) or (free is not None and not isinstance(free, Mapping | Iterable)):
         raise OptionError(
-            f"found free={free!r}; expected names with bounds, such as {{'force.value': (-10, 10)}}, or a list.",
+            f"found free={free!r}; expected names with bounds, or a list of names. Write, for instance, "
+            "free={'force.value': (-10, 10)}.",
             block=diagram.name,
             port="free",
         )
-    asked = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free or ())
+    asked: dict[str, Any] = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free or ())
     guess = operating_point(diagram, at, options)
     base = diagram.replace(guess.parameters) if guess.parameters else diagram
     flat = base.flatten(guess.base)
-    states = known_states(flat, guess)
+    states = index_states(flat, guess)
     parameters, base = free_parameters(base, {n: b for n, b in asked.items() if n not in states})
     flat = base.flatten(guess.base)
     bounds = {n: b for n, b in asked.items() if n in states}
-    target = targets_of(flat, states, targets or {}, rates or {}, [fixed] if isinstance(fixed, str) else fixed, bounds)
-    return _found(base, diagram, flat, guess, parameters, target, tolerance, PointOrigin.TRIM)
+    target = read_targets(
+        flat, states, targets or {}, rates or {}, [fixed] if isinstance(fixed, str) else fixed, bounds
+    )
+    return _solve_trim(base, diagram, flat, guess, parameters, target, tolerance, PointOrigin.TRIM)
 
 
-def given(diagram: WiredDiagram, t: float, states: Mapping[str, Any], options: Mapping[str, Any]) -> OperatingPoint:
-    """Return the operating point with states that are given by name, the others as they are at the time t.
+def point_from_states(
+    diagram: WiredDiagram, t: float, states: Mapping[str, Any], options: Mapping[str, Any]
+) -> OperatingPoint:
+    """Return the operating point with states given by name; the others are those at the time t.
 
     Signals and the FMUs' outputs follow from the states. See `Diagram.operating_point`.
     """
     guess = operating_point(diagram, t, options)
     flat = diagram.flatten(guess.base)
-    guess = named_states(flat, guess, states)
-    known = known_states(flat, guess)
-    target = targets_of(flat, known, {}, {}, list(known), {})
+    guess = set_states(flat, guess, states)
+    known = index_states(flat, guess)
+    target = read_targets(flat, known, {}, {}, list(known), {})
     target.rest = False
-    return _found(diagram, diagram, flat, guess, [], target, TOLERANCE, PointOrigin.GIVEN)
+    return _solve_trim(diagram, diagram, flat, guess, [], target, TOLERANCE, PointOrigin.GIVEN)
 
 
-def _found(
+def _solve_trim(
     base: WiredDiagram, diagram: WiredDiagram, flat: FlatDiagram, guess: OperatingPoint,
     parameters: list[Free], target: Target, tolerance: float, how: PointOrigin,
 ) -> OperatingPoint:  # fmt: skip
     equations = _Equations(base, flat, guess, parameters, target)
     unknown = solve(equations)
-    left = equations.scaled(unknown)
+    left = equations.scale_residual(unknown)
     order = [i for i in np.argsort(-left) if equations.keep[i]]
     residuals = {equations.names[i]: float(left[i]) for i in order}
     worst = float(left[order[0]]) if order else 0.0
@@ -295,21 +304,23 @@ def _found(
         stuck = [f.name for f, v in zip(parameters, q, strict=True) if f.is_at_bound(v)]
         advice = f"{', '.join(stuck)} is at its bound. " if stuck else ""
         raise SimulationError(
-            f"no operating point was found: relative to 1 + their size, these are left: {shown}; expected at most "
-            f"{tolerance:g}. {advice}Free more parameters or states, widen bounds, begin nearer with at=…, or "
-            "take what is nearest with tolerance=….",
+            f"no operating point was found: relative to 1 + their size, these equations have the residuals {shown}; "
+            f"expected at most {tolerance:g}. {advice}Free more parameters or states, widen bounds, begin nearer with "
+            "at=…, or take the nearest point with tolerance=….",
             block=diagram.name,
             t=guess.t,
         )
-    values = {f.name: f.shaped(v) for f, v in zip(parameters, q, strict=True)}
+    values = {f.name: f.shape_value(v) for f, v in zip(parameters, q, strict=True)}
     final = diagram.replace({**guess.parameters, **values})
-    plants = equations.plants.points(xp, equations.at_unknown(unknown)[2], equations.plants.changed(parameters, q))
-    return _completed(final, guess, x, w, plants, {
+    plants = equations.plants.points(
+        xp, equations.residual_at(unknown)[2], equations.plants.change_blocks(parameters, q)
+    )
+    return _complete_point(final, guess, x, w, plants, {
         "parameters": {**guess.parameters, **values}, "residuals": residuals, "how": how,
     })  # fmt: skip
 
 
-def _completed(
+def _complete_point(
     diagram: WiredDiagram,
     guess: OperatingPoint,
     x: np.ndarray,
@@ -317,7 +328,7 @@ def _completed(
     plants: Mapping[str, Any],
     more: dict[str, Any],
 ) -> OperatingPoint:
-    """Return the operating point with all its signals: the subsystems hold what they put out there."""
+    """Return the operating point with all its signals; subsystems hold their outputs."""
     flat = diagram.flatten(guess.base)
     at_tick = flat.at_tick(frozenset(flat.clocks.values()))
     x_next, z, log, _ = at_tick(guess.t, x, w, flat.p)
@@ -326,4 +337,4 @@ def _completed(
     for name, where in flat.held.slices.items():
         x[where] = np.ravel(values[name])
     point = replace(guess, x=x, w=w.copy(), z=z, plants=plants, values=values, **more)
-    return judged(flat, point, x_next)
+    return with_residual(flat, point, x_next)

@@ -178,7 +178,7 @@ def test_an_ideal_controller_around_an_fmu_is_continuous():
         diagram.continuous().linearize(0.1)
     point = diagram.continuous().operating_point(0.1, step=T)
     close(diagram.continuous().linearize(point).A, lin.A, 1e-9)
-    with pytest.raises(OptionError, match=r'found plants="step"; this model is continuous'):
+    with pytest.raises(OptionError, match=r'found plants="step" for a continuous model'):
         diagram.continuous().linearize(plants="step")
 
 

@@ -7,7 +7,7 @@ from scipy.linalg import expm
 from loopwright.blocks import Constant, FmuError, Gain
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.linearization import identification as _identification
-from loopwright.diagrams.linearization.identification import identified, realization
+from loopwright.diagrams.linearization.identification import identify_step, realize
 from loopwright.fmus import Fmu, dc_motor, gantry, mass_spring_damper
 from support.plants import hidden
 
@@ -38,7 +38,7 @@ def test_a_mass_on_a_spring_is_found_with_its_poles_and_feedthrough(tmp_path, sa
     """m s̈ + d ṡ + k s = F; the acceleration's feedthrough is a pole at z = 0."""
     block = Fmu(hidden(mass_spring_damper.build(), tmp_path, saves=saves), start={"position": 0.0})
     assert not block.description.states
-    m = identified(block, {"t": 0.0, "state": {}, "inputs": {"force": np.array(0.0)}}, H)
+    m = identify_step(block, {"t": 0.0, "state": {}, "inputs": {"force": np.array(0.0)}}, H)
     A, B = held(np.array([[0, 1.0], [-100, -1]]), np.array([[0.0], [1]]))
     C, D = np.array([[1.0, 0], [0, 1], [-100, -1]]), np.array([[0.0], [0], [1]])
     assert len(m.A) == 3
@@ -55,7 +55,7 @@ def test_a_motor_is_found_with_both_its_inputs(tmp_path):
     known = Fmu(motor, start={"voltage": 0.0, "load_torque": 0.0}).linear_model()
     block = Fmu(hidden(motor, tmp_path), start={"voltage": 0.0, "load_torque": 0.0})
     inputs = {name: np.zeros(port.shape or ()) for name, port in block.inputs.items()}
-    m = identified(block, {"t": 0.0, "state": {}, "inputs": inputs}, H)
+    m = identify_step(block, {"t": 0.0, "state": {}, "inputs": inputs}, H)
     A, B = held(known.A, known.B)
     want = responses(A, B, known.C, known.D, 1000)
     scale = np.max(np.abs(want), axis=0)
@@ -103,7 +103,7 @@ def test_friction_in_the_pulse_is_taken_away(tmp_path, monkeypatch, pulse, bound
     file = gantry.build(gantry.nominal.replace(gravity=0.0), tmp_path / "weightless.fmu")
     block = Fmu(hidden(file, tmp_path), start=start)
     inputs = {name: np.zeros(2) for name in ("motor_force", "external_force")}
-    m = identified(block, {"t": 0.0, "state": {}, "inputs": inputs}, H)
+    m = identify_step(block, {"t": 0.0, "state": {}, "inputs": inputs}, H)
     rate = (65.42 / 0.01 + 175.93) / 36.87
     velocity = got(m, 50)[:, 2, 0]
     want = (1 - np.exp(-rate * H)) / rate / 36.87 * np.exp(-rate * H * np.arange(50))
@@ -114,11 +114,11 @@ def test_where_it_comes_to_no_rest_or_to_another_one_is_an_error(tmp_path):
     block = Fmu(hidden(mass_spring_damper.build(), tmp_path), start={"position": 0.0})
     point = {"t": 0.0, "state": {}, "inputs": {"force": np.array(0.0)}}
     with pytest.raises(FmuError, match="comes to rest by itself"):
-        identified(block, point, H, np.array([0.2, 0.0, -20.0]))
+        identify_step(block, point, H, np.array([0.2, 0.0, -20.0]))
     motor = Fmu(hidden(dc_motor.build(), tmp_path), start={"voltage": 1.0, "load_torque": 0.0})
     spinning = {"t": 0.0, "state": {}, "inputs": {"voltage": np.array(1.0), "load_torque": np.array(0.0)}}
     with pytest.raises(FmuError, match="it still moves after"):
-        identified(motor, spinning, H)
+        identify_step(motor, spinning, H)
 
 
 def test_a_realization_has_the_order_of_what_it_explains():
@@ -129,7 +129,7 @@ def test_a_realization_has_the_order_of_what_it_explains():
     G = responses(A, B, C, 0.0, 800)
     for noise, order in ((0.0, 4), (1e-6, 4)):
         shaken = G + noise * np.random.default_rng(1).standard_normal(G.shape)
-        a, b, c, sigma = realization(shaken, np.full((1, 1), noise))
+        a, b, c, sigma = realize(shaken, np.full((1, 1), noise))
         assert len(a) == order
         assert len(sigma) > order
         np.testing.assert_allclose(responses(a, b, c, 0.0, 800), G, atol=1e-10 + 300 * noise)

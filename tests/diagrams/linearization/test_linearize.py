@@ -360,7 +360,7 @@ def test_an_event_within_the_period_is_told():
     lin = Diagram("d", x(Sum(signs="++")(relay, box(x.y)))).linearize()
     (note,) = lin.notes
     assert re.match(
-        r"relay: its event '\w+' comes within the period from t = 0 s; the model is that of the motion", note
+        r"relay: its event '\w+' fires within the period from t = 0 s; the model is that of the motion", note
     )
     (finding,) = lin.findings
     assert isinstance(finding, EventWithinPeriod)
@@ -508,17 +508,17 @@ def test_a_batch_goes_through_points_and_parameters():
     ("error", "text", "call"),
     [
         (UnknownNameError, r"there is no signal 'forse' in this diagram\. Did you mean 'force'", {"inputs": "forse"}),
-        (UnknownNameError, r"'y' has the shape \(2,\), and no entry \[2\]", {"inputs": "y[2]"}),
+        (UnknownNameError, r"'y' has no entry \[2\]; expected one within its shape \(2,\)", {"inputs": "y[2]"}),
         (UnknownNameError, r"linearize takes no 'ouputs'\. Did you mean 'outputs'", {"ouputs": "y"}),
         (OptionError, r"found plants='magic'; expected one of 'equations', 'step'", {"plants": "magic"}),
         (
             OptionError,
-            r"operating point: t = 0\.07 s is between two ticks, 0\.05 s apart\. Take 0\.05 s",
+            r"operating point: t = 0\.07 s is between two ticks, which are 0\.05 s apart\. Take 0\.05 s",
             {"point": 0.07},
         ),
-        (OptionError, r"found an operating point at t = -1\.0 s; expected a time from 0 s on", {"point": -1}),
+        (OptionError, r"found t = -1\.0 s; expected a time from 0 s on", {"point": -1}),
         (OptionError, r"found 'now'; expected an operating point", {"point": "now"}),
-        (OptionError, r"found an operating point at t = nan s", {"point": float("nan")}),
+        (OptionError, r"found t = nan s", {"point": float("nan")}),
     ],
 )
 def test_what_is_wrong_is_said(error, text, call):
@@ -529,7 +529,7 @@ def test_what_is_wrong_is_said(error, text, call):
 def test_an_opening_at_which_nothing_is_wired_is_refused():
     x = Integrator(name="x")
     diagram = Diagram("d", x(Constant(value=0.0)))
-    with pytest.raises(WiringError, match=r"^x\.y: nothing is wired to it, so there is nothing to cut at 'x\.y'"):
+    with pytest.raises(WiringError, match=r"^x\.y: found nothing wired to it; expected a wire to cut at 'x\.y'"):
         diagram.linearize(openings="x.y")
 
 
@@ -546,7 +546,7 @@ def test_the_point_of_another_diagram_is_refused():
         pendulum().linearize(point)
     with pytest.raises(OptionError, match=r"found an instant of a run of the diagram 'hybrid', which has other blocks"):
         pendulum().linearize(hybrid().simulate(T, progress=False).at(T))
-    with pytest.raises(OptionError, match=r"found step=0\.01, but the operating point stands on ticks of 0\.05 s"):
+    with pytest.raises(OptionError, match=r"found step=0\.01; expected 0\.05 s, the ticks of the operating point"):
         hybrid().linearize(point, step=0.01)
 
 
@@ -572,12 +572,12 @@ def test_a_point_on_an_event_or_after_the_end_is_refused():
 def test_a_point_without_derivative_is_an_error():
     x = Integrator()
     diagram = Diagram("d", x(Function(np.sqrt)(x.y)))
-    with pytest.raises(NonFiniteError, match="derivative of what the diagram does is not finite here"):
+    with pytest.raises(NonFiniteError, match="found a derivative of the diagram's functions that is not finite"):
         diagram.linearize()
 
 
 def test_a_model_without_signals_is_no_system():
     with pytest.raises(OptionError, match="found 0 inputs and 0 outputs; expected at least one of each"):
         _ = hybrid().linearize().system
-    with pytest.raises(OptionError, match="no wire was named"):
+    with pytest.raises(OptionError, match="found no name of a wire"):
         hybrid().linearize().loop()

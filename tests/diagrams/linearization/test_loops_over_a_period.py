@@ -7,7 +7,7 @@ import scipy.optimize
 from loopwright.blocks import PID, Constant, Gain, Integrator, TransferFunction
 from loopwright.blocks.core.errors import ConfirmationError, WiringError
 from loopwright.diagrams import Diagram, margins, subsystem
-from loopwright.diagrams.linearization.loops_over_a_period import confirm_closed
+from loopwright.diagrams.linearization.loops_over_a_period import confirm_loop
 from loopwright.diagrams.linearization.over_a_period import Model
 
 
@@ -109,10 +109,10 @@ def test_lifting_a_wire_that_is_renewed_once_changes_nothing():
 def test_a_loop_that_does_not_close_to_the_diagram_is_refused():
     one = np.eye(1)
     cut = Model((0.5 * one, one, -0.2 * one, 0 * one), 0.1, ["x"], np.zeros(1))
-    confirm_closed(cut, 0.3 * one, ("u",), "d")
-    confirm_closed(cut, np.diag([0.3, 0.0]), ("u",), "d")  # what is only held for later does not count
+    confirm_loop(cut, 0.3 * one, ("u",), "d")
+    confirm_loop(cut, np.diag([0.3, 0.0]), ("u",), "d")  # what is only held for later does not count
     with pytest.raises(ConfirmationError, match="'u', closed, has the poles of another system"):
-        confirm_closed(cut, 0.31 * one, ("u",), "d")
+        confirm_loop(cut, 0.31 * one, ("u",), "d")
 
 
 def test_an_injection_at_a_box_with_an_offset_measures_the_loop():

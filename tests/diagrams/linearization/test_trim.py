@@ -201,6 +201,11 @@ def test_a_parameter_that_is_structure_is_refused():
         start.trim(free=["m.start_position"])
 
 
+def test_an_unknown_parameter_of_a_blocks_path_is_told_with_the_block():
+    with pytest.raises(UnknownNameError, match=r"path_projection: it has no parameter 'centre'\. .*center"):
+        fig3_at_rest().trim(free=["controller.path_projection.path.centre"])
+
+
 def test_given_states_make_the_signals_that_follow_from_them():
     point = mass().operating_point(step=1e-3, states={"plant.position": 0.3, "plant.velocity": -0.1})
     assert point.how == "given"
