@@ -144,17 +144,17 @@ class AdmittanceLoop(Value):
         """
         names = (*(f"{kind}_{s}" for kind in ("admittance", "pid") for s in SIDES),)
         linearization = cast(FeedbackLinearization, diagram["controller.feedback_linearization"])
-        sensor, frame = cast(ForceSensor, diagram["sensors.force_sensor"]), diagram.subsystems["controller"]
+        sensor, controller = cast(ForceSensor, diagram["sensors.force_sensor"]), diagram.subsystems["controller"]
         found: dict[str, Any] = {name: diagram[f"controller.{name}"] for name in names}
-        if frame.sample_time is None:
+        if controller.sample_time is None:
             raise UnknownNameError(
                 "found no sample time; expected that of Fig. 3. Make the diagram with fig3().", block="controller"
             )
         found |= {
             "path": linearization.path,
             "model": linearization.model,
-            "sample_time": float(frame.sample_time),
-            "method": frame.method,
+            "sample_time": float(controller.sample_time),
+            "method": controller.method,
             "delay": delay_of(diagram),
             "tool_mass": sensor.tool_mass,
         }

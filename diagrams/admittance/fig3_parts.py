@@ -95,9 +95,9 @@ def delay_of(diagram: WiredDiagram) -> int:
     controller, sensors = subsystems[_CONTROLLER], subsystems["sensors"]
     found = (sensors.sample_time, sensors.offset, sensors.delay)
     if found != (controller.sample_time, controller.offset, 0):
-        told = " s, ".join(str(v) for v in found)
+        settings = " s, ".join(str(v) for v in found)
         raise ParameterError(
-            f"found the sample time, offset and delay {told}; expected {controller.sample_time} s, "
+            f"found the sample time, offset and delay {settings}; expected {controller.sample_time} s, "
             f"{controller.offset} s, 0: the reduced loop reads the sensors at the controller's ticks. Linearize the "
             "diagram itself.",
             block="sensors",

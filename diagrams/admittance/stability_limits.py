@@ -320,10 +320,10 @@ def _refine(growth_at: Growth, low: float, high: float) -> float:
     """Return the value at which the growth rate changes its sign, by Brent's method."""
     from scipy.optimize import brentq
 
-    def bounded(y: float) -> float:
+    def bound_growth(y: float) -> float:
         return min(max(growth_at(math.exp(y)), -1e6), 1e6)  # infinite where the equations have no solution
 
-    return math.exp(float(brentq(bounded, math.log(low), math.log(high), xtol=1e-13, rtol=1e-13, maxiter=200)))
+    return math.exp(float(brentq(bound_growth, math.log(low), math.log(high), xtol=1e-13, rtol=1e-13, maxiter=200)))
 
 
 def _confirm(loop: AdmittanceLoop, over: str, value: float, step: float, environment: dict[str, float]) -> str:

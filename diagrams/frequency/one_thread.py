@@ -38,8 +38,8 @@ def on_one_thread(function: Callable[P, R]) -> Callable[P, R]:
     """Run a function inside `one_thread`."""
 
     @wraps(function)
-    def limited(*args: P.args, **kwargs: P.kwargs) -> R:
+    def run_limited(*args: P.args, **kwargs: P.kwargs) -> R:
         with one_thread():
             return function(*args, **kwargs)
 
-    return limited
+    return run_limited

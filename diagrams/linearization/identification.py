@@ -132,7 +132,7 @@ class _Runner:
     def close(self) -> None:
         """Free the instance."""
         if self._saved is not None:
-            self.instance._fmu.freeFMUState(self._saved)
+            self.instance.call("freeing its saved state", "freeFMUState", self._saved)
         self.instance.close()
 
     def _begin(self) -> None:

@@ -303,7 +303,7 @@ def _is_moving(flat: FlatDiagram, signal: Signal) -> bool:
     return bool(flat.output(signal.port).depends("y", "x")[:, flat.continuous].any())
 
 
-# --- what counts as a state ------------------------------------------------------------------------------------------
+# --- states of the model ---------------------------------------------------------------------------------------------
 
 
 def own_states(flat: FlatDiagram) -> set[int]:

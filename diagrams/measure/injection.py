@@ -219,7 +219,7 @@ class InjectionRun:
         ends included, and a column for each entry.
         """
         simulation = self.simulation
-        simulation.run(final=False)  # leaves out earlier records
+        simulation.run(final=False)  # discards earlier records
         first = simulation.view.tick
         simulation.record_instant()
         self.go(count, every)

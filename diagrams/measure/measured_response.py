@@ -25,14 +25,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ...blocks.core import OptionError
 from ..flat import FlatDiagram, WiredDiagram
-from ..linearization import find_signal, operating_point, ticks_to_renewal
+from ..linearization import PointLike, find_signal, operating_point, ticks_to_renewal
 from ..results import OperatingPoint, PointOrigin, Snapshot
 from .injection import InjectionRun, inject_signal
 from .waveforms import KINDS, Part, choose_step, compute_phasors, plan_signal
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from control import FrequencyResponseData
 
     from ..linearization import Linearization
-
-Beginning: TypeAlias = OperatingPoint | Snapshot | float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +207,7 @@ class FrequencyResponse:
 
 def frequency_response(
     diagram: WiredDiagram, wire: str, frequencies: ArrayLike, *, amplitude: float, kind: str = "sine",
-    at: Beginning = 0.0, outputs: str | Iterable[str] = (), windows: int = 40, agreement: float = 1e-6, **options: Any,
+    at: PointLike = 0.0, outputs: str | Iterable[str] = (), windows: int = 40, agreement: float = 1e-6, **options: Any,
 ) -> FrequencyResponse:  # fmt: skip
     """Measure a frequency response; see `Diagram.frequency_response`."""
     omega = _check_request(diagram, frequencies, amplitude, kind, windows)
@@ -300,7 +298,7 @@ def _check_request(
 
 
 def _find_beginning(
-    diagram: WiredDiagram, at: Beginning, options: dict[str, Any]
+    diagram: WiredDiagram, at: PointLike, options: dict[str, Any]
 ) -> tuple[dict[str, Any], OperatingPoint | None, float]:
     """Return the options of the run and its beginning: an operating point to start from, or None and a time in s."""
     if isinstance(at, Snapshot):
