@@ -81,9 +81,10 @@ class ErrorDynamics(Block):
 class AdmittanceFilter(Block):
     """Admittance control law (15): the path reference yields to a force like m ë + d ė + k e = F − F^d, (14).
 
-    e = r^p − r^d is the deviation of the path reference from the given reference; d = 2 ζ √(m k) (E7). Force tracking
-    (section IV-B) is the case k = 0 with a desired force; then the damping must be given (E8). ``offset`` is a
-    set-point without derivatives, measured from the reference; it adds k·offset to the force (E27).
+    r̈^p = r̈^d + (F − F^d − d ė − k e)/m, where e = r^p − r^d is the deviation of the path reference from the given
+    reference and d = 2 ζ √(m k) (E7). Force tracking (section IV-B) is the case k = 0 with a desired force; then the
+    damping must be given (E8). ``offset`` is a set-point without derivatives, measured from the reference; it adds
+    k·offset to the force (E27).
 
     ``velocity_limit`` and ``acceleration_limit`` bound the path reference by conditional integration (end of section
     IV-A). In a tick in which one would be exceeded, the acceleration a of r^p is cut to the admissible value and held

@@ -55,8 +55,9 @@ def expect_model(block: Block, model: Any) -> None:
 class PathTracking(Block):
     """Base of blocks that follow the foot point of a position on a path.
 
-    At the start the foot point is the global arg min of (4). From then on Newton's method on (6) starts from the last
-    foot point, so that θ counts laps (E17). The state ``foot`` is the last foot point, nothing else.
+    At the start the foot point is the global arg min of (4). From then on Newton's method on (6),
+    (y − σ̂(θ̂))ᵀ σ̂′(θ̂) = 0, starts from the last foot point, so that θ counts laps (E17). The state ``foot`` is the last
+    foot point, nothing else.
 
     Raises
     ------
@@ -182,7 +183,7 @@ class PathProjection(PathTracking):
 class TransverseTransform(Block):
     """Coordinate transform (7): η = (arc length, its rate), ξ = (signed distance to the path, its rate).
 
-    η₁ = g(θ̂), (5), lifted over laps (E17); ξ₁ = nᵀ(y − σ); η₂ = tᵀẏ / q; ξ₂ = nᵀẏ.
+    η₁ = ∫₀^θ̂ ‖σ̂′(τ)‖ dτ, (5), lifted over laps (E17); η₂ = tᵀẏ / q; ξ₁ = nᵀ(y − σ); ξ₂ = nᵀẏ.
 
     The inputs are ``theta``, the path parameter θ̂ of the foot point, then ``position`` and ``velocity``. Without a
     model these are y and its rate; with a model they are x_c and x_v, and y = h(x_c), ẏ = dh x_v, (3).
@@ -248,8 +249,8 @@ class ForceProjection(Block):
 class FeedbackLinearization(Block):
     """Input-output feedback linearization (10), which makes η̈₁ = v∥ and ξ̈₁ = v⊥, (11).
 
-    With J = [nᵀ; tᵀ/q] the rates of (ξ₁, η₁) are J ẏ, and (9) reads ÿ~ = b + D_u (u + dhᵀF), D_u = J dh G_v (E2, E3).
-    Solved for the motor force, J⁻¹ = [n, q t] in closed form (E4 orders v):
+    The virtual output (8) is ỹ = (ξ₁, η₁). With J = [nᵀ; tᵀ/q] its rate is J ẏ, and (9) reads ỹ¨ = b + D_u (u + dhᵀF),
+    D_u = J dh G_v (E2, E3). Solved for the motor force, J⁻¹ = [n, q t] in closed form (E4 orders v):
 
         u = (dh G_v)⁻¹ { n (v⊥ + κ q η₂²) + t (q v∥ − 2 κ η₂ ξ₂ − κ_s ξ₁ η₂²) − dh f_v − (dh)˙ x_v } − dhᵀ F.
 

@@ -80,11 +80,11 @@ class Gantry(PlanarModel):
         return coulomb + self.viscous_scale * self.viscous_friction * x_v
 
     def f_v(self, x_c: Array, x_v: Array) -> Array:
-        """Return the drift of (2): friction and weight over inertia, m/s²."""
+        """Return the drift of (2), f_v = −(F_F + F_G) / M: friction and weight over inertia, m/s²."""
         return (-self.friction(x_v) - self.weight) / self.mass
 
     def G_v(self, x_c: Array) -> Array:  # noqa: N802 - the paper's symbol
-        """Return the input matrix of (2), 1/kg."""
+        """Return the input matrix of (2), G_v = M⁻¹, 1/kg."""
         return np.eye(2) / self.mass
 
     def coordinate_acceleration(self, x_c: Array, x_v: Array, motor_force: Array, force: Array) -> Array:

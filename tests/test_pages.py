@@ -1,0 +1,140 @@
+"""The pages for users: the README's code, the pages under docs/ and the notebooks run, and say what is so."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import zipfile
+from contextlib import chdir
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import matplotlib
+import nbformat
+import numpy as np
+import pytest
+from nbclient import NotebookClient
+
+import loopwright.fmus
+
+ROOT = Path(__file__).parent.parent
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+QUICK = "03_your_own_diagram"  # the notebook of the quick set
+
+
+def blocks_of_code(text):
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+def run_commands(text, folder):
+    """Run the lines of a page's shell code that are commands of an installed package."""
+    lines = [line for part in re.findall(r"```sh\n(.*?)```", text, re.DOTALL) for line in part.splitlines()]
+    commands = [shlex.split(line, comments=True) for line in lines if line.startswith(("loopwright ", "fmpy "))]
+    assert len(commands) >= 3
+    for program, *arguments in commands:
+        found = shutil.which(program, path=os.path.dirname(sys.executable))
+        done = subprocess.run(
+            [found, *arguments], cwd=folder, capture_output=True, text=True, check=False, env=os.environ
+        )
+        assert done.returncode == 0, f"{program} {arguments}: {done.stdout}{done.stderr}"
+
+
+def test_the_readme_opens_with_a_closed_loop_in_ten_lines_that_runs(tmp_path):
+    first, *more = blocks_of_code((ROOT / "README.md").read_text(encoding="utf-8"))
+    lines = [line for line in first.splitlines() if line.strip()]
+    assert len(lines) <= 10
+    (tmp_path / "loop.py").write_text(first, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "loop.py"], cwd=tmp_path, capture_output=True, text=True, check=False, env=os.environ
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "loop.png").read_bytes().startswith(b"\x89PNG")
+    scope = {}
+    with chdir(tmp_path):
+        exec(first, scope)
+        assert isinstance(scope["run"].plot("position"), matplotlib.figure.Figure)  # which a notebook shows
+        for snippet in more:
+            exec(snippet, scope)
+    run_commands((ROOT / "README.md").read_text(encoding="utf-8"), tmp_path)
+
+
+def test_the_page_on_diagrams_runs(tmp_path):
+    scope = {}
+    with chdir(tmp_path):
+        for snippet in blocks_of_code((ROOT / "docs" / "diagrams.md").read_text(encoding="utf-8")):
+            exec(snippet, scope)
+
+
+def as_in_a_table(value):
+    return "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.6g}"
+
+
+def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_path):
+    text, scope = (ROOT / "docs" / "frequency.md").read_text(encoding="utf-8"), {}
+    with chdir(tmp_path):
+        for snippet in blocks_of_code(text):
+            exec(snippet, scope)
+    for name, cells in re.findall(r"^\| `([\w.]+)` \|(.*)\|$", text, re.MULTILINE):
+        told = [c.strip() for c in re.split(r"(?<!\\)\|", cells)]
+        if name in scope["limits"]:
+            limit = scope["limits"][name]
+            assert told == [as_in_a_table(limit.value), as_in_a_table(limit.rule_of_thumb)], name
+        else:
+            made = [
+                getattr(scope["disks" if hasattr(scope["disks"][v], name) else "found"][v], name)
+                for v in ("continuous", "sampled_d0", "sampled_d1")
+            ]
+            assert told[-3:] == [as_in_a_table(float(v)) for v in made], name
+    assert f"here {scope['sign'].frequency:.3f} rad/s" in text
+
+
+def test_the_page_on_export_runs(tmp_path):
+    text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
+    model, *more = blocks_of_code(text)
+    (tmp_path / "thermostat.py").write_text(model, encoding="utf-8")
+    (tmp_path / "page.py").write_text("\n".join(more), encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "page.py"], cwd=tmp_path, capture_output=True, text=True, check=False, env=os.environ
+    )
+    assert done.returncode == 0, done.stderr
+    run_commands(text, tmp_path)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("model", ["gantry", "bouncing_ball"])
+def test_the_page_on_export_tells_the_flags_as_they_are(fmi, model, tmp_path):
+    path = getattr(loopwright.fmus, model).build(out=tmp_path, fmi=fmi)
+    with zipfile.ZipFile(path) as archive:
+        tree = ET.fromstring(archive.read("modelDescription.xml"))
+    text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)`(?: \(2\.0: `(\w+)`\))? \|(.*)\|$", text.split("## Integrators")[0], re.MULTILINE)
+    with_events = "true" if model == "bouncing_ball" else "false"
+    spelling = {"canGetAndSetFMUState": "canGetAndSetFMUstate", "canSerializeFMUState": "canSerializeFMUstate",
+                "providesDirectionalDerivatives": "providesDirectionalDerivative"}  # fmt: skip
+    for column, interface in enumerate(("CoSimulation", "ModelExchange"), 0 if fmi == 3 else 2):
+        told = {}
+        for name, name2, cells in rows:
+            cell = [c.strip() for c in cells.split("|")][column]
+            if cell != "–":
+                key = name if fmi == 3 else name2 or spelling.get(name, name)
+                told[key] = with_events if cell == "with events" else cell
+        attributes = dict(tree.find(interface).attrib)
+        del attributes["modelIdentifier"]
+        assert told == attributes, interface
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, id=path.stem, marks=() if path.stem == QUICK else pytest.mark.slow) for path in NOTEBOOKS],
+)
+def test_the_notebooks_run(path):
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(path.parent)}}).execute()
+    shown = [o for cell in notebook.cells for o in cell.get("outputs", [])]
+    assert any("image/png" in o.get("data", {}) for o in shown)
+
+
+def test_one_notebook_is_in_the_quick_set():
+    assert QUICK in [path.stem for path in NOTEBOOKS]
