@@ -1,19 +1,16 @@
 """Random linear diagrams: nested, flattened, and the matrix exponential; any order of definition."""
 
 import numpy as np
-import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume
 from hypothesis import strategies as st
 
 from loopwright.blocks import Sine, TransferFunction
 from loopwright.diagrams import Diagram
+from support.random_cases import random_cases
 from support.random_linear import BASE, PERIOD, Matrices, diagram, specs
 
 LAST = 2 * PERIOD
 TIGHT = {"solver": "DOP853", "rtol": 1e-12, "atol": 1e-13, "progress": False}
-SLOW_IS_FINE = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.large_base_example]
-QUICK = settings(max_examples=20, deadline=None, derandomize=True, suppress_health_check=SLOW_IS_FINE)
-MANY = settings(QUICK, max_examples=200, derandomize=False)
 
 
 def bounded(spec):
@@ -49,26 +46,22 @@ def check(spec):
     return worst
 
 
-@QUICK
-@given(specs(least=12))
+@random_cases(5, 200, specs(least=12), fresh=True)
 def test_nested_flattened_and_matrix_exponential_agree(spec):
     check(spec)
 
 
-@QUICK
-@given(specs(least=12, clocked=False))
+@random_cases(5, 40, specs(least=12, clocked=False))
 def test_without_any_clock_it_is_one_matrix_exponential(spec):
     check(spec)
 
 
-@QUICK
-@given(specs(least=12, continuous=False))
+@random_cases(5, 40, specs(least=12, continuous=False))
 def test_without_anything_continuous_it_is_a_product_of_matrices(spec):
     check(spec)
 
 
-@QUICK
-@given(specs(least=12), st.integers(0, 2**32 - 1))
+@random_cases(5, 40, specs(least=12), st.integers(0, 2**32 - 1))
 def test_shuffled_definitions_give_the_same_bits(spec, seed):
     spec, oracle = bounded(spec)
     order = np.random.default_rng(seed)
@@ -78,10 +71,8 @@ def test_shuffled_definitions_give_the_same_bits(spec, seed):
     assert first.data.tobytes() == second.data.tobytes()
 
 
-@pytest.mark.slow
-@MANY
-@given(specs())
-def test_nested_flattened_and_matrix_exponential_agree_in_many_diagrams(spec):
+@random_cases(None, 200, specs(), fresh=True)
+def test_nested_flattened_and_matrix_exponential_agree_in_diagrams_of_any_size(spec):
     check(spec)
 
 

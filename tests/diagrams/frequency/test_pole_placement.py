@@ -3,15 +3,13 @@
 import control
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from loopwright.blocks import ConfirmationError, ErrorDynamics, ParameterError
 from loopwright.diagrams import delayed_hold, place, sampled_gains, sampled_poles
 from loopwright.diagrams.frequency import pole_placement as placement
-
-RANDOM = settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True)
+from support.random_cases import random_cases
 
 
 def same_polynomial(A, poles, relative=1e-7):
@@ -69,8 +67,7 @@ def test_dependent_inputs_are_one_input():
     assert same_polynomial(A - B @ place(A, B, [-3.0] * 3), [-3.0] * 3)
 
 
-@RANDOM
-@given(st.integers(1, 5), st.integers(1, 3), st.integers(0, 10_000), st.booleans())
+@random_cases(60, 400, st.integers(1, 5), st.integers(1, 3), st.integers(0, 10_000), st.booleans())
 def test_random_systems_get_the_polynomial_that_was_asked_for(n, m, seed, twice):
     rng = np.random.default_rng(seed)
     A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))

@@ -5,16 +5,15 @@ from math import lcm
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import block_diag, expm
 
 from loopwright.blocks import Constant, DiscreteStateSpace, Function, Gain, StateSpace
 from loopwright.diagrams import Diagram, subsystem
 from support.linear import by_simulation
+from support.random_cases import random_cases
 
 NEAR = 1e-10
-few = settings(max_examples=10, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -110,8 +109,7 @@ def all_of(net, diagram, **options):
     check(cut, (A, B[:, e], C[e], D[np.ix_(e, e)]))
 
 
-@few
-@given(seeds)
+@random_cases(4, 30, seeds, fresh=True)
 def test_continuous_diagrams(seed):
     net = Net(seed)
     diagram = Diagram("net", *net.wire(StateSpace))
@@ -122,8 +120,7 @@ def test_continuous_diagrams(seed):
     close(np.poly(lin.poles), np.poly(net.model()[0]))
 
 
-@few
-@given(seeds)
+@random_cases(4, 30, seeds, fresh=True)
 def test_sampled_diagrams(seed):
     net = Net(seed)
     diagram = Diagram("net", sampled(net)())
@@ -139,8 +136,7 @@ def sampled(net):
     return box
 
 
-@few
-@given(seeds)
+@random_cases(4, 30, seeds, fresh=True)
 def test_solved_algebraic_loops(seed):
     net = Net(seed, loops=True)
     all_of(net, Diagram("net", *net.wire(StateSpace), loops="solve"))
@@ -241,8 +237,7 @@ class Loop:
         return lin, M
 
 
-@few
-@given(seeds, st.booleans())
+@random_cases(4, 30, seeds, st.booleans(), fresh=True)
 def test_a_sampled_controller_around_a_continuous_plant(seed, deep):
     loop = Loop(seed, [(1, 0)])
     lin, M = loop.check(deep=deep)
@@ -259,8 +254,7 @@ RATES = st.lists(st.integers(1, 4), min_size=2, max_size=3).flatmap(
 )
 
 
-@few
-@given(seeds, RATES)
+@random_cases(4, 30, seeds, RATES, fresh=True)
 def test_several_rates_and_offsets(seed, clocks):
     loop = Loop(seed, clocks)
     for cut in ((0,), (0, 1)):
@@ -270,8 +264,7 @@ def test_several_rates_and_offsets(seed, clocks):
     close(poles, want[: len(poles)], 1e-9)
 
 
-@few
-@given(seeds)
+@random_cases(4, 30, seeds, fresh=True)
 def test_the_poles_do_not_depend_on_the_tick_at_which_the_period_begins(seed):
     diagram = Loop(seed, [(2, 1), (3, 0)]).diagram()
     found = [diagram.linearize(k * 1e-2, step=1e-2).A for k in range(6)]
@@ -281,8 +274,7 @@ def test_the_poles_do_not_depend_on_the_tick_at_which_the_period_begins(seed):
         close(np.poly(A)[:size], want[:size], 1e-9)
 
 
-@settings(max_examples=4, deadline=None)
-@given(seeds, RATES, st.integers(0, 3))
+@random_cases(2, 12, seeds, RATES, st.integers(0, 3), fresh=True)
 def test_bent_ones_on_the_move_against_differences_of_the_simulation(seed, clocks, k):
     diagram = Loop(seed, clocks).diagram(bend=np.sin)
     t = k * float(diagram.flatten().base)
@@ -303,8 +295,7 @@ def test_bent_ones_on_the_move_against_differences_of_the_simulation(seed, clock
 
 @pytest.mark.parametrize("T", [None, 0.01], ids=["continuous", "sampled"])
 @pytest.mark.parametrize("on", [0.0, 1.0])
-@few
-@given(seed=seeds)
+@random_cases(4, 30, seed=seeds, fresh=True)
 def test_an_enabled_box_counts_as_it_is_at_the_operating_point(T, on, seed):
     net, kind = Net(seed), StateSpace if T is None else DiscreteStateSpace
     first, second = net.nodes[:2]
