@@ -1,19 +1,11 @@
-"""A cache of its own for all tests of FMUs, and exported FMUs."""
+"""Exported FMUs, and instances of them that are freed at the end."""
 
 import pytest
 
-from loopwright.fmus.export.package import build_fmu
-from support.exported import Instance, mass_spring_damper, pendulums
-from support.exported2 import Instance2
-
-
-@pytest.fixture(scope="session", autouse=True)
-def cache(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("cache")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LOOPWRIGHT_CACHE", str(folder))
-        patch.delenv("LOOPWRIGHT_CC", raising=False)
-        yield folder
+from loopwright.fmus import build_fmu
+from loopwright.fmus.export import package as _build
+from support.exported import mass_spring_damper
+from support.instances import Exchange, open_instance
 
 
 @pytest.fixture(scope="module")
@@ -23,35 +15,26 @@ def msd(cache):
 
 @pytest.fixture
 def instance(tmp_path):
+    """instance(path, **options) -> the FMU, of either version, instantiated."""
     made = []
 
     def make(path, **options):
-        made.append(Instance(path, tmp_path / str(len(made)), **options))
+        made.append(open_instance(path, tmp_path / str(len(made)), **options))
         return made[-1]
 
     yield make
     for item in made:
         item.fmu.freeInstance()
-
-
-@pytest.fixture(scope="module")
-def msd2(cache):
-    return build_fmu(mass_spring_damper(), fmi=2)
-
-
-@pytest.fixture(scope="module")
-def pendulums2(cache):
-    return build_fmu(pendulums(), fmi=2)
 
 
 @pytest.fixture
-def instance2(tmp_path):
-    made = []
+def exchange(instance):
+    """exchange(path, **options) -> the FMU, of either version, instantiated for Model Exchange."""
+    return lambda path, **options: Exchange(instance(path, model_exchange=True, **options))
 
-    def make(path, **options):
-        made.append(Instance2(path, tmp_path / f"v2-{len(made)}", **options))
-        return made[-1]
 
-    yield make
-    for item in made:
-        item.fmu.freeInstance()
+@pytest.fixture
+def uncompiled(tmp_path, monkeypatch):
+    """Builds have an empty file as their binary, in a cache of their own: for tests of what else is in the file."""
+    monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "uncompiled"))
+    monkeypatch.setattr(_build, "compile_shared", lambda sources, out, **options: out.touch())

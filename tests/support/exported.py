@@ -1,15 +1,13 @@
-"""Models to export, and an FMU under FMPy's low-level interface: for the tests of export."""
+"""Models to export, and their solutions in closed form."""
 
 from dataclasses import replace
 
 import casadi as ca
-import fmpy
-import fmpy.fmi3
 import numpy as np
-import pytest
 from scipy.linalg import expm
 
-from loopwright.fmus.export.model import EventSpec, ModelSpec, Variable
+from loopwright.fmus import ModelSpec, Variable
+from loopwright.fmus.export.model import EventSpec
 
 M, D, K = 2.0, 0.5, 10.0
 
@@ -227,86 +225,56 @@ def heating(t):
     return (5.0 + 16.0 * np.exp(-0.1 * s), 0.0) if s < cold else (35.0 - 16.0 * np.exp(-0.1 * (s - cold)), 1.0)
 
 
-class Instance:
-    """An FMU under FMPy's low-level interface, by names, with what it logs."""
-
-    def __init__(self, path, folder, name="plant", token=None, start_time=0.0, stop_time=None, **options):
-        description = fmpy.read_model_description(str(path))
-        self.references = {v.name: v.valueReference for v in description.modelVariables}
-        self.sizes = {v.name: int(np.prod([d.start for d in v.dimensions] or [1])) for v in description.modelVariables}
-        self.log = []
-        self.folder, self.start_time, self.stop_time = folder, start_time, stop_time
-        fmpy.extract(str(path), str(folder))
-        exchange = options.pop("model_exchange", False)
-        self.n_states, self.n_events = description.numberOfContinuousStates, description.numberOfEventIndicators
-        self.fmu = (fmpy.fmi3.FMU3Model if exchange else fmpy.fmi3.FMU3Slave)(
-            guid=token or description.guid,
-            unzipDirectory=str(folder),
-            modelIdentifier=description.modelName,
-            instanceName=name,
-        )
-        self.fmu.instantiate(loggingOn=True, logMessage=self._logged, **options)
-
-    def _logged(self, environment, status, category, message):
-        self.log.append((status, category.decode(), message.decode()))
-
-    def initialize(self, **start):
-        for name, value in start.items():
-            self[name] = value
-        self.fmu.enterInitializationMode(startTime=self.start_time, stopTime=self.stop_time)
-        self.fmu.exitInitializationMode()
-        return self
-
-    def __getitem__(self, name):
-        values = self.fmu.getFloat64([self.references[name]], self.sizes[name])
-        return values[0] if self.sizes[name] == 1 else np.array(values)
-
-    def __setitem__(self, name, value):
-        self.fmu.setFloat64([self.references[name]], np.ravel(value).tolist())
-
-    def step(self, t, h, **inputs):
-        for name, value in inputs.items():
-            self[name] = value
-        return self.fmu.doStep(t, h)
-
-    def directional(self, unknown, known, seed):
-        vr = self.references
-        return self.fmu.getDirectionalDerivative([vr[unknown]], [vr[known]], seed, self.sizes[unknown])
-
-    def adjoint(self, unknown, known, seed):
-        vr = self.references
-        return self.fmu.getAdjointDerivative([vr[unknown]], [vr[known]], seed, self.sizes[known])
-
-
-def fails(item, call, *parts):
-    """The call fails, and the log says why; the FMU is reset."""
-    before = len(item.log)
-    with pytest.raises(fmpy.fmi1.FMICallException):
-        call()
-    assert len(item.log) == before + 1, item.log[before:]
-    status, category, message = item.log[-1]
-    assert (status, category) == (fmpy.fmi3.fmi3Error, "logStatusError")
-    for part in parts:
-        assert part in message
-    item.fmu.reset()
-
-
-def run(item, t, n, h=0.01):
-    for k in range(n):
-        item.step(t + k * h, h, force=np.sin(t + k * h))
-    return [item[name] for name in ("time", "position", "velocity", "acceleration", "der(velocity)")]
-
-
 def unbound(spec):
     """The same model, with nominal values so large that no tolerance cuts a step: a communication step is one step."""
     return replace(spec, states=tuple(replace(v, nominal=1e9) for v in spec.states), tolerance=0.1)
 
 
-def enter(item, **start):
-    """Initialize, and leave the Event Mode that follows."""
-    for name, value in start.items():
-        item[name] = value
-    item.fmu.enterInitializationMode()
-    item.fmu.exitInitializationMode()
-    assert item.fmu.updateDiscreteStates() == (False, False, False, False, False, 0.0)
-    item.fmu.enterStepMode()
+def echoing_ball():
+    """A ball that bounces on the floor and counts it; ``flash`` fires at the same instant, and ``echo`` of the count."""
+    t, x, u, p = ca.SX.sym("t"), ca.SX.sym("x", 4), ca.SX.sym("u", 0), ca.SX.sym("p", 2)
+    fired = ca.SX.sym("fired", 2)
+    velocity = ca.if_else(fired[0], -p[1] * x[1], x[1])
+    return ModelSpec(
+        name="echoing_ball",
+        description="A bouncing ball",
+        inputs=(),
+        outputs=(Variable("energy", "output", unit="J/kg"),),
+        parameters=(
+            Variable("gravity", "parameter", "fixed", unit="m/s2", start=G),
+            Variable("restitution", "parameter", "tunable", unit="1", start=E, minimum=0.0, maximum=1.0),
+        ),
+        states=(
+            Variable("height", "output", unit="m", start=1.0, state=True),
+            Variable("velocity", "local", unit="m/s", start=0.0, state=True, nominal=4.0),
+            Variable("bounces", "output", "discrete", unit="1", start=0.0, state=True),
+            Variable("echoes", "local", "discrete", unit="1", start=0.0, state=True),
+        ),
+        derivative=ca.Function("f", [t, x, u, p], [ca.vertcat(x[1], -p[0])]),
+        output=ca.Function("g", [t, x, u, p], [p[0] * x[0] + x[1] ** 2 / 2]),
+        events=(
+            EventSpec("bounce", "falling", "The floor"),
+            EventSpec("echo", "rising", "After a bounce, at the same instant"),
+        ),
+        indicators=ca.Function("z", [t, x, u, p], [ca.vertcat(x[0], x[2] - x[3] - 0.5)]),
+        jump=ca.Function("j", [t, x, u, p, fired], [ca.vertcat(x[0], velocity, x[2] + fired[0], x[3] + fired[1])]),
+        internal_step=1e-2,
+    )
+
+
+def flight(t, e=E):
+    """Height, velocity and bounces of the echoing ball until t: parabolas, each with the fraction e of the speed."""
+    begin, up, n = -np.sqrt(2 / G), np.sqrt(2 * G), 0
+    while t > begin + 2 * up / G:
+        begin, up, n = begin + 2 * up / G, e * up, n + 1
+    return up * (t - begin) - G * (t - begin) ** 2 / 2, up - G * (t - begin), n
+
+
+def stiff():
+    """x' = -rate (x - cos t) - sin t, whose solution from x(0) = 1 is cos t."""
+    t, x, u, p = ca.SX.sym("t"), ca.SX.sym("x"), ca.SX.sym("u", 0), ca.SX.sym("p")
+    f = ca.Function("f", [t, x, u, p], [-p * (x - ca.cos(t)) - ca.sin(t)])
+    g = ca.Function("g", [t, x, u, p], [x - ca.cos(t)])
+    rate = (Variable("rate", "parameter", start=1e6, variability="fixed"),)
+    state = (Variable("x", start=1.0, state=True),)
+    return ModelSpec("stiff", "", (), (Variable("error", "output"),), rate, state, f, g, integrator="rodas")

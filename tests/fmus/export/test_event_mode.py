@@ -3,8 +3,9 @@
 import fmpy
 import pytest
 
-from loopwright.fmus.export.package import build_fmu
-from support.exported import E, ball, bounces, bouncing_ball, counter, enter, fails
+from loopwright.fmus import build_fmu
+from support.exported import E, ball, bounces, bouncing_ball, counter
+from support.instances import enter, fails
 
 INTEGRATORS = (1, 2, 3)
 

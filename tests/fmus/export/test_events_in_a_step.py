@@ -9,8 +9,8 @@ import pytest
 from fmpy.validation import validate_fmu
 
 from loopwright.blocks.core.errors import DefinitionError, ParameterError
-from loopwright.fmus.export.model import EventSpec, Variable
-from loopwright.fmus.export.package import build_fmu
+from loopwright.fmus import Variable, build_fmu
+from loopwright.fmus.export.model import EventSpec
 from support.exported import E, G, ball, bouncing_ball, counter, heating, mass_spring_damper, relay, thermostat
 
 INTEGRATORS = (1, 2, 3)

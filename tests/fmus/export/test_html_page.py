@@ -9,13 +9,12 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from loopwright.fmus import gantry
+from loopwright.fmus import ModelSpec, Variable, build, build_fmu, gantry
 from loopwright.fmus.export.equation_text import equations, number
-from loopwright.fmus.export.from_block import build
 from loopwright.fmus.export.html_page import block_text, index_html
-from loopwright.fmus.export.model import ModelSpec, Variable
-from loopwright.fmus.export.package import build_fmu
 from support.exported import bouncing_ball, mass_spring_damper, pendulums, thermostat
+
+pytestmark = pytest.mark.usefixtures("uncompiled")
 
 
 def page(path):

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from loopwright.fmus.export.model import Variable
-from loopwright.fmus.export.package import build_fmu
+from loopwright.fmus import Variable, build_fmu
 from support.exported import counter, driven, make_model, mass_spring_damper, unbound, van_der_pol
-from support.exported2 import fails2
+from support.instances import fails
 
 RK4, DOPRI5, RODAS = INTEGRATORS = (1, 2, 3)
 
@@ -57,9 +56,9 @@ def polynomial(s, x, v, *u):
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("slopes", [(2.0,), (-3.0, 4.0), (0.0, 1.5)])
-def test_polynomials_up_to_the_order_of_the_integrator_are_exact(integrators2, instance2, integrator, slopes):
+def test_polynomials_up_to_the_order_of_the_integrator_are_exact(integrators2, instance, integrator, slopes):
     """The position is a polynomial of degree 3 or 4, which a method of order 4 integrates without error, in one step."""
-    item = instance2(integrators2)
+    item = instance(integrators2)
     item.initialize(integrator=integrator, internal_step=10.0, tolerance=1e-12)
     item["u"] = 0.5
     move(item, *slopes)
@@ -68,8 +67,8 @@ def test_polynomials_up_to_the_order_of_the_integrator_are_exact(integrators2, i
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_all_orders(integrators2, instance2, integrator):
-    item = instance2(integrators2)
+def test_all_orders(integrators2, instance, integrator):
+    item = instance(integrators2)
     item.initialize(integrator=integrator, internal_step=1e-3, tolerance=1e-12)
     move(item, -1.0, 2.0, 3.0, -4.0)
     item.step(0.0, 0.75)
@@ -78,8 +77,8 @@ def test_all_orders(integrators2, instance2, integrator):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_they_hold_for_one_step(integrators2, instance2, integrator):
-    item = instance2(integrators2)
+def test_they_hold_for_one_step(integrators2, instance, integrator):
+    item = instance(integrators2)
     item.initialize(integrator=integrator, tolerance=1e-12)
     move(item, 2.0)
     item.step(0.0, 1.0, u=0.5)  # set after its derivative: the order of the two calls is free
@@ -94,9 +93,9 @@ def wave(t):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_a_broken_line_against_scipy(instance2, integrator):
+def test_a_broken_line_against_scipy(instance, integrator):
     """An importer that joins samples of a wave by lines."""
-    item = instance2(build_fmu(driven(), fmi=2))
+    item = instance(build_fmu(driven(), fmi=2))
     item.initialize(integrator=integrator, internal_step=1e-3, tolerance=1e-12)
     x, h = np.array([1.0, 0.5]), 0.1
     for k in range(20):
@@ -115,13 +114,13 @@ def test_a_broken_line_against_scipy(instance2, integrator):
 
 
 @pytest.mark.parametrize(("integrator", "order"), [(RK4, 4.0), (RODAS, 4.0), (DOPRI5, 5.0)])
-def test_the_order_is_kept(driven2, instance2, integrator, order):
+def test_the_order_is_kept(driven2, instance, integrator, order):
     """One internal step for each communication step. Rosenbrock methods lose order if the input's rate is left out."""
 
     def rhs(t, x):
         return [-x[0] * x[1] + np.sin(3 * t) + wave(t), x[0] - x[1] ** 3 - 0.5 * x[1] * np.cos(t)]
 
-    item, counts, errors = instance2(driven2), (12, 16, 24, 32), []
+    item, counts, errors = instance(driven2), (12, 16, 24, 32), []
     for n in counts:
         item.fmu.reset()
         item.initialize(integrator=integrator, internal_step=10.0)
@@ -150,15 +149,15 @@ def ramps(item, first, last, between=None):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_they_are_part_of_the_state(instance2, integrator):
+def test_they_are_part_of_the_state(instance, integrator):
     path = build_fmu(driven(), fmi=2)
 
     def elsewhere(item):
-        other = instance2(path)
+        other = instance(path)
         other.fmu.setFMUState(other.fmu.deserializeFMUState(item.fmu.serializeFMUState(item.fmu.getFMUState())))
         return other
 
-    item, cut = instance2(path).initialize(integrator=integrator), instance2(path).initialize(integrator=integrator)
+    item, cut = instance(path).initialize(integrator=integrator), instance(path).initialize(integrator=integrator)
     state = item.fmu.getFMUState()
     whole = ramps(item, 0, 8)
     assert ramps(cut, 0, 8, elsewhere) == whole
@@ -174,10 +173,10 @@ def test_they_are_part_of_the_state(instance2, integrator):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_derivatives_of_zero_change_no_bit(driven2, instance2, integrator):
+def test_derivatives_of_zero_change_no_bit(driven2, instance, integrator):
     found = []
     for slopes in ((), (0.0,), (-0.0, 0.0)):
-        item = instance2(driven2)
+        item = instance(driven2)
         item.initialize(integrator=integrator)
         for k in range(5):
             item["u"] = wave(k)
@@ -187,11 +186,11 @@ def test_derivatives_of_zero_change_no_bit(driven2, instance2, integrator):
     assert found[0] == found[1] == found[2]
 
 
-def test_an_input_that_goes_on_is_no_jump(instance2):
+def test_an_input_that_goes_on_is_no_jump(instance):
     """It is set to where it has moved to, but for rounding: the adaptive step isn't chosen anew."""
     path, found = build_fmu(driven(), fmi=2), []
     for shift in (0.0, 1e-15, 1e-9):
-        item = instance2(path).initialize(integrator=DOPRI5, tolerance=1e-6)
+        item = instance(path).initialize(integrator=DOPRI5, tolerance=1e-6)
         item["u"] = 1.0
         move(item, 0.1)
         item.step(0.0, 1.0)
@@ -204,10 +203,10 @@ def test_an_input_that_goes_on_is_no_jump(instance2):
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_events_by_a_moving_input(instance2, integrator):
+def test_events_by_a_moving_input(instance, integrator):
     """The input passes 1 upwards and comes back within one internal step; x remembers when."""
     spec = counter(lambda t, x, u, p, fired: [t, x[1] + 1.0], z=lambda t, x, u, p: [u[0] - 1.0])
-    item = instance2(build_fmu(spec, fmi=2))
+    item = instance(build_fmu(spec, fmi=2))
     item.initialize(integrator=integrator, internal_step=10.0)
     item["u"] = 0.0
     move(item, 2.0)
@@ -224,34 +223,34 @@ def test_events_by_a_moving_input(instance2, integrator):
 
 
 @pytest.mark.parametrize("order", [0, 5])
-def test_orders_that_are_refused(integrators2, instance2, order):
-    item = instance2(integrators2).initialize()
+def test_orders_that_are_refused(integrators2, instance, order):
+    item = instance(integrators2).initialize()
     call = item.fmu.setRealInputDerivatives
-    fails2(item, lambda: call(item.references["u"], [order], [1.0]), f"derivative of u is {order}, expected 1 to 4")
+    fails(item, lambda: call(item.references["u"], [order], [1.0]), f"derivative of u is {order}, expected 1 to 4")
 
 
-def test_what_is_refused(integrators2, instance2):
-    item = instance2(integrators2).initialize()
-    fails2(item, lambda: move(item, 1.0, name="x"), "x is no continuous input")
+def test_what_is_refused(integrators2, instance):
+    item = instance(integrators2).initialize()
+    fails(item, lambda: move(item, 1.0, name="x"), "x is no continuous input")
     item.initialize()
-    fails2(item, lambda: move(item, 1.0, float("nan")), "derivative 2 of u was set to nan", "expected a finite number")
+    fails(item, lambda: move(item, 1.0, float("nan")), "derivative 2 of u was set to nan", "expected a finite number")
     item.initialize()
-    fails2(
+    fails(
         item, lambda: item.fmu.setRealInputDerivatives([99], [1], [1.0]), "no Float64 variable with value reference 99"
     )
-    item = instance2(build_fmu(counter(lambda t, x, u, p, fired: [x[0], x[1]]), fmi=2)).initialize()
-    fails2(item, lambda: move(item, 1.0, name="v"), "v is no continuous input")
-    item = instance2(build_fmu(van_der_pol(), fmi=2)).initialize()
-    fails2(item, lambda: item.fmu.setRealInputDerivatives([0], [1], [1.0]), "this FMU has no inputs")
-    item = instance2(integrators2, kind=fmpy.fmi2.FMU2Model).initialize()
+    item = instance(build_fmu(counter(lambda t, x, u, p, fired: [x[0], x[1]]), fmi=2)).initialize()
+    fails(item, lambda: move(item, 1.0, name="v"), "v is no continuous input")
+    item = instance(build_fmu(van_der_pol(), fmi=2)).initialize()
+    fails(item, lambda: item.fmu.setRealInputDerivatives([0], [1], [1.0]), "this FMU has no inputs")
+    item = instance(integrators2, model_exchange=True).initialize()
     call = item.fmu.dll.fmi2SetRealInputDerivatives  # FMPy has it for Co-Simulation alone
     nothing = ctypes.c_void_p()
     assert call(ctypes.c_void_p(item.fmu.component), nothing, ctypes.c_size_t(0), nothing, nothing) == 3
     assert "this is a Model Exchange instance" in item.log[-1][2]
 
 
-def test_a_step_that_fails_keeps_them(instance2):
-    item = instance2(build_fmu(mass_spring_damper(), fmi=2)).initialize(integrator=RK4)
+def test_a_step_that_fails_keeps_them(instance):
+    item = instance(build_fmu(mass_spring_damper(), fmi=2)).initialize(integrator=RK4)
     item["force"] = 1.0
     move(item, 2.0, name="force")
     state = item.fmu.getFMUState()

@@ -8,22 +8,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.fmus.export.package import build_fmu
-from support.exported import (
-    D,
-    Instance,
-    K,
-    M,
-    bounces,
-    bouncing_ball,
-    counter,
-    driven,
-    enter,
-    exact,
-    fails,
-    mass_spring_damper,
-    thermostat,
-)
+from loopwright.fmus import build_fmu
+from support.exported import D, K, M, bounces, bouncing_ball, counter, driven, exact, mass_spring_damper, thermostat
+from support.instances import enter, fails, open_instance
 
 RK4, DOPRI5, RODAS = INTEGRATORS = (1, 2, 3)
 
@@ -334,4 +321,4 @@ def test_the_model_description_says_so(instance, tmp_path):
     item = instance(path, requiredIntermediateVariables=list(flagged.values()))
     for reference in (item.references["set_point"], item.references["on"], 999):
         with pytest.raises(Exception, match="Failed to instantiate"):
-            Instance(path, tmp_path / f"refused-{reference}", requiredIntermediateVariables=[reference])
+            open_instance(path, tmp_path / f"refused-{reference}", requiredIntermediateVariables=[reference])

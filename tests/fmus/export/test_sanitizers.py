@@ -14,9 +14,9 @@ from support import TESTS
 SCENARIO = """
 import ctypes, pathlib, sys
 import fmpy, fmpy.fmi2, fmpy.fmi3
-from support.exported import Instance, bouncing_ball, mass_spring_damper, pendulums, thermostat, van_der_pol
-from support.exported2 import Instance2
-from loopwright.fmus.export.package import build_fmu
+from support.exported import bouncing_ball, mass_spring_damper, pendulums, thermostat, van_der_pol
+from support.instances import open_instance
+from loopwright.fmus import build_fmu
 
 folder = pathlib.Path(sys.argv[1])
 
@@ -33,7 +33,7 @@ def refused(item, *calls):
 
 
 def step(item, integrator):
-    two = isinstance(item, Instance2)
+    two = item.fmi == 2
     item.initialize(integrator=integrator)
     for k in range(20):
         item.step(0.05 * k, 0.05)
@@ -50,7 +50,7 @@ def step(item, integrator):
 
 
 def exchange(item, n, n_events):
-    two = isinstance(item, Instance2)
+    two = item.fmi == 2
     fmu, vector = item.fmu, lambda m: (ctypes.c_double * m)()
     for _ in range(2):
         item.initialize()
@@ -76,12 +76,9 @@ for make, n, n_events in models:
         path = build_fmu(make(), fmi=fmi)
         for integrator in (3,) if make is van_der_pol else (1, 2, 3, None):  # it is stiff
             where, me = folder / f"{make.__name__}-{fmi}-{integrator}", integrator is None
-            if fmi == 2:
-                item = Instance2(path, where, kind=fmpy.fmi2.FMU2Model if me else fmpy.fmi2.FMU2Slave)
-            else:
-                item = Instance(path, where, model_exchange=me)
+            item = open_instance(path, where, model_exchange=me)
             exchange(item, n, n_events) if me else step(item, integrator)
-            (item.fmu.fmi2FreeInstance if fmi == 2 else item.fmu.fmi3FreeInstance)(item.fmu.component)
+            item.free()
 print("all done")
 """
 

@@ -11,6 +11,8 @@ from loopwright.blocks import Block, Input, State
 from loopwright.fmus import build, build_fmu, gantry
 from support.exported import pendulums
 
+pytestmark = pytest.mark.usefixtures("uncompiled")
+
 
 class Force(Block):
     """A model whose variable has the name of a type, with a unit that has no common name."""

@@ -61,7 +61,7 @@ def pushes(n, T, amplitude):
 
 @pytest.mark.parametrize("fmi", [3, 2])
 @pytest.mark.parametrize("name", PLANTS)
-def test_every_plant_passes_fmpys_validation_and_says_what_its_variables_are(build, name, fmi):
+def test_every_plant_passes_fmpys_validation_and_says_what_its_variables_are(uncompiled, build, name, fmi):
     file = build(name, fmi=fmi)
     assert file.name == f"{name}.fmu"
     assert validate_fmu(str(file)) == []

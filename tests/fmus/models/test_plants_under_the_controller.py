@@ -52,6 +52,7 @@ COST = {
 }
 
 
+@pytest.mark.drawn(6)
 @pytest.mark.parametrize(("plant", "letter"), COST, ids=lambda v: getattr(v, "__name__", v).rpartition(".")[2])
 def test_what_another_plant_costs_in_tracking(runs, plant, letter):
     nominal = rms(runs(letter)[1])
@@ -93,7 +94,7 @@ def test_every_experiment_touches_the_wall(letter, longest, push):
 class Elastic:
     """The oracle's plant with an elastic screw: slide and motor."""
 
-    def __init__(self, options, rtol, max_step):
+    def __init__(self, options):
         self.x = self.force = None
 
     def rhs(self, t, x):

@@ -168,7 +168,7 @@ def test_what_an_fmu_would_leave_out_is_refused(block, text):
         build(block)
 
 
-def test_defaults_and_open_bounds_are_exported(cache):
+def test_defaults_and_open_bounds_are_exported(uncompiled):
     class Steep(Block):
         slope: float = parameter(default=6.0, above=5.0, unit="1")
         u = Input(default=4.0, unit="1", maximum=9.0)

@@ -1,121 +1,34 @@
-"""Export to FMI 3.0: the file, the standard's rules, the build, the compiler, bad models."""
+"""Builds: the same bytes, the cache, bad models, compilers that fail."""
 
-import ctypes
 import os
-import re
 import shutil
 import subprocess
 import sys
 import threading
-import xml.etree.ElementTree as ET
 import zipfile
 from pathlib import Path
 
 import casadi as ca
-import fmpy
-import fmpy.fmi3
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
 
 from loopwright.blocks.core.errors import CompilerError, DefinitionError, FmuError, ParameterError, UnitError
+from loopwright.fmus import Variable, build_fmu
 from loopwright.fmus.export import compiler as _compiler
 from loopwright.fmus.export import package as _build
 from loopwright.fmus.export.c_code import runtime
 from loopwright.fmus.export.compiler import TARGETS, compile_shared, find_compiler
-from loopwright.fmus.export.model import Variable
-from loopwright.fmus.export.package import build_fmu
 from loopwright.fmus.platform import native_platform
-from support.exported import mass_spring_damper, pendulums, run
-
-# ---- the file ----
-
-
-@pytest.mark.parametrize("make", [mass_spring_damper, pendulums])
-def test_valid(make):
-    path = build_fmu(make())
-    assert validate_fmu(str(path)) == []
-    assert fmpy.read_model_description(str(path), validate=True).coSimulation is not None
+from support.exported import mass_spring_damper
+from support.instances import run
 
 
-def xml(path):
-    with zipfile.ZipFile(path) as archive:
-        return ET.fromstring(archive.read("modelDescription.xml"))
-
-
-def structure(path):
-    root = xml(path)
-    names = {v.get("valueReference"): v.get("name") for v in root.find("ModelVariables")}
-    found = {}
-    for item in root.find("ModelStructure"):
-        pairs = zip(item.get("dependencies").split(), item.get("dependenciesKind").split(), strict=True)
-        found[item.tag, names[item.get("valueReference")]] = {names[r]: kind for r, kind in pairs}
-    return found
-
-
-def test_structure_is_complete_and_traced(msd):
-    everything = dict.fromkeys(("mass", "damping", "stiffness", "force", "position", "velocity"), "dependent")
-    now = {"force": "fixed", "position": "fixed", "velocity": "tunable", "damping": "dependent"}
-    assert structure(msd) == {
-        ("Output", "position"): {"position": "constant"},
-        ("Output", "acceleration"): now,
-        ("ContinuousStateDerivative", "der(position)"): {"velocity": "constant"},
-        ("ContinuousStateDerivative", "der(velocity)"): now,
-        ("InitialUnknown", "der(position)"): {"velocity": "constant"},
-        ("InitialUnknown", "der(velocity)"): everything,
-        ("InitialUnknown", "acceleration"): everything,
-    }
-
-
-def test_structure_of_arrays(cache):
-    found = structure(build_fmu(pendulums()))
-    assert found["ContinuousStateDerivative", "der(clock)"] == {}
-    assert found["Output", "deflection"] == {"angle": "dependent"}
-    assert found["Output", "positive"] == {"torque": "dependent"}  # a step: no constant factor
-    assert set(found["ContinuousStateDerivative", "der(rate)"]) == {"time", "gain", "torque", "angle", "rate"}
-
-
-def test_variables_say_what_they_are(msd):
-    rows = {v.get("name"): v.attrib for v in xml(msd).find("ModelVariables")}
-    assert rows["force"]["description"] == 'Force "from outside"'
-    assert (rows["position"]["causality"], rows["position"]["initial"]) == ("output", "exact")
-    assert rows["der(velocity)"]["derivative"] == rows["velocity"]["valueReference"]
-    assert rows["der(velocity)"]["unit"] == "m/s2"
-    assert rows["mass"]["min"] == "1e-06"
-    assert (rows["internal_step"]["unit"], rows["internal_step"]["start"]) == ("s", "0.001")
-    units = {u.get("name"): u.find("BaseUnit").attrib for u in xml(msd).find("UnitDefinitions")}
-    assert units["N.s/m"] == {"kg": "1", "s": "-1"}
-
-
-def test_exports_every_function_of_the_standard(msd, tmp_path):
-    fmpy.extract(str(msd), str(tmp_path))
-    library = ctypes.CDLL(str(next((tmp_path / "binaries" / native_platform()).iterdir())))
-    header = (Path(fmpy.__file__).parent / "c-code" / "fmi3Functions.h").read_text()
-    names = re.findall(r"^FMI3_Export\s+fmi3\w+TYPE\s+(fmi3\w+);", header, re.MULTILINE)
-    assert len(names) == 75
-    assert [name for name in sorted(names) if not hasattr(library, name)] == []
-
-
-def test_compiles_from_its_sources_without_warnings(msd, tmp_path):
-    if (gcc := shutil.which("gcc")) is None:
-        pytest.skip("no gcc on this machine")
-    with zipfile.ZipFile(msd) as archive:
-        archive.extractall(tmp_path)
-    flags = ["-std=c11", "-O1", "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror", "-fPIC", "-shared"]
-    source = tmp_path / "sources" / "model.c"
-    headers = f"-I{_build.fmi_headers()[0]}"
-    done = subprocess.run(
-        [gcc, *flags, headers, "-o", tmp_path / "a.so", source], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-
-
-def test_same_input_same_bytes(tmp_path, monkeypatch, cache):
-    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(cache / "zig"))  # the libc; the model is compiled anew
+def test_same_input_same_bytes(tmp_path, monkeypatch):
     built = []
     for name in ("a", "b"):
         monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / name))
-        monkeypatch.setenv("ZIG_LOCAL_CACHE_DIR", str(tmp_path / name / "local"))
+        monkeypatch.setenv("ZIG_LOCAL_CACHE_DIR", str(tmp_path / name / "local"))  # the model is compiled anew
         built.append(build_fmu(mass_spring_damper(), tmp_path / f"{name}.fmu"))
     assert built[0].read_bytes() == built[1].read_bytes()
     with zipfile.ZipFile(built[0]) as archive:
@@ -123,8 +36,8 @@ def test_same_input_same_bytes(tmp_path, monkeypatch, cache):
 
 
 @pytest.mark.slow
-def test_same_bytes_from_cold_caches_in_other_processes(tmp_path, cache):
-    code = "import sys, test_fmi3_files as e; e.build_fmu(e.mass_spring_damper(), sys.argv[1])"
+def test_same_bytes_from_cold_caches_in_other_processes(tmp_path):
+    code = "import sys, test_build as e; e.build_fmu(e.mass_spring_damper(), sys.argv[1])"
     for name in ("a", "b"):
         environment = {k: v for k, v in os.environ.items() if not k.startswith("ZIG_")}
         environment |= {"LOOPWRIGHT_CACHE": str(tmp_path / name)}
@@ -164,8 +77,7 @@ def test_key_depends_on_everything(msd):
     assert key() == key()
 
 
-def test_builds_at_once_in_threads(tmp_path, monkeypatch, cache):
-    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(cache / "zig"))
+def test_builds_at_once_in_threads(tmp_path, monkeypatch):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
     built, spec = [], mass_spring_damper()
     threads = [threading.Thread(target=lambda: built.append(build_fmu(spec))) for _ in range(3)]
@@ -231,9 +143,7 @@ def test_a_failing_compiler_is_quoted(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_failed_build_leaves_nothing(tmp_path, monkeypatch, cache):
-    monkeypatch.setenv("ZIG_GLOBAL_CACHE_DIR", str(cache / "zig"))
-    monkeypatch.setenv("ZIG_LOCAL_CACHE_DIR", str(cache / "zig"))
+def test_a_failed_build_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "c"))
     monkeypatch.setattr(_build, "runtime", lambda fmi: runtime(fmi) | {"core.c": "#error broken"})
     with pytest.raises(CompilerError, match="broken"):
@@ -301,3 +211,13 @@ def test_all_platforms(tmp_path, cache):
             assert data.startswith(magic[name.split("-")[1]])
             assert b"fmi3DoStep" in data
     assert validate_fmu(str(path)) == []
+
+
+def test_unknown_version():
+    with pytest.raises(FmuError, match=r"found fmi=1, expected 3 \(FMI 3.0\) or 2"):
+        build_fmu(mass_spring_damper(), fmi=1)
+
+
+def test_elements_have_names_of_their_own():
+    with pytest.raises(DefinitionError, match="not made of identifiers"):
+        Variable("angle[1]")
