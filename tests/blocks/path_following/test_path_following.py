@@ -361,6 +361,7 @@ def test_the_arm_of_these_tests_obeys_lagrange():
 # --- exact linearization ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(4)
 @MODEL
 @EVERY
 def test_the_linearization_is_exact(kind, model):
@@ -406,6 +407,7 @@ def test_a_linearization_needs_a_model():
 # --- the coordinate transform, its inverse and its derivatives --------------------------------------------------------
 
 
+@pytest.mark.drawn(3)
 @EVERY
 def test_path_coordinates_are_those_of_the_definition(kind):
     # eta_1 to 1e-12 (the arc length's accuracy); rates at speeds of 1 m/s and q > 0.4 to rounding
@@ -437,6 +439,7 @@ def full_jacobian(path):
     return ca.Function("J", [start, y, v], [ca.jacobian(ca.vertcat(eta, xi), ca.vertcat(y, v))])
 
 
+@pytest.mark.drawn(3)
 @EVERY
 def test_all_derivatives_of_the_transform_are_those_of_the_definition(kind):
     # Entries: d eta_2/dy holds kappa_s xi/q^2, with reaches of 0.1 m about 1e3; the foot point's rounding (1e-16) times the
@@ -468,6 +471,7 @@ def test_all_derivatives_of_the_transform_are_those_of_the_definition(kind):
         assert abs(np.linalg.det(got)) == pytest.approx(1 / q**2, rel=1e-9)  # notes, paragraph 2
 
 
+@pytest.mark.drawn(3)
 @EVERY
 def test_the_inverse_transform_is_the_inverse_by_the_definition(kind):
     path, rng = PATHS[kind], np.random.default_rng(8)
@@ -702,6 +706,7 @@ def test_forces_are_projected_on_tangent_and_normal(kind):
         assert got["f_perp"] == pytest.approx(normal @ force, abs=1e-12)
 
 
+@pytest.mark.drawn(3)
 @EVERY
 def test_a_hand_pushes_along_tangent_and_normal(kind):
     rng = np.random.default_rng(7)
@@ -713,6 +718,7 @@ def test_a_hand_pushes_along_tangent_and_normal(kind):
         np.testing.assert_allclose(got, f_par * tangent + f_perp * normal, rtol=0, atol=1e-12)
 
 
+@pytest.mark.drawn(3)
 @EVERY
 def test_a_spring_presses_back_on_its_side_only(kind):
     rng = np.random.default_rng(9)

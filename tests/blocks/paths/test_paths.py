@@ -278,6 +278,7 @@ def test_perimeter_of_the_papers_ellipse():
     assert Ellipse(semi_axes=(1, 1)).length == pytest.approx(2 * np.pi, rel=1e-15)
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("axes", [(A, B), (B, A), (0.4, 0.4), (0.7, 0.1), (0.8, 0.1), (1.0, 0.01), (1.0, 1e-4)])
 def test_arc_length_of_ellipses_agrees_with_elliptic_integrals(axes):
     path = Ellipse(semi_axes=axes, center=(3.0, -1.0))
@@ -393,6 +394,7 @@ def test_contact_curvature_is_smooth_where_its_series_takes_over():
             assert value == pytest.approx(float(exact), rel=1e-6)
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("name", ["closed spline", "open spline", "bean", "three points, closed"])
 def test_up_to_its_reach_a_point_is_the_nearest_and_beyond_it_is_not(name):
     path = PATHS[name]
@@ -433,6 +435,7 @@ def brute_force(path, y, samples=1_000_000):
     return theta[i], distance[i], theta[1] * np.max(np.hypot(*path.sigma(theta[::1000], 1)))
 
 
+@pytest.mark.drawn(3)
 @EVERY
 def test_projection_is_the_global_minimum(path):
     rng = np.random.default_rng(3)
@@ -450,6 +453,7 @@ def test_projection_is_the_global_minimum(path):
         assert 0.0 <= theta < path.period if path.closed else path.domain[0] <= theta <= path.domain[1]
 
 
+@pytest.mark.drawn(4)
 @EVERY
 def test_projection_undoes_going_off_the_path_within_reach(path):
     rng = np.random.default_rng(4)
@@ -565,6 +569,7 @@ def test_newton_converges_quadratically_to_the_foot_point(path):
 # --- traced as in NumPy -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(4)
 @EVERY
 def test_every_traced_equation_agrees_with_numpy(path):
     equations = {
@@ -677,6 +682,7 @@ def test_beyond_an_end_there_are_no_path_coordinates(name):
 # --- values -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(3)
 @EVERY
 def test_paths_are_values_whatever_has_been_tabulated(path):
     fresh = path.replace()

@@ -332,6 +332,7 @@ def test_every_delay_counts():
 PARTS = ("poles", "admittance", "time_domain")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plant", [gantry_elastic, gantry_stiction])
 def test_a_report_of_another_plant_has_no_limits_and_says_why(plant):
     found = report(plant, *PARTS)
@@ -366,6 +367,7 @@ def test_friction_is_taken_out_of_a_plant_only_where_that_is_shown():
     assert Fig3Case(diagram()).plant_model == gantry.nominal
 
 
+@pytest.mark.slow
 def test_a_report_of_a_heavier_gantry_is_of_that_gantry():
     made = experiments.compliance(plant=Fmu(gantry.build(), start=HEAVY)).diagram
     found = analyse(made, only=("admittance",)).numbers()
@@ -374,6 +376,7 @@ def test_a_report_of_a_heavier_gantry_is_of_that_gantry():
     assert found["admittance.perp.ke_limit_friction.sampled_d0.be_10"].value == pytest.approx(want.value, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_wall_is_not_in_the_time_runs():
     found = analyse(diagram(gantry_contact), only=("time_domain",))
     assert not found.numbers()

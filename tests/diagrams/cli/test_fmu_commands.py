@@ -93,14 +93,6 @@ number = 3
 '''
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path_factory, monkeypatch):
-    """One cache for the module, so that a model is compiled once."""
-    folder = tmp_path_factory.getbasetemp() / "command_fmu_cache"
-    monkeypatch.setenv("LOOPWRIGHT_CACHE", str(folder))
-    monkeypatch.delenv("LOOPWRIGHT_CC", raising=False)
-
-
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     """The current folder, with a file of models."""
@@ -127,13 +119,9 @@ def lag(tmp_path_factory):
     folder = tmp_path_factory.mktemp("lag")
     (folder / "mine.py").write_text(MODELS, encoding="utf-8")
     (folder / "constants.py").write_text("OFFSET = 10.0\n")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LOOPWRIGHT_CACHE", str(tmp_path_factory.getbasetemp() / "command_fmu_cache"))
-        for fmi, name in ((3, "lag"), (2, "lag2")):
-            assert (
-                main(["build", f"{folder / 'mine.py'}:Lag", "--fmi", str(fmi), "--name", name, "--out", str(folder)])
-                == 0
-            )
+    for fmi, name in ((3, "lag"), (2, "lag2")):
+        build = ["build", f"{folder / 'mine.py'}:Lag", "--fmi", str(fmi), "--name", name, "--out", str(folder)]
+        assert main(build) == 0
     return folder
 
 
@@ -529,12 +517,10 @@ def library(folder, name, source, *more):
     """Compile a shared library; return its bytes."""
     (folder / f"{name}.c").write_text(source)
     out = folder / f"{name}.so"
-    command, environment = [shutil.which("cc") or "", "-O1", "-shared", "-fPIC"], dict(os.environ)
+    command = [shutil.which("cc") or "", "-O1", "-shared", "-fPIC"]
     if not command[0]:
         command = [*find_compiler().command, "-target", "x86_64-linux-gnu.2.17", *command[1:]]
-        zig = f"{os.environ['LOOPWRIGHT_CACHE']}/zig"
-        environment |= {"ZIG_GLOBAL_CACHE_DIR": zig, "ZIG_LOCAL_CACHE_DIR": zig}
-    subprocess.run([*command, "-o", str(out), f"{name}.c", *more], cwd=folder, env=environment, check=True)
+    subprocess.run([*command, "-o", str(out), f"{name}.c", *more], cwd=folder, check=True)
     return out.read_bytes()
 
 
@@ -597,6 +583,7 @@ def problems(file, capsys, *options):
     return found
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("name", ["lag.fmu", "lag2.fmu"])
 def test_ours_are_clean_and_run(lag, name, capsys):
     assert main(["validate", str(lag / name)]) == 0
@@ -697,6 +684,7 @@ def test_paths_that_leave_the_folder(altered, capsys):
     assert found == ["the archive holds '../../escape.txt', which points out of its folder."]
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("name", ["lag.fmu", "lag2.fmu"])
 def test_a_start_value_that_it_refuses(altered, name, capsys):
     """What fails is told with the FMU's own words."""

@@ -34,6 +34,21 @@ def finite(text):
     raise AssertionError(f"{text} is no strict JSON")
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Figures are empty files: for runs of which the files are counted and no figure is looked at."""
+
+    def save(figure, stem):
+        files = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
+        for file in files:
+            file.touch()
+        return files
+
+    for name in ("plot_path", "plot_experiment"):
+        monkeypatch.setattr(f"loopwright.diagrams.paper.figures.{name}", lambda *_: None)
+    monkeypatch.setattr("loopwright.diagrams.results.plots.save", save)
+
+
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
     """Run experiment A once by the command; give the folder and what the same experiment gives in Python."""
@@ -101,7 +116,7 @@ def test_drawing_leaves_matplotlib_alone(done):
         run.plot()
 
 
-def test_table_fits_eighty_columns(tmp_path, capsys):
+def test_table_fits_eighty_columns(tmp_path, capsys, undrawn):
     assert main(["run", "D", "B", "--out", str(tmp_path), "--option", "cubic=true", "--option", "delay=1"]) == 0
     out, err = capsys.readouterr()
     lines = out.splitlines()
@@ -120,7 +135,7 @@ def test_table_fits_eighty_columns(tmp_path, capsys):
     assert files(tmp_path) == sorted(f"{letter}{ending}" for letter in "BD" for ending in ALL)
 
 
-def test_options_change_the_run(tmp_path, capsys):
+def test_options_change_the_run(tmp_path, capsys, undrawn):
     options = ["--option", "motor_force_limit=(300, 250)", "--option", "coulomb_scale=1.2", "--option", "delay=1"]
     assert main(["run", "A", "--out", str(tmp_path), *options]) == 0
     content = json.loads((tmp_path / "A.json").read_text())
@@ -128,7 +143,7 @@ def test_options_change_the_run(tmp_path, capsys):
     assert content["peak_motor_force_z"] == 250.0
 
 
-def test_what_never_settles_is_null(tmp_path, capsys):
+def test_what_never_settles_is_null(tmp_path, capsys, undrawn):
     assert main(["run", "A", "--out", str(tmp_path), "--option", "motor_force_limit=5"]) == 0
     row = next(line for line in capsys.readouterr().out.splitlines() if "settling_par" in line)
     assert row.split() == ["settling_par", "s", "never"]
@@ -162,7 +177,7 @@ def test_option_values(text, value):
 # --- a run that fails -----------------------------------------------------------------------------------------------
 
 
-def test_a_failed_run_keeps_its_files_and_the_others_run(tmp_path, capsys):
+def test_a_failed_run_keeps_its_files_and_the_others_run(tmp_path, capsys, undrawn):
     (tmp_path / "B.csv").write_text("of an older run")
     assert main(["run", "B", "A", "--out", str(tmp_path), "--option", "tool_mass=5"]) == 1
     out, err = capsys.readouterr()
@@ -200,6 +215,7 @@ def test_a_run_that_fails_before_its_first_sample_leaves_an_older_ones_files(tmp
     assert not out
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("ticks", [0, 1])
 def test_figures_of_next_to_nothing(done, tmp_path, ticks):
     from dataclasses import replace
@@ -218,7 +234,7 @@ def test_figures_of_next_to_nothing(done, tmp_path, ticks):
     assert len(lines) == 1 + ticks
 
 
-def test_interrupted(tmp_path, capsys, monkeypatch):
+def test_interrupted(tmp_path, capsys, monkeypatch, undrawn):
     simulate = experiments.Experiment.simulate
 
     def interrupt(self, **options):
@@ -291,7 +307,7 @@ def test_out_is_a_file(tmp_path, capsys):
     assert "--out: the folder" in capsys.readouterr().err
 
 
-def test_a_plant_of_ones_own(tmp_path):
+def test_a_plant_of_ones_own(tmp_path, undrawn):
     from loopwright.fmus import gantry
 
     plant = gantry.build(out=tmp_path / "mine.fmu")

@@ -107,6 +107,7 @@ def anything(seed, count):
     return nodes, [Net(f"{a} {b}", (a, b), ends, chance.choice([0.0, 40.0])) for (a, b), ends in sinks.items()]
 
 
+@pytest.mark.drawn(12)
 @pytest.mark.parametrize("seed", range(60))
 def test_wires_reach_their_ends_and_lie_on_nothing_else(seed):
     nodes, nets = anything(seed, 3 + seed % 12 if seed < 50 else 40)
@@ -225,6 +226,7 @@ def test_texts_are_escaped_and_nested_boxes_keep_their_conditions():
     assert any("enabled, reset" in text for text in shown)
 
 
+@pytest.mark.slow
 def test_the_same_diagram_is_drawn_the_same_in_every_process():
     script = "from loopwright.diagrams import experiments; print(experiments.compliance().diagram.draw().svg)"
     drawn = {

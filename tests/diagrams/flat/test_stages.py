@@ -27,7 +27,7 @@ from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.flat.layout import NONE, FlatLayout
 from loopwright.diagrams.flat.stages import OpaqueStage, TracedStage
 from loopwright.diagrams.flat.total_derivative import Derivative
-from loopwright.diagrams.linearization.derivatives import Parts, find_signal
+from loopwright.diagrams.linearization.derivatives import LocalDerivatives, find_signal
 from loopwright.diagrams.simulation.workspace import Workspace
 
 RNG = np.random.default_rng(9)
@@ -394,9 +394,9 @@ def test_linear_models_go_through_opaque_stages(paths):
     diagram = loop()
     flat = diagram.flatten(1).with_apart(*paths)
     measured = [find_signal(flat, name) for name in ("q.y", "r.y")]
-    parts = Parts(flat, [find_signal(flat, "p.y")], measured, (), evaluators=OUTSIDE)
+    parts = LocalDerivatives(flat, [find_signal(flat, "p.y")], measured, (), evaluators=OUTSIDE)
     t, x, w, _ = next(instants(flat))
-    found = parts.at(NONE, t, x, w)
+    found = parts.differentiate(NONE, t, x, w)
     np.testing.assert_allclose(found["dx", "x"], A, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(found["y", "x"], C[2:], rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(found["y", "d"], np.vstack([D_Q, -D_R @ D_Q]), rtol=1e-12, atol=1e-12)

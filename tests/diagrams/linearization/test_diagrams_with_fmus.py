@@ -328,6 +328,7 @@ def test_the_frictionless_loops_at_rest_have_the_known_margins():
     assert phase_margin(lin.loop("v_perp")) == pytest.approx(67.88699231, abs=1e-7)
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize(("theta", "offset"), PLACES)
 def test_with_matched_parameters_poles_are_those_asked_for_at_every_point_and_offset(theta, offset):
     ideal = at_rest(theta, offset).continuous().linearize()
@@ -341,6 +342,7 @@ def test_with_matched_parameters_poles_are_those_asked_for_at_every_point_and_of
     assert lin.memory == ("controller.path_projection.foot",)
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize(("theta", "offset"), PLACES)
 def test_with_matched_parameters_the_directions_are_decoupled(theta, offset):
     L = at_rest(theta, offset).linearize().loop("v_par", "v_perp")

@@ -154,6 +154,7 @@ def test_time_in_the_flow_counts_even_where_nothing_moves():
     assert A[-1, -1] == pytest.approx(np.exp(40 * (1 - np.cos(2 * np.pi * T)) / (2 * np.pi)), rel=1e-10)
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("t", [0.0, 0.1, 0.15, 0.2])
 def test_several_rates_that_move_against_differences_of_the_simulation(t):
     """Boxes every 2 and every 3 ticks with an offset around the pendulum's equation."""

@@ -52,6 +52,7 @@ def lifted_limit(L):
     return scipy.optimize.brentq(beyond, 1.5, 100.0)
 
 
+@pytest.mark.drawn
 @pytest.mark.parametrize("wire", ["u", "y", "after_hold"])
 @pytest.mark.parametrize("phase", [0.03, 0.07, 0.09])
 def test_an_offset_of_the_only_clock_does_not_change_the_loop(phase, wire):
@@ -123,6 +124,7 @@ def test_an_injection_at_a_box_with_an_offset_measures_the_loop():
         assert found.compare(diagram.linearize(), of) <= 1e-6
 
 
+@pytest.mark.slow
 def test_a_report_says_why_a_periodic_wire_has_no_margins_and_is_not_injected_into():
     report = cascade().report(only=("inner", "injection"))
     text = [line for s in report.sections for line in (*s.text, *(t for part in s.sections for t in part.text))]

@@ -78,6 +78,7 @@ def test_a_sampled_loop_has_its_closed_form(kind):
     np.testing.assert_allclose(found.omega, [2.0, 20.0, 90.0], rtol=0.01)
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(
     "options", [{}, {"xi": 0.03}, {"friction": False}, {"xi": 0.03, "friction": False}, {"delay": 1}], ids=str
 )
@@ -94,6 +95,7 @@ def test_fig3_answers_an_injection_as_its_linear_model_does(options, wire):
     assert found.moved <= 1e-8
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("kind", ["multisine", "chirp"])
 def test_fig3_answers_other_test_signals_alike(kind):
     diagram = fig3_loop(xi=0.03)

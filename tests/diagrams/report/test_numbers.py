@@ -178,6 +178,7 @@ def test_stiffness_limits_lie_by_the_rule_of_thumb_and_friction_at_rest_lowers_t
     assert value("admittance.perp.ke_limit.sampled_d0.be_10") == pytest.approx(46785.893, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_limits_grow_in_the_co_simulation_as_predicted():
     report = analyse(experiments.compliance(), only=("time_domain",))
     numbers = report.numbers()
@@ -187,6 +188,7 @@ def test_the_limits_grow_in_the_co_simulation_as_predicted():
         assert (number.value < 0) is (".below." in path)
 
 
+@pytest.mark.slow
 def test_a_delay_of_the_experiments_own_is_taken_out():
     keys = ("inner.perp.sampled_d0.phase_margin_deg", "inner.perp.sampled_d1.phase_margin_deg")
     delayed = analyse(experiments.compliance(delay=1), only=("inner",)).numbers()
@@ -197,6 +199,7 @@ def test_a_delay_of_the_experiments_own_is_taken_out():
 SLOW = [pytest.param(e, marks=pytest.mark.slow) for e in (experiments.path_following, experiments.force_tracking)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [experiments.hand_guiding, *SLOW])
 def test_other_experiments_have_the_same_inner_loops(start):
     numbers = analyse(start(), only=("inner",)).numbers()

@@ -38,6 +38,7 @@ from support.hybrid_blocks import TIGHT, Ball
 # --- bouncing ball -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("solver", ["DOP853", "RK45", "Radau", "auto"])
 def test_a_bouncing_ball_meets_its_first_twenty_bounces_and_then_its_zeno_point(solver):
     e, g = 0.8, 9.81
@@ -129,17 +130,18 @@ class DryFriction(Block):
         return x.x, np.where(fired.stop > 0.5, self.belt + 0.0 * x.v, x.v), mode
 
 
-def test_stick_slip_on_a_belt_has_the_period_of_its_closed_form():
+@pytest.mark.parametrize("duration", [20.0, pytest.param(60.0, marks=pytest.mark.slow)])
+def test_stick_slip_on_a_belt_has_the_period_of_its_closed_form(duration):
     m, k, vb, Fs, Fc = 1.0, 4.0, 0.1, 1.5, 1.0
     mass = DryFriction(mass=m, coulomb=Fc, static=Fs, stiffness=k, belt=vb, name="mass")
-    run = Diagram("belt", mass(Constant(value=0.0))).simulate(60.0, step=0.01, **TIGHT)
+    run = Diagram("belt", mass(Constant(value=0.0))).simulate(duration, step=0.01, **TIGHT)
     w = np.sqrt(k / m)
     slip = 2 * (np.pi - np.arctan((Fs - Fc) * w / (k * vb))) / w
     stick = 2 * (Fs - Fc) / (k * vb)
     first = Fs / (k * vb)
     times = first + np.concatenate([[0.0], np.cumsum([slip, stick] * 20)])
     assert [e.event for e in run.events] == (["left", "stop"] * 20)[: len(run.events)]
-    assert len(run.events) == np.sum(times < 60.0) >= 20
+    assert len(run.events) == np.sum(times < duration) >= duration / 3
     assert np.max(np.abs([e.t for e in run.events] - times[: len(run.events)])) < 1e-9
     inside = (run.t > first) & (run.t < first + slip)
     tau = run.t[inside] - first
@@ -172,6 +174,7 @@ def forced(F, w, Fs, Fc, end):
     return [(t, m) for t, m in found if t < end]
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(("F", "sticks"), [(2.0, True), (6.0, False)])
 def test_a_mass_that_is_pushed_to_and_fro_sticks_and_slips_both_ways(F, sticks):
     """With the larger force it never rests: where it stops, it slips back at the same instant."""
@@ -211,6 +214,7 @@ def van_der_pol():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["auto", "BDF", "Radau", "CVODE_BDF"])
 def test_a_stiff_van_der_pol_oscillator_of_single_blocks_jumps_when_scipy_says(solver, van_der_pol):
     """ẍ = μ (1 − x²) ẋ − x, μ = 1000: the time of each jump, and the state between them."""
@@ -281,6 +285,7 @@ class PI:
         return integral + T * self.ki * e + (1 - np.exp(-T * self.ki / self.kp)) * (u - v)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("anti_windup", ["back_calculation", "clamping"])
 def test_a_cascade_of_pi_controllers_in_two_rates_is_its_recursion_by_hand(anti_windup):
     run = drive(anti_windup).simulate(0.3, **TIGHT)

@@ -63,6 +63,7 @@ def crossings():
     return found.t_events[0]
 
 
+@pytest.mark.drawn(4)
 @pytest.mark.parametrize("solver", METHODS)
 def test_each_solver_finds_all_crossings_to_its_tolerance(solver, crossings):
     diagram = Diagram("swing", Swing(name="swing", level=0.3))
@@ -77,6 +78,7 @@ def test_each_solver_finds_all_crossings_to_its_tolerance(solver, crossings):
     assert errors[1] < errors[0] / 10
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(("solver", "order"), [("euler", 1), ("heun", 2), ("rk4", 4)])
 def test_each_fixed_step_finds_crossings_with_its_order(solver, order, crossings):
     diagram = Diagram("swing", Swing(name="swing", level=0.3))
@@ -312,6 +314,7 @@ def test_an_event_far_from_the_start_is_found_as_exactly():
     assert run.events[-1].t == pytest.approx(1e5 + 0.125, abs=3e-11)
 
 
+@pytest.mark.slow
 def test_many_events_at_one_instant_are_no_chattering():
     crossings = [Crossings(name=f"c{i}")(Clock() - 0.5) for i in range(600)]
     run = Diagram("d", *crossings).simulate(1.0, step=0.5, progress=False)

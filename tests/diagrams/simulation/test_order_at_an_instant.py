@@ -207,11 +207,12 @@ def test_a_sampled_box_in_an_enabled_one_acts_while_that_is_true_at_its_tick():
 
 @pytest.mark.parametrize("frequency", [5.0, 49.0, 50.0, 100.0])
 @pytest.mark.parametrize("options", [{}, {"solver": "rk4", "step": 0.1}])
-def test_events_of_a_fast_source_are_found_however_long_the_steps_are(frequency, options):
+@pytest.mark.parametrize("duration", [1.0, pytest.param(10.0, marks=pytest.mark.slow)])
+def test_events_of_a_fast_source_are_found_however_long_the_steps_are(frequency, options, duration):
     relay = Relay(on_point=0.1, off_point=-0.1)(Sine(frequency=frequency))
-    run = Diagram("d", Integrator(name="i")(relay)).simulate(10.0, progress=False, **options)
-    assert len(run.events) == 20 * frequency
-    assert run["i.y"][-1] == pytest.approx(5.0, abs=1e-3)
+    run = Diagram("d", Integrator(name="i")(relay)).simulate(duration, progress=False, **options)
+    assert len(run.events) == 2 * frequency * duration
+    assert run["i.y"][-1] == pytest.approx(duration / 2, abs=1e-3)
 
 
 def test_an_indicator_that_crosses_for_a_small_part_of_a_step_is_followed():
@@ -220,6 +221,7 @@ def test_an_indicator_that_crosses_for_a_small_part_of_a_step_is_followed():
     assert run["count.y"][-1] == 100.0
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("solver", ["auto", "LSODA", "BDF", "CVODE_BDF", "CVODE_Adams"])
 def test_no_solver_lets_a_ball_through_the_floor(solver):
     with pytest.raises(SimulationError, match="shows Zeno behaviour"):
@@ -444,6 +446,7 @@ def test_the_order_of_definition_changes_no_bit_of_a_result():
         assert [(e.t, e.block) for e in run.events] == [(e.t, e.block) for e in first.events]
 
 
+@pytest.mark.slow
 def test_hashing_changes_no_bit_of_a_result():
     code = (
         "import sys, hashlib; sys.path[:0] = sys.argv[1:]\n"

@@ -50,6 +50,7 @@ def test_a_delay_in_a_loop_is_the_method_of_steps():
     assert np.max(np.abs(run["i.y"] - method_of_steps(run.t))) < 1e-11
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("solver", ["RK45", "Radau", "BDF", "LSODA", "CVODE_BDF", "auto"])
 def test_every_solver_meets_its_tolerance_with_a_delay(solver):
     run = delayed_feedback(gain=4.0).simulate(3.0, step=0.01, rtol=1e-8, atol=1e-10, solver=solver, progress=False)
@@ -84,6 +85,7 @@ def test_a_step_comes_out_at_its_time_sharply():
     assert np.max(np.abs(run["late.y"] - late)[inner]) < 1e-14
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("frequency", [1.0, 10.0, 53.0])
 def test_a_signal_that_is_faster_than_the_steps_of_the_solver_comes_out_as_it_went_in(frequency):
     """Nothing but the delay looks at the sine in the first second: the solver would go there in one step."""

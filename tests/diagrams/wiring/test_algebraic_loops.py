@@ -113,6 +113,7 @@ def test_a_nonlinear_loop_follows_its_branch():
     assert np.max(run.residual) < 1e-13
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("solver", ["rk4", "DOP853", "Radau", "BDF", "CVODE_BDF", "auto"])
 def test_a_loop_inside_the_rates_is_solved_at_every_evaluation(solver):
     """Ẏ = s, s = 3 − tanh(s) − y: an index-1 differential-algebraic equation, against SciPy."""
