@@ -12,7 +12,6 @@ from loopwright.diagrams.cli.command_line import _make_parser, main
 from loopwright.diagrams.document.model import Section
 from loopwright.diagrams.document.report import Report
 from loopwright.diagrams.frequency.number import Number
-from loopwright.diagrams.report import analysis as _report_analysis
 
 LOOP = """
 from loopwright.blocks import Gain, Integrator, Sine, Sum
@@ -52,7 +51,7 @@ def asked(monkeypatch):
             f"Report of {diagram.name}", (Section("inner", "Loops", numbers=numbers),), {"diagram": diagram.name}
         )
 
-    monkeypatch.setattr(_report_analysis, "analyse", analyse)
+    monkeypatch.setattr("loopwright.diagrams.report.analyse", analyse)
     monkeypatch.setattr("loopwright.diagrams.diagram.analyse", analyse)
     return calls
 
@@ -118,7 +117,7 @@ def test_an_analysis_that_is_not_confirmed_writes_nothing(folder, monkeypatch, c
     def analyse(diagram, **options):
         raise ConfirmationError("the margin is not confirmed.", block="loop")
 
-    monkeypatch.setattr(_report_analysis, "analyse", analyse)
+    monkeypatch.setattr("loopwright.diagrams.report.analyse", analyse)
     monkeypatch.setattr("loopwright.diagrams.diagram.analyse", analyse)
     assert main(["report", "loop.py:loop"]) == 1
     assert "not confirmed" in capsys.readouterr().err
@@ -129,7 +128,7 @@ def test_an_interrupted_analysis_writes_nothing(folder, monkeypatch, capsys):
     def analyse(diagram, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_report_analysis, "analyse", analyse)
+    monkeypatch.setattr("loopwright.diagrams.report.analyse", analyse)
     monkeypatch.setattr("loopwright.diagrams.diagram.analyse", analyse)
     assert main(["report", "loop.py:loop"]) == 130
     assert "interrupted" in capsys.readouterr().err
