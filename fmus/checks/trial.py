@@ -18,13 +18,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-STAGES = {
-    "load": "loading and instantiating it",
-    "initialize": "initializing it",
-    "step": "its first step",
-    "get": "getting its outputs",
-    "terminate": "terminating it",
-}
 _MESSAGES = 20
 
 

@@ -23,7 +23,7 @@ from typing import Any
 from ...blocks.core import FmuFileError
 from ..platform import native_platform
 from .summary import INTERFACES, binaries_of, library_name, platforms_of_binary, read_archive, tuple_of
-from .trial import STAGES
+from .trial_stages import STAGES
 
 #: Seconds that an FMU may take for its first step before it counts as hung.
 PATIENCE = 120.0
