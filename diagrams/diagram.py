@@ -51,7 +51,7 @@ class Diagram(WiredDiagram):
     def simulate(self, duration: float, *, progress: bool | None = None, **options: Unpack[RunKeywords]) -> Run:
         """Run the diagram and return what it recorded: from t = 0, or from a saved state.
 
-        What happens in which order is said in `loopwright.diagrams.Simulation`'s module, in one page.
+        The page docs/architecture.md says what happens in which order.
 
         Parameters
         ----------

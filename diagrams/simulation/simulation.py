@@ -1,42 +1,6 @@
-"""Simulation: what happens in which order.
+"""A run in the making: it goes on, is saved, restored and read.
 
-**Time.** Everything sampled happens at integer ticks of one common base, the greatest common divisor of all sample
-times and offsets (and of ``step``, where one is given). Tick k is at k·numerator / denominator seconds, rounded once:
-time never accumulates, and two rates never drift. A subsystem with sample time T and offset d acts at d, d + T, …;
-between its ticks its outputs are held, before its first one they are what it puts out at the start. Visited are the
-ticks at which a subsystem acts, or every tick where there is an FMU, a ``step``, or a solver of fixed step.
-
-**At one instant**, in this order:
-
-1. The outputs of the FMUs are those at the end of their last step: a co-simulation FMU has no feedthrough between
-   communication points (FMI 3.0, Step Mode). The continuous states are what the solver arrived at, from the left.
-2. Discontinuities of sources in time (a step, an edge of a pulse) take effect: a source's value at t is its value from
-   the right.
-3. Indicators of events are looked at. Those that have changed their domain fire, all together: each jump sees the
-   instant before all of them. Then they are looked at again, until none fires. The same happens between ticks wherever
-   the solver finds a change. A subsystem that is enabled or triggered in continuous time is such an event.
-4. If the instant is a tick: all blocks are evaluated once, each port after the ports that it depends on
-   (`evaluation_order`). A subsystem acts if its clock ticks and the signal that enables or triggers it says so. The
-   next states of sampled blocks and the held outputs take effect. Then point 3 is gone through again, as subsystems
-   may have changed what indicators look at.
-5. The signals to be recorded are evaluated and recorded: the values from the right, after all events.
-6. A stop condition that is true ends the run; nothing steps beyond.
-7. The continuous states go on to the next tick, with everything sampled and the FMUs' outputs held; then the inputs of
-   the FMUs, held since this tick, are set, and every FMU steps to the next one.
-
-**Between ticks** the solver integrates all continuous blocks as one system. It lands on every tick at which something
-acts, on every discontinuity that a source announces (`Block.next_instant`), where it takes values from the left, and on
-every event. Other samples come from its dense output, or, where the relative tolerance is below 1e-9, it lands on them,
-too. Memory of blocks (a projection's last foot point) and the last solution of an algebraic loop are renewed at
-accepted steps only.
-
-**At the start** initial states are computed in an order of their own (a block may need its inputs for it), FMUs and
-blocks are evaluated until their values agree, and indicators are taken as they are: nothing fires.
-
-**Order of definition and hashing never matter**: blocks, states, events and subsystems are taken by path.
-
-If a value is not finite or a guard fails, the instant is evaluated again block by block to name the first one that is
-concerned; the run until then is kept in the error.
+The page docs/architecture.md says what happens in which order.
 """
 
 from __future__ import annotations
