@@ -17,7 +17,8 @@ def add_delay_blocks(table: Structure) -> Structure:
     """Return the structure with a delay block for every output that leaves a subsystem with a computational delay.
 
     The block stands inside the subsystem, acts at its ticks, and is called ``delay_`` and the output's name, numbered
-    where two outputs share a name. Blocks inside the subsystem still read the output without delay.
+    where two outputs share a name. Blocks inside the subsystem still read the output without delay. A wire that is
+    named inside and leaves the subsystem is the one that its consumers outside get: with the delay.
     """
     sampled = {}
     for path, block in sorted(table.blocks.items()):
@@ -67,6 +68,29 @@ def _delay_outputs(table: Structure, subsystem: str) -> None:
     for path, wire in sorted(table.controls.items()):
         if leaves(wire, path.rpartition(".")[0]):
             table.controls[path] = delay(wire)
+    leaving = [
+        wire
+        for (path, _), wire in table.results.items()
+        if path == subsystem and _is_inside(subsystem, table.subsystem_of[wire.block])
+    ]
     for name, wire in sorted(table.names.items()):
-        if leaves(wire, name.rpartition(".")[0]):
+        if leaves(wire, name.rpartition(".")[0]) or any(_overlap(wire, result) for result in leaving):
             table.names[name] = delay(wire)
+    for (path, output), wire in sorted(table.results.items()):
+        outside = path == subsystem or not _is_inside(subsystem, path)
+        if outside and (wire.block, wire.port) in made:
+            table.results[path, output] = delay(wire)
+
+
+def _overlap(a: Wire, b: Wire) -> bool:
+    """Whether two wires have an entry in common; parts of a port that are counted from its end may have one."""
+    if (a.block, a.port) != (b.block, b.port):
+        return False
+    for one, other in ((a.index, b.index), (b.index, a.index)):
+        if isinstance(one, int) and isinstance(other, int) and min(one, other) >= 0:
+            return one == other
+        if isinstance(one, int) and one >= 0 and isinstance(other, slice):
+            start, stop, step = other.start or 0, other.stop, other.step or 1
+            if start >= 0 and step > 0 and (stop is None or stop >= 0):
+                return one in range(start, one + 1 if stop is None else stop, step)
+    return True

@@ -89,6 +89,8 @@ class Structure:
         The source of the signal that enables or triggers a subsystem, by the subsystem's path.
     handed : dict
         For an input, by (block path, input): the subsystems, each with its output, that only pass its signal through.
+    results : dict
+        The source of every output of a subsystem, by (the subsystem's path, output).
     """
 
     blocks: dict[str, Block] = field(default_factory=dict)
@@ -98,6 +100,7 @@ class Structure:
     names: dict[str, Wire] = field(default_factory=dict)
     controls: dict[str, Wire] = field(default_factory=dict)
     handed: dict[tuple[str, str], tuple[tuple[str, str], ...]] = field(default_factory=dict)
+    results: dict[tuple[str, str], Wire] = field(default_factory=dict)
 
     def copy(self) -> Structure:
         """Return a structure with dictionaries of its own."""
@@ -109,6 +112,7 @@ class Structure:
             dict(self.names),
             dict(self.controls),
             dict(self.handed),
+            dict(self.results),
         )
 
     def clock(self, subsystem: str) -> SubsystemSettings | None:
@@ -342,6 +346,8 @@ class Collector:
         for inner in self.subsystems.values():
             if inner.subsystem.control:
                 table.controls[subsystem_path(inner)] = _resolve(inner.wires[inner.subsystem.control_input], paths)
+            for output, result in inner.results.items():
+                table.results[subsystem_path(inner), output] = _resolve(result, paths)
         for name, signal, consumer in self.named:
             wire = _resolve(signal, paths)
             subsystem = place_of(consumer)

@@ -5,7 +5,17 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, Gain, OptionError, Sine, UnitDelay, UnknownNameError, WiringError
+from loopwright.blocks import (
+    Clock,
+    Constant,
+    Gain,
+    Integrator,
+    OptionError,
+    Sine,
+    UnitDelay,
+    UnknownNameError,
+    WiringError,
+)
 from loopwright.diagrams import Diagram, subsystem
 
 
@@ -135,3 +145,63 @@ def test_what_is_decorated_must_be_a_function():
         WiringError, match=r"found 0\.001; expected a function, or keywords: @subsystem\(sample_time=0\.0"
     ):
         subsystem(1e-3)
+
+
+def late_by_two(inner_name="y"):
+    """An integrator behind a gain of 3 that is computed for two samples of 0.1 s."""
+
+    @subsystem(sample_time=0.1, delay=2)
+    def controller(u):
+        y = Gain(gain=3.0)(u)
+        return y.named(inner_name) if inner_name else y
+
+    return controller
+
+
+def test_a_wire_named_in_a_subsystem_with_a_delay_is_the_one_that_its_consumers_outside_get():
+    """The first computed value, 0, leaves in the first ticks; then 3 t of two ticks before."""
+    run = Diagram("d", Integrator()(late_by_two()(Clock()))).simulate(0.5, step=0.1, progress=False)
+    assert np.allclose(run["y"], [0, 0, 0, 0.3, 0.6, 0.9], rtol=0, atol=1e-15)
+    assert np.allclose(run["gain.y"], 3 * run.t, rtol=0, atol=1e-15)  # the port is the block's own
+    # the integral of a signal that is held, computed by hand: 0.1 (0 + 0 + 0 + 0.3 + 0.6)
+    assert run["integrator.y"][-1] == pytest.approx(0.1 * run["y"][:-1].sum(), abs=1e-12)
+
+
+def test_a_named_output_that_nobody_reads_is_late_too():
+    run = Diagram("d", late_by_two()(Clock())).simulate(0.5, step=0.1, progress=False)
+    assert np.allclose(run["y"], [0, 0, 0, 0.3, 0.6, 0.9], rtol=0, atol=1e-15)
+
+
+def test_delays_of_nested_subsystems_add_up_on_a_wire_that_is_named_in_the_inner_one():
+    @subsystem(sample_time=0.1, delay=1)
+    def outer(u):
+        return late_by_two()(u)
+
+    run = Diagram("d", Integrator()(outer(Clock()))).simulate(0.5, step=0.1, progress=False)
+    assert np.allclose(run["y"], [0, 0, 0, 0, 0.3, 0.6], rtol=0, atol=1e-15)
+
+
+def test_a_wire_that_stays_inside_is_recorded_without_the_delay_of_what_leaves():
+    @subsystem(sample_time=0.1, delay=1)
+    def controller(u):
+        pair = Gain(gain=[1.0, 2.0], name="pair")(u)
+        kept = pair[1].named("kept")
+        return pair[0].named("left"), Gain(gain=1.0, name="last")(kept)
+
+    run = Diagram("d", Integrator()(controller(Clock()).left)).simulate(0.3, step=0.1, progress=False)
+    assert np.allclose(run["left"], [0, 0, 0.1, 0.2], rtol=0, atol=1e-15)
+    assert np.allclose(run["kept"], 2 * run.t, rtol=0, atol=1e-15)
+
+
+def test_the_loop_at_a_wire_that_leaves_contains_the_delay_wherever_it_was_named():
+    """L of 3 z^-2 T / (z - 1) at the wire, by hand; and the wire is cut where it leaves."""
+
+    def closed(controller):
+        plant = Integrator(name="plant")
+        return Diagram("d", plant(controller(0.0 - plant.y)))
+
+    for inner, outer in (("y", None), (None, "y")):
+        controller = late_by_two(inner)
+        d = closed((lambda e, c=controller: c(e).named("y")) if outer else controller)
+        z = np.exp(0.3j)
+        assert complex(d.linearize().loop("y")(z)) == pytest.approx(3 * 0.1 / (z**2 * (z - 1)), rel=1e-9)
