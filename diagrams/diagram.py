@@ -1,22 +1,26 @@
-"""The diagram: blocks and wires as one value, with all that is done with it."""
+"""The diagram: blocks and wires as one value, with all that is done with it.
+
+What describes and runs a diagram is imported with it; a method that linearizes, measures, draws or reports imports its
+sub-package when it is first called, so that a run does not pay for it.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any
 
-from .document import Report, check_files, write_report
-from .drawing import Drawing, draw
-from .flat import WiredDiagram
-from .linearization import Linearization, linearize, linearize_batch, point_from_states, run_to, trim
-from .measure import FrequencyResponse, frequency_response
-from .report import analyse, with_drawing
-from .results import OperatingPoint, Run
-from .simulation import RunKeywords, RunOptions, Simulation, simulate
+from .results import OperatingPoint
+from .simulation import SimulatedDiagram
+
+if TYPE_CHECKING:
+    from .document import Report
+    from .drawing import Drawing
+    from .linearization import Linearization
+    from .measure import FrequencyResponse
 
 
-class Diagram(WiredDiagram):
+class Diagram(SimulatedDiagram):
     """A diagram: what its last calls need, found by walking the wires backwards.
 
     Building it checks everything: unwired inputs, double drives, shapes, units, names, algebraic loops.
@@ -48,52 +52,6 @@ class Diagram(WiredDiagram):
     [0.0, 1.414214, 2.0, 1.414214, 0.0]
     """
 
-    def simulate(self, duration: float, *, progress: bool | None = None, **options: Unpack[RunKeywords]) -> Run:
-        """Run the diagram and return what it recorded: from t = 0, or from a saved state.
-
-        The page docs/architecture.md says what happens in which order.
-
-        Parameters
-        ----------
-        duration : float
-            Simulated time in s, a multiple of the step between ticks.
-        progress : bool, optional
-            Show a progress bar; by default on a terminal, and in a notebook where ipywidgets is installed.
-        **options
-            Options of the run by name: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step``, ``record``, ``every``,
-            ``states``, ``to``, ``overwrite``, ``start``. `RunOptions` says what each means, and its default.
-
-        Returns
-        -------
-        Run
-            Every output at every sample.
-
-        Raises
-        ------
-        SimulationError
-            `PathDomainError`, `GuardError`, `NonFiniteError` or `FmuRuntimeError`, a solver that can't go on, events
-            that pile up, an algebraic loop without a solution; ``error.run`` holds what was recorded until then.
-        OptionError
-            A duration that is not positive, or no multiple of the step; an unknown option or solver, a tolerance out of
-            range.
-        """
-        return simulate(self, duration, RunOptions.of(options, block=self.name), progress=progress)
-
-    def simulation(self, **options: Unpack[RunKeywords]) -> Simulation:
-        """Return a run in the making, to go on step by step, to save and to restore; see `Simulation`.
-
-        Parameters
-        ----------
-        **options
-            As for `simulate`; see `RunOptions`.
-
-        Raises
-        ------
-        OptionError
-            An unknown option or solver, a tolerance out of range.
-        """
-        return Simulation(self, RunOptions.of(options, block=self.name))
-
     def operating_point(
         self, t: float = 0.0, *, states: Mapping[str, Any] | None = None, **options: Any
     ) -> OperatingPoint:
@@ -114,6 +72,8 @@ class Diagram(WiredDiagram):
         UnknownNameError
             A state that isn't there.
         """
+        from .linearization import point_from_states, run_to
+
         if states:
             return point_from_states(self, t, states, options)
         return run_to(self, t, options)
@@ -164,21 +124,21 @@ class Diagram(WiredDiagram):
         ------
         SimulationError
             If no such point is found; the message has the largest residuals, and the parameters at a bound.
-        UnknownNameError, OptionError, ParameterError
-            A name that isn't there, bounds or values that don't fit, a parameter that can't change.
-        FmuError
-            An FMU without a linear model.
+        UnknownNameError, OptionError, ParameterError, FmuError
+            A name that isn't there, bounds or values that don't fit, a parameter that can't change; an FMU without a
+            linear model.
 
         Examples
         --------
         >>> from loopwright.blocks import Constant, Integrator
-        >>> from loopwright.diagrams import Diagram
         >>> level, inflow = Integrator(name="level"), Constant(value=1.0, name="inflow")
         >>> tank = Diagram("tank", level(inflow - 0.5 * level.y))
         >>> point = tank.trim(free={"inflow.value": (0, 10)}, targets={"level.y": 3.0})
         >>> round(point.parameters["inflow.value"], 12)
         1.5
         """
+        from .linearization import trim
+
         return trim(self, free, targets, rates=rates, fixed=fixed, at=at, tolerance=tolerance, **options)
 
     def linearize(
@@ -223,13 +183,12 @@ class Diagram(WiredDiagram):
 
         Raises
         ------
-        UnknownNameError
-            A signal that isn't there.
-        WiringError
-            An opening at which nothing is wired, or a transport delay in continuous time.
-        FmuError
-            An FMU that can't be linearized; the error says what it lacks.
+        UnknownNameError, WiringError, FmuError
+            A signal that isn't there; an opening at which nothing is wired, or a transport delay in continuous time; an
+            FMU that can't be linearized: the error says what it lacks.
         """
+        from .linearization import linearize
+
         return linearize(self, point, inputs=inputs, outputs=outputs, openings=openings, plants=plants, **options)
 
     def linearize_batch(
@@ -257,6 +216,8 @@ class Diagram(WiredDiagram):
         LoopwrightError
             As `linearize` and `replace`; the message says with which variant, and at which point.
         """
+        from .linearization import linearize_batch
+
         return linearize_batch(self, points, variants, **options)
 
     def report(
@@ -272,11 +233,11 @@ class Diagram(WiredDiagram):
         Parameters
         ----------
         path : path, optional
-            File to write, ``.html``; without it nothing is written. A notebook shows what is returned.
+            File to write, ``.html``; without it nothing is written. A notebook shows the report.
         pdf, json : bool
             Write ``.pdf`` (which needs ``pip install 'loopwright[pdf]'``) and ``.json`` beside it, too.
         **options
-            What `loopwright.diagrams.report.analyse.analyse` takes, such as ``point`` and ``loops``.
+            What `loopwright.diagrams.analyse` takes, such as ``point`` and ``loops``.
 
         Returns
         -------
@@ -285,11 +246,12 @@ class Diagram(WiredDiagram):
 
         Raises
         ------
-        OptionError
-            A path that does not end in ``.html``, or a PDF without the library that makes it.
-        ConfirmationError
-            A number that its independent confirmation does not bear out.
+        OptionError, ConfirmationError
+            A path that does not end in ``.html``, a PDF without its library; a number that its confirmation refutes.
         """
+        from .document import check_files, write_report
+        from .report import analyse, with_drawing
+
         check_files(path, pdf=pdf, json=json)
         made = with_drawing(analyse(self, **options), self)
         write_report(made, path, pdf=pdf, json=json)
@@ -304,7 +266,7 @@ class Diagram(WiredDiagram):
     ) -> Drawing:
         """Draw the diagram itself: blocks, subsystems with their rates, wires with their names, FMUs marked.
 
-        Signals run from left to right; what closes a loop runs back below. Nothing but Python is needed.
+        Signals run from left to right; feedback runs back below. Nothing but Python is needed.
 
         Parameters
         ----------
@@ -326,6 +288,8 @@ class Diagram(WiredDiagram):
         OptionError
             No such subsystem, or a file that is no ``.svg``.
         """
+        from .drawing import Drawing, draw
+
         drawing = Drawing(draw(self, subsystem=subsystem, closed=closed))
         if path is not None:
             drawing.save(path)
@@ -387,13 +351,12 @@ class Diagram(WiredDiagram):
 
         Raises
         ------
-        UnknownNameError
-            A signal that isn't there.
-        WiringError
-            A port that nothing is wired to.
-        OptionError
-            Frequencies that are not positive or too high for the samples, no amplitude, an unknown kind.
+        UnknownNameError, WiringError, OptionError
+            A signal that isn't there; a port that nothing is wired to; frequencies that are not positive or too high
+            for the samples, no amplitude, an unknown kind.
         """
+        from .measure import frequency_response
+
         return frequency_response(
             self, wire, frequencies, amplitude=amplitude, kind=kind, at=at, outputs=outputs, windows=windows,
             agreement=agreement, **options,

@@ -13,6 +13,7 @@ ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "architecture.md"
 ROOMS = ("blocks", "fmus", "diagrams")
 FILES = sorted(p.relative_to(ROOT) for room in ROOMS for p in (ROOT / room).rglob("*.py"))
+STUBS = [Path(room, "__init__.pyi") for room in ROOMS]  # the names that a room loads when they are used
 
 
 def place_of(path):
@@ -25,8 +26,9 @@ def place_of(path):
 def imports():
     """List every relative import, lazy ones and those for annotations too: file, line, imported file, imported name."""
     found = []
-    for path in FILES:
-        for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
+    for file in (*FILES, *STUBS):
+        path = file.with_suffix(".py")
+        for node in ast.walk(ast.parse((ROOT / file).read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 assert not any(a.name.startswith("loopwright") for a in node.names), f"{path}: rooms import relatively"
             if not isinstance(node, ast.ImportFrom):
@@ -231,4 +233,8 @@ PUBLIC = {
 @pytest.mark.parametrize("room", ROOMS)
 def test_public_names_are_those_that_users_know(room):
     """A name that goes, comes or changes stands in the changelog, and then here."""
-    assert importlib.import_module(f"loopwright.{room}").__all__ == PUBLIC[room].split()
+    module = importlib.import_module(f"loopwright.{room}")
+    assert module.__all__ == PUBLIC[room].split()
+    assert all(hasattr(module, name) for name in module.__all__)
+    stub = ast.parse((ROOT / room / "__init__.pyi").read_text(encoding="utf-8"))
+    assert module.__all__ == ast.literal_eval(stub.body[-1].value)  # what type checkers see

@@ -1,6 +1,6 @@
 """The base of all blocks: ports, signals, values, units and errors."""
 
-from . import arithmetic, moved, source
+from . import arithmetic, source
 from .arithmetic import Gain, Product, Sum, check_shapes, shape_of
 from .block import SOLVED, Block
 from .errors import (
@@ -100,7 +100,6 @@ __all__ = [
     "is_before",
     "left_of",
     "move_earlier",
-    "moved",
     "near",
     "next_edge",
     "parameter",
@@ -113,5 +112,3 @@ __all__ = [
     "shorten",
     "source",
 ]
-
-moved.explain_moved_modules()

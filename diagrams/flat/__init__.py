@@ -1,5 +1,6 @@
 """A whole diagram as functions of (t, x, w, p)."""
 
+from ...blocks.core import Layout
 from .evaluation import Apart, Instant, evaluate
 from .flat_diagram import FlatDiagram
 from .layout import NONE, StateLayout, TickPattern
@@ -19,6 +20,7 @@ __all__ = [
     "Evaluators",
     "FlatDiagram",
     "Instant",
+    "Layout",
     "Schedule",
     "StateLayout",
     "TickPattern",

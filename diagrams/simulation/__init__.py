@@ -1,6 +1,7 @@
 """The loop over ticks, and between them."""
 
 from .run_options import RunKeywords, RunOptions
+from .simulated_diagram import SimulatedDiagram
 from .simulation import Simulation, simulate
 from .start_at_point import apply_point, copy_states
 from .view import SimulationView
@@ -9,6 +10,7 @@ from .workspace import Workspace
 __all__ = [
     "RunKeywords",
     "RunOptions",
+    "SimulatedDiagram",
     "Simulation",
     "SimulationView",
     "Workspace",

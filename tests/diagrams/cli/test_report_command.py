@@ -52,7 +52,6 @@ def asked(monkeypatch):
         )
 
     monkeypatch.setattr("loopwright.diagrams.report.analyse", analyse)
-    monkeypatch.setattr("loopwright.diagrams.diagram.analyse", analyse)
     return calls
 
 
@@ -118,7 +117,6 @@ def test_an_analysis_that_is_not_confirmed_writes_nothing(folder, monkeypatch, c
         raise ConfirmationError("the margin is not confirmed.", block="loop")
 
     monkeypatch.setattr("loopwright.diagrams.report.analyse", analyse)
-    monkeypatch.setattr("loopwright.diagrams.diagram.analyse", analyse)
     assert main(["report", "loop.py:loop"]) == 1
     assert "not confirmed" in capsys.readouterr().err
     assert not (folder / "loop.html").exists()
@@ -129,7 +127,6 @@ def test_an_interrupted_analysis_writes_nothing(folder, monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("loopwright.diagrams.report.analyse", analyse)
-    monkeypatch.setattr("loopwright.diagrams.diagram.analyse", analyse)
     assert main(["report", "loop.py:loop"]) == 130
     assert "interrupted" in capsys.readouterr().err
     assert not (folder / "loop.html").exists()
