@@ -1,7 +1,8 @@
 """Margins, Nyquist, disks and pole placement of linear systems."""
 
 from .disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
-from .loop_margins import GainCrossover, Margins, PhaseCrossover, margins
+from .loop_margins import margins
+from .margins_found import GainCrossover, Margins, PhaseCrossover
 from .number import Number
 from .nyquist import NyquistCount, nyquist_count
 from .one_thread import on_one_thread

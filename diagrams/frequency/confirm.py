@@ -5,7 +5,8 @@ Each ``confirm_…`` raises ConfirmationError if its computation disagrees, and 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -17,6 +18,25 @@ from .realization import Realization
 
 STEP = 0.01
 LEVEL = 1e-3
+
+
+@contextmanager
+def refuse_singular(name: str) -> Iterator[None]:
+    """Raise a ConfirmationError for an equation that rounding leaves without a solution.
+
+    Parameters
+    ----------
+    name : str
+        Function that the error names.
+    """
+    try:
+        yield
+    except np.linalg.LinAlgError as error:
+        raise ConfirmationError(
+            f"found an equation of the loop without a solution ({error}); expected one at every frequency off the "
+            "poles. The realization is ill-conditioned: give the loop as a state space with balanced states.",
+            block=name,
+        ) from error
 
 
 def pick_test_values(value: float, others: Sequence[float], nominal: float) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import ConfirmationError, ParameterError
-from .confirm import confirm_limit, confirm_peak
+from .confirm import confirm_limit, confirm_peak, refuse_singular
 from .features import Features, scan
 from .loop_margins import EIGENVALUES
 from .number import Number
@@ -75,7 +75,9 @@ def disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Dis
     ParameterError
         If the closed loop is not stable.
     """
-    return _compute_disk_margin(Realization.of(loop, delay=delay), skew)
+    r = Realization.of(loop, delay=delay)
+    with refuse_singular("disk_margin"):
+        return _compute_disk_margin(r, skew)
 
 
 def mimo_disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> DiskMargin:
@@ -100,7 +102,9 @@ def mimo_disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -
     ParameterError
         If the closed loop is not stable, or the loop is not square.
     """
-    return _compute_disk_margin(Realization.of(loop, delay=delay), skew)
+    r = Realization.of(loop, delay=delay)
+    with refuse_singular("disk_margin"):
+        return _compute_disk_margin(r, skew)
 
 
 def loop_at(plant: StateSpace, controller: StateSpace, where: str = "input") -> StateSpace:

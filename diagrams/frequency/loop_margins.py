@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,9 +17,11 @@ from .confirm import (
     confirm_peak,
     count_unstable,
     find_level_frequencies,
+    refuse_singular,
 )
 from .crossings import Crossing, Peak, Scan
 from .features import split_axis_poles
+from .margins_found import GainCrossover, Margins, PhaseCrossover
 from .number import Number
 from .nyquist import count_encirclements
 from .one_thread import on_one_thread
@@ -32,98 +34,6 @@ EIGENVALUES = "closed-loop eigenvalues"
 GAINS = (1.5, 2.0, 5.0, 10.0, 100.0, 1e3)
 
 
-@dataclass(frozen=True)
-class GainCrossover:
-    """A frequency at which |L| = 1, and the rotation that takes L to −1 there (−180° to 180°)."""
-
-    frequency: Number
-    phase_margin_deg: Number
-
-
-@dataclass(frozen=True)
-class PhaseCrossover:
-    """A frequency at which L is real and negative, and the factor that takes it to −1 there."""
-
-    frequency: Number
-    gain_margin: Number
-
-
-@dataclass(frozen=True)
-class Margins:
-    """Margins of a loop L with S = 1/(1 + L) and T = L/(1 + L).
-
-    The margins of an unstable closed loop are NaN; its crossings and poles are there.
-
-    Parameters
-    ----------
-    stable : bool
-        Whether all of `closed_loop_poles` are stable. Hidden modes are not among them: see `hidden_unstable`.
-    gain_crossovers, phase_crossovers : tuple
-        All crossovers by rising frequency; phase crossovers also at 0, at π/T and at infinity.
-    gain_margin_low, gain_margin_high : Number
-        Largest factor below 1, and smallest above 1, on L that ends stability; 0 and infinity where there is none.
-    phase_margin_deg : Number
-        Smallest rotation of L, to either side, that ends stability; infinite where |L| = 1 nowhere.
-    delay_margin_s, delay_margin_samples : Number
-        Smallest delay τ in series, e^(−jωτ), that ends stability. In a sampled loop it is read from the response
-        between the samples. Where |L| > 1 at π/T that has no meaning: the whole samples that the loop bears are given.
-        `delayed_hold_margin` gives another number, the delay in front of the plant's hold.
-    modulus_margin : Number
-        Smallest distance of L to −1, 1/M_s.
-    disk_margin : Number
-        α of the symmetric disk (S − T), or of that with the given skew; see `disk_margin`.
-    ms, ms_frequency, mt, mt_frequency : Number
-        Largest |S| and |T|, and their frequencies.
-    bandwidth : Number
-        Lowest frequency at which |T| falls below 1/√2 (3.0103 dB) of its value at low frequency.
-    closed_loop_poles : tuple of complex
-        In the s plane (continuous) or the z plane (sampled). Multiple poles scatter, as ε^(1/multiplicity).
-    hidden_poles : tuple of complex
-        Poles that are not controllable or not observable in the loop; none of the numbers above contains them.
-    hidden_unstable : tuple of complex
-        Hidden poles beyond the limit of stability. No gain in this loop stabilizes them: another loop must.
-    encirclements : int
-        Clockwise encirclements of −1 by L.
-    """
-
-    stable: bool
-    gain_crossovers: tuple[GainCrossover, ...]
-    phase_crossovers: tuple[PhaseCrossover, ...]
-    gain_margin_low: Number
-    gain_margin_high: Number
-    phase_margin_deg: Number
-    delay_margin_s: Number
-    delay_margin_samples: Number
-    modulus_margin: Number
-    disk_margin: Number
-    ms: Number
-    ms_frequency: Number
-    mt: Number
-    mt_frequency: Number
-    bandwidth: Number
-    closed_loop_poles: tuple[complex, ...]
-    hidden_poles: tuple[complex, ...]
-    hidden_unstable: tuple[complex, ...]
-    encirclements: int
-
-    def numbers(self) -> dict[str, Number]:
-        """Return the single numbers by name, in the order of the report."""
-        found = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {name: value for name, value in found.items() if isinstance(value, Number)}
-
-    def as_dict(self) -> dict[str, dict[str, float | str]]:
-        """Return the single numbers by name, as in a report's JSON."""
-        return {name: number.as_dict() for name, number in self.numbers().items()}
-
-    def __str__(self) -> str:
-        lines = [f"{name:22s}{number}" for name, number in self.numbers().items()]
-        if self.hidden_unstable:
-            lines.append(
-                f"hidden_unstable       {', '.join(f'{p:.6g}' for p in self.hidden_unstable)}: not in this loop"
-            )
-        return "\n".join(lines)
-
-
 @on_one_thread
 def margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Margins:
     """Return all margins of a loop with one channel, each confirmed by a second computation.
@@ -132,7 +42,8 @@ def margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Margins
     ----------
     loop : control.StateSpace
         L with S = 1/(1 + L): continuous (dt = 0) or sampled (dt = T). It may have poles at s = 0 or z = 1, and
-        unstable ones. A transfer function is realized first.
+        unstable ones. A transfer function is realized first, in powers of z − 1 where it is sampled: the margins
+        are those of its coefficients as they were given, which far below 1/T say less than a state space does.
     delay : int
         Whole samples of delay in series with a sampled loop.
     skew : float
@@ -141,7 +52,7 @@ def margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Margins
     Raises
     ------
     ConfirmationError
-        If a number and its confirmation disagree.
+        If a number and its confirmation disagree, or rounding leaves an equation without a solution.
     ParameterError
         If the loop has several channels, no states or no definite sample time, or L is −1 at infinite frequency.
 
@@ -172,7 +83,8 @@ def margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Margins
             "loop's direct feedthrough D.",
             block="margins",
         )
-    return _MarginFinder(r, skew).find_margins()
+    with refuse_singular("margins"):
+        return _MarginFinder(r, skew).find_margins()
 
 
 class _MarginFinder:
@@ -209,6 +121,7 @@ class _MarginFinder:
             hidden_poles=tuple(complex(p) for p in (r.hidden + 1 if r.dt else r.hidden)),
             hidden_unstable=self._find_hidden_unstable(),
             encirclements=encirclements,
+            dt=r.dt,
             **found,
         )
 

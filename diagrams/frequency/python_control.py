@@ -12,7 +12,8 @@ import numpy as np
 from ...blocks.core import ConfirmationError, ParameterError
 from .confirm import confirm_limit, pick_test_values
 from .crossings import Scan
-from .loop_margins import Margins, margins
+from .loop_margins import margins
+from .margins_found import Margins
 from .one_thread import on_one_thread
 from .realization import Realization
 

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
+from .transfer_functions import realize
+
 if TYPE_CHECKING:
     from control import StateSpace, TransferFunction
 
@@ -41,9 +43,18 @@ class Matrices(NamedTuple):
 
 
 def read_matrices(system: LinearSystem) -> Matrices:
-    """Return the matrices of a system of python-control; a transfer function is realized first."""
+    """Return the matrices of a system of python-control; a transfer function is realized first.
+
+    A transfer function with one channel is realized around z = 1 (`realize`), others by python-control.
+    """
     import control
 
+    if isinstance(system, control.TransferFunction) and system.ninputs == system.noutputs == 1:
+        sampled = system.dt is True or bool(system.dt)
+        form = realize(system.num[0][0], system.den[0][0], sampled=sampled)
+        if form is not None:
+            A = form.A + np.eye(len(form.A)) * sampled
+            return Matrices(A, form.B, form.C, form.D, system.dt)
     made = control.ss(system)
     A, B, C, D = (np.asarray(getattr(made, name), dtype=float) for name in "ABCD")
     return Matrices(A, B, C, D, made.dt)

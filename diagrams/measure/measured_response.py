@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, SimulationError
 from ..flat import FlatDiagram, WiredDiagram
 from ..linearization import PointLike, find_signal, operating_point, ticks_to_renewal
 from ..results import OperatingPoint, PointOrigin, Snapshot
@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from control import FrequencyResponseData
 
     from ..linearization import Linearization
+
+GROWN = 1e9
+"""Growth of a signal, relative to the test signal and to the states before it, that no stable loop makes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,6 +250,7 @@ def frequency_response(
             if wait:
                 run.go(wait, 1)
             before = run.read_states()
+            found.largest = GROWN * max(float(amplitude), float(np.max(np.abs(before), initial=0.0)))
             for i, part in enumerate(plan):
                 _measure(run, part, entry, j, every, windows, agreement, found, i)
             run.play(plan[0].silence, entry, ramp=1.0)
@@ -332,6 +336,30 @@ class _Measurement:
         self.uncertainty, self.distortion = np.zeros(lines), np.zeros(lines)
         self.windows, self.settled = np.zeros(lines, int), np.ones(lines, bool)
         self.moved, self.held = 0.0, True
+        self.largest = np.inf
+        """Size above which a signal shows that the diagram is not stable."""
+
+
+def _check_size(run: InjectionRun, part: Part, v: np.ndarray, largest: float) -> None:
+    """Refuse to go on where a signal grows without end.
+
+    Raises
+    ------
+    SimulationError
+        If the signal at the wire is larger than any stable loop makes it.
+    """
+    size = float(np.max(np.abs(v), initial=0.0))
+    if size <= largest:
+        return
+    block, port = run.signal.port
+    raise SimulationError(
+        f"found a signal that has grown to {size:.3g} under a test signal of "
+        f"{float(np.max(np.abs(part.waveform.amplitude))):.3g}; expected one that settles: the diagram is not stable "
+        "there. Look at linearize().poles.",
+        block=block,
+        port=port,
+        t=run.t,
+    )
 
 
 def _measure(
@@ -348,6 +376,7 @@ def _measure(
     last, error, count = None, np.full(len(part.lines), np.inf), 0
     while count < windows and not np.all(error <= agreement):
         v, u, y = run.record(n, every)
+        _check_size(run, part, v, found.largest)
         here, rest = compute_phasors(part, np.hstack([v, u, y]))
         count, m = count + 1, v.shape[1]
         if last is not None:

@@ -14,6 +14,7 @@ from ..report import (
     REMARKS,
     SUBJECT,
     SUBJECT_TITLE,
+    UNSTABLE,
     ReportKind,
     ReportPart,
 )
@@ -57,6 +58,7 @@ def friction_not_modelled(case: Fig3Case) -> Section:
 FIG3 = ReportKind(
     Fig3Case,
     (
+        UNSTABLE,
         SUBJECT,
         ReportPart("subject", friction_in_keys, has_friction),
         REMARKS,

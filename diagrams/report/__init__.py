@@ -10,6 +10,7 @@ from .analysis import (
     OPERATING_POINTS,
     REMARKS,
     SUBJECT,
+    UNSTABLE,
     analyse,
 )
 from .case import Basis, Case, Excitation
@@ -19,8 +20,9 @@ from .parts import MakesSections, ReportKind, ReportPart
 from .plots import look_of
 from .points import point_of
 from .section_limits import LIMITS_TITLE
-from .section_poles import POLES_TITLE, scatter, without_memory
+from .section_poles import POLES_TITLE
 from .section_subject import SUBJECT_TITLE
+from .stability import scatter, without_memory
 from .variant import Implementation, Variant, in_s
 
 __all__ = [
@@ -36,6 +38,7 @@ __all__ = [
     "REMARKS",
     "SUBJECT",
     "SUBJECT_TITLE",
+    "UNSTABLE",
     "Basis",
     "Case",
     "Excitation",

@@ -19,7 +19,9 @@ from .section_limits import not_modelled
 from .section_loops import inner
 from .section_poles import closed_loops, memory
 from .section_subject import operating_points, remarks, subject, versions
+from .stability import unstable_first
 
+UNSTABLE = ReportPart("subject", unstable_first)
 SUBJECT = ReportPart("subject", subject)
 REMARKS = ReportPart("subject", remarks)
 OPERATING_POINTS = ReportPart("operating_points", operating_points)
@@ -31,7 +33,7 @@ LIMITS = ReportPart("limits", not_modelled)
 
 ANY_DIAGRAM = ReportKind(
     Case,
-    (SUBJECT, REMARKS, OPERATING_POINTS, CLOSED_LOOPS, MEMORY, INNER_LOOPS, INJECTION, LIMITS),
+    (UNSTABLE, SUBJECT, REMARKS, OPERATING_POINTS, CLOSED_LOOPS, MEMORY, INNER_LOOPS, INJECTION, LIMITS),
     DEFINITIONS,
 )
 """The report of a diagram of which nothing is known but its structure."""

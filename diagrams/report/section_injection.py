@@ -13,6 +13,7 @@ from ..linearization import Linearization
 from ..measure import FrequencyResponse, frequency_response
 from . import plots as figures
 from .case import Case
+from .stability import Stability
 from .variant import Implementation, Variant
 
 TEXTS = Texts(__package__, "injection")
@@ -34,6 +35,9 @@ def injected(case: Case) -> Section | None:
         measured = {}
         for v in case.usable(Implementation.SAMPLED, Implementation.DELAYED):
             if v.implementation.delay and not v.is_design:
+                continue
+            if Stability.of(v) is Stability.UNSTABLE:
+                text.append(TEXTS.line("unstable", variant=v.title, wire=wire))
                 continue
             if not v.rests:
                 text.append(TEXTS.line("moving", variant=v.title, wire=wire, **_moving(v)))

@@ -71,7 +71,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
             shown = _poles(m.hidden_unstable, L.dt)
             notes.append(TEXTS.line("hidden_unstable", variant=v.title, poles=shown))
         if not m.stable:
-            notes.append(TEXTS.line("unstable", variant=v.title))
+            notes.append(TEXTS.line("unstable", variant=v.title, poles=_poles(m.unstable_poles, L.dt)))
         elif v.is_design:
             try:
                 with np.errstate(all="ignore"):

@@ -166,6 +166,31 @@ def test_an_unstable_closed_loop_has_no_margins_but_crossings_and_poles():
     assert sum(p.real > 0 for p in found.closed_loop_poles) == found.encirclements == 2
 
 
+@pytest.mark.parametrize("sampled", [False, True])
+def test_an_unstable_closed_loop_prints_its_poles_in_place_of_margins(sampled):
+    # 4/(s(s + 2)) (s → −s for damping below 0) behind a hold of 10 ms: closed loop by hand
+    a, k, T = (2.0, 200.0, 0.01) if sampled else (-2.0, 1.0, 0.0)
+    if sampled:
+        e = np.exp(-a * T)
+        A, B = np.array([[1, (1 - e) / a], [0, e]]), 4 * np.array([[(T - (1 - e) / a) / a], [(1 - e) / a]])
+    else:
+        A, B = np.array([[0, 1], [0, -a]]), np.array([[0], [4.0]])
+    poles = np.linalg.eigvals(A - k * B @ [[1, 0]])
+    found = margins(control.ss(A, B, [[k, 0]], [[0.0]], T))
+    lines = str(found).splitlines()
+    assert lines[0] == "unstable: the closed loop has no margins"
+    assert "nan" not in str(found)
+    assert sorted(found.unstable_poles, key=np.imag) == pytest.approx(sorted(poles, key=np.imag))
+    assert all(f"{p:.5g}"[:6] in lines[1] for p in poles)
+    assert ("|z| < 1" if sampled else "Re s < 0") in lines[1]
+
+
+def test_a_stable_loop_has_no_unstable_poles_and_prints_its_margins():
+    found = margins(triple(20.0))
+    assert found.unstable_poles == ()
+    assert str(found).startswith("gain_margin_low")
+
+
 def test_a_closed_loop_on_the_limit_is_not_called_stable_by_rounding():
     loop = control.ss(np.diag([-1.0, 1.0]), [[2.063406], [2.063406]], [[-2.557134, 2.557134]], 2.0)  # L real for all ω
     found = margins(loop)

@@ -1,0 +1,95 @@
+"""Transfer functions in z keep their digits near z = 1, where a companion form scatters multiple poles."""
+
+from fractions import Fraction
+
+import control
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+from loopwright.blocks import ConfirmationError
+from loopwright.diagrams import margins
+from loopwright.diagrams.frequency.state_space import read_matrices
+from support.random_cases import random_cases
+
+P = 20.0
+
+
+def held_triple(T, factor=1.0):
+    """Return three integrators with a triple zero, P³(1 + s/P)³ − s³ over s³, behind a hold, as polynomials in z."""
+    w = np.poly1d([1, -1])
+    over = 3 * P * T * w * w + 3 * P**2 * T**2 / 2 * np.poly1d([1, 1]) * w + P**3 * T**3 / 6 * np.poly1d([1, 4, 1])
+    return control.tf(factor * over.coeffs, factor * (w * w * w).coeffs, T)
+
+
+def held_triple_states(T):
+    """Return the same loop as a state space, with the matrix exponential of a chain of integrators written out."""
+    A = np.array([[1, T, T * T / 2], [0, 1, T], [0, 0, 1]])
+    return control.ss(A, [[T**3 / 6], [T * T / 2], [T]], [[P**3, 3 * P**2, 3 * P]], [[0.0]], T)
+
+
+@pytest.mark.parametrize("T", [1e-2, 1e-4, 1e-5, 1e-6])
+@pytest.mark.parametrize("factor", [1.0, 0.1])
+def test_three_integrators_sampled_fast_have_the_margins_of_their_state_space(T, factor):
+    found, exact = margins(held_triple(T, factor)), margins(held_triple_states(T))
+    # rounding of the numerator's coefficients, 3 P T each, relative to its value 3 P T (ω T)² at the crossing
+    digits = 10 * np.finfo(float).eps / (P * T) ** 2
+    assert found.stable
+    for name in ("phase_margin_deg", "gain_margin_low", "mt", "bandwidth", "delay_margin_s"):
+        one, other = found.numbers()[name].value, exact.numbers()[name].value
+        assert one == pytest.approx(other, rel=max(1e-11, digits)), name
+
+
+def exact_value(numerator, denominator, z):
+    """Return a transfer function at a rational z, in exact arithmetic."""
+
+    def value(coefficients):
+        return sum(Fraction(float(c)) * z**k for k, c in enumerate(reversed(np.atleast_1d(coefficients))))
+
+    return float(value(numerator) / value(denominator))
+
+
+def polynomials(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 6))
+    poles = 1 - 10.0 ** rng.uniform(-4, 0, n)
+    zeros = 1 - 10.0 ** rng.uniform(-4, 0, int(rng.integers(0, n + 1)))
+    return rng.uniform(0.1, 9) * np.poly(zeros), rng.uniform(0.1, 9) * np.poly(poles)
+
+
+@random_cases(12, 300, st.integers(0, 10**6))
+def test_a_realization_has_the_values_of_the_polynomials_in_exact_arithmetic(seed):
+    over, under = polynomials(seed)
+    A, B, C, D, dt = read_matrices(control.tf(over, under, 0.1))
+    assert dt == 0.1
+    for z in (Fraction(3, 2), Fraction(-2), Fraction(33, 32)):
+        got = (C @ np.linalg.solve(float(z) * np.eye(len(A)) - A, B) + D)[0, 0]
+        assert got == pytest.approx(exact_value(over, under, z), rel=1e-11)
+
+
+@pytest.mark.parametrize(
+    "system",
+    [
+        control.tf([2.0], [4.0], 0.1),
+        control.tf([1.0, 2.0], [1.0, 3.0]),
+        control.tf([1.0], [1.0, 0.0, 0.0]),
+        control.tf([1.0, 0.5], [1.0, -0.25], True),
+    ],
+    ids=["constant", "continuous", "double integrator", "open sample time"],
+)
+def test_other_forms_are_those_of_python_control(system):
+    A, B, C, D, dt = read_matrices(system)
+    theirs = control.ss(system)
+    for p in (0.3 + 1j, 2.0):
+        got = (C @ np.linalg.solve(p * np.eye(len(A)) - A, B) + D)[0, 0]
+        assert got == pytest.approx(complex(theirs(p)), rel=1e-12)
+    assert dt is system.dt or dt == system.dt
+
+
+def test_an_equation_without_a_solution_is_an_error_with_a_next_step(monkeypatch):
+    def singular(*args, **options):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr("loopwright.diagrams.frequency.loop_margins._MarginFinder.find_margins", singular)
+    with pytest.raises(ConfirmationError, match=r"margins: found an equation .* \(Singular matrix\); .*balanced"):
+        margins(control.tf([1.0], [1.0, 1.0]))
