@@ -261,8 +261,8 @@ class ResettableIntegrator(_Limits, Block):
 class FilteredDerivative(Block):
     """Filtered derivative: Y(s) = s / (T_f s + 1) U(s), element by element.
 
-    T_f ẋ = u − x, y = (u − x) / T_f. The filter starts at ``initial_value``; without it, at the first input, so that y
-    is zero at the start.
+    T_f ẋ = u − x, y = (u − x) / T_f. The filter starts at ``initial_value``; without it, at the input just before t =
+    0, so that y is zero at the start, unless a source jumps there.
 
     Raises
     ------

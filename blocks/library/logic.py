@@ -282,14 +282,19 @@ class Latch(Block):
         return expect_scalar(u.set, "set") - 0.5, expect_scalar(u.reset, "reset") - 0.5
 
     def jump(self, t: Array, x: Any, u: Any, fired: Any) -> Array:
-        """Keep the output."""
-        return self.output(t, x, u)
+        """Keep the output: that of the inputs as they were before they crossed 0.5, then that of the inputs now."""
+        set_now, reset_now = truth(u.set), truth(u.reset)
+        was_set = np.where(fired.sets > 0.5, 1.0 - set_now, set_now)
+        was_reset = np.where(fired.resets > 0.5, 1.0 - reset_now, reset_now)
+        before = (1.0 - was_reset) * np.where(was_set > 0.5, 1.0, truth(x.kept))
+        return (1.0 - reset_now) * np.where(set_now > 0.5, 1.0, before)
 
 
 class Counter(Block):
     """Counter of the times at which u became true, since the start or since ``reset`` was last true.
 
-    A u that is true at the start is not counted. At a tick the edge of that tick is counted already.
+    A u that is true at the start is not counted, unless it comes from a source that jumps at t = 0. At a tick the edge
+    of that tick is counted already.
 
     Raises
     ------

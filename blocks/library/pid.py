@@ -32,8 +32,8 @@ class PID(Block):
     range, so that it doesn't chatter.
 
     It starts with x_f = c r − y, so that D = 0, and with I = 0 or, if ``initial_output`` is given, with the I that
-    makes u equal to it. With ``tracking`` the start reads no input, since ``actual`` depends on u: x_f = 0 and I =
-    ``initial_output``.
+    makes u equal to it. These are r and y just before t = 0: a `Step` at t = 0 kicks. With ``tracking`` the start reads
+    no input, since ``actual`` depends on u: x_f = 0 and I = ``initial_output``.
 
     Raises
     ------

@@ -92,7 +92,8 @@ class SmoothStep(Source):
 class Step(Source):
     """Steps: y is ``initial_value``, then ``values[i]`` from ``times[i]`` on.
 
-    Rounding of the times is allowed for: a step at ``3 * 0.1`` acts at the tick at 0.3 s.
+    Rounding of the times is allowed for: a step at ``3 * 0.1`` acts at the tick at 0.3 s. A step at t = 0 is a jump
+    like any other: blocks that start from their inputs, such as `FilteredDerivative`, start from ``initial_value``.
     """
 
     times: Array = parameter(unit="s", description="times of the steps, rising; a number or several")

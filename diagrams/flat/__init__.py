@@ -3,6 +3,7 @@
 from ...blocks.core import Layout
 from .evaluation import Apart, Instant, evaluate
 from .flat_diagram import FlatDiagram
+from .functions import indicators_of
 from .layout import NONE, StateLayout, TickPattern
 from .logic import TRUE, is_true
 from .stages import Bound, Evaluators, Schedule, evaluate_apart
@@ -27,6 +28,7 @@ __all__ = [
     "WiredDiagram",
     "evaluate",
     "evaluate_apart",
+    "indicators_of",
     "is_true",
     "join_columns",
     "loop_mismatch",

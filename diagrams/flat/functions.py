@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from .block_functions import BlockFunctions
-from .evaluation import INDICATORS, JUMP, Apart, evaluate, rows
+from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, rows
 from .layout import NONE, FlatLayout, TickPattern
 from .logic import choose, is_true, logic_and, logic_not
 from .stages import Schedule
@@ -83,24 +83,30 @@ def trace_indicators(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
     symbols = make_symbols(layout)
 
     def results(apart: Apart) -> Mapping[str, Any]:
-        instant = evaluate(layout, functions, NONE, **symbols, apart=apart)
-        g, opened, blocks = [], [], dict[str, Any]()
-        for event in layout.events:
-            if event.subsystem:
-                g.append(instant.control(event.path) - 0.5)
-                gate: Any = True
-                for subsystem in layout.table.gates(event.path.rpartition(".")[0]):
-                    gate = logic_and(gate, instant.is_open(subsystem))
-            else:
-                path = event.path
-                if path not in blocks:
-                    blocks[path] = ca.vertsplit(instant.events_of(path, INDICATORS))
-                g.append(blocks[path][list(layout.table.blocks[path].events).index(event.name)])
-                gate = instant.gate_of(path)
-            opened.append(ca.MX(1.0) if gate is True else ca.MX(0.0) if gate is False else gate)
+        g, opened = indicators_of(evaluate(layout, functions, NONE, **symbols, apart=apart))
         return {"g": ca.vertcat(*g), "open": ca.vertcat(*opened)}
 
     return trace_schedule("indicators", symbols, results)
+
+
+def indicators_of(instant: Instant) -> tuple[list[Any], list[Any]]:
+    """Return the indicators of all events at an instant, and 1 where the subsystems around them are open."""
+    layout = instant.layout
+    g, opened, blocks = [], [], dict[str, Any]()
+    for event in layout.events:
+        if event.subsystem:
+            g.append(instant.control(event.path) - 0.5)
+            gate: Any = True
+            for subsystem in layout.table.gates(event.path.rpartition(".")[0]):
+                gate = logic_and(gate, instant.is_open(subsystem))
+        else:
+            path = event.path
+            if path not in blocks:
+                blocks[path] = ca.vertsplit(instant.events_of(path, INDICATORS))
+            g.append(blocks[path][list(layout.table.blocks[path].events).index(event.name)])
+            gate = instant.gate_of(path)
+        opened.append(ca.MX(1.0) if gate is True else ca.MX(0.0) if gate is False else gate)
+    return g, opened
 
 
 def trace_jump(layout: FlatLayout, functions: BlockFunctions) -> Schedule:

@@ -13,6 +13,7 @@ from ..results import Occurrence
 from ..solvers import Problem, Step, make_solver
 from .diagnosis import forget_trials, opaque_failure, state_values
 from .events import Domains
+from .left_of_start import domains_from_left
 from .solver_setup import absolute_tolerances, remembers, time_scale_of
 from .transport_delays import delays_of, keep_step
 from .workspace import Workspace
@@ -191,11 +192,13 @@ class Continuous:
             forget_trials(self.flat)
         self._synchronize()
 
-    def begin(self) -> None:
-        """Take the domains of the indicators at the start."""
+    def begin(self, *, at_start: bool) -> None:
+        """Take the domains of the indicators where a run begins, at t = 0 from the left; elsewhere as they are."""
         self.enter(float(self.workspace.here.t[0]))
         if self.domains is not None:
             self.domains.begin(float(self.workspace.here.t[0]), self.workspace.here.x[self.where])
+            if at_start:
+                self.domains.above = domains_from_left(self.workspace, self.domains.above)
         if self.delays is not None:
             self.delays.note_edge(float(self.workspace.here.t[0]))
 

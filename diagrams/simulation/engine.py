@@ -90,9 +90,9 @@ class Engine:
         """Go through the tick with which the run begins, tick 0 or that of an operating point, and record it."""
         first = 0 if point is None else start_at(self.workspace, point, self.name)
         if self.continuous is not None:
-            self.continuous.begin()
+            self.continuous.begin(at_start=point is None)
         now = self.position.time_of(first)
-        take_tick(self.workspace, self.continuous, self.plants, now, self.flat.acting(first), first=first == 0)
+        take_tick(self.workspace, self.continuous, self.plants, now, self.flat.acting(first))
         row(now, self.workspace.log)
         self._arrive(first)
 
@@ -164,4 +164,4 @@ class Engine:
         """Put the blocks to the states of another diagram; see `Simulation.take_over`."""
         take_over(self.workspace, x, of, self.flat.acting(self.position.tick))
         if self.continuous is not None:
-            self.continuous.begin()
+            self.continuous.begin(at_start=False)

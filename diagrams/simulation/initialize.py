@@ -11,6 +11,7 @@ from ...blocks.core import LoopwrightError, NonFiniteError, SimulationError
 from ...blocks.tracing import bundle, initial_state
 from ..flat import NONE, FlatDiagram, Instant, evaluate, evaluate_apart, is_true
 from .diagnosis import inputs_text, shaped_inputs
+from .left_of_start import values_from_left
 from .plants import Plant
 from .transport_delays import Delays
 from .workspace import Workspace
@@ -24,6 +25,9 @@ def initialize(workspace: Workspace, plants: Mapping[str, Plant], delays: Delays
 
     In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). Outputs are passed on
     until inputs change by no more than rounding.
+
+    Initial states that are computed from inputs are those of the instant before: a source that jumps at t = 0 has its
+    value from the left there, so that a derivative sees the jump, as it sees one at any later time.
     """
     flat = workspace.flat
     acting = flat.acting(0)
@@ -68,7 +72,7 @@ def _set_initial_states(workspace: Workspace) -> None:
                 u = bundle("u", shaped_inputs(trace, inputs))
                 x[flat.states.slices[path]] = _initial(path, block, u, trace.states)
 
-        _evaluate(workspace, order=flat.start_order.steps, before=before)
+        _evaluate(workspace, order=flat.start_order.steps, before=before, taps=values_from_left(workspace))
     for path, where in flat.starts.slices.items():
         x[where] = x[flat.states.slices[path]]
 
@@ -95,11 +99,12 @@ def _hold_first_outputs(workspace: Workspace) -> None:
     if not flat.held.slices and not flat.gates.slices:
         return
     done = _evaluate(workspace)
+    before = _evaluate(workspace, taps=values_from_left(workspace)) if flat.gates.slices else done
     for name, column in done.held.items():
         where = flat.held.slices[name]
         x[where] = np.ravel(np.array(column))
     for subsystem, where in flat.gates.slices.items():
-        x[where] = float(is_true(done.control(subsystem)))
+        x[where] = float(is_true(before.control(subsystem)))
 
 
 def _evaluate(workspace: Workspace, **options: Any) -> Instant:

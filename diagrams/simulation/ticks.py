@@ -138,8 +138,6 @@ def take_tick(
     plants: Mapping[str, Plant],
     now: float,
     acting: frozenset[TickPattern],
-    *,
-    first: bool = False,
 ) -> None:
     """Go through one tick with the events before and after it, and leave in ``log`` what is to be recorded.
 
@@ -149,15 +147,13 @@ def take_tick(
         Its time in s.
     acting : frozenset of TickPattern
         The clocks that act at it.
-    first : bool
-        Whether it is tick 0, before which nothing fires.
     """
     if continuous is None:
         workspace.here.t[0] = now
         workspace.tick(acting)
         return
     continuous.enter(now)
-    if acting and not first:
+    if acting:
         continuous.settle(now)  # subsystems see the instant after its own events
     workspace.tick(acting)
     continuous.enter(now)
