@@ -51,7 +51,7 @@ from .measure import FrequencyResponse
 from .paper import Channel, Fig3Diagram, Rig, experiments, fig3
 from .report import analyse
 from .results import Occurrence, OperatingPoint, Run, RunState, Snapshot, Stopped
-from .simulation import RunOptions, Simulation, SimulationView
+from .simulation import Interrupted, RunOptions, Simulation, SimulationView
 from .wiring import Subsystem, SubsystemSettings, Wire, subsystem
 
 __all__ = [
@@ -67,6 +67,7 @@ __all__ = [
     "FrequencyResponse",
     "GainCrossover",
     "GangOfFour",
+    "Interrupted",
     "Layout",
     "Linearization",
     "Margins",

@@ -218,7 +218,7 @@ PUBLIC = {
     """,
     "diagrams": """
         AdmittanceLoop BlockReport Channel Comparison Diagram DiskMargin Drawing Fig3Diagram FlatDiagram
-        FrequencyResponse GainCrossover GangOfFour Layout Linearization Margins Number NyquistCount Occurrence
+        FrequencyResponse GainCrossover GangOfFour Interrupted Layout Linearization Margins Number NyquistCount Occurrence
         OperatingPoint Passivity PhaseCrossover Plot Report Rig Run RunOptions RunState SampledDesign Section
         Simulation SimulationView Snapshot StabilityLimit StabilityMap Stopped Subsystem SubsystemSettings Table
         Wire analyse check_block compare_with_control complementary crossing_frequency delayed_hold

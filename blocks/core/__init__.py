@@ -32,7 +32,7 @@ from .errors import (
 )
 from .frozen import FrozenMapping
 from .instants import is_before, left_of, move_earlier, next_edge, period_of
-from .layout import Layout, elements
+from .layout import Layout, elements, lay_out
 from .parameters import ParameterSpec
 from .ports import Event, Input, Output, Port, PortUnit, Shape, State
 from .signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, recorder
@@ -98,6 +98,7 @@ __all__ = [
     "elements",
     "identity",
     "is_before",
+    "lay_out",
     "left_of",
     "move_earlier",
     "near",

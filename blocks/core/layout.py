@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import numpy as np
 
@@ -19,6 +20,18 @@ def elements(name: str, shape: Shape, first: int = 0) -> list[str]:
         Number of the first element; FMI counts from 1.
     """
     return [f"{name}[{','.join(str(i + first) for i in index)}]" if index else name for index in np.ndindex(*shape)]
+
+
+def lay_out(sizes: Iterable[int], offset: int = 0) -> list[slice]:
+    """Return the slices of pieces of a flat vector, one after the other.
+
+    Examples
+    --------
+    >>> lay_out([2, 0, 1], offset=3)
+    [slice(3, 5, None), slice(5, 5, None), slice(5, 6, None)]
+    """
+    ends = list(accumulate(sizes, initial=offset))
+    return [slice(start, end) for start, end in pairwise(ends)]
 
 
 @dataclass(frozen=True)
@@ -46,12 +59,8 @@ class Layout:
         offset : int, default: 0
             Number of the first entry.
         """
-        slices = {}
-        for name, shape in shapes.items():
-            end = offset + int(np.prod(shape, dtype=int))
-            slices[name] = slice(offset, end)
-            offset = end
-        return Layout(slices, dict(shapes))
+        sizes = [int(np.prod(shape, dtype=int)) for shape in shapes.values()]
+        return Layout(dict(zip(shapes, lay_out(sizes, offset), strict=True)), dict(shapes))
 
     @property
     def total(self) -> int:

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core import Array, Block, Input, Output, ParameterError, State, parameter
+from ..core import Array, Block, Input, Output, ParameterError, State, lay_out, parameter
 from .branching import truth
 from .delays import History, push
 from .integrators import check_limits, clip
@@ -251,13 +251,12 @@ class IIR(Block):
 
     def cascade(self, x: Any, u: Any) -> tuple[Array, Array]:
         """Return the output and the next state."""
-        signal, parts, position = u.u, [], 0
+        signal, parts = u.u, []
         several = len(self.b.shape) == 2
-        for i, n in enumerate(self.orders):
+        for i, (n, place) in enumerate(zip(self.orders, lay_out(self.orders), strict=True)):
             b, a = (_pad(c[i] if several else c, n + 1) for c in (self.b, self.a))
-            signal, part = section(b, a, x.x[position : position + n], signal)
+            signal, part = section(b, a, x.x[place], signal)
             parts.append(part)
-            position += n
         return signal, np.concatenate(parts)
 
     def output(self, t: Array, x: Any, u: Any) -> Array:

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core import Array, Block, Input, Output, ParameterError, State, parameter
+from ..core import Array, Block, Input, Output, ParameterError, State, lay_out, parameter
 from .linear import Names, section
 from .python_control import (
     FixedSampleTime,
@@ -130,12 +130,10 @@ class _ZeroPoleGain(Block):
 
     def cascade(self, x: Any, u: Any) -> tuple[Array, Array]:
         """Return the output, and the rates or next states of all sections."""
-        signal, parts, position, gain = u.u, [], 0, 1.0
-        for b, a in self.factors():
-            state = x.x[position : position + len(a) - 1]
-            signal, part, factor = self.advance_section(b, a, state, signal)
+        signal, parts, gain, factors = u.u, [], 1.0, self.factors()
+        for (b, a), place in zip(factors, lay_out(len(a) - 1 for _, a in factors), strict=True):
+            signal, part, factor = self.advance_section(b, a, x.x[place], signal)
             parts.append(part)
-            position += len(a) - 1
             gain *= factor
         return self.gain * gain * signal, np.concatenate(parts)
 

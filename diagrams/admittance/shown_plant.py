@@ -149,11 +149,7 @@ def _make_linearizer(diagram: WiredDiagram, path: str, point: OperatingPoint | N
     def linearize(x: np.ndarray | None, u: np.ndarray | None) -> FmuLinearization:
         about, state = block.description, dict(here.get("state", {}))
         if x is not None:
-            first = 0
-            for name in about.states:
-                variable = about.variables[name]
-                state[name] = x[first : first + variable.size].reshape(variable.shape)
-                first += variable.size
+            state |= about.layout(about.states).split(x)
         inputs = here.get("inputs") if u is None else u
         return block.linear_model(here.get("t", 0.0), state=state, inputs=inputs)
 

@@ -21,6 +21,7 @@ from ...blocks.core import FmuError, FmuFileError, LoopwrightError, OptionError
 from ...fmus.models import gantry
 from ..paper import DEFINITIONS, EXPERIMENTS, Experiment, key_numbers
 from ..results import Run
+from ..simulation import Interrupted
 from .fmu import COMMANDS, add_commands
 from .options import option_lines, parse_letters, parse_options, share
 from .report import add_report, report_command
@@ -194,7 +195,7 @@ def _simulate(experiment: Experiment) -> tuple[Run | None, str | None, bool]:
     except LoopwrightError as error:
         return getattr(error, "run", None), str(error), False
     except KeyboardInterrupt as interrupt:
-        return getattr(interrupt, "run", None), "interrupted", True
+        return interrupt.run if isinstance(interrupt, Interrupted) else None, "interrupted", True
 
 
 def _write(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import GuardError, ShapeError, TraceError
+from ...blocks.core import GuardError, ShapeError, TraceError, lay_out
 from ...blocks.tracing import GUARDS, NEXT, bundle
 from .exercise import Bench, Point
 from .values import rule_error
@@ -84,10 +84,10 @@ def check_derivatives(bench: Bench) -> float:
     for point in [*bench.points[:8], *_origin(bench)]:
         at = point.columns()
         flat = np.concatenate(at[1:]) if len(at) > 1 else np.zeros(0)
-        cuts = np.cumsum([np.size(v) for v in at[1:]])[:-1]
+        parts = lay_out(np.size(v) for v in at[1:])
         h = np.diag(_STEP * (1.0 + np.abs(flat)))
         many = flat[:, None] + np.hstack([h, -h, 0.5 * h, -0.5 * h, 0.0 * h[:, :1]])
-        y = np.array(values.call([at[0], *np.split(many, cuts), bench.p])[0])
+        y = np.array(values.call([at[0], *(many[part] for part in parts), bench.p])[0])
         n, d = len(flat), np.diag(h)
         y0 = y[:, -1:]
         up, down, half = (

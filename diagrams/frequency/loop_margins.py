@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_type_hints
 
 import numpy as np
 
@@ -103,7 +102,7 @@ class _MarginFinder:
             reason = f"the closed loop is not stable: {self.unstable} of its poles are not (largest growth {near:.3g})"
             units = {"phase_margin_deg": "deg", "delay_margin_s": "s", "delay_margin_samples": "samples"}
             units |= dict.fromkeys(("ms_frequency", "mt_frequency", "bandwidth"), "rad/s")
-            names = [f.name for f in fields(Margins) if f.type == "Number"]
+            names = [name for name, kind in get_type_hints(Margins).items() if kind is Number]
             found = {name: Number(np.nan, units.get(name, "1"), np.nan, reason) for name in names}
             try:
                 encirclements = count_encirclements(r, self.scan.features).encirclements

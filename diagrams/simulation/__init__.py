@@ -1,5 +1,6 @@
 """The loop over ticks, and between them."""
 
+from .interrupted import Interrupted
 from .run_options import RunKeywords, RunOptions
 from .simulated_diagram import SimulatedDiagram
 from .simulation import Simulation, simulate
@@ -8,6 +9,7 @@ from .view import SimulationView
 from .workspace import Workspace
 
 __all__ = [
+    "Interrupted",
     "RunKeywords",
     "RunOptions",
     "SimulatedDiagram",

@@ -28,6 +28,7 @@ from ..results import (
 )
 from .duration import default_step, ticks_in
 from .engine import Engine
+from .interrupted import Interrupted
 from .plants import has_plants
 from .progress import progress_bar
 from .run_options import RunOptions
@@ -193,8 +194,7 @@ class Simulation:
             raise self._with_run(error) from error.__cause__
         except KeyboardInterrupt as interrupt:
             self._elapsed += time.perf_counter() - started
-            interrupt.run = self.run(final=False)  # type: ignore[attr-defined]
-            raise
+            raise Interrupted(self.run(final=False)) from interrupt
         self._elapsed += time.perf_counter() - started
 
     def _on_event(self, event: Occurrence) -> None:

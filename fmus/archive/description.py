@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import zipfile
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -13,7 +14,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from ...blocks.core import FmuFileError, UnitError, parse_unit
+from ...blocks.core import FmuFileError, Layout, UnitError, parse_unit
 from ..platform import native_platform
 
 
@@ -70,6 +71,10 @@ class FmuDescription:
     """Model identifier of the model-exchange interface; None without that interface."""
     model_exchange_has_derivatives: bool = False
     """Whether the FMU computes directional derivatives in model exchange."""
+
+    def layout(self, names: Iterable[str]) -> Layout:
+        """Return the layout of some variables in a flat vector, one after the other."""
+        return Layout.of({name: self.variables[name].shape for name in names})
 
     def of(self, causality: str) -> dict[str, FmuVariable]:
         """Return the variables of a causality, in the file's order."""

@@ -6,7 +6,6 @@ import ctypes
 import struct
 import weakref
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -284,9 +283,8 @@ class FmuInstance(LoadedFmu):
         return FmuState(self, handle, t, running)
 
     def _release(self, handle: Any) -> None:
-        if self._handles.pop(id(handle), None) is not None and not self.fatal:
-            with suppress(Exception):
-                self._fmu.freeFMUState(handle)
+        if self._handles.pop(id(handle), None) is not None:
+            self.free_state(handle)
 
     def _check_can(self, flag: str, action: str, can: bool) -> None:
         if not self._open:

@@ -146,6 +146,12 @@ class LoadedFmu:
             reference = self.description.variables[name].reference
             self._fmu.setFloat64([reference], [float(v) for v in np.ravel(value)])
 
+    def free_state(self, handle: Any) -> None:
+        """Free a state that getFMUState gave; after a fatal error nothing is called any more (FMI 3.0, 2.3)."""
+        if not self.fatal:
+            with suppress(Exception):
+                self._fmu.freeFMUState(handle)
+
     def values(self, names: Iterable[str]) -> np.ndarray:
         """Return the elements of variables, one after the other."""
         variables = [self.description.variables[name] for name in names]

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import casadi as ca
 
-from ...blocks.core import DefinitionError, rate_of
+from ...blocks.core import DefinitionError, lay_out, rate_of
 from .model import DIRECTIONS, INTEGRATORS, ModelSpec, Variable
 
 Kind = Literal["time", "fixed", "tunable", "input", "state", "discrete", "derivative", "output", "indicator"]
@@ -128,12 +128,12 @@ def layout(spec: ModelSpec) -> tuple[Entry, ...]:
     rows += [("output", v, v.name) for v in spec.outputs]
     rows += _indicators(spec)
     rows += _settings(spec)
-    entries: list[Entry] = []
-    first = 0
-    for reference, (kind, variable, name) in enumerate(rows):
+    entries = []
+    for reference, ((kind, variable, name), place) in enumerate(
+        zip(rows, lay_out(v.size for _, v, _ in rows), strict=True)
+    ):
         of = reference - len(spec.states) if kind == "derivative" else None
-        entries.append(Entry(reference, kind, variable, name, first, of))
-        first += variable.size
+        entries.append(Entry(reference, kind, variable, name, place.start, of))
     return tuple(entries)
 
 

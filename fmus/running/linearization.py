@@ -102,7 +102,7 @@ class _OperatingPoint:
 
     def check(self, found: np.ndarray) -> None:
         """Refuse an operating point that the FMU does not accept."""
-        for name, part in _layout(self.about, self.states).split(found).items():
+        for name, part in self.about.layout(self.states).split(found).items():
             if name in self.given and not np.allclose(part, self.given[name], rtol=1e-9, atol=0.0):
                 raise FmuError(
                     f"its state was set to {self.given[name].tolist()}, but is {np.ravel(part).tolist()} when the FMU "
@@ -203,7 +203,7 @@ def _enter_continuous_time(point: _OperatingPoint, instance: LoadedFmu) -> None:
     guessed = [n for n in point.states if n in point.given and point.about.variables[n].initial != "exact"]
     if guessed:
         x = instance.values(point.states)
-        where = _layout(point.about, point.states).slices
+        where = point.about.layout(point.states).slices
         for name in guessed:
             x[where[name]] = np.ravel(point.given[name])
         _set_states(instance, x)
@@ -307,7 +307,7 @@ def _linearize_step(point: _OperatingPoint, instance: LoadedFmu, h: float, relat
     instance.begin()
     x, u = instance.values(point.states), instance.values(point.inputs)
     point.check(x)
-    at = _layout(about, known).split(np.concatenate([x, u]))
+    at = about.layout(known).split(np.concatenate([x, u]))
     saved = instance.call("saving its state", "getFMUState") if about.can_save else None
 
     def step_from_point(
@@ -341,11 +341,6 @@ def _linearize_step(point: _OperatingPoint, instance: LoadedFmu, h: float, relat
         J, uncertainty = differentiate(column, values, evaluate)
     finally:
         if saved is not None:
-            instance._fmu.freeFMUState(saved)
+            instance.free_state(saved)
     derivation = Derivation(DerivativeMethod.STEP_DIFFERENCES)
     return point.model(J, x, u, values, h=h, derivation=derivation, uncertainty=uncertainty)
-
-
-def _layout(about: FmuDescription, names: list[str]) -> Layout:
-    """Return the layout of variables, one after the other."""
-    return Layout.of({name: about.variables[name].shape for name in names})

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import OptionError, PathDomainError
-from loopwright.diagrams import experiments
+from loopwright.diagrams import Interrupted, experiments
 from loopwright.diagrams.cli import command_line as _cli
 from loopwright.diagrams.cli import options as _cli_options
 from loopwright.diagrams.cli.command_line import main
@@ -238,9 +238,7 @@ def test_interrupted(tmp_path, capsys, monkeypatch, undrawn):
     simulate = experiments.Experiment.simulate
 
     def interrupt(self, **options):
-        stop = KeyboardInterrupt()
-        stop.run = simulate(self, progress=False)
-        raise stop
+        raise Interrupted(simulate(self, progress=False))
 
     monkeypatch.setattr(experiments.Experiment, "simulate", interrupt)
     assert main(["run", "A", "B", "--out", str(tmp_path)]) == 130

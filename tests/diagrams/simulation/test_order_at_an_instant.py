@@ -39,7 +39,7 @@ from loopwright.blocks import (
     Switch,
     UnitDelay,
 )
-from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams import Diagram, Interrupted, subsystem
 from loopwright.diagrams.simulation.workspace import Workspace
 from support import TESTS
 from support.hybrid_blocks import TIGHT, Ball, Crossings, Falls, Lag, Takes, Twice, counting, decay
@@ -543,6 +543,7 @@ def test_an_interrupt_keeps_the_run(continuous):
     extra = (Falls(name="f"),) if continuous else ()
     with pytest.raises(KeyboardInterrupt) as caught:
         Diagram("d", box(Clock()), *extra).simulate(1.0, progress=False)
+    assert isinstance(caught.value, Interrupted)
     run = caught.value.run
     assert run.t[-1] == 0.5
     assert np.array_equal(run["y"], run.t)
