@@ -23,7 +23,7 @@ class Picture:
     screen : Markup
         The SVG.
     paper : Markup, optional
-        The same with ids of its own, of a wide figure.
+        SVG of a wide figure for paper, with ids of its own.
     width, height : float
         Size of a wide figure in pixels.
     """

@@ -118,7 +118,8 @@ class Numbered:
             return CellView(cell(value), kind, first)
         path = self.paths.get(id(value)) or self.equal.get(value)
         text = quantity(value) if with_unit else value_text(value)
-        about = f"{path + ': ' if path else ''}{tolerance_text(value)}; confirmed by {value.confirmed_by}"
+        why = value.confirmed_by if value.given else f"confirmed by {value.confirmed_by}"
+        about = f"{path + ': ' if path else ''}{tolerance_text(value)}; {why}"
         letter = letters.get(_kind(_reason(value)), "")
         return CellView(text, kind, False, True, anchor("n", path) if path else "", about, letter)
 

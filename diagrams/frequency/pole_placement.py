@@ -221,7 +221,7 @@ class SampledDesign:
     poles : tuple of complex
         All closed-loop poles as s = log(z)/T in 1/s, the slowest first. Multiple ones scatter.
     poles_z : tuple of complex
-        The same poles in the z plane.
+        All closed-loop poles in the z plane, in the order of ``poles``.
     polynomial : tuple of float
         Characteristic polynomial in w = (z − 1)/T, highest power first.
     """

@@ -48,7 +48,7 @@ class ReducedLoops:
     plain : mapping of str to AdmittanceLoop
         By direction; of the design without friction, where the diagram has some.
     rough : mapping of str to AdmittanceLoop
-        The same with the slope of the friction at rest, and with its compensation; empty where there is none.
+        By direction; with the slope of the friction at rest, and with its compensation. Empty where there is none.
     """
 
     plain: Mapping[str, AdmittanceLoop]
@@ -66,7 +66,7 @@ class ReducedLoops:
         base : WiredDiagram
             The diagram at rest.
         smooth : WiredDiagram, optional
-            The same without friction, where it has some.
+            The diagram without its friction, where it has some.
         plant : Gantry, optional
             The model that the plant is shown to be, where the controller inverts another one.
         path : Path

@@ -57,7 +57,7 @@ class Variant:
     key : str
         Its part of dotted paths, such as ``sampled_d0``.
     title : str
-        The same in words.
+        Its name in words.
     diagram : WiredDiagram
         The diagram.
     where : OperatingPoint, Snapshot or float, optional

@@ -58,7 +58,7 @@ class SimulationView:
         States, held outputs, gates, reset states and loop values at this instant, laid out as `FlatDiagram` says; in
         the units of the blocks' states.
     x_next : ndarray, shape (n,)
-        The same after the instant: what the run goes on with.
+        The states after the instant, laid out as ``x``: the run goes on with them.
     w : ndarray, shape (m,)
         Outputs of plants and of transport delays, as ``FlatDiagram.plant_outputs`` lays them out, in the ports' units.
     z : ndarray, shape (k,)

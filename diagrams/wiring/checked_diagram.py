@@ -123,7 +123,7 @@ class CheckedDiagram:
             ``delay`` (``"controller.sample_time"``; None: that of its surroundings), a plant's start value
             (``"plant.start.position"``).
         **more
-            The same, for paths that are identifiers: ``replace(plant=Fmu("other.fmu"))``.
+            Changes whose paths are identifiers, as keywords: ``replace(plant=Fmu("other.fmu"))``.
 
         Raises
         ------
