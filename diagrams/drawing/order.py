@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from ..wiring import find_cyclic_parts
+
 
 class Pin(NamedTuple):
     """A pin of a block, by its port, or of a subsystem, by the output that makes the signal.
@@ -78,7 +80,7 @@ def cut_loops(keys: Sequence[str], pairs: Iterable[tuple[str, str]], plants: set
     left = [pair for pair in dict.fromkeys(pairs) if pair[0] != pair[1]]
     place = {key: i for i, key in enumerate(keys)}
     while True:
-        knots = [knot for knot in _find_knots(keys, left) if len(knot) > 1]
+        knots = find_cyclic_parts(keys, left)
         if not knots:
             return left
         gone: set[tuple[str, str]] = set()
@@ -91,40 +93,6 @@ def cut_loops(keys: Sequence[str], pairs: Iterable[tuple[str, str]], plants: set
                 door = min(entered or knot, key=place.__getitem__)
                 gone |= {(a, b) for a, b in left if b == door and a in knot}
         left = [pair for pair in left if pair not in gone]
-
-
-def _find_knots(keys: Sequence[str], pairs: Iterable[tuple[str, str]]) -> list[set[str]]:
-    """Return the strongly connected parts of a graph (Tarjan's algorithm, without recursion)."""
-    after: dict[str, list[str]] = {key: [] for key in keys}
-    for a, b in pairs:
-        after[a].append(b)
-    number: dict[str, int] = {}
-    low: dict[str, int] = {}
-    open_: list[str] = []
-    found: list[set[str]] = []
-    for root in keys:
-        work = [(root, 0)] if root not in number else []
-        while work:
-            key, i = work.pop()
-            if key not in number:
-                number[key] = low[key] = len(number)
-                open_.append(key)
-            descended = False
-            for j in range(i, len(after[key])):
-                other = after[key][j]
-                if other not in number:
-                    work += [(key, j), (other, 0)]
-                    descended = True
-                    break
-                if other in open_:
-                    low[key] = min(low[key], low[other])
-            if descended:
-                continue
-            if low[key] == number[key]:
-                at = open_.index(key)
-                found.append(set(open_[at:]))
-                del open_[at:]
-    return found
 
 
 # --- positions in a layer -------------------------------------------------------------------------------------------

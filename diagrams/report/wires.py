@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
-from ..wiring import CheckedDiagram
+from ..wiring import CheckedDiagram, find_cyclic_parts
 
 MOST = 4
 """Wires at which loops are looked at where none has a name."""
@@ -46,19 +44,9 @@ def wires_on_loops(diagram: CheckedDiagram, wires: Sequence[str] | None = None) 
 
 def blocks_on_loops(diagram: CheckedDiagram) -> set[str]:
     """Return the blocks that lie on a cycle of wires."""
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-
     table = diagram.structure
-    index = {path: i for i, path in enumerate(sorted(table.blocks))}
-    edges = [(index[w.block], index[block]) for (block, _), w in table.wires.items()]
-    if not edges:
-        return set()
-    rows, columns = zip(*edges, strict=True)
-    graph = csr_matrix((np.ones(len(edges)), (rows, columns)), shape=(len(index), len(index)))
-    _, labels = connected_components(graph, directed=True, connection="strong")
-    own = {a for a, b in edges if a == b}
-    return {path for path, i in index.items() if np.sum(labels == labels[i]) > 1 or i in own}
+    pairs = [(w.block, block) for (block, _), w in table.wires.items()]
+    return set().union(*find_cyclic_parts(sorted(table.blocks), pairs))
 
 
 def _key(name: str) -> str:

@@ -2,6 +2,7 @@
 
 from .check import Checked
 from .checked_diagram import CheckedDiagram
+from .cycles import find_cyclic_parts
 from .order import Order, Step, evaluation_order
 from .structure import Collector, Structure, SubsystemSettings, Wire, join, stepped_blocks
 from .subsystems import FINEST, Subsystem, exact_time, subsystem
@@ -21,6 +22,7 @@ __all__ = [
     "change_parameter",
     "evaluation_order",
     "exact_time",
+    "find_cyclic_parts",
     "join",
     "split_path",
     "stepped_blocks",
