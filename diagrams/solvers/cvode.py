@@ -28,6 +28,7 @@ import numpy as np
 
 from ...blocks.core import NonFiniteError, OptionError
 from .base import Dense, Problem, Statistics, Step, VariableStep
+from .from_start import from_derivatives
 
 _ADAMS, _BDF, _ONE_STEP = 1, 2, 2
 _MEMORY = -20  # this code and those below are misuse or lack of memory, not mathematics
@@ -69,6 +70,7 @@ _FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {  # library â†’ function â†
         "CVodeSetStopTime": (c_int, c_void_p, c_double),
         "CVode": (c_int, c_void_p, c_double, c_void_p, POINTER(c_double), c_int),
         "CVodeGetDky": (c_int, c_void_p, c_double, c_int, c_void_p),
+        "CVodeGetLastOrder": (c_int, c_void_p, POINTER(c_int)),
         "CVodeGetCurrentStep": (c_int, c_void_p, POINTER(c_double)),
         "CVodeGetNumErrTestFails": (c_int, c_void_p, POINTER(c_long)),
         "SUNNonlinSol_FixedPoint": (c_void_p, c_void_p, c_int, c_void_p),
@@ -199,25 +201,27 @@ class Cvode(VariableStep):
         self._check(self._library.CVodeSetStopTime(self._memory, self.stop))
 
     def _advance(self) -> Step:
-        t = self._t
+        t, x_old = self._t, self._x_old
         self._check(self._library.CVode(self._memory, self.stop, self._x, byref(self._t_new), _ONE_STEP))
         self._t, self._x_old = self._t_new.value, self._calls.vector(self._x).copy()
         self.check_finite(self._t, self._x_old, "state")
         self.statistics.steps += 1
         self.statistics.rejected = self._fails + self._count_failed_tests()
-        return Step(t, self._t, self._x_old.copy(), self._prepare_dense)
+        return Step(t, self._t, self._x_old.copy(), lambda: self._prepare_dense(t, x_old))
 
     def _count_failed_tests(self) -> int:
         count = c_long()
         self._library.CVodeGetNumErrTestFails(self._memory, byref(count))
         return count.value
 
-    def _prepare_dense(self) -> Dense:
-        def at(t: float) -> np.ndarray:
-            self._check(self._library.CVodeGetDky(self._memory, t, 0, self._dky))
-            return self._calls.vector(self._dky).copy()
-
-        return at
+    def _prepare_dense(self, t_old: float, x_old: np.ndarray) -> Dense:
+        order = c_int()
+        self._check(self._library.CVodeGetLastOrder(self._memory, byref(order)))
+        derivatives = np.empty((order.value, self.problem.size))
+        for k in range(order.value):
+            self._check(self._library.CVodeGetDky(self._memory, t_old, k + 1, self._dky))
+            derivatives[k] = self._calls.vector(self._dky)
+        return from_derivatives(t_old, x_old, self._t - t_old, derivatives)
 
     def _check(self, code: int) -> None:
         if code >= 0:

@@ -25,9 +25,10 @@ import numpy as np
 
 from ...blocks.core import SimulationError
 from .base import Dense, Problem, Step, VariableStep
+from .from_start import from_differences, from_nordsieck
 
 _ATTEMPT = {"RK23": 3, "RK45": 6, "DOP853": 12}  # evaluations of the rates per attempted step
-_MULTISTEP = ("BDF", "LSODA")
+_MULTISTEP = {"BDF": from_differences, "LSODA": from_nordsieck}
 _RETRIES = 30  # of one step; of steps in a row each counts 3, and a step at once gives 1 back
 
 
@@ -135,17 +136,17 @@ class SciPySolver(VariableStep):
         planned = 0.0 if self.name == "LSODA" else inner.h_abs
         if self._strange and inner.t_old is None:  # the first step: perhaps the start itself is the cause
             self.check_finite(inner.t, super().rate(inner.t, inner.y), "rate")
-        t_old = self._attempt_step()
+        t_old, x_old = self._attempt_step()
         inner = self._inner
         if self._attempt and self.statistics.rejected is not None:
             self.statistics.rejected += (self.statistics.rate_evaluations - before) // self._attempt - 1
         if self.name not in _MULTISTEP:  # a step that was cut at the stop says little about the next
             self.planned = max(planned, inner.h_abs) if inner.t == self.stop else inner.h_abs
         self.statistics.steps += 1
-        return Step(float(t_old), float(inner.t), inner.y.copy(), self._prepare_dense)
+        return Step(float(t_old), float(inner.t), inner.y.copy(), lambda: self._prepare_dense(t_old, x_old))
 
-    def _attempt_step(self) -> float:
-        """Take a step, a shorter one where it ends at rates that are not finite, and return the time of its start."""
+    def _attempt_step(self) -> tuple[float, np.ndarray]:
+        """Take a step, a shorter one where it ends at rates that are not finite; return the time and state before."""
         first = self._inner
         for _ in range(_RETRIES if self._retried < _RETRIES else 1):
             inner = self._inner
@@ -162,7 +163,7 @@ class SciPySolver(VariableStep):
                 break
             if self._is_sound(inner):
                 self._retried = max(0, self._retried - 1) if inner is first else self._retried + 3
-                return t
+                return t, x
             h = 0.25 * (inner.t - t)
             if h < 10 * math.ulp(t):
                 break
@@ -182,8 +183,10 @@ class SciPySolver(VariableStep):
         finite = np.isfinite(inner.y).all() and np.isfinite(getattr(inner, "f", 0.0)).all()
         return bool(finite and not math.isnan(inner.h_abs))
 
-    def _prepare_dense(self) -> Dense:
-        return self._inner.dense_output()
+    def _prepare_dense(self, t_old: float, x_old: np.ndarray) -> Dense:
+        dense = self._inner.dense_output()
+        expand = _MULTISTEP.get(self.name)
+        return dense if expand is None else expand(dense, t_old, x_old)
 
 
 _STABLE = {"RK45": 3.25, "DOP853": 6.1}  # h|λ| at the border of the stable region on the real axis

@@ -1,0 +1,68 @@
+"""Dense output of the multistep methods, as a polynomial from the start of its step.
+
+A multistep method keeps a polynomial about the end of a step. Near the start its value is the state there plus rounding
+errors of the terms, a few ulps, which can carry an indicator that has just crossed zero back across it: an event that
+isn't there. Expanded about the start, x(t₀ + u h) = x₀ + Σ cₖ uᵏ with k ≥ 1, the terms vanish with u, and so do their
+errors.
+"""
+
+from __future__ import annotations
+
+from math import comb, factorial
+from typing import Any
+
+import numpy as np
+
+
+class FromStart:
+    """The polynomial x(t₀ + u h) = x₀ + Σ cₖ uᵏ over a step.
+
+    Parameters
+    ----------
+    t : float
+        Start t₀ of the step in s.
+    x : ndarray, shape (n,)
+        State x₀ there.
+    h : float
+        Length of the step in s.
+    coefficients : ndarray, shape (q, n)
+        c₁ to c_q.
+    """
+
+    def __init__(self, t: float, x: np.ndarray, h: float, coefficients: np.ndarray):
+        self._t, self._x, self._h, self._coefficients = t, x, h, coefficients[::-1].copy()
+
+    def __call__(self, t: float) -> np.ndarray:
+        """Return the state at a time within the step."""
+        u = (t - self._t) / self._h
+        change = np.zeros_like(self._x)
+        for c in self._coefficients:
+            change = (change + c) * u
+        return np.asarray(self._x + change)
+
+
+def from_nordsieck(dense: Any, t_old: float, x_old: np.ndarray) -> FromStart:
+    """Return LSODA's dense output: Σ yⱼ sʲ with s = (t − t₁)/h₁, expanded about the start of the step."""
+    h, start, terms = dense.t - t_old, (t_old - dense.t) / dense.h, dense.yh
+    ratio, q = h / dense.h, terms.shape[1] - 1
+    coefficients = [
+        sum(terms[:, j] * (comb(j, k) * start ** (j - k)) for j in range(k, q + 1)) * ratio**k for k in range(1, q + 1)
+    ]
+    return FromStart(t_old, x_old, h, np.array(coefficients))
+
+
+def from_differences(dense: Any, t_old: float, x_old: np.ndarray) -> FromStart:
+    """Return the dense output of SciPy's BDF: Newton's polynomial through backward differences, about the start."""
+    h, q = dense.t - t_old, len(dense.denom)
+    coefficients, product = np.zeros((q, len(x_old))), np.array([1.0])
+    for j in range(q):  # one more factor, a + b u, in each term
+        product = np.convolve(product, [(t_old - dense.t_shift[j]) / dense.denom[j], h / dense.denom[j]])
+        coefficients[: j + 1] += np.outer(product[1:], dense.D[j + 1])
+    return FromStart(t_old, x_old, h, coefficients)
+
+
+def from_derivatives(t_old: float, x_old: np.ndarray, h: float, derivatives: np.ndarray) -> FromStart:
+    """Return the Taylor polynomial of a dense output whose derivatives at the start are known, shape (q, n)."""
+    q = len(derivatives)
+    scale = np.array([h**k / factorial(k) for k in range(1, q + 1)])
+    return FromStart(t_old, x_old, h, scale[:, None] * derivatives)
