@@ -13,7 +13,9 @@ ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "architecture.md"
 ROOMS = ("blocks", "fmus", "diagrams")
 FILES = sorted(p.relative_to(ROOT) for room in ROOMS for p in (ROOT / room).rglob("*.py"))
-STUBS = [Path(room, "__init__.pyi") for room in ROOMS]  # the names that a room loads when they are used
+STUBS = sorted(
+    p.relative_to(ROOT) for room in ROOMS for p in (ROOT / room).rglob("*.pyi")
+)  # names that are loaded when they are used
 
 
 def place_of(path):

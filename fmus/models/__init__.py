@@ -1,25 +1,5 @@
 """Plants of the library."""
 
-from . import (
-    bouncing_ball,
-    dc_motor,
-    gantry,
-    gantry_contact,
-    gantry_elastic,
-    gantry_stiction,
-    mass_spring_damper,
-    scara,
-)
-from .gantry import Gantry
+from lazy_loader import attach_stub as _load_on_use
 
-__all__ = [
-    "Gantry",
-    "bouncing_ball",
-    "dc_motor",
-    "gantry",
-    "gantry_contact",
-    "gantry_elastic",
-    "gantry_stiction",
-    "mass_spring_damper",
-    "scara",
-]
+__getattr__, __dir__, __all__ = _load_on_use(__name__, __file__)  # the names stand in __init__.pyi
