@@ -14,6 +14,7 @@ import numpy as np
 from casadi import ArrayInterface
 
 from ..core import Array, TraceError
+from ..tracing import as_traced
 
 __all__ = ["bilinear", "is_traced", "jet", "piecewise", "wrap"]
 
@@ -103,7 +104,7 @@ def _traced_jet(breaks: np.ndarray, coefficients: np.ndarray, s: Any, highest: i
     gathered = table[stride * index + ca.DM(np.arange(stride))]
     values = _horner_function(functions, powers - 1, highest)(gathered, symbol - places[index])
     values = values if isinstance(values, tuple) else (values,)
-    return tuple(ArrayInterface(ca.densify(v).T, ndim=1) for v in values)
+    return tuple(as_traced(ArrayInterface(ca.densify(v).T, ndim=1)) for v in values)
 
 
 def bilinear(rows: np.ndarray, columns: np.ndarray, values: np.ndarray, a: Array, b: Array) -> Array:
@@ -133,10 +134,10 @@ def bilinear(rows: np.ndarray, columns: np.ndarray, values: np.ndarray, a: Array
         table = _constant(np.ascontiguousarray(values).tobytes())
         corners = ca.vertsplit(table[wide * i + j + ca.DM([0, 1, wide, wide + 1])])
         alpha, beta = (
-            ArrayInterface((symbol - at[k]) / (at[k + 1] - at[k]), ndim=0)
+            as_traced(ArrayInterface((symbol - at[k]) / (at[k + 1] - at[k]), ndim=0))
             for symbol, at, k in zip(sought, places, (i, j), strict=True)
         )
-        corners = [ArrayInterface(corner, ndim=0) for corner in corners]
+        corners = [as_traced(ArrayInterface(corner, ndim=0)) for corner in corners]
     else:
         i = int(np.clip(np.searchsorted(rows, a, side="right") - 1, 0, len(rows) - 2))
         j = int(np.clip(np.searchsorted(columns, b, side="right") - 1, 0, wide - 2))

@@ -7,11 +7,13 @@ from .opaque_equations import raise_failure
 from .structure import is_traced_by, traced_parameters
 from .symbols import bundle, flat_column, size, with_values, wrap
 from .traced import Traced, constants_of, trace
+from .traced_array import as_traced
 
 __all__ = [
     "GUARDS",
     "NEXT",
     "Traced",
+    "as_traced",
     "bundle",
     "check_method",
     "constants_of",

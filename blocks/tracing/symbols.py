@@ -12,6 +12,7 @@ import numpy as np
 from casadi import ArrayInterface
 
 from ..core import Shape, ShapeError
+from .traced_array import as_traced
 
 
 def size(shape: Shape) -> int:
@@ -58,11 +59,11 @@ def with_values(block: Any, values: Mapping[str, Any]) -> Any:
 def wrap(flat: Any, shape: Shape) -> Any:
     """Give a flat CasADi column NumPy's interface, in C order."""
     if shape == ():
-        return ArrayInterface(flat, ndim=0)
+        return as_traced(ArrayInterface(flat, ndim=0))
     if len(shape) == 1:
-        return ArrayInterface(flat.T, ndim=1)
+        return as_traced(ArrayInterface(flat.T, ndim=1))
     if len(shape) == 2:
-        return ArrayInterface(ca.reshape(flat, shape[1], shape[0]).T, ndim=2)
+        return as_traced(ArrayInterface(ca.reshape(flat, shape[1], shape[0]).T, ndim=2))
     raise ShapeError(f"found a signal of shape {shape}; expected at most two dimensions.")
 
 
