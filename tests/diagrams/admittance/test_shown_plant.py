@@ -363,7 +363,7 @@ def test_friction_is_taken_out_of_a_plant_only_where_that_is_shown():
     case = Fig3Case(diagram(gantry_elastic))
     assert list(case.variants) == ["continuous", "sampled_d0", "sampled_d1"]
     assert case.smooth is None
-    assert any(note.startswith("The plant is not shown to be the gantry, so that its friction") for note in case.notes)
+    assert any(note.startswith("The plant is not shown to be the gantry, so its friction") for note in case.notes)
     assert Fig3Case(diagram()).plant_model == gantry.nominal
 
 
