@@ -96,7 +96,7 @@ def test_a_turning_angle_on_which_nothing_depends_is_told_apart():
     point = diagram.trim(rates={"motor.angle": None}, step=T)
     said = [t for t in analyse(diagram, point=point, only=("operating_points",)).sections[0].text if "not an eq" in t]
     assert said
-    assert all("nothing but motor.angle moves, on which nothing depends" in t for t in said)
+    assert all("only motor.angle moves, and nothing depends on it" in t for t in said)
 
 
 def test_an_integrator_outside_the_loop_is_called_neither_stable_nor_unstable():
