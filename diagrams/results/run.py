@@ -56,7 +56,7 @@ class Run:
     t : (N,) ndarray
         Times in s, ascending, up to and including the end.
     messages : tuple of str
-        Messages of the FMUs, and whether the run was cut off.
+        Messages of the FMUs, other solutions of algebraic loops, and whether the run was cut off.
     events : sequence of Occurrence
         The events that fired, in their order.
     stopped : Stopped or None

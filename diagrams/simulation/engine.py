@@ -85,6 +85,7 @@ class Engine:
         initialize(self.workspace, self.plants, None if self.continuous is None else self.continuous.delays)
         for plant in self.plants.values():
             plant.begin()
+        self.workspace.begun = True
 
     def take_first_tick(self, point: OperatingPoint | None, row: Row) -> None:
         """Go through the tick with which the run begins, tick 0 or that of an operating point, and record it."""
@@ -92,6 +93,7 @@ class Engine:
         if self.continuous is not None:
             self.continuous.begin(at_start=point is None)
         now = self.position.time_of(first)
+        self.workspace.begin(self.flat.acting(first))
         take_tick(self.workspace, self.continuous, self.plants, now, self.flat.acting(first))
         row(now, self.workspace.log)
         self._arrive(first)

@@ -291,7 +291,7 @@ class Simulation:
 
     @property
     def _messages(self) -> tuple[str, ...]:
-        return tuple(m for plant in self._engine.plants.values() for m in plant.messages)
+        return (*self._engine.workspace.messages, *(m for p in self._engine.plants.values() for m in p.messages))
 
     @property
     def can_save(self) -> bool:

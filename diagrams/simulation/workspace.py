@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, ParameterError, SimulationError
+from ...blocks.core import Block, ParameterError
 from ...blocks.tracing import is_traced_by
 from ..flat import NONE, Bound, Derivative, Evaluators, FlatDiagram, Schedule, TickPattern
+from .algebraic_loops import LoopSolver
 from .diagnosis import failure
 from .vectors import Vectors
-
-TOLERANCE = 1e-9
-"""Largest residual of an algebraic loop that counts as solved, relative to 1 + the size of its values."""
-_ITERATIONS = 50
-_ROUNDING = 1e-14
 
 
 class Workspace:
@@ -42,6 +37,10 @@ class Workspace:
         residual.
     ok : ndarray
         Shape (1,); 0 where a value was not finite or a guard failed.
+    begun : bool
+        Whether the start has been found: algebraic loops must determine their values from then on.
+    messages : tuple of str
+        Messages about the run so far.
     """
 
     def __init__(self, flat: FlatDiagram, evaluators: Evaluators | None = None):
@@ -56,7 +55,9 @@ class Workspace:
         self._evaluations: dict[frozenset[TickPattern], Callable[[], None]] = {}
         self._ticks: dict[frozenset[TickPattern], Callable[[], None]] = {}
         self._kept: list[Bound] = []
-        self._solved: dict[Any, Callable[[], None]] = {}
+        self.begun = False
+        self.messages: tuple[str, ...] = ()
+        self._solved: dict[tuple[frozenset[TickPattern], int], LoopSolver] = {}
 
     def _bind(
         self,
@@ -223,85 +224,57 @@ class Workspace:
     def loop_solver(self, acting: frozenset[TickPattern], vectors: Vectors) -> Callable[[], None] | None:
         """Return the call that solves the algebraic loops at some of its vectors; None where there are none.
 
-        Newton's method with the exact derivative, started from the last solution; a step that makes the residual larger
-        is halved, and on, as long as that helps.
+        At ``here`` it also refuses values that the loops do not determine, once the run has begun.
         """
+        loops = self.loops(acting, vectors)
+        if loops is None or vectors is not self.here:
+            return None if loops is None else loops.solve
+
+        def solve() -> None:
+            loops.solve()
+            if self.begun:
+                loops.check_determined()
+
+        return solve
+
+    def loops(self, acting: frozenset[TickPattern], vectors: Vectors) -> LoopSolver | None:
+        """Return the solver of the algebraic loops at some of its vectors; None where there are none."""
         if not self.looped:
             return None
         key = (acting, id(vectors))
-        if key in self._solved:
-            return self._solved[key]
-        function = self.flat.loop_equations(acting)
-        if function is None:
-            return None
-        bound = self._bind(function, vectors)
-        r, J = bound.outputs
-        where = np.array(self.flat.active_loops(acting))
-        n, x, call = len(where), vectors.x, bound.call
-
-        def size_of(r: np.ndarray, v: np.ndarray) -> float:
-            return float(np.max(np.abs(r)) / (1.0 + np.max(np.abs(v))))
-
-        def solve() -> None:
-            call()
-            v = x[where]
-            size = float(np.linalg.norm(r))
-            for _ in range(_ITERATIONS):
-                if not size_of(r, v) > _ROUNDING:
-                    break
-                try:
-                    direction = np.linalg.solve(J.reshape(n, n, order="F"), r)
-                except np.linalg.LinAlgError:
-                    break
-                if not np.all(np.isfinite(direction)):
-                    break
-                best, step = 0.0, 1.0  # the mismatch itself must shrink: relative to values that run away, any would
-                for _ in range(30):
-                    x[where] = v - step * direction
-                    call()
-                    now = float(np.linalg.norm(r))
-                    if now < size:
-                        best, size = step, now
-                    elif best:
-                        break
-                    if best == 1.0:
-                        break
-                    step *= 0.5
-                if best != step:
-                    x[where] = v - best * direction  # the best one; 0 at the level of rounding, or where it is stuck
-                    call()
-                if not best:
-                    break
-                v = x[where]
-            found = size_of(r, x[where])
-            if not found <= TOLERANCE and math.isfinite(found):  # a NaN that comes in is told by who made it
-                raise self.unsolved(found, float(vectors.t[0]))
-
-        self._solved[key] = solve
-        return solve
+        if key not in self._solved:
+            function = self.flat.loop_equations(acting)
+            if function is None:
+                return None
+            bound, where = self._bind(function, vectors), self.flat.active_loops(acting)
+            names = {
+                entry: name if stop - start == 1 else f"{name}[{entry - start + 1}]"
+                for name, slot in self.flat.loops.slices.items()
+                for start, stop in [(slot.start, slot.stop)]
+                for entry in range(start, stop)
+            }
+            r, J = bound.outputs
+            ports = [names[i] for i in where]
+            self._solved[key] = LoopSolver(ports, where, vectors.t, vectors.x, bound.call, r, J, self.flat.order.loops)
+        return self._solved[key]
 
     def solve_loops(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return x with the algebraic loops solved at an instant; they are sought from the values in x on."""
-        solve = self.loop_solver(acting, self.here)
-        if solve is None:
+        loops = self.loops(acting, self.here)
+        if loops is None:
             return x
         self.put(t, x, w)
-        solve()
+        loops.solve()
+        loops.check_determined()
         return self.here.x.copy()
 
-    def unsolved(self, residual: float, t: float) -> SimulationError:
-        """Return the error of a loop that has no solution, or that Newton's method does not find."""
-        loops = "\n".join(self.flat.order.loops)
-        path, port = self.flat.order.torn[0]
-        return SimulationError(
-            f"the algebraic loop was not solved: its residual is {residual:.3g}, expected at most {TOLERANCE:g}. "
-            "Newton's method, started from the last solution, got no closer; the loop may have none, or "
-            f"several.\n{loops}\n"
-            "Break it with a UnitDelay where a delay is real, or solve the equations for the signal by hand.",
-            block=path,
-            port=port,
-            t=t,
-        )
+    def begin(self, acting: frozenset[TickPattern]) -> None:
+        """Let a run begin at ``here``: other solutions that the algebraic loops have there are told in ``messages``."""
+        loops = self.loops(acting, self.here)
+        if loops is not None:
+            loops.solve()
+            loops.check_determined()
+            self.messages = (loops.describe(others),) if (others := loops.others()) else ()
 
 
 def _plans_ahead(block: Block) -> bool:

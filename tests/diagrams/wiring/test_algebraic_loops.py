@@ -14,6 +14,7 @@ from loopwright.blocks import (
     Function,
     Gain,
     NonFiniteError,
+    Product,
     PythonFunction,
     Relay,
     SimulationError,
@@ -280,3 +281,79 @@ def test_newtons_steps_that_go_too_far_are_shortened(root):
     e = Sum(signs="++", name="e")
     run = Diagram("loop", e(Constant(value=0.0), turn(e.y)), loops="solve").simulate(0.1, step=0.1, progress=False)
     assert run["e.y"] == pytest.approx([root, root], rel=1e-12)
+
+
+# --- loops with more than one solution --------------------------------------------------------------------------------
+
+
+def run_of(*calls):
+    return Diagram("loop", *calls, loops="solve").simulate(0.2, step=0.1, progress=False)
+
+
+def test_a_singular_loop_that_any_value_solves_says_so():
+    g = Gain(gain=1.0, name="g")
+    with pytest.raises(SimulationError, match=r"g\.y, t = 0 s: the algebraic loop does not determine g\.y: it is sing"):
+        run_of(g(g.y))
+
+
+def test_a_singular_loop_of_vectors_names_the_entries_that_are_free():
+    """The second and the third entry swap: only their sum is determined, by nothing."""
+    A = np.array([[0.5, 0, 0], [0, 0, 1.0], [0, 1.0, 0]])
+    e = Sum(signs="++", name="e")
+    with pytest.raises(SimulationError, match=r"does not determine (e|A)\.y\[2\], (e|A)\.y\[3\]: it is singular"):
+        run_of(e(Constant(value=[1.0, 0.0, 0.0]), Gain(gain=A, name="A")(e.y)))
+
+
+def test_a_loop_that_becomes_singular_says_when():
+    """The values go with y = g(t) y, g = 10 t: at 0.1 s anything solves it."""
+    times = Product(name="times")
+    with pytest.raises(SimulationError, match=r"t = 0\.1 s: the algebraic loop does not determine times\.y"):
+        run_of(times(Gain(gain=10.0)(Clock()), times.y))
+
+
+def test_a_multiple_root_is_a_solution():
+    """The only solution of y = y − y³ is 0, at which the derivative of the loop is singular."""
+    f = Function(lambda v: v - v**3, name="f")
+    assert run_of(f(f.y))["f.y"].tolist() == [0, 0, 0]
+
+
+def test_linearization_refuses_an_undetermined_loop_too():
+    g, lag = Gain(gain=1.0, name="g"), Lag(name="lag", k=1.0)
+    diagram = Diagram("loop", g(g.y), lag(Constant(value=1.0)), loops="solve")
+    with pytest.raises(SimulationError, match="does not determine"):
+        diagram.linearize()
+
+
+def test_of_several_solutions_the_other_ones_are_told():
+    """Those of y = 2 − y² are 1 and −2."""
+    f = Function(lambda v, u: u - v**2, name="f")
+    run = run_of(f(f.y, Constant(value=2.0)))
+    assert run["f.y"] == pytest.approx([1.0, 1.0, 1.0], abs=1e-12)
+    (message,) = run.messages
+    assert "several solutions at t = 0 s" in message
+    assert "others are -2." in message
+    assert str(message) in repr(run)
+
+
+def test_three_solutions_are_told_and_a_unique_one_is_not():
+    """Y = tanh(3 y) has 0 and ± y with y = 0.9949; y = −tanh(3 y) has 0 only."""
+    up, down = Function(lambda v: np.tanh(3 * v), name="f"), Function(lambda v: -np.tanh(3 * v), name="f")
+    other = brentq(lambda v: v - np.tanh(3 * v), 0.5, 1.5)
+    (message,) = run_of(up(up.y)).messages
+    assert f"{other:.6g}" in message
+    assert f"{-other:.6g}" in message
+    assert run_of(down(down.y)).messages == ()
+
+
+def test_a_block_without_values_elsewhere_does_no_harm():
+    """Other solutions are sought where a user's own code fails."""
+
+    def root(v):
+        if not -0.5 < v < 3.5:
+            raise ValueError("out of range")
+        return 0.25 * v + 1.5
+
+    f = PythonFunction(root, name="f", results={"y": ()})
+    run = run_of(f(f.y))
+    assert run["f.y"] == pytest.approx([2.0, 2.0, 2.0], abs=1e-9)
+    assert run.messages == ()

@@ -1,0 +1,205 @@
+"""Algebraic loops, solved at an instant: Newton's method, and what tells that a solution is not the only one.
+
+The loops are the equations F(v) = v of the values v at their torn ports. J = ∂F/∂v − 1 is exact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ...blocks.core import SimulationError
+
+TOLERANCE = 1e-9
+"""Largest residual of an algebraic loop that counts as solved, relative to 1 + the size of its values."""
+_ITERATIONS = 50
+_ROUNDING = 1e-14
+_SINGULAR = 1e-13  # least singular value of J, relative to that of the loop's gain
+_ASIDE = 1e-3  # step along a direction in which J is zero, relative to 1 + the size of the values
+_APART = 1e-6  # distance of two solutions, relative to 1 + their size
+_STARTS = (0.0, 1.0, -1.0, 10.0, -10.0, 0.1, -0.1, 100.0, -100.0)
+
+
+class LoopSolver:
+    """Solves the algebraic loops at the vectors that an evaluation of them is bound to.
+
+    Parameters
+    ----------
+    names : sequence of str
+        What to call each entry, such as "e.y".
+    where : sequence of int
+        Entries of x that hold v.
+    t, x : ndarray
+        The time, shape (1,), and x: v is sought in it, from the values there on.
+    call : callable
+        Evaluates what comes round the loops less v, and J, into ``r`` and ``J``.
+    loops : sequence of str
+        The loops, written port by port, for messages.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        where: Sequence[int],
+        t: np.ndarray,
+        x: np.ndarray,
+        call: Callable[[], None],
+        r: np.ndarray,
+        J: np.ndarray,
+        loops: Sequence[str],
+    ):
+        self.names, self.where, self.t, self.x, self.call, self.r = names, np.array(where), t, x, call, r
+        n = len(names)
+        self.J = J.reshape(n, n, order="F")
+        self.loops = loops
+
+    def solve(self) -> None:
+        """Solve them from the values in x on.
+
+        Newton's method with the exact derivative; a step that makes the residual larger is halved, and on, as long as
+        that helps.
+
+        Raises
+        ------
+        SimulationError
+            If there is no solution, or Newton's method does not find it.
+        """
+        found = self._seek()
+        if not found <= TOLERANCE and math.isfinite(found):  # a NaN that comes in is told by who made it
+            raise self._unsolved(found)
+
+    def _size(self, v: np.ndarray) -> float:
+        return float(np.max(np.abs(self.r)) / (1.0 + np.max(np.abs(v))))
+
+    def _seek(self) -> float:
+        """Go to a solution, and return the residual that is left, relative to 1 + the size of the values."""
+        x, where, call, r = self.x, self.where, self.call, self.r
+        call()
+        v = x[where]
+        size = float(np.linalg.norm(r))
+        for _ in range(_ITERATIONS):
+            if not self._size(v) > _ROUNDING:
+                break
+            try:
+                direction = np.linalg.solve(self.J, r)
+            except np.linalg.LinAlgError:  # the shortest step, to one of many solutions if there are any
+                direction = np.linalg.lstsq(self.J, r)[0] if np.all(np.isfinite(self.J)) else np.array([math.nan])
+            if not np.all(np.isfinite(direction)):
+                break
+            best, step = 0.0, 1.0  # the mismatch itself must shrink: relative to values that run away, any would
+            for _ in range(30):
+                x[where] = v - step * direction
+                call()
+                now = float(np.linalg.norm(r))
+                if now < size:
+                    best, size = step, now
+                elif best:
+                    break
+                if best == 1.0:
+                    break
+                step *= 0.5
+            if best != step:
+                x[where] = v - best * direction  # the best one; 0 at the level of rounding, or where it is stuck
+                call()
+            if not best:
+                break
+            v = x[where]
+        return self._size(x[where])
+
+    # --- solutions that are not the only ones -------------------------------------------------------------------------
+
+    def check_determined(self) -> None:
+        """Refuse values that the loops do not determine: neighbours in some direction solve them as well.
+
+        Raises
+        ------
+        SimulationError
+            With the entries that are free.
+        """
+        J = self.J
+        gain = float(np.max(np.abs(J + np.eye(len(J))), initial=0.0))
+        if not np.all(np.isfinite(J)):
+            return
+        if len(J) == 1:
+            least, direction = abs(float(J[0, 0])), np.ones(1)
+        else:
+            _, sizes, rows = np.linalg.svd(J)
+            least, direction = float(sizes[-1]), rows[-1]
+        if least > _SINGULAR * (1.0 + gain):
+            return
+        solution = self.x[self.where].copy()
+        aside = _ASIDE * (1.0 + np.max(np.abs(solution))) * direction
+        free = False
+        for sign in (1.0, -1.0):  # a multiple root has no neighbours, and is determined
+            self.x[self.where] = solution + sign * aside
+            self.call()
+            free = free or self._size(solution) <= _ROUNDING * (1.0 + gain)
+        self.x[self.where] = solution
+        self.call()
+        if free:
+            raise self._undetermined(direction)
+
+    def others(self) -> list[np.ndarray]:
+        """Return other solutions, as far as Newton's method finds them from a few other values; x stays as it is."""
+        solution = self.x[self.where].copy()
+        found: list[np.ndarray] = []
+        alternating = np.where(np.arange(len(solution)) % 2, -1.0, 1.0)
+        patterns = [np.ones(len(solution))] + ([alternating] if len(solution) > 1 else [])
+        try:
+            for start in (s * (1.0 + np.abs(solution)) * p for p in patterns for s in _STARTS):
+                self.x[self.where] = start
+                try:
+                    left = self._seek()
+                except SimulationError:  # of a block that has no value there
+                    continue
+                v = self.x[self.where].copy()
+                if left <= TOLERANCE and all(_differ(v, known) for known in (solution, *found)):
+                    found.append(v)
+        finally:
+            self.x[self.where] = solution
+            self.call()
+        return found
+
+    # --- words -------------------------------------------------------------------------------------------------------
+
+    def _error(self, text: str) -> SimulationError:
+        loops = "\n".join(self.loops)
+        path, _, port = self.names[0].rpartition(".")
+        return SimulationError(f"{text}\n{loops}\n{_ADVICE}", block=path, port=port, t=float(self.t[0]))
+
+    def _unsolved(self, residual: float) -> SimulationError:
+        return self._error(
+            f"the algebraic loop was not solved: its residual is {residual:.3g}, expected at most {TOLERANCE:g}. "
+            "Newton's method, started from the last solution, got no closer; the loop may have none, or several."
+        )
+
+    def _undetermined(self, direction: np.ndarray) -> SimulationError:
+        part = np.abs(direction) > 1e-6 * np.max(np.abs(direction))
+        free = ", ".join(name for name, is_free in zip(self.names, part, strict=True) if is_free)
+        return self._error(
+            f"the algebraic loop does not determine {free}: it is singular, and values beside "
+            f"{_text(self.x[self.where])} solve it as well; expected one solution."
+        )
+
+    def describe(self, others: Sequence[np.ndarray]) -> str:
+        """Return the message that there are other solutions."""
+        names = ", ".join(self.names)
+        found = "; ".join(map(_text, others))
+        return (
+            f"The algebraic loop at {names} has several solutions at t = {float(self.t[0]):g} s. The run follows "
+            f"{_text(self.x[self.where])}, which Newton's method found first; others are {found}. If another one is "
+            "meant, solve the equations for the signal by hand, or break the loop with a UnitDelay(initial_value=…)."
+        )
+
+
+_ADVICE = "Break it with a UnitDelay where a delay is real, or solve the equations for the signal by hand."
+
+
+def _differ(a: np.ndarray, b: np.ndarray) -> bool:
+    return bool(np.max(np.abs(a - b)) > _APART * (1.0 + np.max(np.abs(b))))
+
+
+def _text(values: np.ndarray) -> str:
+    return f"{float(values[0]):.6g}" if len(values) == 1 else f"({', '.join(f'{float(v):.6g}' for v in values)})"
