@@ -206,7 +206,7 @@ PUBLIC = {
         FilteredDerivative FmuError FmuFileError FmuRuntimeError ForceProjection ForceSensor Frame Function Gain
         GuardError HandForce HandProfile Hold IIR Input Integrator Latch LimitedIntegrator Line Lookup1D
         Lookup2D LoopwrightError Maximum Minimum MovingAverage NonFiniteError Not OptionError Or Output PID
-        PadeDelay ParameterError Path PathDomainError PathProjection PathSpring PathTracking PiecewiseLinear
+        PadeDelay ParameterError Path PathDomainError PathProjection PathSpring PathTracking PeriodicLoopError PiecewiseLinear
         PlanarModel Product Pulse PulseTrain PythonFunction Quantizer Ramp RateLimiter Recorded Reference Relay
         Requirement ResettableIntegrator SampleTimeError Saturation ShapeError Signal SimulationError Sine
         SmoothStep SpringDamper State StateMachine StateSpace Step StopCondition Sum Switch TraceError
@@ -221,11 +221,12 @@ PUBLIC = {
     "diagrams": """
         AdmittanceLoop BlockReport Channel Comparison Diagram DiskMargin Drawing Fig3Diagram FlatDiagram
         FrequencyResponse GainCrossover GangOfFour Interrupted Layout Linearization Margins Number NyquistCount Occurrence
-        OperatingPoint Passivity PhaseCrossover Plot Report Rig Run RunOptions RunState SampledDesign Section
+        OperatingPoint Passivity PeriodicMargins PhaseCrossover Plot Report Rig Run RunOptions RunState SampledDesign
+        Section
         Simulation SimulationView Snapshot StabilityLimit StabilityMap Stopped Subsystem SubsystemSettings Table
         Wire analyse check_block compare_with_control complementary crossing_frequency delayed_hold
         delayed_hold_margin disk_margin experiments fig3 gang_of_four growth_rate loop_at margins
-        mimo_disk_margin nyquist_count passivity place poles rendered_admittance rendered_response
+        mimo_disk_margin nyquist_count passivity periodic_margins place poles rendered_admittance rendered_response
         rendered_system rule_of_thumb sampled_gains sampled_poles sensitivity stability_limit stability_map
         stiffness_limits subsystem target_admittance
     """,

@@ -157,6 +157,10 @@ class AlgebraicLoopError(WiringError):
     """Ports depend on each other without a state in between."""
 
 
+class PeriodicLoopError(WiringError):
+    """A loop is cut at a wire that is renewed several times in the model's period: it has no L at one rate."""
+
+
 class SimulationError(LoopwrightError, RuntimeError):
     """A run stopped.
 

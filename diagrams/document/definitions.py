@@ -44,7 +44,7 @@ def definition(path: str, more: Mapping[str, str] = MappingProxyType({})) -> tup
         parts[0] == "subject" and parts[-1] != "sample_time"
     ):  # subsystems, blocks and parameters have names of their own
         parts = ["subject"]
-    elif parts[0] == "inner" and parts[3:4] == ["control"]:  # inner.WIRE.VARIANT.control.NUMBER
+    elif parts[0] == "inner" and parts[-2:-1] == ["control"] and len(parts) > 4:  # inner.WIRE.VARIANT….control.NUMBER
         parts = ["control"]
     elif parts[0] in ("inner", "injection"):
         del parts[1:2]  # the wire's name

@@ -6,6 +6,7 @@ from .margins_found import GainCrossover, Margins, PhaseCrossover
 from .number import Number
 from .nyquist import NyquistCount, nyquist_count
 from .one_thread import on_one_thread
+from .periodic_margins import PeriodicMargins, periodic_margins
 from .pole_placement import SampledDesign, place, sampled_gains, sampled_poles
 from .polynomials import relative_difference
 from .python_control import Comparison, compare_margins, compare_with_control
@@ -21,6 +22,7 @@ __all__ = [
     "Margins",
     "Number",
     "NyquistCount",
+    "PeriodicMargins",
     "PhaseCrossover",
     "Realization",
     "SampledDesign",
@@ -36,6 +38,7 @@ __all__ = [
     "mimo_disk_margin",
     "nyquist_count",
     "on_one_thread",
+    "periodic_margins",
     "place",
     "read_matrices",
     "relative_difference",

@@ -225,7 +225,7 @@ def _compute_disk_margin(r: Realization, skew: float) -> DiskMargin:
         )
 
     def matrix(omega: float) -> np.ndarray:
-        return _sensitivity_at(r, omega) + (skew - 1) / 2 * np.eye(n)
+        return sensitivity_at(r, omega) + (skew - 1) / 2 * np.eye(n)
 
     _, omega = _find_largest(r, lambda w: mu_bound(matrix(w), polish=False))
     bound = mu_bound(matrix(omega))
@@ -285,7 +285,7 @@ def _confirm_destabilizing(r: Realization, delta: np.ndarray, skew: float) -> st
         return "I + L F is singular at infinite frequency with δ"
 
 
-def _sensitivity_at(r: Realization, omega: float) -> np.ndarray:
+def sensitivity_at(r: Realization, omega: float) -> np.ndarray:
     """Return S = (I + L)⁻¹ at ω, by the closed loop: it is finite where the loop has poles on the axis."""
     n = len(r.D)
     if np.isinf(omega):

@@ -10,21 +10,27 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError, WiringError
 from ...fmus.running import Derivation, DerivativeMethod
-from ..flat import NONE, FlatDiagram, WiredDiagram
+from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import exact_time
+from .continuous_model import model_continuous
 from .derivatives import LocalDerivatives, Signal, find_signal, find_steps_only
 from .findings import Finding
-from .loops_over_a_period import advance_point, confirm_loop, model_loop, period_of, ticks_to_renewal
+from .loops_over_a_period import (
+    advance_point,
+    confirm_loop,
+    find_slower_clocks,
+    model_loop,
+    ticks_to_renewal,
+)
 from .operating_points import PointLike, check_options, operating_point
-from .over_a_period import EQUILIBRIUM, Model, find_moving, model_period
-from .plant_models import join_matrices, model_equations, states_of
+from .over_a_period import EQUILIBRIUM, Model, find_moving, model_period, period_of
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -136,7 +142,7 @@ class Linearization:
         """Whether the operating point is an equilibrium."""
         return bool(np.max(np.abs(self.affine), initial=0.0) <= EQUILIBRIUM)
 
-    def loop(self, *wires: str, lifted: bool = False) -> StateSpace:
+    def loop(self, *wires: str, lifted: bool = False, slow: Literal["closed", "open"] = "closed") -> StateSpace:
         """Return the loop transfer function L at a wire, all other loops closed: S = 1/(1 + L).
 
         The wire is cut behind the port, for all consumers: L = −(returning signal)/(injected signal). With several
@@ -149,7 +155,10 @@ class Linearization:
             Names of wires, paths of ports, or entries of them: ``"motor_force"``, ``"motor_force[0]"``.
         lifted : bool, default: False
             Whether a wire that is renewed several times in the model's period gets one channel for each renewal:
-            ``"u@0"``, ``"u@1"``, …. A factor common to all of them is a gain in the wire.
+            ``"u@0"``, ``"u@1"``, …. A factor common to all of them is a gain in the wire: see `periodic_margins`.
+        slow : {"closed", "open"}
+            Whether the loops of subsystems that are sampled slower than the wire are closed. Open, these subsystems
+            hold their outputs and states, and L is that of the inner loop at the wire's own rate.
 
         Returns
         -------
@@ -160,13 +169,15 @@ class Linearization:
         ------
         OptionError
             If no wire is named or, in a discrete model, a wire changes between ticks and acts there: it has no loop at
-            ticks.
-        WiringError
+            ticks. Also if there is no such ``slow``, or no clock behind the wire or its readers.
+        PeriodicLoopError
             If a wire is renewed several times in the model's period, unless ``lifted``: its loop is periodic.
         ConfirmationError
             If the closed L does not have the diagram's poles.
         """
-        cut = self._make_at(wires, openings=wires, loop="lifted" if lifted else "one")
+        if slow not in ("closed", "open"):
+            raise OptionError(f"found slow={slow!r}; expected 'closed' or 'open'. Choose one of them.", port="slow")
+        cut = self._make_at(wires, openings=wires, loop="lifted" if lifted else "one", slow=slow)
         return cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})")
 
     def sensitivity(self, *wires: str) -> StateSpace:
@@ -184,7 +195,9 @@ class Linearization:
         closed = self._make_at(wires)
         return closed._state_space(-closed.C, -closed.D, f"T({', '.join(wires)})")
 
-    def _make_at(self, wires: tuple[str, ...], openings: tuple[str, ...] = (), loop: str = "") -> Linearization:
+    def _make_at(
+        self, wires: tuple[str, ...], openings: tuple[str, ...] = (), loop: str = "", slow: str = "closed"
+    ) -> Linearization:
         """Return the model at these wires; ``loop`` is "one", "lifted", or "" for the closed loops."""
         if not wires:
             raise OptionError(
@@ -193,14 +206,18 @@ class Linearization:
                 port="wires",
             )
         flat = self.diagram.flatten(self.point.base)
-        at, shift = self.point, 0
+        at, shift, frozen = self.point, 0, NONE
+        ports = [find_signal(flat, w).port for w in wires]
+        if slow == "open":
+            frozen = find_slower_clocks(flat, ports, self.diagram.name)
         if self.dt and period_of(flat) > 1:
-            shift = ticks_to_renewal(flat, [find_signal(flat, w).port for w in wires], at.tick)
+            shift = ticks_to_renewal(flat, ports, at.tick)
             at = advance_point(flat, at, self.plants, shift)
-        made = _linearize(self.diagram, at, wires, wires, openings, plants=self.plants, step=self.step, loop=loop)
+        how: dict[str, Any] = {"plants": self.plants, "step": self.step, "frozen": frozen}
+        made = _linearize(self.diagram, at, wires, wires, openings, loop=loop, **how)
         if loop:
-            own = not shift and not self.openings
-            closed = self if own else _linearize(self.diagram, at, (), (), (), plants=self.plants, step=self.step)
+            own = not shift and not self.openings and not frozen
+            closed = self if own else _linearize(self.diagram, at, (), (), (), **how)
             cut = Model((made.A, made.B, made.C, made.D), made.dt, [], made.affine, uncertainty=made.uncertainty)
             confirm_loop(cut, closed.A, wires, self.diagram.name)
         return made
@@ -233,6 +250,7 @@ def _linearize(
     plants: str | None,
     step: float | Fraction | None,
     loop: str = "",
+    frozen: frozenset[TickPattern] = NONE,
 ) -> Linearization:
     if step is not None and exact_time(step, block=diagram.name) != at.base and (diagram.has_clock or diagram.has_fmu):
         raise OptionError(
@@ -253,11 +271,11 @@ def _linearize(
         if loop:
             _check_loop(flat, local, at)
         if loop and period_of(flat) > 1:
-            model, channels = model_loop(flat, local, at, plants, lifted=loop == "lifted")
+            model, channels = model_loop(flat, local, at, plants, lifted=loop == "lifted", frozen=frozen)
         else:
-            model = model_period(flat, local, at, plants)
+            model = model_period(flat, local, at, plants, frozen)
     else:
-        model = _model_continuous(diagram, flat, local, at, plants)
+        model = model_continuous(diagram, flat, local, at, plants)
     A, B, C, D = model.matrices
     n, ins, outs = len(A), *(tuple(e for s in group for e in s.labels) for group in found[:2])
     if channels:
@@ -320,48 +338,6 @@ def _check_opening(flat: FlatDiagram, signal: Signal) -> None:
         f"found nothing wired to it; expected a wire to cut at {signal.name!r}. Name a wire that closes a loop.",
         block=signal.port[0],
         port=signal.port[1],
-    )
-
-
-def _model_continuous(
-    diagram: WiredDiagram, flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint, plants: str | None
-) -> Model:
-    """Return the model of a diagram without sampling."""
-    J = local.differentiate(NONE, at.t, at.x, at.w)
-    models = model_equations(flat, at, plants)
-    xc = flat.continuous
-    Ap, Bp, Cp, Dp = (join_matrices(flat, models, which) for which in "ABCD")
-    # w = Cp xp + Dp z, z = Zx x + Zw w + Zd d
-    loop = np.eye(len(at.w)) - Dp @ J["z", "w"]
-    if loop.size and not np.linalg.cond(loop) < 1e12:
-        raise OptionError(
-            "found a loop through the FMU's feedthrough without a unique solution; expected one. Wire an output "
-            "without feedthrough, or linearize over a step, step=….",
-            block=diagram.name,
-        )
-    zx = J["z", "x"][:, xc]
-    w_of = {k: np.linalg.solve(loop, v) for k, v in (("x", Dp @ zx), ("p", Cp), ("d", Dp @ J["z", "d"]))}
-    z_of = {
-        "x": zx + J["z", "w"] @ w_of["x"],
-        "p": J["z", "w"] @ w_of["p"],
-        "d": J["z", "d"] + J["z", "w"] @ w_of["d"],
-    }
-
-    def eliminate_w(quantity: str) -> list[np.ndarray]:
-        by_w = J[quantity, "w"]
-        return [J[quantity, "x"][:, xc] + by_w @ w_of["x"], by_w @ w_of["p"], J[quantity, "d"] + by_w @ w_of["d"]]
-
-    fx, fp, fd = eliminate_w("dx")
-    yx, yp, yd = eliminate_w("y")
-    A = np.block([[fx, fp], [Bp @ z_of["x"], Ap + Bp @ z_of["p"]]])
-    B = np.vstack([fd, Bp @ z_of["d"]])
-    return Model(
-        (A, B, np.hstack([yx, yp]), yd),
-        0.0,
-        flat.continuous_labels + states_of(models),
-        np.concatenate([J["dx"], *(m.f for m in models)]),
-        {m.path: m.derivation for m in models},
-        max((m.uncertainty for m in models), default=0.0),
     )
 
 

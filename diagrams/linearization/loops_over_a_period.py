@@ -5,31 +5,28 @@ in the period, at its beginning. The period of a loop therefore begins at a tick
 
 A signal of its own is injected at every tick. Ticks between which the wire stays the same make one channel; a channel
 that nothing on the loop uses is left out. A wire that is renewed once has one channel, and L. A wire that is renewed N
-times has a periodic loop: no L at one rate, but a lifted L of N × N.
+times has a periodic loop: no L at one rate, but a lifted L of N × N, with a channel for each renewal.
+
+The loop of a fast wire with the slow loops open needs no lifting: the clocks slower than the wire's are frozen, and the
+period is that of the others.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, WiringError
-from ..flat import FlatDiagram, TickPattern
+from ...blocks.core import ConfirmationError, OptionError, PeriodicLoopError
+from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
-from .derivatives import LocalDerivatives
-from .over_a_period import Chain, Model, find_needed, own_states, ticks_of_period
+from .derivatives import LocalDerivatives, Signal
+from .over_a_period import Chain, Model, find_needed, own_states, period_of, ticks_of_period
 
 SAME_ROWS = 1e-12
 """Relative difference up to which a wire counts as unchanged from one tick to the next."""
 SAME_POLES = 1e-6
 """Relative difference up to which two characteristic polynomials count as the same."""
-
-
-def period_of(flat: FlatDiagram) -> int:
-    """Return the least common period of all clocks, in ticks of the base."""
-    return math.lcm(*(clock.every for clock in flat.distinct)) if flat.distinct else 1
 
 
 def ticks_to_renewal(flat: FlatDiagram, ports: Iterable[tuple[str, str]], tick: int) -> int:
@@ -38,15 +35,42 @@ def ticks_to_renewal(flat: FlatDiagram, ports: Iterable[tuple[str, str]], tick: 
     A wire is renewed at the ticks of the clock behind its source. A wire that follows continuous states or an FMU is
     renewed at the ticks of the clock of its readers.
     """
+    clock = _find_one_clock(flat, list(ports))
+    return 0 if clock is None or clock.acts(tick) else clock.after(tick) - tick
+
+
+def find_slower_clocks(flat: FlatDiagram, ports: Iterable[tuple[str, str]], name: str) -> frozenset[TickPattern]:
+    """Return the clocks that are slower than the wires: than the fastest clock behind their sources, or their readers.
+
+    Raises
+    ------
+    OptionError
+        If no sampled subsystem makes or reads a wire.
+    """
+    ports = list(ports)
+    for reading in (False, True):
+        found = [_find_clocks(flat, port, reading=reading) for port in ports]
+        if all(found):
+            every = min(clock.every for clocks in found for clock in clocks or ())
+            return frozenset(clock for clock in flat.distinct if clock.every > every)
+    raise OptionError(
+        f"found no sampled subsystem that makes or reads {', '.join('.'.join(port) for port in ports)} alone; expected "
+        "one, whose rate tells the slower loops. Take the loop at a wire of a sampled subsystem.",
+        block=name,
+        port="slow",
+    )
+
+
+def _find_one_clock(flat: FlatDiagram, ports: Sequence[tuple[str, str]]) -> TickPattern | None:
+    """Return the one clock behind the sources of all wires, or else that of all their readers; None without one."""
     for reading in (False, True):
         found: set[TickPattern] | None = set()
         for port in ports:
             clocks = _find_clocks(flat, port, reading=reading)
             found = None if clocks is None or found is None else found | clocks
         if found is not None and len(found) == 1:
-            (clock,) = found
-            return 0 if clock.acts(tick) else clock.after(tick) - tick
-    return 0
+            return next(iter(found))
+    return None
 
 
 def _find_clocks(flat: FlatDiagram, port: tuple[str, str], *, reading: bool) -> set[TickPattern] | None:
@@ -91,35 +115,39 @@ def advance_point(flat: FlatDiagram, at: OperatingPoint, way: str | None, count:
 
 
 def model_loop(
-    flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint, way: str | None, *, lifted: bool
+    flat: FlatDiagram,
+    local: LocalDerivatives,
+    at: OperatingPoint,
+    way: str | None,
+    *,
+    lifted: bool,
+    frozen: frozenset[TickPattern] = NONE,
 ) -> tuple[Model, list[str]]:
     """Return the model from the injected to the returning signals at the same wires, and the names of its channels.
 
     Raises
     ------
-    WiringError
+    PeriodicLoopError
         If a wire is renewed, and used, several times in the period, unless ``lifted``.
     """
-    period, m = period_of(flat), local.n_inputs
-    chain = Chain(flat, local, at, way)
-    for k, following in ticks_of_period(flat, at.tick, period):
+    period, m = period_of(flat, frozen), local.n_inputs
+    chain = Chain(flat, local, at, way, frozen)
+    ticks = list(ticks_of_period(flat, at.tick, period))
+    for k, following in ticks:
         chain.go(k, following - k)
     A, B, C, D = _model_each_tick(chain)
     plants = set(range(flat.width, flat.width + chain.n_p))
-    keep = find_needed(A, C, own_states(flat), plants)
+    keep = find_needed(A, C, own_states(flat, frozen), plants)
     names, labels = chain.labels, [e for s in local.inputs for e in s.labels]
     A, B, C = A[np.ix_(keep, keep)], B[keep], C[:, keep]
     groups = _find_channels(A, B, C, D, m)
     many = [e for e in range(m) if len(groups[e]) > 1]
     if many and not lifted:
         signal = next(s for s in local.inputs if labels[many[0]] in s.labels)
-        raise WiringError(
-            f"{signal.name!r} is renewed {len(groups[many[0]])} times in the model's period of "
-            f"{float(flat.base * period):g} s; expected once: its loop is periodic and has no L at one rate. Take "
-            "loop(…, lifted=True), with one channel for each renewal, or a wire that is renewed once.",
-            block=signal.port[0],
-            port=signal.port[1],
-        )
+        raise _make_error(signal, len(groups[many[0]]), float(flat.base * period))
+    if many:  # all renewals, so that a delay of one is a shift by one channel
+        renewals = _find_renewals(flat, local.inputs, [k for k, _ in ticks])
+        groups = [renewals if renewals and len(group) > 1 else group for group in groups]
     chosen = [(e, j, group) for e in range(m) for j, group in enumerate(groups[e])]
     into = np.zeros((B.shape[1], len(chosen)))
     for column, (e, _, group) in enumerate(chosen):
@@ -134,6 +162,31 @@ def model_loop(
         chain.uncertainty,
     )
     return model, [f"{labels[e]}@{j}" if len(groups[e]) > 1 else labels[e] for e, j, _ in chosen]
+
+
+def _make_error(signal: Signal, count: int, period: float) -> PeriodicLoopError:
+    return PeriodicLoopError(
+        f"{signal.name!r} is renewed {count} times in the model's period of {period:g} s; expected once: its loop is "
+        f"periodic and has no L at one rate. Take loop({signal.name!r}, slow='open') for the loop at its own rate, "
+        "with slower subsystems holding; with all loops closed take "
+        f"periodic_margins(loop({signal.name!r}, lifted=True)).",
+        block=signal.port[0],
+        port=signal.port[1],
+    )
+
+
+def _find_renewals(flat: FlatDiagram, signals: Sequence[Signal], ticks: Sequence[int]) -> list[list[int]]:
+    """Return the groups of places in ``ticks`` between the renewals of the wires; empty if no one clock renews them."""
+    clock = _find_one_clock(flat, [signal.port for signal in signals])
+    if clock is None or not clock.acts(ticks[0]):
+        return []
+    groups: list[list[int]] = []
+    for place, k in enumerate(ticks):
+        if clock.acts(k):
+            groups.append([place])
+        else:
+            groups[-1].append(place)
+    return groups
 
 
 def _model_each_tick(chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...blocks.core import Block, left_of
 from ...fmus.running import Derivation
-from ..flat import NONE, FlatDiagram
+from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
 from .derivatives import LocalDerivatives, Numbers, Signal
 from .findings import EventWithinPeriod, Finding, MemoryActs, UnusualStart
@@ -44,15 +44,26 @@ class Model:
     findings: tuple[Finding, ...] = ()
 
 
-def model_period(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint, way: str | None) -> Model:
-    """Return the model over the least common period of all clocks."""
-    period = math.lcm(*(clock.every for clock in flat.distinct)) if flat.distinct else 1
-    chain = Chain(flat, local, at, way)
+def period_of(flat: FlatDiagram, frozen: frozenset[TickPattern] = NONE) -> int:
+    """Return the least common period of all clocks that are not frozen, in ticks of the base."""
+    return math.lcm(*(clock.every for clock in flat.distinct if clock not in frozen))
+
+
+def model_period(
+    flat: FlatDiagram,
+    local: LocalDerivatives,
+    at: OperatingPoint,
+    way: str | None,
+    frozen: frozenset[TickPattern] = NONE,
+) -> Model:
+    """Return the model over the least common period of all clocks; those that are frozen do not act."""
+    period = period_of(flat, frozen)
+    chain = Chain(flat, local, at, way, frozen)
     for k, following in ticks_of_period(flat, at.tick, period):
         chain.go(k, following - k)
     A, B = chain.M, chain.N
     names = chain.labels
-    keep = find_needed(A, chain.C, own_states(flat), set(range(flat.width, flat.width + chain.n_p)))
+    keep = find_needed(A, chain.C, own_states(flat, frozen), set(range(flat.width, flat.width + chain.n_p)))
     memory, findings = _find_memory(flat, A, names)
     findings += chain.findings(at.tick + period)
     A, B, C = A[np.ix_(keep, keep)], B[keep], chain.C[:, keep]
@@ -84,11 +95,18 @@ class Chain:
 
     M and N lead from the state just before the first tick, and from the injected signals, to the state just before the
     tick that is reached. C and D lead to the signals that are measured at the first tick. ``steps`` holds the four
-    matrices of each tick.
+    matrices of each tick. Clocks that are ``frozen`` do not act: their subsystems hold outputs and states.
     """
 
-    def __init__(self, flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint, way: str | None):
-        self.flat, self.local, self.way = flat, local, way
+    def __init__(
+        self,
+        flat: FlatDiagram,
+        local: LocalDerivatives,
+        at: OperatingPoint,
+        way: str | None,
+        frozen: frozenset[TickPattern] = NONE,
+    ):
+        self.flat, self.local, self.way, self.frozen = flat, local, way, frozen
         self.first = self.here = at
         self.models: Sequence[PlantModel] = ()
         self.derivations: dict[str, Derivation] = {}
@@ -103,7 +121,7 @@ class Chain:
     def go(self, k: int, count: int) -> None:
         """Go from tick ``k`` to the tick ``count`` base periods later."""
         flat, here, h = self.flat, self.here, float(self.flat.base * count)
-        tick = self.local.differentiate(flat.acting(k), here.t, here.x, here.w)
+        tick = self.local.differentiate(flat.acting(k) - self.frozen, here.t, here.x, here.w)
         models = self.models = self._model_plants(tick["z"], h)
         Ap, Bp, Cp, Dp = (join_matrices(flat, models, which) for which in "ABCD")
         nx, nz, n_p = flat.width, flat.plant_inputs.total, len(Ap)
@@ -195,7 +213,9 @@ class Chain:
         """Return the events within the period, and a start whose tick is unlike the tick ``last``."""
         findings = list(dict.fromkeys(self._fired))
         if self.first.tick == 0 and np.max(np.abs(self.affine()), initial=0.0) <= EQUILIBRIUM:
-            later = self.local.differentiate(self.flat.acting(last), self.here.t, self.here.x, self.here.w)
+            later = self.local.differentiate(
+                self.flat.acting(last) - self.frozen, self.here.t, self.here.x, self.here.w
+            )
             pairs = [(self._first_tick[e, a], later[e, a]) for e in "xzy" for a in "xwd"]
             if any(np.max(np.abs(a - b), initial=0.0) > 1e-9 * (1 + np.max(np.abs(b), initial=0.0)) for a, b in pairs):
                 findings.append(UnusualStart())
@@ -306,13 +326,19 @@ def _is_moving(flat: FlatDiagram, signal: Signal) -> bool:
 # --- states of the model ---------------------------------------------------------------------------------------------
 
 
-def own_states(flat: FlatDiagram) -> set[int]:
+def own_states(flat: FlatDiagram, frozen: frozenset[TickPattern] = NONE) -> set[int]:
     """Return the numbers of the states of blocks that are states of the model.
 
-    Modes that only events change, and states from which a block in continuous time only starts a search, are not.
+    Modes that only events change, states from which a block in continuous time only starts a search, and states of
+    frozen clocks are not.
     """
     table = flat.table
-    sampled = flat.states.entries(path for path in flat.states.slices if table.is_sampled(table.subsystem_of[path]))
+
+    def acts(path: str) -> bool:
+        subsystem = table.subsystem_of[path]
+        return table.is_sampled(subsystem) and flat.clocks.get(subsystem) not in frozen
+
+    sampled = flat.states.entries(path for path in flat.states.slices if acts(path))
     return {*flat.continuous.tolist(), *sampled}
 
 

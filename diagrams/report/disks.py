@@ -4,32 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ...blocks.core import LoopwrightError
+from ...blocks.core import LoopwrightError, PeriodicLoopError
 from ..document import Section, Table
 from ..frequency import DiskMargin, Number, mimo_disk_margin
 from .case import Case
-from .uncertainty import LoopPart
-from .variant import Variant
+from .uncertainty import LoopPart, cut_key
+from .variant import Cut, Variant
 
 
 def several(case: Case, key: str, wire: str) -> LoopPart | None:
     """Return the section about a wire with several entries: its MIMO disk margin; None where it has none."""
-    own: dict[Variant, Mapping[str, Number]] = {}
+    own: dict[tuple[Variant, Cut], Mapping[str, Number]] = {}
     rows, notes = [], []
     for v in case.usable():
+        cut, title = Cut.PLAIN, v.title
         try:
-            disk = mimo_disk_margin(v.loop(wire))
+            try:
+                L = v.loop(wire)
+            except PeriodicLoopError:
+                cut, title = Cut.SLOW_OPEN, f"{v.title}, slow loops open"
+                L = v.loop(wire, cut=cut)
+            disk = mimo_disk_margin(L)
         except LoopwrightError as error:
             notes.append(f"{v.title}: {error.message}")
             continue
-        own[v] = disk_numbers(disk)
-        rows.append((v.title, disk.alpha, disk.frequency, disk_range(disk)))
+        own[v, cut] = disk_numbers(disk)
+        rows.append((title, disk.alpha, disk.frequency, disk_range(disk)))
     if not rows:
         return None
     table = Table(
         f"MIMO disk margin at {wire}", ("variant", "α", "at", "gains and phase of all entries at once"), tuple(rows)
     )
-    numbers = {f"{v.key}.{name}": number for v, mine in own.items() for name, number in mine.items()}
+    numbers = {f"{cut_key(*at)}.{name}": number for at, mine in own.items() for name, number in mine.items()}
     return LoopPart(Section(key, f"Loops at {wire}", tuple(notes), (table,), (), numbers), own)
 
 

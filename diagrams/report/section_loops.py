@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError
+from ...blocks.core import LoopwrightError, PeriodicLoopError
 from ..document import Section, Table, Texts
-from ..frequency import Comparison, Margins, Number, Realization, compare_margins, margins
+from ..frequency import (
+    Comparison,
+    Margins,
+    Number,
+    PeriodicMargins,
+    Realization,
+    compare_margins,
+    margins,
+    periodic_margins,
+)
 from . import plots as figures
 from .case import Case
 from .disks import several
-from .uncertainty import LoopPart, left_out, widened
-from .variant import Variant, in_s
+from .uncertainty import LoopPart, cut_key, left_out, widened
+from .variant import Cut, Variant, in_s
 from .wires import blocks_on_loops
 
 TEXTS = Texts(__package__, "loops")
@@ -32,6 +42,7 @@ ROWS: Mapping[str, str] = {
     "mt_frequency": "M_t at",
     "bandwidth": "bandwidth",
 }
+PERIODIC = frozenset(f.name for f in fields(PeriodicMargins))
 
 
 def inner(case: Case) -> Section:
@@ -49,43 +60,67 @@ def inner(case: Case) -> Section:
 
 
 def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
-    own: dict[Variant, Mapping[str, Number]] = {}
+    own: dict[tuple[Variant, Cut], Mapping[str, Number]] = {}
     found: dict[str, Margins] = {}
     loops: dict[str, Any] = {}
+    titles: dict[str, str] = {}
+    designs: list[str] = []
+    periodic: dict[str, PeriodicMargins] = {}
     notes: list[str] = []
     numbers: dict[str, Number] = {}
     beside: list[tuple[Any, ...]] = []
     for v in case.usable():
+        cut, title = Cut.PLAIN, v.title
         try:
-            L = v.loop(wire)
+            try:
+                L = v.loop(wire)
+            except PeriodicLoopError:
+                cut, title = Cut.SLOW_OPEN, f"{v.title}, slow loops open"
+                L = v.loop(wire, cut=cut)
             if L.ninputs > 1:
                 return several(case, key, wire)
             m = margins(L)
         except LoopwrightError as error:
             notes.append(f"{v.title}: {error.message}")
             continue
-        found[v.key], loops[v.key] = m, L
-        own[v] = _numbers(m)
-        numbers |= {f"{v.key}.{name}": number for name, number in own[v].items()}
+        at = cut_key(v, cut)
+        found[at], loops[at], titles[at] = m, L, title
+        designs += [at] if v.is_design else []
+        own[v, cut] = _numbers(m)
+        numbers |= {f"{at}.{name}": number for name, number in own[v, cut].items()}
         if m.hidden_unstable:
             shown = _poles(m.hidden_unstable, L.dt)
-            notes.append(TEXTS.line("hidden_unstable", variant=v.title, poles=shown))
+            notes.append(TEXTS.line("hidden_unstable", variant=title, poles=shown))
+        if cut is Cut.SLOW_OPEN:
+            try:
+                p = periodic_margins(v.loop(wire, cut=Cut.PERIODIC))
+            except LoopwrightError as error:
+                notes.append(f"{v.title}: {error.message}")
+            else:
+                periodic[v.title] = p
+                own[v, Cut.PERIODIC] = _periodic_numbers(p)
+                where = cut_key(v, Cut.PERIODIC)
+                numbers |= {f"{where}.{name}": number for name, number in own[v, Cut.PERIODIC].items()}
+                if not p.stable:
+                    shown = _poles(p.unstable_poles, p.dt)
+                    notes.append(TEXTS.line("unstable", variant=v.title, poles=shown))
         if not m.stable:
-            notes.append(TEXTS.line("unstable", variant=v.title, poles=_poles(m.unstable_poles, L.dt)))
+            notes.append(TEXTS.line("unstable", variant=title, poles=_poles(m.unstable_poles, L.dt)))
         elif v.is_design:
             try:
                 with np.errstate(all="ignore"):
                     r = Realization.of(L)
                     rows = compare_margins(r, m, _as_control(r))
             except (LoopwrightError, np.linalg.LinAlgError, ArithmeticError, ValueError) as error:
-                notes.append(TEXTS.line("not_compared", variant=v.title, error=str(error)))
+                notes.append(TEXTS.line("not_compared", variant=title, error=str(error)))
                 continue
             for c in rows:
-                numbers[f"{v.key}.control.{c.name}"] = _theirs(m, c)
-                beside.append((v.title, c.name, c.value, c.control, c.function, c.right, c.why))
+                numbers[f"{at}.control.{c.name}"] = _theirs(m, c)
+                beside.append((title, c.name, c.value, c.control, c.function, c.right, c.why))
     if not found:
         return None
-    titles = {v.key: v.title for v in case.usable()}
+    if periodic:
+        notes += TEXTS.paragraphs("periodic", wire=wire)
     tables = [
         Table(
             f"Margins at {wire}",
@@ -103,10 +138,12 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
             "Multiple poles scatter, as ε^(1/multiplicity).",
         ),
     ]
+    if periodic:
+        tables.append(_periodic_table(wire, periodic))
     if beside:
         columns = ("variant", "number", "here", "python-control", "its function", "right", "why")
         tables.append(Table("Beside python-control's own values", columns, tuple(beside)))
-    plain = {v.key: loops[v.key] for v in case.designs() if v.key in loops}
+    plain = {at: loops[at] for at in designs}
     plots = (
         figures.bode(f"inner_{key}_bode", wire, plain, found, titles),
         figures.nyquist(f"inner_{key}_nyquist", wire, plain, found, titles),
@@ -132,6 +169,19 @@ def _numbers(m: Margins) -> dict[str, Number]:
             found[f"{kind}_{i}.frequency"] = c.frequency
             found[f"{kind}_{i}.{margin}"] = getattr(c, margin)
     return found
+
+
+def _periodic_numbers(p: PeriodicMargins) -> dict[str, Number]:
+    """Return the numbers of a periodic loop by the ends of their paths."""
+    return {**p.numbers(), "stable": Number(float(p.stable), "1", 0.0, "closed-loop eigenvalues of the lifted system")}
+
+
+def _periodic_table(wire: str, periodic: Mapping[str, PeriodicMargins]) -> Table:
+    """Return the margins of a wire with all loops closed, one factor at all its renewals."""
+    names = {**ROWS, "disk_frequency": "disk margin at"}
+    rows = [(text, *(p.numbers()[name] for p in periodic.values())) for name, text in names.items() if name in PERIODIC]
+    renewals = ("renewals in a period", *(f"{p.renewals} in {p.dt:g} s" for p in periodic.values()))
+    return Table(f"Periodic loop at {wire}, all loops closed", ("", *periodic), (*rows, renewals))
 
 
 def _as_control(r: Realization) -> Any:

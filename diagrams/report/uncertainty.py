@@ -15,7 +15,7 @@ from ..document import Section, Table, Texts
 from ..frequency import Number, margins
 from ..linearization import StepsOnly, linearize
 from .case import Case
-from .variant import Variant
+from .variant import Cut, Variant
 
 PEAKS = ("ms", "mt")
 """The numbers that say how much an error of L is amplified."""
@@ -63,12 +63,17 @@ class LoopPart:
     ----------
     section : Section
         The section.
-    numbers : mapping of Variant to mapping of str to Number
-        Those of its numbers that come from each variant's linear model, by path behind the variant's key.
+    numbers : mapping of (Variant, Cut) to mapping of str to Number
+        Those of its numbers that come from each variant's loop, by path behind the key of `cut_key`.
     """
 
     section: Section
-    numbers: Mapping[Variant, Mapping[str, Number]]
+    numbers: Mapping[tuple[Variant, Cut], Mapping[str, Number]]
+
+
+def cut_key(v: Variant, cut: Cut) -> str:
+    """Return the part of dotted paths of a variant's loop, such as ``sampled_d0`` or ``sampled_d0.periodic``."""
+    return f"{v.key}.{cut}" if cut else v.key
 
 
 def widened(wire: str, part: LoopPart) -> Section:
@@ -80,13 +85,13 @@ def widened(wire: str, part: LoopPart) -> Section:
     """
     changed: dict[int, Number] = {}
     numbers, text = dict(part.section.numbers), list(part.section.text)
-    for v, own in part.numbers.items():
+    for (v, cut), own in part.numbers.items():
         if all(derivation.is_exact for derivation in v.model.derivations.values()):
             continue
         w = [n.value for n in own.values() if n.unit == "rad/s" and 0 < n.value < math.inf]
         if not w:
             continue
-        error, said = _relative_error(v, wire, np.unique(w))
+        error, said = _relative_error(v, wire, cut, np.unique(w))
         text += [f"{v.title}: {said}"] if said else []
         peaks = [own[name].value for name in PEAKS if name in own and math.isfinite(own[name].value)]
         slopes = 1.0 + 2.0 * max([1.0, *peaks])
@@ -95,7 +100,7 @@ def widened(wire: str, part: LoopPart) -> Section:
             if more > n.tolerance:
                 why = f"{n.confirmed_by}; tolerance: its FMUs' linear models are right to {error:.1e} of L"
                 new = replace(n, tolerance=more, confirmed_by=why)
-                changed[id(n)] = numbers[f"{v.key}.{name}"] = new
+                changed[id(n)] = numbers[f"{cut_key(v, cut)}.{name}"] = new
     tables = tuple(_renewed(table, changed) for table in part.section.tables)
     return replace(part.section, numbers=numbers, tables=tables, text=tuple(text))
 
@@ -110,9 +115,9 @@ def _floor(n: Number, error: float) -> float:
     return 0.0 if whole else error * abs(n.value)
 
 
-def _relative_error(v: Variant, wire: str, w: np.ndarray) -> tuple[float, str]:
+def _relative_error(v: Variant, wire: str, cut: Cut, w: np.ndarray) -> tuple[float, str]:
     """Return the largest relative error of L at frequencies, and what is to be said of it."""
-    L = v.loop(wire)
+    L = v.loop(wire, cut=cut)
     points = np.exp(1j * w * L.dt) if L.dt else 1j * w
     nominal = [_response(L, p) for p in points]
     sizes = [np.linalg.norm(n) or 1.0 for n in nominal]
@@ -130,7 +135,7 @@ def _relative_error(v: Variant, wire: str, w: np.ndarray) -> tuple[float, str]:
     if not any(d.method is DerivativeMethod.STEP_DIFFERENCES for d in v.model.derivations.values()):
         return error, ""
     try:
-        held = linearize(v.diagram, v.point, plants="equations").loop(wire)
+        held = cut.loop(linearize(v.diagram, v.point, plants="equations"), wire)
     except LoopwrightError:
         return error, TEXTS.line("no_equations")
     solver = off(held)

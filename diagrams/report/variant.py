@@ -48,6 +48,23 @@ _WORDS = {
 }
 
 
+class Cut(StrEnum):
+    """A way in which a loop is cut; the value of all but the plain one stands in dotted paths."""
+
+    PLAIN = ""
+    """All other loops closed, L at one rate."""
+    SLOW_OPEN = "slow_open"
+    """The loops of slower subsystems open."""
+    PERIODIC = "periodic"
+    """All other loops closed, with a channel for each renewal of the wire."""
+
+    def loop(self, model: Linearization, *wires: str) -> Any:
+        """Return the loop transfer function of a linear model at wires."""
+        if self is Cut.SLOW_OPEN:
+            return model.loop(*wires, slow="open")
+        return model.loop(*wires, lifted=self is Cut.PERIODIC)
+
+
 @dataclass(eq=False)
 class Variant:
     """A diagram that is analysed: itself, without sampling, with a delay.
@@ -85,7 +102,7 @@ class Variant:
     source: WiredDiagram | None = None
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
-    _loops: dict[tuple[str, ...], Any] = field(default_factory=dict, repr=False)
+    _loops: dict[tuple[Any, ...], Any] = field(default_factory=dict, repr=False)
 
     @cached_property
     def point(self) -> OperatingPoint:
@@ -97,11 +114,11 @@ class Variant:
         """Its linear model."""
         return linearize(self.diagram, self.point, inputs=self.inputs, outputs=self.outputs)
 
-    def loop(self, *wires: str) -> Any:
+    def loop(self, *wires: str, cut: Cut = Cut.PLAIN) -> Any:
         """Return the loop transfer function at wires, computed once."""
-        if wires not in self._loops:
-            self._loops[wires] = self.model.loop(*wires)
-        return self._loops[wires]
+        if (wires, cut) not in self._loops:
+            self._loops[wires, cut] = cut.loop(self.model, *wires)
+        return self._loops[wires, cut]
 
     @property
     def rests(self) -> bool:

@@ -7,6 +7,7 @@ import scipy.optimize
 from loopwright.blocks import PID, Constant, Gain, Integrator, TransferFunction
 from loopwright.blocks.core.errors import ConfirmationError, WiringError
 from loopwright.diagrams import Diagram, margins, subsystem
+from loopwright.diagrams.document.definitions import definition
 from loopwright.diagrams.linearization.loops_over_a_period import confirm_loop
 from loopwright.diagrams.linearization.over_a_period import Model
 
@@ -125,13 +126,22 @@ def test_an_injection_at_a_box_with_an_offset_measures_the_loop():
 
 
 @pytest.mark.slow
-def test_a_report_says_why_a_periodic_wire_has_no_margins_and_is_not_injected_into():
+def test_a_report_has_the_margins_of_a_periodic_wire_with_slow_loops_open_and_closed_and_does_not_inject_there():
     report = cascade().report(only=("inner", "injection"))
     text = [line for s in report.sections for line in (*s.text, *(t for part in s.sections for t in part.text))]
     assert sum("'current_loop.voltage' is renewed 5 times" in line for line in text) >= 2
+    assert sum("the loop is periodic" in line for line in text) == 1
     numbers = report.numbers()
     assert "inner.voltage.sampled_d0.gain_margin_high" not in numbers
     assert not [name for name in numbers if name.startswith("injection.voltage")]
+    assert numbers["inner.voltage.sampled_d0.periodic.gain_margin_high"].value == pytest.approx(
+        limit(lambda k: cascade(inner=k)), rel=1e-8
+    )
+    alone = margins(cascade().linearize().loop("voltage", slow="open")).numbers()
+    for name in ("gain_margin_high", "phase_margin_deg", "disk_margin"):
+        assert numbers[f"inner.voltage.sampled_d0.slow_open.{name}"].value == pytest.approx(alone[name].value, rel=1e-9)
+        assert definition(f"inner.voltage.sampled_d0.periodic.{name}")[0] == name
+        assert definition(f"inner.voltage.sampled_d0.slow_open.control.{name}")[0] == "control"
     assert numbers["inner.reference.sampled_d0.gain_margin_high"].value == pytest.approx(
         limit(lambda k: cascade(outer=k)), rel=1e-8
     )

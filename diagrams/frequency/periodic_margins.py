@@ -1,0 +1,359 @@
+"""Margins of a periodic loop: one static factor on a wire that is renewed several times in the period.
+
+The loop is lifted: L is N × N, with a channel for each of the N renewals, and one factor f multiplies all of them. The
+closed loop has a pole at z = e^(jθ) where −1/f is an eigenvalue of L(e^(jθ)). The factors that destabilize are curves
+in the complex plane, F = {−1/λ(L(e^(jθ)))}, and a margin is a distance to them. Closed-loop eigenvalues of the lifted
+system find the limits of gain, rotation and delay, and confirm the disk margin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...blocks.core import ConfirmationError, ParameterError
+from .confirm import confirm_limit, confirm_no_limit, refuse_singular
+from .disk import disk_gains, sensitivity_at
+from .features import SIDES
+from .number import Number
+from .one_thread import on_one_thread
+from .realization import Realization
+
+if TYPE_CHECKING:
+    from .state_space import LinearSystem
+
+EIGENVALUES = "closed-loop eigenvalues of the lifted system"
+LARGEST = 1e4
+"""Largest gain at which a limit is looked for, and reciprocal of the smallest."""
+SMALLEST_STEP = 1e-3
+"""Least relative step of the search for a limit."""
+RENEWALS = 100
+"""Most renewals of delay that are tried."""
+INSIDE = 1e-3
+"""Relative distance from the disk's rim at which closed-loop eigenvalues are looked at."""
+ON_RIM = 180
+"""Factors on the upper half of the disk's rim at which they are looked at."""
+
+
+@dataclass(frozen=True)
+class PeriodicMargins:
+    """Margins of a periodic loop, of one static factor on the wire; those of an unstable closed loop are NaN.
+
+    Parameters
+    ----------
+    stable : bool
+        Whether all of `closed_loop_poles` are stable.
+    gain_margin_low, gain_margin_high : Number
+        Largest factor below 1, and smallest above 1, that ends stability; 0 and infinity where there is none.
+    phase_margin_deg : Number
+        Smallest angle φ, to either side, for which the factor e^(jφ) ends stability; infinite where none does.
+    delay_margin_samples, delay_margin_s : Number
+        Whole renewals of delay on the wire that the loop bears, and the time that they take; one more ends stability.
+    disk_margin : Number
+        Smallest α for which a factor (1 + δ/2)/(1 − δ/2), |δ| = α, ends stability. For a loop with one renewal in
+        the period it is that of `disk_margin`.
+    disk_frequency : Number
+        Frequency θ/T of the closed-loop pole that this factor puts on the limit, T the period.
+    destabilizing : complex
+        The factor.
+    closed_loop_poles : tuple of complex
+        Poles z over the period.
+    renewals : int
+        Renewals of the wire in the period.
+    dt : float
+        The period in s.
+    """
+
+    stable: bool
+    gain_margin_low: Number
+    gain_margin_high: Number
+    phase_margin_deg: Number
+    delay_margin_samples: Number
+    delay_margin_s: Number
+    disk_margin: Number
+    disk_frequency: Number
+    destabilizing: complex
+    closed_loop_poles: tuple[complex, ...]
+    renewals: int
+    dt: float
+
+    def numbers(self) -> dict[str, Number]:
+        """Return the single numbers by name."""
+        found = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {name: value for name, value in found.items() if isinstance(value, Number)}
+
+    @property
+    def unstable_poles(self) -> tuple[complex, ...]:
+        """The closed-loop poles z that are not stable; empty for a stable loop."""
+        return () if self.stable else tuple(p for p in self.closed_loop_poles if abs(p) >= 1.0 - 1e-12)
+
+    def __str__(self) -> str:
+        if self.stable:
+            return "\n".join(f"{name:22s}{number}" for name, number in self.numbers().items())
+        poles = ", ".join(f"{p:.6g}" for p in self.unstable_poles)
+        return (
+            "unstable: the closed loop has no margins\n"
+            f"unstable_poles        z = {poles} over the period of {self.dt:g} s (stable: |z| < 1)"
+        )
+
+
+@on_one_thread
+def periodic_margins(loop: LinearSystem) -> PeriodicMargins:
+    """Return the margins of a periodic loop, each confirmed by closed-loop eigenvalues of the lifted system.
+
+    All slower and faster loops are closed. A factor stays the same at all renewals: a gain, a rotation, or any factor
+    of the disk. For the loop with the slower loops open take `margins` of ``loop(wire, slow="open")``.
+
+    Parameters
+    ----------
+    loop : control.StateSpace
+        Lifted loop of one wire, ``Linearization.loop(wire, lifted=True)``: N × N, a channel for each renewal, sampled
+        with the period.
+
+    Raises
+    ------
+    ConfirmationError
+        If a number and its confirmation disagree.
+    ParameterError
+        If the loop is not sampled, not square, of several wires, without states, or without a unique solution when it
+        is closed.
+
+    Examples
+    --------
+    >>> import control
+    >>> D = [[0.0, 0.0], [0.4, 0.0]]  # x⁺ = x + 0.4 u, over two renewals
+    >>> lifted = control.ss([[1.0]], [[0.4, 0.4]], [[1.0], [1.0]], D, 0.2)
+    >>> round(periodic_margins(lifted).gain_margin_high.value, 9)
+    5.0
+    """
+    r = Realization.of(loop)
+    n, wires = len(r.D), {str(name).rpartition("@")[0] for name in getattr(loop, "input_labels", ())}
+    if len(wires) > 1:  # a delay of one renewal is a shift by one channel
+        raise ParameterError(
+            f"found channels of {len(wires)} wires or entries, {', '.join(sorted(wires))}; expected one. Take the loop "
+            "of one entry, loop('motor_force[0]', lifted=True).",
+            block="periodic_margins",
+        )
+    if not r.dt or r.D.shape != (n, n) or not r.order:
+        raise ParameterError(
+            f"found a loop of shape {r.D.shape} with dt = {r.dt:g} and {r.order} states; expected a sampled square one "
+            "with states, a channel for each renewal of a wire. Take Linearization.loop(wire, lifted=True).",
+            block="periodic_margins",
+        )
+    if not np.linalg.cond(np.eye(n) + r.D) < 1e12:
+        raise ParameterError(
+            "found a loop without a unique solution when it is closed; expected a direct feedthrough D with I + D "
+            "regular. Look at the feedthrough of the loop.",
+            block="periodic_margins",
+        )
+    with refuse_singular("periodic_margins"):
+        return PeriodicMarginFinder(r).find_margins()
+
+
+class PeriodicMarginFinder:
+    """Factors that destabilize a lifted loop, on a grid of θ; each ``_find_…`` computes and confirms margins.
+
+    Parameters
+    ----------
+    r : Realization
+        The lifted loop.
+    """
+
+    def __init__(self, r: Realization):
+        self.r = r
+        self.theta = _make_grid(r)
+        self.factors = np.array([self.destabilizing(theta) for theta in self.theta])
+        self.all_factors = np.concatenate([self.factors.ravel(), np.conj(self.factors.ravel())])
+
+    def find_margins(self) -> PeriodicMargins:
+        """Return all margins."""
+        r = self.r
+        poles = r.eigenvalues()
+        stable = r.is_stable()
+        if stable:
+            found = {**self._find_gain_margins(), **self._find_phase_margin(), **self._find_delay_margin()}
+            disk, factor = self._find_disk_margin()
+            found |= disk
+        else:
+            reason = f"the closed loop is not stable: {r.count_unstable()} of its poles are not"
+            units = {"phase_margin_deg": "deg", "delay_margin_s": "s", "delay_margin_samples": "samples"}
+            units |= {"disk_frequency": "rad/s"}
+            names = [f.name for f in fields(PeriodicMargins) if f.type == "Number"]
+            found = {name: Number(np.nan, units.get(name, "1"), np.nan, reason) for name in names}
+            factor = complex(np.nan)
+        return PeriodicMargins(
+            stable=stable,
+            destabilizing=factor,
+            closed_loop_poles=tuple(complex(p) for p in np.sort_complex(poles + 1)),
+            renewals=len(r.D),
+            dt=r.dt,
+            **found,
+        )
+
+    def destabilizing(self, theta: float) -> np.ndarray:
+        """Return the factors −1/λ that put a closed-loop pole at e^(jθ); infinite ones as NaN.
+
+        They are s/(s − 1) of the eigenvalues s of S = (I + L)⁻¹, which is finite where L is not.
+        """
+        s = np.linalg.eigvals(sensitivity_at(self.r, theta / self.r.dt))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factors = s / (s - 1.0)
+        return np.where(np.isfinite(factors) & (np.abs(s - 1.0) > 1e-14), factors, np.nan)
+
+    def _distance(self, f: complex) -> float:
+        """Return the distance of a factor to the nearest one of the grid that destabilizes."""
+        return float(np.nanmin(np.abs(self.all_factors - f), initial=np.inf))
+
+    def _march(self, at: Callable[[float], complex], begin: float, end: float) -> float | None:
+        """Return the first limit of stability along a curve of factors; None if there is none.
+
+        A step is as long as the distance to the destabilizing factors allows, so that no limit is stepped over.
+
+        Parameters
+        ----------
+        at : callable
+            From a number to the factor there; its derivative has the size of the factor.
+        begin, end : float
+            First and last number.
+        """
+        from scipy.optimize import brentq
+
+        def growth(x: float) -> float:
+            return float(np.max(self.r.growth(self.r.eigenvalues(at(x)))))
+
+        x, sign = begin, np.sign(end - begin)
+        while (end - x) * sign > 0:
+            f = at(x)
+            step = max(0.5 * self._distance(f) / abs(f), SMALLEST_STEP)
+            following = x + sign * min(step, abs(end - x))
+            if growth(following) >= 0:
+                return float(brentq(growth, x, following, xtol=1e-14 * abs(following), rtol=1e-14))
+            x = following
+        return None
+
+    def _find_gain_margins(self) -> dict[str, Number]:
+        found = {}
+        for name, end in (("gain_margin_low", -1.0), ("gain_margin_high", 1.0)):
+            x = self._march(lambda x: complex(np.exp(x)), 0.0, end * np.log(LARGEST))
+            if x is None:
+                values = LARGEST ** (end * np.linspace(0.1, 1.0, 10))
+                how = confirm_no_limit(name, [float(v) for v in values], self.r.is_stable, EIGENVALUES)
+                found[name] = Number(0.0 if end < 0 else np.inf, "1", 0.0, how)
+                continue
+            k = float(np.exp(x))
+            how = confirm_limit(name, k, [], 1.0, self.r.is_stable, EIGENVALUES)
+            found[name] = Number(k, "1", 1e-9 * k, how)
+        return found
+
+    def _find_phase_margin(self) -> dict[str, Number]:
+        def stable(degrees: float) -> bool:
+            return self.r.is_stable(np.exp(1j * np.radians(degrees)))
+
+        name = "phase_margin_deg"
+        x = self._march(lambda x: complex(np.exp(1j * x)), 0.0, np.pi)
+        if x is None:
+            how = confirm_no_limit(name, [30.0, 60.0, 90.0, 120.0, 150.0, 180.0], stable, EIGENVALUES)
+            return {name: Number(np.inf, "deg", 0.0, how)}
+        degrees = float(np.degrees(x))
+        how = confirm_limit(name, degrees, [360 - degrees], 0.0, stable, EIGENVALUES + " with the factor rotated")
+        return {name: Number(degrees, "deg", 1e-7, how)}
+
+    def _find_delay_margin(self) -> dict[str, Number]:
+        n, delayed, T = 0, _delay_by_a_renewal(self.r), self.r.dt / len(self.r.D)
+        while n < RENEWALS and delayed.is_stable():
+            n, delayed = n + 1, _delay_by_a_renewal(delayed)
+        if n < RENEWALS:
+            how = f"{EIGENVALUES}, delayed by whole renewals: stable at {n}, unstable at {n + 1}"
+            samples, seconds = float(n), n * T
+        elif all(np.linalg.norm(self.r.matrix(np.array([1j * w / self.r.dt]))[0], 2) < 1 for w in self.theta):
+            how = "the largest singular value of the lifted loop is below 1 at all frequencies: no delay matters"
+            samples = seconds = np.inf
+        else:
+            how = f"no value: {EIGENVALUES} say stable with each of up to {RENEWALS} renewals of delay"
+            samples = seconds = np.nan
+        error = np.nan if np.isnan(samples) else 0.0
+        return {
+            "delay_margin_samples": Number(samples, "samples", error, how),
+            "delay_margin_s": Number(seconds, "s", error, how),
+        }
+
+    def _find_disk_margin(self) -> tuple[dict[str, Number], complex]:
+        from scipy.optimize import minimize_scalar
+
+        def size(factors: np.ndarray) -> np.ndarray:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                return np.asarray(2 * np.abs((factors - 1) / (factors + 1)))
+
+        def smallest(theta: float) -> float:
+            return float(np.nanmin(size(self.destabilizing(theta)), initial=np.inf))
+
+        on_grid = np.nanmin(np.where(np.isnan(self.factors), np.inf, size(self.factors)), axis=1)
+        theta = float(self.theta[int(np.argmin(on_grid))])
+        padded = np.concatenate([[np.inf], on_grid, [np.inf]])
+        valleys = np.flatnonzero((padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]))
+        for m in valleys[np.argsort(on_grid[valleys], kind="stable")][:8]:
+            low, high = self.theta[max(m - 1, 0)], self.theta[min(m + 1, len(self.theta) - 1)]
+            found = minimize_scalar(smallest, bounds=(low, high), method="bounded", options={"xatol": 1e-13 * high})
+            theta = min(theta, float(found.x), key=smallest)
+        factors = self.destabilizing(theta)
+        factor = complex(factors[int(np.nanargmin(size(factors)))])
+        alpha = smallest(theta)
+        how = self._confirm_disk(alpha, factor, theta)
+        low, high, phase = disk_gains(alpha, 0.0)
+        how += f"; gains {low:.6g} … {high:.6g} and phases up to ± {phase:.6g}° may vary together"
+        return {
+            "disk_margin": Number(alpha, "1", 1e-8 * alpha, how),
+            "disk_frequency": Number(theta / self.r.dt, "rad/s", 1e-3 * theta / self.r.dt, how),
+        }, factor
+
+    def _confirm_disk(self, alpha: float, factor: complex, theta: float) -> str:
+        """Confirm a disk margin by eigenvalues around the rim and at the factor; return the computation."""
+        delta = 2 * (factor - 1) / (factor + 1)
+        if np.isclose(alpha, 2.0, rtol=1e-12) or abs(2 - delta) < 1e-9:
+            return "the loop's factors: one of them is 0 or infinite"
+
+        def at(d: complex) -> complex:
+            return (1 + d / 2) / (1 - d / 2)
+
+        turns = np.concatenate([np.linspace(0.0, np.pi, ON_RIM + 1), [abs(np.angle(delta))]])
+        inner = [at((1 - INSIDE) * alpha * np.exp(1j * turn)) for turn in turns]
+        bad = [f for f in inner if not self.r.is_stable(f)]
+        p = complex(self.r.point(np.array(1j * theta / self.r.dt)))
+        apart = float(np.min(np.abs(self.r.eigenvalues(factor) - p)))
+        beyond = self.r.is_stable(at((1 + INSIDE) * delta))
+        if bad or beyond or apart > 1e-6 * (1 + abs(p)):
+            raise ConfirmationError(
+                f"found α = {alpha:.9g} at the factor {factor:.6g}, but {EIGENVALUES} say {len(bad)} of {len(inner)} "
+                f"factors just inside unstable, just beyond {'stable' if beyond else 'unstable'}, and the nearest pole "
+                f"{apart:.3g} from e^(jθ); expected none, unstable, and a pole there. Look at closed_loop_poles.",
+                block="disk_margin",
+            )
+        return (
+            f"{EIGENVALUES}: stable at {len(inner)} factors of {1 - INSIDE:g} α, unstable at {1 + INSIDE:g} α, "
+            "a pole on the limit at the factor itself"
+        )
+
+
+def _make_grid(r: Realization) -> np.ndarray:
+    """Return angles θ up to π that resolve the poles of the open and the closed loop."""
+    s = r.logarithm(np.concatenate([np.linalg.eigvals(r.A), r.eigenvalues()])) * r.dt
+    s = s[np.isfinite(s)]
+    sizes = np.abs(s)[np.abs(s) > 1e-9]
+    low = 1e-2 * float(np.min(sizes, initial=1.0))
+    around = [np.abs(s.imag) + np.abs(s.real) * side for side in SIDES]
+    near = [np.abs(s) * (1 + 0.1 * k) for k in range(-3, 4)]
+    theta = np.concatenate([np.geomspace(low, np.pi, 400), np.linspace(low, np.pi, 400), *around, *near])
+    return np.unique(np.append(theta[(theta >= low) & (theta <= np.pi)], 0.0))
+
+
+def _delay_by_a_renewal(r: Realization) -> Realization:
+    """Return a lifted loop with one renewal of delay: a channel gets the one before it, the first one the last one."""
+    n, m = r.order, len(r.D)
+    A = np.block([[r.A, np.zeros((n, 1))], [r.C[-1:], -np.ones((1, 1))]])  # p s = y − s
+    B = np.vstack([r.B, r.D[-1:]])
+    C = np.block([[np.zeros((1, n)), np.ones((1, 1))], [r.C[:-1], np.zeros((m - 1, 1))]])
+    D = np.vstack([np.zeros((1, m)), r.D[:-1]])
+    return Realization(A, B, C, D, r.dt, r.hidden)
