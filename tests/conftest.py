@@ -1,6 +1,7 @@
 """The quick part of products of cases (`support.drawn`), a cache for each worker, and runs that tests share."""
 
 import os
+import sys
 from collections import defaultdict
 from functools import cache as keep
 from functools import lru_cache
@@ -9,9 +10,22 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small, an
 
 import pytest
 
-from loopwright.diagrams import experiments
-from support import oracle
 from support.drawn import draw, identify
+
+WORKER = os.environ.get("PYTEST_XDIST_WORKER", "")
+
+# The processes of a run share bytecode, else each one compiles the rooms anew.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    """Read the folders backwards in every other worker: each takes what another has compiled before it came there."""
+    report = yield
+    if isinstance(collector, pytest.Dir) and WORKER[-1:] in set("13579"):
+        report.result = report.result[::-1]
+    return report
 
 
 @pytest.hookimpl(wrapper=True)
@@ -30,15 +44,30 @@ def pytest_pycollect_makeitem(collector, name, obj):
 
 
 def pytest_xdist_make_scheduler(config, log):
-    """Give each file to one worker, so that what its tests share is made once; the longest file first."""
+    """Give each file to one worker, so that what its tests share is made once; the longest first.
+
+    Few workers take all files on exported FMUs as one, since they share builds.
+    """
     from xdist.scheduler import LoadFileScheduling
 
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            exported = nodeid.startswith("tests/fmus/export/") and self.numnodes <= 3
+            return "tests/fmus/export" if exported else super()._split_scope(nodeid)
+
     config.option.loadscopereorder = False
-    return LoadFileScheduling(config, log)
+    return Scheduling(config, log)
 
 
 def pytest_collection_modifyitems(items):
-    items.sort(key=lambda item: item.path.name != "test_project.py")
+    """Sort by file, so that all workers have one order; before the others those that take longest."""
+    longest = ("tests/test_project.py", "tests/fmus/export/", "tests/test_pages.py")
+
+    def place(item):
+        first = next((i for i, name in enumerate(longest) if item.nodeid.startswith(name)), len(longest))
+        return first, item.nodeid.partition("::")[0]
+
+    items.sort(key=place)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -46,7 +75,7 @@ def cache(tmp_path_factory):
     """Folder of this worker's cache. The compiler's own, 50 MB that are the same for all, is shared by the workers."""
     folder = tmp_path_factory.mktemp("cache")
     base = tmp_path_factory.getbasetemp()
-    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    shared = base.parent if WORKER else base
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("LOOPWRIGHT_CACHE", str(folder))
         patch.setenv("ZIG_GLOBAL_CACHE_DIR", str(shared / "zig"))
@@ -55,9 +84,17 @@ def cache(tmp_path_factory):
         yield folder
 
 
+@pytest.fixture
+def uncompiled(tmp_path_factory, monkeypatch):
+    """Builds have an empty file as their binary, in a cache of their own: for tests of what else is in the file."""
+    monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path_factory.mktemp("uncompiled")))
+    monkeypatch.setattr("loopwright.fmus.export.package.compile_shared", lambda sources, out, **options: out.touch())
+
+
 @pytest.fixture(scope="session")
 def runs():
     """runs(letter, **options) -> (experiment, run)."""
+    from loopwright.diagrams import experiments
 
     @lru_cache(maxsize=16)  # a run holds some 10 MB
     def run(letter, **options):
@@ -70,6 +107,7 @@ def runs():
 @pytest.fixture(scope="session")
 def solutions():
     """solutions(letter, **options) -> arrays by name, by the independent solution of `oracle`."""
+    from support import oracle
 
     @keep
     def solve(letter, **options):

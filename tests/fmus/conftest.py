@@ -3,7 +3,6 @@
 import pytest
 
 from loopwright.fmus import build_fmu
-from loopwright.fmus.export import package as _build
 from support.exported import mass_spring_damper
 from support.instances import Exchange, open_instance
 
@@ -31,10 +30,3 @@ def instance(tmp_path):
 def exchange(instance):
     """exchange(path, **options) -> the FMU, of either version, instantiated for Model Exchange."""
     return lambda path, **options: Exchange(instance(path, model_exchange=True, **options))
-
-
-@pytest.fixture
-def uncompiled(tmp_path, monkeypatch):
-    """Builds have an empty file as their binary, in a cache of their own: for tests of what else is in the file."""
-    monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "uncompiled"))
-    monkeypatch.setattr(_build, "compile_shared", lambda sources, out, **options: out.touch())

@@ -177,7 +177,7 @@ def test_a_model_of_ones_own_goes_all_the_way(here, capsys):
         assert values == pytest.approx([*y, sum(y) + 10.0], abs=1e-11)  # (4e-3)⁵ / 120 a step, 1000 steps
 
 
-def test_nothing_of_the_file_stays_loaded(here, capsys):
+def test_nothing_of_the_file_stays_loaded(here, capsys, uncompiled):
     """A second build finds what has changed, and another file of the same name."""
     before, path = dict(sys.modules), list(sys.path)
     assert main(["build", "mine.py:Lag"]) == 0
@@ -213,7 +213,7 @@ def test_a_plant_as_fmi_2(here, capsys):
     assert result["position"] == pytest.approx(exact, abs=1e-9)
 
 
-def test_a_file_to_write(here):
+def test_a_file_to_write(here, uncompiled):
     assert main(["build", "mine.py:Lag", "--out", "a/b.fmu"]) == 0
     (here / "a" / "b.fmu").write_text("of an older build")
     assert main(["build", "mine.py:Lag", "--out", "a/b.fmu"]) == 0
@@ -237,7 +237,7 @@ def test_platforms(here, capsys, monkeypatch):
     assert names(here) == SOURCES
 
 
-def test_integrator_and_tolerance(here):
+def test_integrator_and_tolerance(here, uncompiled):
     assert main(["build", "mine.py:Lag", "--integrator", "dopri5", "--tolerance", "1e-6"]) == 0
     variables = {v.name: v for v in fmpy.read_model_description("lag.fmu").modelVariables}
     assert float(variables["integrator"].start) == 2

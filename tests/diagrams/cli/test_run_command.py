@@ -1,5 +1,6 @@
 """``loopwright run``: files, tables, exit statuses, and what it says when it is used wrongly."""
 
+import io
 import json
 import os
 import subprocess
@@ -45,8 +46,8 @@ def undrawn(monkeypatch):
         return files
 
     for name in ("plot_path", "plot_experiment"):
-        monkeypatch.setattr(f"loopwright.diagrams.paper.figures.{name}", lambda *_: None)
-    monkeypatch.setattr("loopwright.diagrams.results.plots.save", save)
+        monkeypatch.setattr(f"loopwright.diagrams.paper.{name}", lambda *_: None)
+    monkeypatch.setattr("loopwright.diagrams.results.save", save)
 
 
 @pytest.fixture(scope="module")
@@ -316,6 +317,18 @@ def test_a_plant_of_ones_own(tmp_path, undrawn):
 # --- the process ----------------------------------------------------------------------------------------------------
 
 
+def test_a_stream_without_greek(tmp_path, monkeypatch, undrawn):
+    streams = [io.TextIOWrapper(io.BytesIO(), encoding="ascii") for _ in range(2)]
+    monkeypatch.setattr(sys, "stdout", streams[0])
+    monkeypatch.setattr(sys, "stderr", streams[1])
+    assert main(["run", "B", "--option", "tool_mass=5", "--out", str(tmp_path / "ö")]) == 1
+    out, err = (stream.detach().getvalue() for stream in streams)
+    assert b"peak_acceleration  | m/s2 |" in out
+    assert b"Nearest foot point theta = " in err
+    assert files(tmp_path / "ö") == sorted(f"B{ending}" for ending in ALL)
+
+
+@pytest.mark.slow
 def test_terminal_without_greek(tmp_path):
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
     command = [sys.executable, "-m", "loopwright.diagrams", "run", "B", "--option", "tool_mass=5", "--out", "ö"]

@@ -39,12 +39,25 @@ MARGINS = (
 
 
 @cache
-def fig3_report():
-    return analyse(experiments.compliance(), only=("operating_points", "poles", "inner", "admittance"))
+def fig3_part(*keys):
+    return analyse(experiments.compliance(), only=keys)
+
+
+def fig3_loops():
+    return fig3_part("operating_points", "inner")
+
+
+def fig3_poles():
+    return fig3_part("poles")
+
+
+def fig3_admittance():
+    return fig3_part("admittance")
 
 
 def value(path):
-    return fig3_report().numbers()[path].value
+    part = {"poles": fig3_poles, "admittance": fig3_admittance}.get(path.partition(".")[0], fig3_loops)
+    return part().numbers()[path].value
 
 
 def speed_control(sample_time=1e-3, voltage=0.0):
@@ -105,17 +118,27 @@ def test_compensated_friction_at_rest_changes_the_sampled_margins():
 @pytest.mark.parametrize("side", ["par", "perp"])
 @pytest.mark.parametrize("variant", DESIGN)
 def test_the_paths_that_are_promised_exist(side, variant):
-    numbers = fig3_report().numbers()
+    numbers = fig3_loops().numbers()
     for name in MARGINS:
         assert f"inner.{side}.{variant}.{name}" in numbers
+    assert f"operating_points.{variant}.residual" in numbers
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("side", ["par", "perp"])
+@pytest.mark.parametrize("variant", DESIGN)
+def test_the_paths_of_poles_and_limits_exist(side, variant):
+    numbers = fig3_admittance().numbers()
     for b in ("be_0", "be_10", "be_100"):
         for kind in ("ke_limit", "ke_limit_friction", "force_tracking.ke_limit"):
             assert f"admittance.{side}.{kind}.{variant}.{b}" in numbers
-    for path in (f"poles.{side}.{variant}.polynomial_difference", f"operating_points.{variant}.residual"):
-        assert path in numbers
+    assert f"poles.{side}.{variant}.polynomial_difference" in fig3_poles().numbers()
 
 
-@pytest.mark.parametrize("report", [fig3_report, speed_report])
+PARTS = [fig3_loops, *(pytest.param(part, marks=pytest.mark.slow) for part in (fig3_poles, fig3_admittance))]
+
+
+@pytest.mark.parametrize("report", [*PARTS, speed_report])
 def test_every_number_is_complete(report):
     for path, number in report().numbers().items():
         assert number.unit, path
@@ -127,18 +150,20 @@ def test_every_number_is_complete(report):
         assert set(number.as_dict()) == {"value", "unit", "tolerance", "confirmed_by"}
 
 
-def test_each_table_shows_the_numbers_of_its_section():
+@pytest.mark.parametrize("report", PARTS)
+def test_each_table_shows_the_numbers_of_its_section(report):
     def walk(section):
         yield section
         for inner in section.sections:
             yield from walk(inner)
 
-    known = {id(n) for n in fig3_report().numbers().values()}
-    for section in (s for top in fig3_report().sections for s in walk(top)):
+    known = {id(n) for n in report().numbers().values()}
+    for section in (s for top in report().sections for s in walk(top)):
         assert not section.numbers or section.tables, section.key
         assert {id(n) for n in section.numbers.values()} <= known
 
 
+@pytest.mark.slow
 def test_poles_got_are_those_asked_in_continuous_time_and_others_sampled():
     for side, p in (("par", 20.0), ("perp", 40.0)):
         assert value(f"poles.{side}.continuous.polynomial_difference") < 1e-12
@@ -155,6 +180,7 @@ def test_poles_got_are_those_asked_in_continuous_time_and_others_sampled():
         np.testing.assert_allclose(got, np.poly([math.exp(-p * T)] * 3), atol=1e-11)
 
 
+@pytest.mark.slow
 def test_decoupling_and_independence_of_the_point_hold_and_break_as_claimed():
     claims = "poles.claims."
     for key in ("continuous", "sampled_d0", "continuous_friction"):
@@ -166,6 +192,7 @@ def test_decoupling_and_independence_of_the_point_hold_and_break_as_claimed():
     assert value(claims + "friction_10.from_matched") > 0.05
 
 
+@pytest.mark.slow
 def test_stiffness_limits_lie_by_the_rule_of_thumb_and_friction_at_rest_lowers_them():
     start = "admittance.perp."
     for b in (0, 10):
