@@ -32,7 +32,7 @@ class Diagram(SimulatedDiagram):
     *roots : Call
         The calls that close it, such as ``plant(motor_force=u)``; what they are wired to belongs to the diagram.
     loops : {"error", "solve"}
-        What is done about algebraic loops: they are an error, or Newton's method solves them at every instant, from the
+        Treatment of algebraic loops: they are an error, or Newton's method solves them at every instant, from the
         last solution, with exact derivatives. ``run.residual`` is what is left; above 1e-9 of 1 + the size of the
         signals the run stops.
 
@@ -65,7 +65,7 @@ class Diagram(SimulatedDiagram):
             Values of states of blocks and FMUs that are given, by path: ``{"plant.position": 0.2}``. Signals, and the
             FMUs' outputs, are then what follows from them.
         **options
-            How to run: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step`` and ``start`` of `simulate`.
+            Of the run there: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step`` and ``start`` of `simulate`.
 
         Raises
         ------
@@ -112,7 +112,7 @@ class Diagram(SimulatedDiagram):
         tolerance : float
             Largest residual of an equation, relative to 1 + the size of what it belongs to.
         **options
-            How to run to where the search begins, as in `operating_point`; ``step`` is needed where only an FMU steps.
+            Of the run to where the search begins: see `operating_point`; ``step`` is needed where only an FMU steps.
 
         Returns
         -------
@@ -154,8 +154,8 @@ class Diagram(SimulatedDiagram):
         """Return the linear model of this very diagram at an operating point.
 
         It is continuous where everything is continuous. With sampled subsystems it is discrete, over one base period
-        or, with several rates, their least common one; hold, delay and the time between ticks are exact. What it does
-        not follow, such as a quantizer or an event within the period, is said in its ``notes``.
+        or, with several rates, their least common one; hold, delay and the time between ticks are exact. Its
+        ``notes`` say which effects it does not follow, such as a quantizer or an event within the period.
 
         Parameters
         ----------
@@ -169,11 +169,11 @@ class Diagram(SimulatedDiagram):
             Wires that are cut behind the port, for all its consumers, which get its value at the operating point: that
             stays what it is.
         plants : {"equations", "step", "identified"}, optional
-            How an FMU's step is linearized: by its equations' Jacobian and a matrix exponential, right at an
+            Method for an FMU's step: by its equations' Jacobian and a matrix exponential, right at an
             equilibrium; by differences of the step itself; or from its pulse responses from rest, without its states.
             Without it the first at an equilibrium, else the second, and the third where the FMU allows neither.
         **options
-            How to run to the operating point, where it is a time: see `operating_point`. With ``step`` a diagram that
+            Of the run to the operating point, where it is a time: see `operating_point`. With ``step`` a diagram that
             is continuous but for an FMU is linearized over its communication step.
 
         Returns
@@ -339,7 +339,7 @@ class Diagram(SimulatedDiagram):
         agreement : float
             Relative difference of two windows at which a frequency is done.
         **options
-            How to run, as in `operating_point`. A continuous diagram is run with rtol = 1e-9, atol = 1e-12, and sampled
+            Of the run, as in `operating_point`. A continuous diagram is run with rtol = 1e-9, atol = 1e-12, and sampled
             16 times in a period of the highest frequency, if nothing else is said.
 
         Returns

@@ -1,4 +1,4 @@
-"""What a report holds: sections with text, tables, figures, and numbers by dotted paths."""
+"""Content of a report: sections with text, tables, figures, and numbers by dotted paths."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Document:
     sections : tuple of Section
         In order.
     meta : mapping
-        What was analysed, when, with which versions.
+        Subject of the analysis, its time, and the versions of the libraries.
     """
 
     title: str

@@ -84,7 +84,7 @@ class Page:
     numbers: tuple[tuple[NumberView, ...], ...]
     """All numbers, by the sections that they stand in."""
     reasons: tuple[str, ...]
-    """How numbers were confirmed."""
+    """Computations that confirmed the numbers."""
     terms: tuple[TermView, ...]
     defines_loop: bool
     """Whether terms take the loop for granted, so that it is defined as well."""

@@ -20,7 +20,7 @@ class Report(Document):
     sections : tuple of Section
         In order.
     meta : mapping
-        What was analysed, when, with which versions.
+        Subject of the analysis, its time, and the versions of the libraries.
     """
 
     def _repr_html_(self) -> str:

@@ -92,7 +92,7 @@ class Instant:
     held : dict
         Outputs that are held from now on, by dotted port.
     gates : dict
-        What enabled and triggered subsystems remember of their control from now on, by path.
+        Values of their control that enabled and triggered subsystems remember from now on, by path.
     guards : list
         Columns that must be positive.
     mismatch : list

@@ -68,7 +68,7 @@ def key_numbers(experiment: Experiment, run: Run) -> dict[str, float | None]:
     Parameters
     ----------
     experiment : Experiment
-        What was run.
+        The experiment.
     run : Run
         Its run, a complete one or what ``error.run`` holds.
 

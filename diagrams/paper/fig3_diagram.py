@@ -58,7 +58,7 @@ def fig3(
         Given the plant's position, returns the external force on the robot in N: ``HandForce(path, …)``,
         ``PathSpring(path, …)``, or any call of the user's.
     model : PlanarModel
-        What the feedback linearization inverts.
+        The model that the feedback linearization inverts.
     rig : Rig
         Sensor, actuator and sampling effects.
 

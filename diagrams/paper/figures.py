@@ -27,7 +27,7 @@ def plot_path(experiment: Experiment, run: Run) -> Figure:
     Parameters
     ----------
     experiment : Experiment
-        What was run.
+        The experiment.
     run : Run
         Its run, a complete one or what ``error.run`` holds.
     """
@@ -159,7 +159,7 @@ def plot_experiment(experiment: Experiment, run: Run) -> Figure:
     Parameters
     ----------
     experiment : Experiment
-        What was run.
+        The experiment.
     run : Run
         Its run, a complete one or what ``error.run`` holds.
     """

@@ -45,7 +45,7 @@ OPTIONAL: Mapping[str, str] = MappingProxyType({"contact_force": "N"})
 
 @dataclass(frozen=True)
 class Rig:
-    """What a rig adds to the ideal loop; everything is off by default.
+    """Effects of a real rig that the ideal loop lacks; all are off by default.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ IDEAL = Rig()
 
 @dataclass(frozen=True)
 class Channel:
-    """What drives one direction of the controller.
+    """Reference and admittance of one direction of the controller.
 
     Attributes
     ----------

@@ -49,7 +49,7 @@ def analyse(
     only: tuple[str, ...] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Report:
-    """Analyse a diagram, and return what a report of it holds.
+    """Analyse a diagram, and return the content of its report.
 
     Any diagram gets its parameters, operating points, poles, and the margins at every named wire on a loop: continuous,
     and sampled without and with a sample of delay. A diagram of `fig3` gets besides what the paper claims, its

@@ -1,4 +1,4 @@
-"""The section on what the numbers of a report leave out."""
+"""The section on effects that the numbers of a report leave out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NOT_SMOOTH = (Saturation, Encoder, Quantizer, DeadZone, Relay, Backlash, RateLim
 
 
 def not_modelled(case: Case) -> Section:
-    """Return the section on what the numbers of a report leave out."""
+    """Return the section on effects that the numbers of a report leave out."""
     text = [TEXTS.line("small_motions")]
     for v in case.usable():
         text += [f"{v.title}: {finding}" for finding in v.model.findings]

@@ -1,4 +1,4 @@
-"""What was analysed: blocks, rates, FMUs, versions; and the operating points."""
+"""The subject of a report: blocks, rates, FMUs, versions; and the operating points."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from .variant import AT_REST, Variant
 TEXTS = Texts(__package__, "subject")
 
 CONFIRMED = {PointOrigin.RUN: "the run's own next tick and rates", PointOrigin.TRIM: "the trim's equations"}
-"""How the residual of an operating point is confirmed."""
+"""Confirmation of the residual of an operating point."""
 SUBJECT_TITLE = "What was analysed"
 PACKAGES = ("loopwright", "numpy", "scipy", "casadi", "control", "fmpy", "matplotlib")
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what computed the report."""
+    """Return the versions of Python and of the libraries that computed the report."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -160,7 +160,7 @@ def operating_points(case: Case) -> Section:
 
 
 def _moving(v: Variant) -> str:
-    """Return what is said of an operating point that is no equilibrium."""
+    """Return the notes on an operating point that is no equilibrium."""
     point, model = v.point, v.model
     moving = [i for i, change in enumerate(model.affine) if not abs(change) <= AT_REST]
     fed = model.A - np.eye(len(model.A)) if model.dt else model.A

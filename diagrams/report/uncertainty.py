@@ -1,4 +1,4 @@
-"""What the uncertainty of an FMU's linear model does to a loop's numbers, and why a loop has none."""
+"""Effect of the uncertainty of an FMU's linear model on a loop's numbers, and reasons for a loop to have none."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PEAKS = ("ms", "mt")
 LINEAR = 1e-3
 """A difference between an FMU's step and its equations beyond which it is not the solver's: it moves as it steps."""
 NOTHING = 1e-12
-"""What is left of a loop that is zero, by rounding."""
+"""Size of a loop that is zero but for rounding."""
 TEXTS = Texts(__package__, "loops")
 
 
@@ -116,7 +116,7 @@ def _floor(n: Number, error: float) -> float:
 
 
 def _relative_error(v: Variant, wire: str, cut: Cut, w: np.ndarray) -> tuple[float, str]:
-    """Return the largest relative error of L at frequencies, and what is to be said of it."""
+    """Return the largest relative error of L at frequencies, and the notes on it."""
     L = v.loop(wire, cut=cut)
     points = np.exp(1j * w * L.dt) if L.dt else 1j * w
     nominal = [_response(L, p) for p in points]

@@ -124,7 +124,7 @@ def _overflow(flat: FlatDiagram, log: np.ndarray) -> NonFiniteError:
 
 
 def inputs_text(inputs: dict[str, Any]) -> str:
-    """Say what a block's inputs were."""
+    """Write the values of a block's inputs."""
     shown = ", ".join(f"{n} = {np.asarray(v).tolist()}" for n, v in inputs.items() if v is not None)
     return f"Its inputs then: {shown}." if shown else "It has no inputs."
 

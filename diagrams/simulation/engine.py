@@ -1,4 +1,4 @@
-"""The engine of a run: everything that goes on in time, without what is recorded of it."""
+"""The engine of a run: everything that goes on in time, without the record."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ class Plant(Protocol):
         """Return its complete state."""
 
     def deserialize(self, data: bytes) -> Any:
-        """Make a state, for `restore`, from what `serialize` has returned."""
+        """Make a state, for `restore`, from the bytes of `serialize`."""
 
     def restore(self, state: Any) -> None:
         """Go to a state, and write the outputs there."""

@@ -96,7 +96,7 @@ class Simulation:
         self._open: bool | None = None  # until it begins; False once it has ended
         self._recorder = self._new_recorder()
 
-    # --- what belongs to it ------------------------------------------------------------------------------------------
+    # --- its parts ---------------------------------------------------------------------------------------------------
 
     def _new_recorder(self) -> Recorder:
         every_tick = self._engine.every_tick or not self.flat.distinct
@@ -245,7 +245,7 @@ class Simulation:
             raise not_open_error(self._open, self.diagram.name)
         self._engine.take_over(x, of)
 
-    # --- what it has made --------------------------------------------------------------------------------------------
+    # --- its record --------------------------------------------------------------------------------------------------
 
     def _with_run(self, error: SimulationError) -> SimulationError:
         return error if error.run is not None else error.keep(self.run(final=False))

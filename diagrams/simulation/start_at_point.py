@@ -49,7 +49,7 @@ def copy_states(values: np.ndarray, old: FlatDiagram, new: FlatDiagram, into: np
 
 
 def start_at(workspace: Workspace, point: OperatingPoint, name: str) -> int:
-    """Put a run that has just been initialized to what is just before an operating point's tick, and return that tick.
+    """Put a run that has just been initialized to the instant just before an operating point's tick; return that tick.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ from ..wiring import join
 
 
 class StopConditions:
-    """The stop conditions of a diagram, looked up in what was evaluated last.
+    """The stop conditions of a diagram, looked up in the last evaluation.
 
     Parameters
     ----------

@@ -110,7 +110,7 @@ class Delays:
         return self._edges[0][0] if self._edges else math.inf
 
     def note_reached(self, t: float, *, from_source: bool) -> None:
-        """Note that what is not smooth at ``t``, from a source or out of a delay, goes into the delays."""
+        """Note a discontinuity at ``t``, of a source or out of a delay: it goes into the delays."""
         order = 0 if from_source else math.inf
         while self._edges and not is_before(t, self._edges[0][0]):
             order = min(order, self._edges.pop(0)[1] + self.smoothed)
@@ -131,11 +131,11 @@ class Delays:
         return barycentric(self, (s - a) / (b - a), self._samples[i][:, where])
 
     def save(self) -> Any:
-        """Return what is needed to go on from here."""
+        """Return the memory with which a run goes on from here."""
         return list(self._from), list(self._to), list(self._samples), list(self._edges), list(self.starts)
 
     def restore(self, saved: Any) -> None:
-        """Go back to what `save` returned."""
+        """Go back to the memory that `save` returned."""
         self._from, self._to, self._samples, self._edges, self.starts = (list(part) for part in saved)
 
 

@@ -78,7 +78,7 @@ class Workspace:
         self.here.t[0], self.here.x[:], self.here.w[:] = t, x, w
 
     def restore(self, *, t: float, x: np.ndarray, w: np.ndarray, z: np.ndarray, log: np.ndarray) -> None:
-        """Put ``here`` to an instant that was evaluated before, with what it gave then."""
+        """Put ``here`` to an instant that was evaluated before, with its results."""
         self.put(t, x, w)
         self.z[:], self.log[:] = z, log
 
@@ -87,7 +87,7 @@ class Workspace:
         self._evaluation(acting)()
 
     def check(self, acting: frozenset[TickPattern] = NONE) -> None:
-        """Raise the error of the first block that is to blame, if what was evaluated last is not ok.
+        """Raise the error of the first block that is to blame, if the last evaluation is not ok.
 
         Raises
         ------
@@ -164,7 +164,7 @@ class Workspace:
             )
         self.p[flat.parameters.slices[path]] = flat.pack(path, block)
 
-    # --- what a solver tries -----------------------------------------------------------------------------------------
+    # --- trials of a solver -----------------------------------------------------------------------------------------
 
     def flow(self) -> Callable[[float, np.ndarray], np.ndarray]:
         """Return the rates of the continuous states, ``f(t, x)``; w is that of ``trial``."""
