@@ -322,7 +322,7 @@ class Diagram(SimulatedDiagram):
         Parameters
         ----------
         wire : str
-            A wire or port, or an entry of it, ``"motor_force[0]"``. Of one with several entries, each is excited in a
+            A wire or port, or an entry of it, ``"motor_force[1]"``. Of one with several entries, each is excited in a
             run of its own, and the responses are matrices.
         frequencies : array_like
             In rad/s. They are moved by less than half a sample in a window, so that whole periods fit into it.

@@ -169,7 +169,7 @@ class SimulationError(LoopwrightError, RuntimeError):
     run : Run, optional
         Every sample recorded until then; None before the first.
     state : str, optional
-        Name of the continuous state at which a solver failed, such as ``"plant.position[0]"``.
+        Name of the continuous state at which a solver failed, such as ``"plant.position[1]"``.
     """
 
     run: Any = None

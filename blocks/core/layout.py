@@ -11,15 +11,17 @@ import numpy as np
 from .ports import Shape
 
 
-def elements(name: str, shape: Shape, first: int = 0) -> list[str]:
+def elements(name: str, shape: Shape) -> list[str]:
     """Return the names of the elements of an array, in C order: ``name[i,j]``, or ``name`` of a scalar.
 
-    Parameters
-    ----------
-    first : int, default: 0
-        Number of the first element; FMI counts from 1.
+    In text elements are counted from 1, as FMI does; Python's own indices of arrays and signals count from 0.
+
+    Examples
+    --------
+    >>> elements("motor_force", (2,))
+    ['motor_force[1]', 'motor_force[2]']
     """
-    return [f"{name}[{','.join(str(i + first) for i in index)}]" if index else name for index in np.ndindex(*shape)]
+    return [f"{name}[{','.join(str(i + 1) for i in index)}]" if index else name for index in np.ndindex(*shape)]
 
 
 def lay_out(sizes: Iterable[int], offset: int = 0) -> list[slice]:
@@ -42,7 +44,7 @@ class Layout:
     --------
     >>> layout = Layout.of({"position": (2,), "angle": ()})
     >>> layout.slices["angle"], layout.total, layout.labels
-    (slice(2, 3, None), 3, ['position[0]', 'position[1]', 'angle'])
+    (slice(2, 3, None), 3, ['position[1]', 'position[2]', 'angle'])
     """
 
     slices: dict[str, slice]

@@ -56,7 +56,7 @@ class _End(NamedTuple):
 
 def _ends(port: str, shape: tuple[int, ...]) -> list[_End]:
     """Return the two ends of the table for every entry of an input."""
-    entries = [f"{port}[{i}]" for i in range(shape[0])] if shape else [port]
+    entries = [f"{port}[{i + 1}]" for i in range(shape[0])] if shape else [port]
     return [_End(entry, i, side) for i, entry in enumerate(entries) for side in ("below", "above")]
 
 

@@ -77,9 +77,11 @@ def check_derivatives(bench: Bench) -> float:
         return 0.0
     values = ca.Function("values", symbols, [shown])
     slopes = ca.Function("slopes", symbols, [ca.densify(ca.jacobian(shown, wanted))])
-    rows = [f"{n}[{i}]" for n, r in zip(bench.names, results, strict=False) for i in range(r.numel())]
+    rows = [f"{n}[{i + 1}]" for n, r in zip(bench.names, results, strict=False) for i in range(r.numel())]
     columns = [
-        f"{n}[{i}]" for n, s in zip(("x", *bench.traced.inputs), symbols[1:-1], strict=True) for i in range(s.numel())
+        f"{n}[{i + 1}]"
+        for n, s in zip(("x", *bench.traced.inputs), symbols[1:-1], strict=True)
+        for i in range(s.numel())
     ]
     for point in [*bench.points[:8], *_origin(bench)]:
         at = point.columns()

@@ -48,7 +48,7 @@ class Nets:
     of : dict
         For each subsystem the sources inside, each with all its sinks there.
     parts : dict
-        The index of a wire that leads a part of its signal, by the path and pin at which it ends.
+        The part of its signal that a wire leads, such as "[1]", by the path and pin at which it ends.
     ins, outs : dict
         Pins of every block and subsystem.
     names : dict
@@ -58,7 +58,7 @@ class Nets:
     def __init__(self, table: Structure):
         self.table = table
         self.of: dict[str, dict[PlacedPin, list[PlacedPin]]] = {path: {} for path in table.subsystems}
-        self.parts: dict[tuple[str, Pin], int | slice] = {}
+        self.parts: dict[tuple[str, Pin], str] = {}
         self.ins: dict[str, list[Pin]] = {}
         self.outs: dict[str, list[Pin]] = {}
         self.names: dict[tuple[str, str], list[str]] = {}
@@ -106,7 +106,7 @@ class Nets:
         self._join(here, end, (Place(item), pin))
         _add(self.ins, item, pin)
         if wire.index is not None:
-            self.parts[item, pin] = wire.index
+            self.parts[item, pin] = wire.part
 
     def _join(self, subsystem: str, source: PlacedPin, sink: PlacedPin) -> None:
         sinks = self.of[subsystem].setdefault(source, [])

@@ -342,6 +342,5 @@ class _Picture:
                 out.append(f'<path d="M{x:g} {y:g}l-6.5 -3v6z" fill="{WIRE}"/>\n')
                 part = self.nets.parts.get((item, pin))
                 if part is not None:
-                    text = f"[{part.start or ''}:{part.stop or ''}]" if isinstance(part, slice) else f"[{part}]"
-                    out.append(text_at(x - 8, y - 3.5, text, 8, anchor="end", fill=GREY))
+                    out.append(text_at(x - 8, y - 3.5, part, 8, anchor="end", fill=GREY))
         return "".join(out)

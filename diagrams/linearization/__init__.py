@@ -1,13 +1,14 @@
 """Linear models, operating points and trim."""
 
 from .derivatives import Signal, find_signal
-from .findings import StepsOnly, UnusualStart
+from .findings import EntryTaken, StepsOnly, UnusualStart
 from .linear_model import Linearization, linearize, linearize_batch
 from .loops_over_a_period import ticks_to_renewal
 from .operating_points import PointLike, capture, operating_point, run_to
 from .trim_search import point_from_states, trim
 
 __all__ = [
+    "EntryTaken",
     "Linearization",
     "PointLike",
     "Signal",

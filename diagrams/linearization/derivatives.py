@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,7 +28,7 @@ from ..flat import (
     rates,
     trace_schedule,
 )
-from ..results import resolve
+from ..results import index_of, resolve, split_entry
 from ..simulation import Workspace
 from ..wiring import Wire, join
 from .findings import Finding, StepsOnly
@@ -53,12 +52,15 @@ class Signal:
         Numbers of the entries in the flat port.
     labels : tuple of str
         Names of the entries.
+    entry : tuple of int
+        Numbers of the entry that the name asks for, counted from 1; () for the whole.
     """
 
     name: str
     port: tuple[str, str]
     entries: tuple[int, ...]
     labels: tuple[str, ...]
+    entry: tuple[int, ...] = ()
 
 
 def find_signal(flat: FlatDiagram, name: str) -> Signal:
@@ -72,7 +74,7 @@ def find_signal(flat: FlatDiagram, name: str) -> Signal:
     wires, ports = flat.table.names, flat.log.slices
     if not isinstance(name, str):
         raise UnknownNameError(f"found {name!r}; expected the name of a wire, or the path of a port. Give a text.")
-    name, entry = _split_entry(name, {*wires, *ports})
+    name, entry = split_entry(name, {*wires, *ports})
     try:
         full = resolve(name, wires, ports)
     except UnknownNameError as error:
@@ -86,21 +88,10 @@ def find_signal(flat: FlatDiagram, name: str) -> Signal:
     part = index if wire.index is None else np.asarray(index[wire.index])
     labels = np.array(elements(name if name in wires else full, part.shape)).reshape(part.shape)
     if entry:
-        if len(entry) != part.ndim or any(not i < n for i, n in zip(entry, part.shape, strict=False)):
-            raise UnknownNameError(
-                f"{full!r} has no entry {list(entry)}; expected one within its shape {part.shape}, counted from 0."
-            )
-        part, labels = part[entry], labels[entry]
+        index_of_entry = index_of(entry, part.shape, full)
+        part, labels = part[index_of_entry], labels[index_of_entry]
     flat_labels = tuple(str(e) for e in np.ravel(labels))
-    return Signal(name, (wire.block, wire.port), tuple(np.ravel(part).tolist()), flat_labels)
-
-
-def _split_entry(name: str, known: set[str]) -> tuple[str, tuple[int, ...]]:
-    """Return the name of a signal and the entry after it: ``q[1]`` is entry 1 of ``q``."""
-    found = re.fullmatch(r"(.+)\[(\d+(?:,\d+)*)\]", name)
-    if found is None or name in known:
-        return name, ()
-    return found[1], tuple(int(i) for i in found[2].split(","))
+    return Signal(name, (wire.block, wire.port), tuple(np.ravel(part).tolist()), flat_labels, entry)
 
 
 class LocalDerivatives:

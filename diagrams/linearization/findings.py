@@ -82,3 +82,29 @@ class UnusualStart(Finding):
 
     def __str__(self) -> str:
         return "the start is unlike every later tick, as a block has a first tick of its own; linearize at a later time"
+
+
+@dataclass(frozen=True)
+class EntryTaken(Finding):
+    """An entry of a signal that was asked for by its name, ``"motor_force[1]"``.
+
+    Names count entries from 1 since version 0.2.0; before, these names counted from 0. This finding says which entry is
+    meant, for one release.
+
+    Attributes
+    ----------
+    name : str
+        Name of the signal.
+    entry : tuple of int
+        Numbers of the entry, counted from 1.
+    """
+
+    name: str
+    entry: tuple[int, ...]
+
+    def __str__(self) -> str:
+        text, before = (",".join(str(i - first) for i in self.entry) for first in (0, 1))
+        return (
+            f"{self.name}[{text}] is the entry {text}, counted from 1 as in all names (until version 0.1 it was called "
+            f"{self.name}[{before}] here)"
+        )

@@ -109,7 +109,7 @@ def identify_step(
     model = predict_markov(A, B, C, len(G))
     error = float(np.max(np.abs(model - G), initial=0.0) + np.max(noise, initial=0.0))
     states, derivation = (
-        tuple(f"mode[{i}]" for i in range(len(A))),
+        tuple(f"mode[{i + 1}]" for i in range(len(A))),
         Derivation(DerivativeMethod.IDENTIFIED, order=len(A)),
     )
     return IdentifiedStep(A, B, C, y0, states, sigma, derivation, error)

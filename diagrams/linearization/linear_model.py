@@ -21,7 +21,7 @@ from ..results import OperatingPoint
 from ..wiring import exact_time
 from .continuous_model import model_continuous
 from .derivatives import LocalDerivatives, Signal, find_signal, find_steps_only
-from .findings import Finding
+from .findings import EntryTaken, Finding
 from .loops_over_a_period import (
     advance_point,
     confirm_loop,
@@ -152,7 +152,7 @@ class Linearization:
         Parameters
         ----------
         *wires : str
-            Names of wires, paths of ports, or entries of them: ``"motor_force"``, ``"motor_force[0]"``.
+            Names of wires, paths of ports, or entries of them: ``"motor_force"``, ``"motor_force[1]"``.
         lifted : bool, default: False
             Whether a wire that is renewed several times in the model's period gets one channel for each renewal:
             ``"u@0"``, ``"u@1"``, …. A factor common to all of them is a gain in the wire: see `periodic_margins`.
@@ -280,6 +280,7 @@ def _linearize(
     n, ins, outs = len(A), *(tuple(e for s in group for e in s.labels) for group in found[:2])
     if channels:
         ins = outs = tuple(channels)
+    entries = dict.fromkeys(EntryTaken(s.name, s.entry) for group in found for s in group if s.entry)
     opaque = {p: Derivation(DerivativeMethod.BLOCK_DIFFERENCES) for p, b in flat.table.blocks.items() if b.opaque}
     return Linearization(
         diagram,
@@ -297,7 +298,7 @@ def _linearize(
         uncertainty=model.uncertainty,
         memory=model.memory,
         openings=tuple(names[2]),
-        findings=(*find_steps_only(flat), *model.findings),
+        findings=(*find_steps_only(flat), *model.findings, *entries),
         plants=plants,
         step=step,
     )

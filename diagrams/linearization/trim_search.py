@@ -89,7 +89,7 @@ class _Equations:
         names = [
             *(f"d/dt {states[i]}" for i in flat.continuous),
             *(f"{states[i]} per tick" for i in self.sampled),
-            *(f"loop[{i}]" for i in range(loops)),
+            *(f"loop[{i + 1}]" for i in range(loops)),
             *target.labels,
             *flat.plant_outputs.labels,
             *self.plants.equations,

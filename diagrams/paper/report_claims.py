@@ -105,7 +105,7 @@ def polynomial(v: Variant) -> np.ndarray:
 def coupling(v: Variant) -> float:
     """Return how much of a virtual input appears in the other direction's coordinate, relative to its own one's."""
     model = v.model
-    rows = [model.outputs.index(f"{name}[0]") for name in COORDINATES]
+    rows = [model.outputs.index(f"{name}[1]") for name in COORDINATES]
     w = np.geomspace(1.0, min(1e3, 0.99 * np.pi / model.dt) if model.dt else 1e3, 60)
     p = np.exp(1j * w * model.dt) if model.dt else 1j * w
     eye = np.eye(len(model.A))

@@ -20,7 +20,7 @@ from .recorder import Recorder
 from .recording import Recording
 from .run import Run, Snapshot
 from .saved_state import RunState, check_fits, layout_of, not_open_error
-from .signal_names import resolve
+from .signal_names import index_of, resolve, split_entry
 from .stored import Occurrence, Stopped
 
 __all__ = [
@@ -42,6 +42,7 @@ __all__ = [
     "Snapshot",
     "Stopped",
     "check_fits",
+    "index_of",
     "layout_of",
     "limit_time",
     "marker_of",
@@ -49,5 +50,6 @@ __all__ = [
     "not_open_error",
     "resolve",
     "save",
+    "split_entry",
     "style",
 ]

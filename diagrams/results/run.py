@@ -12,7 +12,7 @@ import numpy as np
 
 from ...blocks.core import Layout, OptionError, PortUnit, UnknownNameError
 from ..wiring import CheckedDiagram, Wire
-from .signal_names import entries, resolve
+from .signal_names import entries, index_of, resolve, split_entry
 from .stored import Occurrence, PathLike, Stopped, header, prepare, read, write
 
 if TYPE_CHECKING:
@@ -40,7 +40,9 @@ class Snapshot:
     """The run that it comes from."""
 
     def __getitem__(self, name: str) -> Any:
-        return self.values[resolve(name, self.names, self.values)]
+        full, entry = split_entry(resolve(name, self.names, self.values), self.values)
+        value = self.values[full]
+        return value[index_of(entry, value.shape, full)] if entry else value
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +206,7 @@ class Run:
         return where if np.all(where >= 0) else None
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return a signal, shape (N, *shape of the port).
+        """Return a signal, shape (N, *shape of the port); ``run["q[1]"]`` is its first entry, ``run["q"][:, 0]``.
 
         Raises
         ------
@@ -253,12 +255,13 @@ class Run:
 
     def unit(self, name: str) -> str | tuple[str, ...] | None:
         """Return the unit of a signal, None where it is not declared."""
-        full = resolve(name, self.wires, self.layout.slices)
+        full, entry = split_entry(resolve(name, self.wires, self.layout.slices), {*self.wires, *self.layout.slices})
         wire = self.wires.get(full)
-        if wire is None:
-            return self.units.get(full)
-        unit = self.units.get(f"{wire.block}.{wire.port}")
-        return unit[wire.index] if isinstance(unit, tuple) and wire.index is not None else unit
+        unit = self.units.get(full if wire is None else f"{wire.block}.{wire.port}")
+        if not isinstance(unit, tuple):
+            return unit
+        part = unit if wire is None or wire.index is None else unit[wire.index]
+        return part[entry[0] - 1] if entry and isinstance(part, tuple) else part
 
     def at(self, t: float) -> Snapshot:
         """Return all recorded signals and the states at the last sample not after ``t`` (in s).
@@ -289,7 +292,7 @@ class Run:
         Parameters
         ----------
         *names : str
-            Signals to draw; a vector's entries share an axis.
+            Signals to draw, or entries of them, ``"motor_force[1]"``; a vector's entries share an axis.
         axes : sequence of matplotlib axes, optional
             Axes to draw into, one per name.
 

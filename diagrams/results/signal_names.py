@@ -1,7 +1,12 @@
-"""Names of a run's signals: full names, and the entries that they stand for."""
+"""Names of a run's signals: full names, and the entries that they stand for.
+
+``name[i]`` is an entry of a vector, ``name[i,j]`` one of a matrix. In names entries are counted from 1, as in FMI; of a
+matrix a single number counts row by row, as the columns of exported tables do.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping
 
 import numpy as np
@@ -9,15 +14,24 @@ import numpy as np
 from ...blocks.core import Layout, UnknownNameError, near
 from ..wiring import Wire
 
+Entry = tuple[int, ...]
+"""Numbers in brackets behind a name, counted from 1; none for the whole signal."""
+
 
 def resolve(name: str, wires: Mapping[str, Wire], ports: Collection[str]) -> str:
     """Return the full name that ``name`` stands for: a wire's or port's path, or a unique end of one; wires go first.
+
+    An entry, ``name[1]``, stays behind it.
 
     Raises
     ------
     UnknownNameError
         If there is none, or several.
     """
+    if not isinstance(name, str):
+        raise UnknownNameError(
+            f"found {name!r}; expected the name of a signal, a text such as {next(iter((*wires, *ports)), 'y')!r}."
+        )
     if name in wires or name in ports:
         return name
     for group in (wires, ports):
@@ -30,13 +44,50 @@ def resolve(name: str, wires: Mapping[str, Wire], ports: Collection[str]) -> str
             )
             error.candidates = tuple(found)
             raise error
+    whole, entry = split_entry(name, {*wires, *ports})
+    if entry:
+        return resolve(whole, wires, ports) + name[len(whole) :]
     short = {n.rpartition(".")[2] for n in (*wires, *ports)}
     raise UnknownNameError(f"no signal {name!r} was recorded. {near(name, short | set(wires) | set(ports))}")
 
 
+def split_entry(name: str, known: Collection[str]) -> tuple[str, Entry]:
+    """Return the name of a signal and the entry behind it; the name of a port may end in brackets, too."""
+    found = re.fullmatch(r"(.+)\[(\d+(?:,\d+)*)\]", name)
+    if found is None or name in known:
+        return name, ()
+    return found[1], tuple(int(i) for i in found[2].split(","))
+
+
+def index_of(entry: Entry, shape: tuple[int, ...], name: str) -> tuple[int, ...]:
+    """Return the index of an entry in an array of a shape, counted from 0.
+
+    Raises
+    ------
+    UnknownNameError
+        If the array has no such entry.
+    """
+    if len(entry) == len(shape) and all(1 <= i <= n for i, n in zip(entry, shape, strict=True)):
+        return tuple(i - 1 for i in entry)
+    if len(entry) == 1 and 1 <= entry[0] <= int(np.prod(shape)) and shape:
+        return tuple(int(i) for i in np.unravel_index(entry[0] - 1, shape))
+    raise UnknownNameError(
+        f"{name!r} has no entry {list(entry)}; expected one within its shape {shape}, counted from 1."
+        if shape
+        else f"{name!r} has no entry {list(entry)}, as it is a scalar. Leave the brackets out."
+    )
+
+
 def entries(full: str, layout: Layout, wires: Mapping[str, Wire]) -> np.ndarray:
-    """Return the numbers of a signal's entries in the vector of a sample, in the signal's shape."""
-    wire = wires.get(full)
-    port = full if wire is None else f"{wire.block}.{wire.port}"
-    whole = layout.index(port)
-    return whole if wire is None or wire.index is None else np.asarray(whole[wire.index])
+    """Return the numbers of a signal's entries in the vector of a sample, in the signal's shape.
+
+    Raises
+    ------
+    UnknownNameError
+        If the signal has no such entry.
+    """
+    name, entry = split_entry(full, {*wires, *layout.slices})
+    wire = wires.get(name)
+    whole = layout.index(name if wire is None else f"{wire.block}.{wire.port}")
+    part = whole if wire is None or wire.index is None else np.asarray(whole[wire.index])
+    return np.asarray(part[index_of(entry, part.shape, name)]) if entry else part

@@ -68,7 +68,9 @@ def part_shape(shape: Shape, wire: Wire, consumer: str, port: str) -> Shape:
         return np.empty(shape)[wire.index].shape
     except IndexError:
         raise ShapeError(
-            f"{wire} is out of range: the port has shape {shape}. Index within it.", block=consumer, port=port
+            f"{wire} is out of range, counted from 1: the port has shape {shape}. Index within it, in Python from 0.",
+            block=consumer,
+            port=port,
         ) from None
 
 

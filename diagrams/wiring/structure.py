@@ -7,7 +7,7 @@ block, across the borders of subsystems.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from fractions import Fraction
 
 from ...blocks.core import (
@@ -64,9 +64,17 @@ class Wire:
     index: int | slice | None = None
 
     def __str__(self) -> str:
+        return f"{self.block}.{self.port}{self.part}"
+
+    @property
+    def part(self) -> str:
+        """The part of the port as text, "" for the whole: entries are counted from 1, up to and including the last."""
+        if self.index is None:
+            return ""
         if isinstance(self.index, slice):
-            return f"{self.block}.{self.port}[{self.index.start or ''}:{self.index.stop or ''}]"
-        return f"{self.block}.{self.port}" + ("" if self.index is None else f"[{self.index}]")
+            start, stop = self.index.start or 0, self.index.stop
+            return f"[{start + (start >= 0)}:{'' if stop is None else stop if stop >= 0 else stop - 1}]"
+        return f"[{self.index + (self.index >= 0)}]"
 
 
 @dataclass
@@ -104,16 +112,7 @@ class Structure:
 
     def copy(self) -> Structure:
         """Return a structure with dictionaries of its own."""
-        return Structure(
-            dict(self.blocks),
-            dict(self.subsystem_of),
-            dict(self.subsystems),
-            dict(self.wires),
-            dict(self.names),
-            dict(self.controls),
-            dict(self.handed),
-            dict(self.results),
-        )
+        return Structure(*(dict(getattr(self, f.name)) for f in fields(self)))
 
     def clock(self, subsystem: str) -> SubsystemSettings | None:
         """Return the subsystem whose sample time holds in one: itself, or the nearest around it; None without any."""

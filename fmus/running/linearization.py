@@ -116,7 +116,7 @@ class _OperatingPoint:
         """Return the names of all elements of variables."""
         rename = self.block.rename if ports else {}
         shapes = ((rename.get(n, n), self.about.variables[n].shape) for n in names)
-        return tuple(label for name, shape in shapes for label in elements(name, shape, first=1))  # FMI counts from 1
+        return tuple(label for name, shape in shapes for label in elements(name, shape))
 
     def model(self, J: np.ndarray, x: np.ndarray, u: np.ndarray, values: np.ndarray, **more: Any) -> FmuLinearization:
         """Return the linear model with this matrix [[A, B], [C, D]]."""

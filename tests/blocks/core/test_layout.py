@@ -30,14 +30,13 @@ def test_what_is_laid_out_comes_one_after_the_other_as_numpy_ravels_it(shapes, o
 
 
 @pytest.mark.parametrize(
-    ("shape", "first", "expected"),
+    ("shape", "expected"),
     [
-        ((), 0, ["q"]),
-        ((2,), 0, ["q[0]", "q[1]"]),
-        ((2,), 1, ["q[1]", "q[2]"]),
-        ((2, 2), 0, ["q[0,0]", "q[0,1]", "q[1,0]", "q[1,1]"]),
-        ((0,), 0, []),
+        ((), ["q"]),
+        ((2,), ["q[1]", "q[2]"]),
+        ((2, 2), ["q[1,1]", "q[1,2]", "q[2,1]", "q[2,2]"]),
+        ((0,), []),
     ],
 )
-def test_elements_have_names(shape, first, expected):
-    assert elements("q", shape, first) == expected
+def test_elements_have_names_that_count_from_1(shape, expected):
+    assert elements("q", shape) == expected

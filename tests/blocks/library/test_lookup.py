@@ -94,11 +94,11 @@ def test_leaving_the_table_is_an_error_where_asked_for():
     value(block, np.array([0.0, 5.0]))
     assert (value.guards > 0).tolist() == [True, True, True, False]
     traced = Driven(block, False, u=lambda t: np.zeros(2)).traced
-    assert traced.guards == ("u[0] below", "u[0] above", "u[1] below", "u[1] above")
-    error = block.guard_error("u[1] above", -1.0, bundle("u", {"u": np.array([0.0, 5.0])}), None)
+    assert traced.guards == ("u[1] below", "u[1] above", "u[2] below", "u[2] above")
+    error = block.guard_error("u[2] above", -1.0, bundle("u", {"u": np.array([0.0, 5.0])}), None)
     assert isinstance(error, GuardError)
     assert str(error).startswith(
-        "u: found u[1] = 5, above the table's range; expected -2 to 4. Extend the table, or give"
+        "u: found u[2] = 5, above the table's range; expected -2 to 4. Extend the table, or give"
     )
     error = block.guard_error("u below", -1.0, bundle("u", {"u": np.float64(-3.5)}), None)
     assert str(error).startswith("u: found u = -3.5, below the table's range; expected -2 to 4.")

@@ -29,7 +29,7 @@ def test_states_are_found_by_block_and_name():
     assert layout.of_block["c.d"].shapes == {"r": (2, 2)}
     assert layout.total == 7
     assert layout.each.slices == {"a.p": slice(5, 6), "a.q": slice(6, 8), "c.d.r": slice(8, 12)}
-    assert layout.labels == ["a.p", "a.q[0]", "a.q[1]", "c.d.r[0,0]", "c.d.r[0,1]", "c.d.r[1,0]", "c.d.r[1,1]"]
+    assert layout.labels == ["a.p", "a.q[1]", "a.q[2]", "c.d.r[1,1]", "c.d.r[1,2]", "c.d.r[2,1]", "c.d.r[2,2]"]
 
 
 def test_every_entry_of_a_flattened_diagram_has_a_name():
@@ -40,13 +40,13 @@ def test_every_entry_of_a_flattened_diagram_has_a_name():
     mixed = Mixed(name="mixed")(Constant(value=(1.0, 2.0)))
     diagram = Diagram("d", sampled(Integrator(name="sum", initial_value=np.zeros(2))(mixed.matrix[1])), mixed)
     flat = diagram.flatten()
-    names = [f"mixed.matrix[{i},{j}]" for i in (0, 1) for j in (0, 1)]
+    names = [f"mixed.matrix[{i},{j}]" for i in (1, 2) for j in (1, 2)]
     assert flat.labels == [
-        *("mixed.speed", *names, "sampled.past.last[0]", "sampled.past.last[1]", "sum.y[0]", "sum.y[1]"),
-        *("held(sampled.past.y[0])", "held(sampled.past.y[1])"),
+        *("mixed.speed", *names, "sampled.past.last[1]", "sampled.past.last[2]", "sum.y[1]", "sum.y[2]"),
+        *("held(sampled.past.y[1])", "held(sampled.past.y[2])"),
     ]
     start = dict(zip(flat.labels, flat.x0, strict=True))
     assert [start[n] for n in names] == [1.0, 2.0, 3.0, 4.0]
     assert start["sampled.past.last[1]"] == 7.0
-    assert flat.continuous_labels == ["mixed.speed", *names, "sum.y[0]", "sum.y[1]"]
+    assert flat.continuous_labels == ["mixed.speed", *names, "sum.y[1]", "sum.y[2]"]
     assert flat.states.of_block["mixed"].split(flat.x0)["matrix"].tolist() == [[1.0, 2.0], [3.0, 4.0]]

@@ -259,7 +259,7 @@ def test_sensitivities_belong_to_the_loop(wire):
         assert np.abs(S(z) - np.linalg.inv(eye + L(z))).max() < 1e-12 * np.abs(S(z)).max()
     assert isinstance(L, control.StateSpace)
     assert L.dt == T
-    assert L.input_labels == [f"controller_u[{i}]" if wire == "u" else f"y[{i}]" for i in range(2)]
+    assert L.input_labels == [f"controller_u[{i}]" if wire == "u" else f"y[{i}]" for i in (1, 2)]
     assert S.name == f"S({wire})"
 
 
@@ -270,7 +270,7 @@ def closed(L):
 def test_the_closed_loops_poles_do_not_depend_on_where_it_is_cut():
     lin = hybrid().linearize()
     want = np.poly(lin.A)
-    for cut in (("u",), ("y",), ("u[0]",), ("y[1]",), ("y[0]", "u[1]")):
+    for cut in (("u",), ("y",), ("u[1]",), ("y[2]",), ("y[1]", "u[2]")):
         L = lin.loop(*cut)
         assert np.abs(closed(L) - want).max() < 1e-12
         assert L.ninputs == (2 if "[" not in cut[0] else len(cut))
@@ -369,13 +369,13 @@ def test_an_event_within_the_period_is_told():
 
 
 def test_names_are_those_of_wires_and_states():
-    lin = hybrid().linearize(inputs="u", outputs=["y[1]", "plant.y"])
-    assert lin.states == ("controller.pi.x[0]", "controller.pi.x[1]", "plant.x[0]", "plant.x[1]", "plant.x[2]")
-    assert lin.inputs == ("controller.u[0]", "controller.u[1]")
-    assert lin.outputs == ("y[1]", "plant.y[0]", "plant.y[1]")
+    lin = hybrid().linearize(inputs="u", outputs=["y[2]", "plant.y"])
+    assert lin.states == ("controller.pi.x[1]", "controller.pi.x[2]", "plant.x[1]", "plant.x[2]", "plant.x[3]")
+    assert lin.inputs == ("controller.u[1]", "controller.u[2]")
+    assert lin.outputs == ("y[2]", "plant.y[1]", "plant.y[2]")
     system = lin.system
-    assert system.state_labels[0] == "controller_pi_x[0]"
-    assert system.output_labels == ["y[1]", "plant_y[0]", "plant_y[1]"]
+    assert system.state_labels[0] == "controller_pi_x[1]"
+    assert system.output_labels == ["y[2]", "plant_y[1]", "plant_y[2]"]
     assert system.name == "hybrid"
     assert isinstance(lin, Linearization)
     assert isinstance(lin.point, OperatingPoint)
@@ -509,7 +509,11 @@ def test_a_batch_goes_through_points_and_parameters():
     ("error", "text", "call"),
     [
         (UnknownNameError, r"there is no signal 'forse' in this diagram\. Did you mean 'force'", {"inputs": "forse"}),
-        (UnknownNameError, r"'y' has no entry \[2\]; expected one within its shape \(2,\)", {"inputs": "y[2]"}),
+        (
+            UnknownNameError,
+            r"'y' has no entry \[0\]; expected one within its shape \(2,\), counted from 1",
+            {"inputs": "y[0]"},
+        ),
         (UnknownNameError, r"linearize takes no 'ouputs'\. Did you mean 'outputs'", {"ouputs": "y"}),
         (OptionError, r"found plants='magic'; expected one of 'equations', 'step'", {"plants": "magic"}),
         (

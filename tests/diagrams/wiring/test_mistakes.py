@@ -205,7 +205,9 @@ def test_a_wrong_shape_names_both_ends():
 
 
 def test_an_index_out_of_range():
-    with pytest.raises(ShapeError, match=r"gain\.u: source\.y\[3\] is out of range: the port has shape \(3,\)"):
+    with pytest.raises(
+        ShapeError, match=r"gain\.u: source\.y\[4\] is out of range, counted from 1: the port has shape \(3,\)"
+    ):
         Diagram("d", Gain(gain=1)(Constant(value=(1, 2, 3), name="source").y[3]))
 
 
@@ -581,7 +583,9 @@ def test_a_name_given_outside_a_box_belongs_to_where_it_is_given():
 
 
 def test_a_part_that_is_not_there_is_refused_on_a_named_wire():
-    with pytest.raises(ShapeError, match=r"constant\.y\[5\] is out of range: the port has shape \(2,\)"):
+    with pytest.raises(
+        ShapeError, match=r"constant\.y\[6\] is out of range, counted from 1: the port has shape \(2,\)"
+    ):
         Diagram("d", Constant(value=(1.0, 2.0)).y[5].named("a"))
 
 

@@ -42,7 +42,7 @@ def test_a_part_of_a_vector_is_compared_by_its_own_shape(name):
 
     run = build(slice(1, 3)).simulate(0.1, step=0.1, progress=False)
     assert run["w"].tolist() == [10.0, 10.0]
-    with pytest.raises(ShapeError, match=rf"^m\.u: {name}\.y\[2\] has shape \(\); expected \(2,\)"):
+    with pytest.raises(ShapeError, match=rf"^m\.u: {name}\.y\[3\] has shape \(\); expected \(2,\)"):
         build(2)
 
 
