@@ -48,7 +48,7 @@ from .frequency import (
     sampled_poles,
     sensitivity,
 )
-from .linearization import Linearization
+from .linearization import Kink, Linearization, MeanSlope, StepsOnly, ZeroSlope
 from .measure import FrequencyResponse
 from .paper import Channel, Fig3Diagram, Rig, experiments, fig3
 from .report import analyse
@@ -70,9 +70,11 @@ __all__ = [
     "GainCrossover",
     "GangOfFour",
     "Interrupted",
+    "Kink",
     "Layout",
     "Linearization",
     "Margins",
+    "MeanSlope",
     "Number",
     "NyquistCount",
     "Occurrence",
@@ -93,11 +95,13 @@ __all__ = [
     "Snapshot",
     "StabilityLimit",
     "StabilityMap",
+    "StepsOnly",
     "Stopped",
     "Subsystem",
     "SubsystemSettings",
     "Table",
     "Wire",
+    "ZeroSlope",
     "analyse",
     "check_block",
     "compare_with_control",

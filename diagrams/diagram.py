@@ -149,13 +149,14 @@ class Diagram(SimulatedDiagram):
         outputs: str | Iterable[str] = (),
         openings: str | Iterable[str] = (),
         plants: str | None = None,
+        stairs: str | None = None,
         **options: Any,
     ) -> Linearization:
         """Return the linear model of this very diagram at an operating point.
 
         It is continuous where everything is continuous. With sampled subsystems it is discrete, over one base period
         or, with several rates, their least common one; hold, delay and the time between ticks are exact. Its
-        ``notes`` say which effects it does not follow, such as a quantizer or an event within the period.
+        ``findings`` say what it does not follow, such as stairs and kinks; loops and their numbers carry them.
 
         Parameters
         ----------
@@ -166,15 +167,15 @@ class Diagram(SimulatedDiagram):
         outputs : str or list of str
             Wires or ports that are measured: what the block puts out, ahead of an injection there.
         openings : str or list of str
-            Wires that are cut behind the port, for all its consumers, which get its value at the operating point: that
-            stays what it is.
+            Wires that are cut behind the port, for all its consumers, which get its value at the operating point.
         plants : {"equations", "step", "identified"}, optional
-            Method for an FMU's step: by its equations' Jacobian and a matrix exponential, right at an
-            equilibrium; by differences of the step itself; or from its pulse responses from rest, without its states.
-            Without it the first at an equilibrium, else the second, and the third where the FMU allows neither.
+            Linear model of an FMU's step: its equations' Jacobian and a matrix exponential, the default at equilibria;
+            differences of the step, elsewhere; or its pulse responses from rest, where it allows neither.
+        stairs : {"gain"}, optional
+            "gain" takes stairs, as of quantizers and encoders, as their mean slope, not as zero. A relay has none.
         **options
-            Of the run to the operating point, where it is a time: see `operating_point`. With ``step`` a diagram that
-            is continuous but for an FMU is linearized over its communication step.
+            Options of the run to a time, as of `operating_point`. With ``step`` a diagram that is continuous but for an
+            FMU is linearized over its communication step.
 
         Returns
         -------
@@ -189,7 +190,8 @@ class Diagram(SimulatedDiagram):
         """
         from .linearization import linearize
 
-        return linearize(self, point, inputs=inputs, outputs=outputs, openings=openings, plants=plants, **options)
+        options = {"plants": plants, "stairs": stairs, **options}
+        return linearize(self, point, inputs=inputs, outputs=outputs, openings=openings, **options)
 
     def linearize_batch(
         self, points: Iterable[Any] = (None,), variants: Iterable[Mapping[str, Any]] = ({},), **options: Any
@@ -199,8 +201,7 @@ class Diagram(SimulatedDiagram):
         Parameters
         ----------
         points : iterable
-            As `linearize` takes them. Each variant runs to a time or an instant of a run anew; an `OperatingPoint` is
-            taken as it is, with the variant's parameters.
+            As `linearize` takes them. Each variant runs to a time or an instant anew; an `OperatingPoint` is taken.
         variants : iterable of mapping
             What `replace` changes: ``[{"controller.pid_par.poles": (-30, -30, -30)}, …]``.
         **options
@@ -316,8 +317,7 @@ class Diagram(SimulatedDiagram):
         With v the output of the wire's port and u = v + d the signal that all its consumers get, S = u/d, T = −v/d and
         L = −v/u, as of `Linearization`. They are sampled where the linear model is; see docs/frequency.md.
 
-        The signal is ramped in; then windows of whole periods follow until two agree. Sources go on meanwhile: let the
-        references stand still, and look at ``moved``.
+        The signal is ramped in; then windows of whole periods follow until two agree. Let the references stand still.
 
         Parameters
         ----------

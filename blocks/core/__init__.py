@@ -31,6 +31,7 @@ from .errors import (
     close_names,
     near,
 )
+from .findings import Finding
 from .frozen import FrozenMapping
 from .instants import is_before, left_of, move_earlier, next_edge, period_of
 from .layout import Layout, elements, lay_out
@@ -55,6 +56,7 @@ __all__ = [
     "DoubleDriveError",
     "DuplicateNameError",
     "Event",
+    "Finding",
     "FmuError",
     "FmuFileError",
     "FmuRuntimeError",

@@ -46,12 +46,12 @@ from typing import Any, NamedTuple, Self, cast
 import numpy as np
 
 from ...blocks import AdmittanceFilter, ErrorDynamics, FeedbackLinearization, ForceSensor, Frame, Path, PlanarModel
-from ...blocks.core import Array, ParameterError, UnknownNameError, Value, parameter
+from ...blocks.core import Array, Finding, ParameterError, UnknownNameError, Value, parameter
 from ...blocks.path_following import expect_model, expect_path
 from ...blocks.tracing import check_method
 from ..flat import WiredDiagram
 from ..results import OperatingPoint
-from .fig3_parts import check_wires, delay_of, plant_path
+from .fig3_parts import check_wires, delay_of, find_kinks, plant_path
 from .planar import compute_slopes
 from .shown_plant import check_plant
 
@@ -110,6 +110,7 @@ class AdmittanceLoop(Value):
     feed_forward: float = parameter(default=1.0, unit="1", description="share φ of ë that is fed forward")
     cancelled: float = parameter(default=1.0, unit="1", description="share β of the measured force that is cancelled")
     tool_mass: float = parameter(default=0.0, unit="kg", minimum=0.0, description="mass beyond the force sensor, of M")
+    findings: tuple[Finding, ...] = parameter(default=(), description="kinks and stairs that its numbers carry")
 
     @classmethod
     def of(
@@ -130,8 +131,8 @@ class AdmittanceLoop(Value):
             Instant of the diagram that gives the plant's states beside position and velocity, such as contact; the
             start without it.
         **changes
-            Parameters that the diagram does not hold, or other values for those it holds. ``eta`` and ``xi`` give the
-            point on the path. ``plant`` gives the true robot where the controller inverts another model.
+            Parameters that the diagram does not hold, or other values: ``eta`` and ``xi`` of the point on the path,
+            ``plant`` for the true robot where the controller inverts another model.
 
         Raises
         ------
@@ -159,7 +160,7 @@ class AdmittanceLoop(Value):
             "tool_mass": sensor.tool_mass,
         }
         check_wires(diagram)
-        loop = cls(**{**found, "side": side, **changes})
+        loop = cls(**{**found, "findings": find_kinks(diagram, point), "side": side, **changes})
         check_plant(
             diagram,
             plant_path(diagram),

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks import Gain, Saturation, UnitDelay
-from ...blocks.core import ParameterError, UnknownNameError
+from ...blocks.core import Finding, ParameterError, UnknownNameError
+from ..linearization import find_kinks_between
 
 if TYPE_CHECKING:
     from ..flat import WiredDiagram
+    from ..results import OperatingPoint
 
 SENSOR = "sensors.force_sensor"
 _CONTROLLER = "controller"
@@ -31,6 +33,13 @@ def plant_path(diagram: WiredDiagram) -> str:
             block=SENSOR,
         )
     return wire.block
+
+
+def find_kinks(diagram: WiredDiagram, point: OperatingPoint | None) -> tuple[Finding, ...]:
+    """Return the kinks and stairs on the loops, and on the ways from the measured force to the plant's motion."""
+    plant = plant_path(diagram)
+    measured, moves = ([(path, port) for port in diagram.blocks[path].outputs] for path in (SENSOR, plant))
+    return find_kinks_between(diagram, point, measured, moves)
 
 
 def check_wires(diagram: WiredDiagram) -> None:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import Array, OptionError
+from ...blocks.core import Array, Finding, OptionError
 from ..frequency import read_matrices
 from .compliance_loop import AdmittanceLoop, hold_force
 from .coupled import close_loop
@@ -61,6 +61,8 @@ class Passivity:
         Meaning of the sign for this loop, and its limits.
     tolerance : float
         Relative error of the frequencies.
+    findings : tuple of Finding
+        Kinks and stairs of the diagram that the loop leaves out.
     """
 
     frequency: float
@@ -69,6 +71,7 @@ class Passivity:
     stable: bool
     caveat: str
     tolerance: float = 1e-9
+    findings: tuple[Finding, ...] = ()
 
 
 def target_admittance(loop: AdmittanceLoop, omega: Array) -> Array:
@@ -197,6 +200,7 @@ def passivity(
         scanned=(low, top),
         stable=stable,
         caveat=(SAMPLED if sampled else CONTINUOUS) + (OFF_PATH if loop.side == "par" and loop.q != 1.0 else ""),
+        findings=loop.findings,
     )
 
 

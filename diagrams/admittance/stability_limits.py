@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Array, ConfirmationError, OptionError, near
+from ...blocks.core import Array, ConfirmationError, Finding, OptionError, near
 from ..frequency import Number, on_one_thread
 from .compliance_loop import AdmittanceLoop
 from .coupled import crossing_frequency, growth_rate, growth_rate_by_control
@@ -63,6 +63,8 @@ class StabilityLimit:
         Independent computation that agrees.
     environment : dict
         Properties that were held.
+    findings : tuple of Finding
+        Kinks and stairs of the diagram that the loop leaves out.
     """
 
     over: str
@@ -77,11 +79,12 @@ class StabilityLimit:
     tolerance: float
     confirmed_by: str
     environment: dict[str, float] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
 
     @property
     def number(self) -> Number:
         """The limit as a number of a report."""
-        return Number(self.value, self.unit, self.tolerance, self.confirmed_by)
+        return Number(self.value, self.unit, self.tolerance, self.confirmed_by, findings=self.findings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +171,7 @@ def stability_limit(
     sigma: np.ndarray = growth_rate(loop, **{over: grid}, **environment)
     rule = rule_of_thumb(loop, environment.get("damping", 0.0)) if over == "stiffness" else math.nan
     common: dict[str, Any] = {"over": over, "unit": UNITS[over], "rule_of_thumb": rule, "scanned": (first, last)}
-    common["environment"] = dict(environment)
+    common |= {"environment": dict(environment), "findings": loop.findings}
 
     def growth_at(x: float) -> float:
         return float(growth_rate(loop, **{over: x}, **environment))

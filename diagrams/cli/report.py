@@ -41,6 +41,9 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     report.add_argument("--json", action="store_true", help="all numbers as JSON beside it")
     report.add_argument("--plant", metavar="FILE.fmu", help="another plant in place of the gantry")
     report.add_argument(
+        "--stairs", choices=["gain"], help="take stairs, as of quantizers and encoders, as their mean slope"
+    )
+    report.add_argument(
         "--option",
         metavar="NAME=VALUE",
         action="append",
@@ -68,7 +71,7 @@ def report_command(arguments: argparse.Namespace) -> int:
         began = time.perf_counter()
         try:
             with _progress(diagram.name) as tell:
-                report = _analyse(diagram, experiment, tell)
+                report = _analyse(diagram, experiment, arguments.stairs, tell)
         except LoopwrightError as error:
             say(f"loopwright: error: {error}", sys.stderr)
             return 1
@@ -85,10 +88,12 @@ def report_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _analyse(diagram: Diagram, experiment: Experiment | None, tell: Callable[[str], None]) -> Report:
+def _analyse(
+    diagram: Diagram, experiment: Experiment | None, stairs: str | None, tell: Callable[[str], None]
+) -> Report:
     from ..report import analyse, with_drawing
 
-    return with_drawing(analyse(diagram, experiment=experiment, progress=tell), diagram)
+    return with_drawing(analyse(diagram, experiment=experiment, stairs=stairs, progress=tell), diagram)
 
 
 @contextlib.contextmanager

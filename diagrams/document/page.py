@@ -12,7 +12,7 @@ from .definitions import LOOP_TERMS, definition
 from .figures import Picture, embedded
 from .model import Document, Plot, Section
 from .tables import Numbered, TableView, anchor
-from .values import cell, symbol, tolerance_text, value_text
+from .values import cell, mark, reason, symbol, tolerance_text, value_text
 
 ITEM = "- "
 """Beginning of a text that is an item of a list."""
@@ -94,16 +94,16 @@ class Page:
         """Return the page of a report."""
         numbers = report.numbers()
         more: Mapping[str, str] = report.meta.get("definitions") or {}
-        reasons = list(dict.fromkeys(n.confirmed_by for n in numbers.values()))
+        reasons = list(dict.fromkeys(map(reason, numbers.values())))
         known = {path: _term(path, more) for path in numbers}
         lines = [
             NumberView(
                 path,
                 anchor("n", path),
-                value_text(number, 10),
+                value_text(number, 10) + mark(number),
                 symbol(number.unit),
                 tolerance_text(number),
-                reasons.index(number.confirmed_by) + 1,
+                reasons.index(reason(number)) + 1,
                 known[path],
             )
             for path, number in numbers.items()

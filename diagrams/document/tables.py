@@ -8,9 +8,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..frequency import Number
+from ..frequency import MARK, Number
 from .model import Table
-from .values import cell, is_numeric, quantity, symbol, tolerance_text, value_text
+from .values import cell, is_numeric, mark, quantity, reason, symbol, tolerance_text, value_text
 
 LONG = 30
 """Rows above which a table may go over to the next page."""
@@ -111,14 +111,15 @@ class Numbered:
                 cells.append(self._cell(value, kind, letters, first=i == 0, with_unit=units[i] is None))
             rows.append(tuple(cells))
         said = tuple(Confirmation(letters.get(kind, ""), _said(*why)) for kind, why in reasons.items() if why[1])
+        said += tuple(Confirmation(MARK, text) for text in _left_out(table))
         return TableView(self.count, table.title, tuple(headings), tuple(rows), table.note, said)
 
     def _cell(self, value: Any, kind: str, letters: Mapping[str, str], *, first: bool, with_unit: bool) -> CellView:
         if not isinstance(value, Number):
             return CellView(cell(value), kind, first)
         path = self.paths.get(id(value)) or self.equal.get(value)
-        text = quantity(value) if with_unit else value_text(value)
-        why = value.confirmed_by if value.given else f"confirmed by {value.confirmed_by}"
+        text = quantity(value) if with_unit else value_text(value) + mark(value)
+        why = reason(value) if value.given else f"confirmed by {reason(value)}"
         about = f"{path + ': ' if path else ''}{tolerance_text(value)}; {why}"
         letter = letters.get(_kind(_reason(value)), "")
         return CellView(text, kind, False, True, anchor("n", path) if path else "", about, letter)
@@ -153,6 +154,12 @@ def _said(number: Number, why: str) -> str:
     """Return a sentence on how a number was confirmed."""
     text = why[0].upper() + why[1:] if number.given or math.isnan(number.value) else f"Confirmed by {why}"
     return text if text.endswith(("…", ".")) else f"{text}."
+
+
+def _left_out(table: Table) -> dict[str, None]:
+    """Return the texts of the findings that numbers of a table carry, each once."""
+    numbers = (value for row in table.rows for value in row if isinstance(value, Number))
+    return dict.fromkeys(f"Limit of the linear model: {finding}." for n in numbers for finding in n.findings)
 
 
 def _common_unit(table: Table, column: int) -> str | None:

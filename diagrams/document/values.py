@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..frequency import Number
+from ..frequency import MARK, Number
 
 _POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _UNITS = {"1": "", "deg": "°"}
@@ -53,8 +53,18 @@ def quantity(number: Number) -> str:
     """Return a number with its unit."""
     text, unit = value_text(number), symbol(number.unit)
     if not unit or text == "–":
-        return text
-    return text + ("" if unit == "°" else "\u202f") + unit
+        return text + mark(number)
+    return text + ("" if unit == "°" else "\u202f") + unit + mark(number)
+
+
+def mark(number: Number) -> str:
+    """Return the mark of a number with findings, empty without any."""
+    return MARK if number.findings else ""
+
+
+def reason(number: Number) -> str:
+    """Return the confirmation of a number, and what the linear model behind it leaves out."""
+    return "; ".join([number.confirmed_by, *(f"{MARK} {finding}" for finding in number.findings)])
 
 
 def tolerance_text(number: Number) -> str:

@@ -1,9 +1,10 @@
 """Margins, Nyquist, disks and pole placement of linear systems."""
 
+from .carried import with_findings
 from .disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
 from .loop_margins import margins
 from .margins_found import GainCrossover, Margins, PhaseCrossover
-from .number import Number
+from .number import MARK, Number
 from .nyquist import NyquistCount, nyquist_count
 from .one_thread import on_one_thread
 from .periodic_margins import PeriodicMargins, periodic_margins
@@ -15,6 +16,7 @@ from .sensitivities import GangOfFour, complementary, delayed_hold, delayed_hold
 from .state_space import read_matrices
 
 __all__ = [
+    "MARK",
     "Comparison",
     "DiskMargin",
     "GainCrossover",
@@ -45,4 +47,5 @@ __all__ = [
     "sampled_gains",
     "sampled_poles",
     "sensitivity",
+    "with_findings",
 ]

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError, Finding, ParameterError
+from .carried import carries_findings
 from .confirm import confirm_limit, confirm_peak, refuse_singular
 from .features import Features, scan
 from .loop_margins import EIGENVALUES
@@ -44,6 +45,8 @@ class DiskMargin:
         Smallest factors found, one a channel, with which the closed loop has a pole at the frequency.
     destabilizing_alpha : float
         |δ| of those factors: α for up to three channels, α or more beyond.
+    findings : tuple of Finding
+        Effects on the loop that its linear model leaves out.
     """
 
     alpha: Number
@@ -54,8 +57,10 @@ class DiskMargin:
     phase_deg: float
     destabilizing: tuple[complex, ...]
     destabilizing_alpha: float
+    findings: tuple[Finding, ...] = ()
 
 
+@carries_findings
 def disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> DiskMargin:
     """Return the disk margin of a loop with one channel, α = 1/max|S + (σ − 1)/2|.
 
@@ -80,6 +85,7 @@ def disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Dis
         return _compute_disk_margin(r, skew)
 
 
+@carries_findings
 def mimo_disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> DiskMargin:
     """Return the disk margin of a square loop with independent perturbations in all channels at once.
 
@@ -107,6 +113,7 @@ def mimo_disk_margin(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -
         return _compute_disk_margin(r, skew)
 
 
+@carries_findings
 def loop_at(plant: StateSpace, controller: StateSpace, where: str = "input") -> StateSpace:
     """Return the loop transfer matrix at the plant's input (C P), its output (P C), or both at once.
 

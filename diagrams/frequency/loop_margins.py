@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, get_type_hints
 import numpy as np
 
 from ...blocks.core import ConfirmationError, ParameterError
+from .carried import carries_findings
 from .confirm import (
     confirm_crossing,
     confirm_delay,
@@ -33,6 +34,7 @@ EIGENVALUES = "closed-loop eigenvalues"
 GAINS = (1.5, 2.0, 5.0, 10.0, 100.0, 1e3)
 
 
+@carries_findings
 @on_one_thread
 def margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Margins:
     """Return all margins of a loop with one channel, each confirmed by a second computation.
@@ -121,6 +123,7 @@ class _MarginFinder:
             hidden_unstable=self._find_hidden_unstable(),
             encirclements=encirclements,
             dt=r.dt,
+            findings=(),
             **found,
         )
 

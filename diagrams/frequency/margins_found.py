@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
-from .number import Number
+from ...blocks.core import Finding
+from .number import MARK, Number
 
 NEAR = 1e-12
 """Distance from the limit of stability, relative to the largest pole, within which an unstable loop's pole is named."""
@@ -66,6 +68,9 @@ class Margins:
         Clockwise encirclements of −1 by L.
     dt : float
         Sample time of the loop in s, 0 of a continuous one.
+    findings : tuple of Finding
+        Effects on the loop that its linear model leaves out, such as a kink at the operating point. Every number
+        carries them.
     """
 
     stable: bool
@@ -88,13 +93,14 @@ class Margins:
     hidden_unstable: tuple[complex, ...]
     encirclements: int
     dt: float = 0.0
+    findings: tuple[Finding, ...] = ()
 
     def numbers(self) -> dict[str, Number]:
         """Return the single numbers by name, in the order of the report."""
         found = {f.name: getattr(self, f.name) for f in fields(self)}
         return {name: value for name, value in found.items() if isinstance(value, Number)}
 
-    def as_dict(self) -> dict[str, dict[str, float | str]]:
+    def as_dict(self) -> dict[str, dict[str, Any]]:
         """Return the single numbers by name, as in a report's JSON."""
         return {name: number.as_dict() for name, number in self.numbers().items()}
 
@@ -124,4 +130,4 @@ class Margins:
             lines.append(
                 f"hidden_unstable       {', '.join(f'{p:.6g}' for p in self.hidden_unstable)}: not in this loop"
             )
-        return "\n".join(lines)
+        return "\n".join([*lines, *(f"{MARK} {finding}" for finding in self.findings)])

@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+from ...blocks.core import Finding
+
+MARK = "†"
+"""Mark of a number with findings."""
 
 
 @dataclass(frozen=True)
@@ -21,6 +27,9 @@ class Number:
         The independent computation that agreed.
     given : bool
         Whether it is a given, such as a parameter, with nothing to confirm.
+    findings : tuple of Finding
+        Effects that the linear model behind it leaves out, such as a kink at the operating point: the number is right
+        for the model, and may be wrong for the diagram. Its text ends with †.
 
     Examples
     --------
@@ -33,6 +42,7 @@ class Number:
     tolerance: float
     confirmed_by: str
     given: bool = False
+    findings: tuple[Finding, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("value", "tolerance"):
@@ -42,8 +52,10 @@ class Number:
         return self.value
 
     def __str__(self) -> str:
-        return f"{self.value:.6g}" + ("" if self.unit == "1" else f" {self.unit}")
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        return f"{self.value:.6g}{unit}" + (f" {MARK}" if self.findings else "")
 
-    def as_dict(self) -> dict[str, float | str]:
-        """Return the four entries by name, as in a report's JSON."""
-        return {name: getattr(self, name) for name in ("value", "unit", "tolerance", "confirmed_by")}
+    def as_dict(self) -> dict[str, Any]:
+        """Return the four entries by name, as in a report's JSON, and ``findings`` if there are any."""
+        found = {name: getattr(self, name) for name in ("value", "unit", "tolerance", "confirmed_by")}
+        return found | ({"findings": [f.as_dict() for f in self.findings]} if self.findings else {})

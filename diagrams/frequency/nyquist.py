@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError, Finding, ParameterError
+from .carried import carries_findings
 from .features import Features, scan
 from .realization import Realization
 
@@ -28,13 +29,17 @@ class NyquistCount:
         P, open-loop poles beyond the limit of stability.
     closed_loop : int
         Z = N + P, closed-loop poles beyond the limit; the eigenvalues agree.
+    findings : tuple of Finding
+        Effects on the loop that its linear model leaves out.
     """
 
     encirclements: int
     open_loop: int
     closed_loop: int
+    findings: tuple[Finding, ...] = field(default=(), repr=False)
 
 
+@carries_findings
 def nyquist_count(loop: LinearSystem, *, delay: int = 0) -> NyquistCount:
     """Count the clockwise encirclements of −1, and confirm them by the eigenvalues of open and closed loop.
 

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError, Finding, ParameterError
+from .carried import carries_findings
 from .confirm import confirm_limit, confirm_no_limit, refuse_singular
 from .disk import disk_gains, sensitivity_at
 from .features import SIDES
-from .number import Number
+from .number import MARK, Number
 from .one_thread import on_one_thread
 from .realization import Realization
 
@@ -65,6 +66,8 @@ class PeriodicMargins:
         Renewals of the wire in the period.
     dt : float
         The period in s.
+    findings : tuple of Finding
+        Effects on the loop that its linear model leaves out.
     """
 
     stable: bool
@@ -79,6 +82,7 @@ class PeriodicMargins:
     closed_loop_poles: tuple[complex, ...]
     renewals: int
     dt: float
+    findings: tuple[Finding, ...] = ()
 
     def numbers(self) -> dict[str, Number]:
         """Return the single numbers by name."""
@@ -91,15 +95,17 @@ class PeriodicMargins:
         return () if self.stable else tuple(p for p in self.closed_loop_poles if abs(p) >= 1.0 - 1e-12)
 
     def __str__(self) -> str:
-        if self.stable:
-            return "\n".join(f"{name:22s}{number}" for name, number in self.numbers().items())
-        poles = ", ".join(f"{p:.6g}" for p in self.unstable_poles)
-        return (
-            "unstable: the closed loop has no margins\n"
-            f"unstable_poles        z = {poles} over the period of {self.dt:g} s (stable: |z| < 1)"
-        )
+        lines = [f"{name:22s}{number}" for name, number in self.numbers().items()]
+        if not self.stable:
+            poles = ", ".join(f"{p:.6g}" for p in self.unstable_poles)
+            lines = [
+                "unstable: the closed loop has no margins",
+                f"unstable_poles        z = {poles} over the period of {self.dt:g} s (stable: |z| < 1)",
+            ]
+        return "\n".join([*lines, *(f"{MARK} {finding}" for finding in self.findings)])
 
 
+@carries_findings
 @on_one_thread
 def periodic_margins(loop: LinearSystem) -> PeriodicMargins:
     """Return the margins of a periodic loop, each confirmed by closed-loop eigenvalues of the lifted system.
@@ -190,6 +196,7 @@ class PeriodicMarginFinder:
             closed_loop_poles=tuple(complex(p) for p in np.sort_complex(poles + 1)),
             renewals=len(r.D),
             dt=r.dt,
+            findings=(),
             **found,
         )
 

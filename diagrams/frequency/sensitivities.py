@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import ConfirmationError, ParameterError
+from .carried import carries_findings
 from .number import Number
 from .state_space import Matrices, make_state_space, read_matrices
 
@@ -39,16 +40,19 @@ class GangOfFour:
     T: StateSpace
 
 
+@carries_findings
 def sensitivity(loop: LinearSystem) -> StateSpace:
     """Return S = (I + L)⁻¹ of a square loop, with L's states."""
     return _close_loop(loop, complementary=False)
 
 
+@carries_findings
 def complementary(loop: LinearSystem) -> StateSpace:
     """Return T = (I + L)⁻¹ L of a square loop, with L's states."""
     return _close_loop(loop, complementary=True)
 
 
+@carries_findings
 def gang_of_four(plant: LinearSystem, controller: LinearSystem) -> GangOfFour:
     """Return S, PS, CS and T, all with the states of plant and controller.
 
@@ -89,6 +93,7 @@ def gang_of_four(plant: LinearSystem, controller: LinearSystem) -> GangOfFour:
     )
 
 
+@carries_findings
 def delayed_hold(plant: LinearSystem, sample_time: float, delay: float = 0.0) -> StateSpace:
     """Return the exact sampled state space of a continuous plant behind a zero-order hold and a delay.
 
@@ -155,6 +160,7 @@ def _delay_hold(P: Matrices, sample_time: float, delay: float) -> Matrices:
     return Matrices(A, B, np.hstack([P.C, np.zeros((P.outputs, states - n))]), none, sample_time)
 
 
+@carries_findings
 def delayed_hold_margin(plant: LinearSystem, controller: LinearSystem, *, largest: float = 200.0) -> Number:
     """Return the smallest delay in s between controller and hold that ends the stability of a sampled loop.
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
+from ...blocks.core import Finding
 from .transfer_functions import realize
 
 if TYPE_CHECKING:
@@ -65,3 +66,9 @@ def make_state_space(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray,
     import control
 
     return control.ss(A, B, C, D, dt)
+
+
+def findings_of(system: LinearSystem) -> tuple[Finding, ...]:
+    """Return the findings that a system carries: of a loop of a diagram those on it, else none."""
+    found: tuple[Finding, ...] = getattr(system, "findings", ())
+    return found

@@ -6,13 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeAlias
-from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
 
 from ...blocks.core import Layout, NonFiniteError, UnknownNameError, elements, near
-from ...blocks.tracing import Traced, size
+from ...blocks.tracing import size
 from ..flat import (
     Apart,
     Derivative,
@@ -31,9 +30,9 @@ from ..flat import (
 from ..results import index_of, resolve, split_entry
 from ..simulation import Workspace
 from ..wiring import Wire, join
-from .findings import Finding, StepsOnly
+from .mean_stairs import NO_STAIRS, Stairs
 
-_RESULTS, _ARGUMENTS = ("x", "z", "y", "dx", "r"), ("x", "w", "d")
+_RESULTS, _ARGUMENTS = ("x", "z", "y", "dx", "v", "r"), ("x", "w", "d", "e")
 Numbers: TypeAlias = dict[str | tuple[str, str], np.ndarray]
 """Values by name, ``found["z"]``, and derivatives by name and argument, ``found["z", "w"]``."""
 
@@ -110,6 +109,8 @@ class LocalDerivatives:
         the injected signal. The motion therefore stays that of the closed diagram.
     evaluators : mapping, optional
         Evaluators of opaque stages; see `Schedule`.
+    stairs : Stairs
+        Stairs that are replaced by their mean slopes.
     """
 
     def __init__(
@@ -119,7 +120,9 @@ class LocalDerivatives:
         outputs: Sequence[Signal],
         openings: Sequence[Signal],
         evaluators: Evaluators | None = None,
+        stairs: Stairs = NO_STAIRS,
     ):
+        self.stairs = stairs
         self.flat, self.inputs, self.outputs, self.openings = flat, inputs, outputs, openings
         lengths = Layout.of({str(i): (len(s.entries),) for i, s in enumerate(inputs)})
         self.n_inputs, self.injected = lengths.total, [*lengths.slices.values()]
@@ -187,15 +190,18 @@ class LocalDerivatives:
         """Return values and derivatives by (x, w, d) at an instant; ``NONE`` is one between ticks."""
         if acting not in self._derivatives:
             flat, symbols = self.flat, self.flat.symbols()
-            d = ca.MX.sym("d", self.n_inputs)
+            d, e = ca.MX.sym("d", self.n_inputs), ca.MX.sym("e", self.stairs.e.total)
             c = ca.MX.sym("c", sum(size(flat.checked.shapes[port]) for port in self.cut))
 
             def results(apart: Apart) -> Mapping[str, Any]:
-                instant = evaluate(flat, flat.blocks, acting, **symbols, taps=self._make_taps(d, c), apart=apart)
+                instant = evaluate(
+                    flat, flat.blocks, acting, **symbols, taps=self._make_taps(d, c), apart=apart,
+                    visit=lambda here, path, inputs, made: self.stairs.add(here, path, made, e),
+                )  # fmt: skip
                 found = {"x_next": next_x(instant), "z": plant_inputs(instant), "y": self._read_outputs(instant)}
-                return {**found, "dx": rates(instant), "r": loop_mismatch(instant)}
+                return {**found, "dx": rates(instant), "v": self.stairs.read(instant), "r": loop_mismatch(instant)}
 
-            schedule = trace_schedule("parts", {**symbols, "d": d, "c": c}, results)
+            schedule = trace_schedule("parts", {**symbols, "d": d, "e": e, "c": c}, results)
             self._derivatives[acting] = Derivative(schedule, [(name, None) for name in _ARGUMENTS])
         return self._derivatives[acting]
 
@@ -218,7 +224,8 @@ class LocalDerivatives:
         x = self._solve_loops(acting, t, x, w)
         at = t, x, w, flat.p
         c = self._trace_closed(acting)(*at, evaluators=self.evaluators)[0] if self.cut else np.zeros(0)
-        numbers = self._trace_derivative(acting)(*at, np.zeros(self.n_inputs), c, evaluators=self.evaluators)
+        zeros = np.zeros(self.n_inputs), np.zeros(self.stairs.e.total)
+        numbers = self._trace_derivative(acting)(*at, *zeros, c, evaluators=self.evaluators)
         names, arguments = _RESULTS, _ARGUMENTS
         keys = [(n, a) for n in names for a in arguments]
         found: Numbers = dict(zip([*names, *keys], numbers, strict=True))
@@ -226,12 +233,13 @@ class LocalDerivatives:
         if found["r"].size:
             where = flat.active_loops(acting)
             through_all = np.linalg.solve(
-                found["r", "x"][:, where].T, np.vstack([found[n, "x"][:, where] for n in names[:4]]).T
+                found["r", "x"][:, where].T, np.vstack([found[n, "x"][:, where] for n in names[:-1]]).T
             ).T
-            for n, rows in Layout.of({n: (len(found[n]),) for n in names[:4]}).slices.items():
+            for n, rows in Layout.of({n: (len(found[n]),) for n in names[:-1]}).slices.items():
                 for a in arguments:
                     found[n, a] = found[n, a] - through_all[rows] @ found["r", a]
                 found[n, "x"][:, where] = 0.0
+        self.stairs.close(found, names[:4], arguments[:3])
         return found
 
 
@@ -244,42 +252,3 @@ def _check_finite(derivatives: Iterable[np.ndarray], t: float) -> None:
                 "at another instant, or take a block that is smooth there.",
                 t=t,
             )
-
-
-def find_steps_only(flat: FlatDiagram) -> tuple[Finding, ...]:
-    """Return the outputs that depend on an input only in steps, as findings.
-
-    Quantizers, encoders and comparisons have such outputs: their symbolic derivative is zero everywhere.
-    """
-    return tuple(
-        StepsOnly(path, port, source)
-        for path, trace in flat.checked.traced.items()
-        for port, source in _recall_steps(trace)
-    )
-
-
-_STEPS: WeakKeyDictionary[Traced, list[tuple[str, str]]] = WeakKeyDictionary()  # diagrams share traces
-
-
-def _recall_steps(trace: Traced) -> list[tuple[str, str]]:
-    """Return the (output, input) pairs of `_find_steps`, found once for each trace."""
-    if trace not in _STEPS:
-        _STEPS[trace] = _find_steps(trace)
-    return _STEPS[trace]
-
-
-def _find_steps(trace: Traced) -> list[tuple[str, str]]:
-    """Return the outputs that depend on an input, with a derivative that is zero everywhere."""
-    try:
-        f = trace.function.expand()
-    except RuntimeError:  # a table, or an opaque block
-        return []
-    arguments = [ca.SX.sym(f"a{i}", f.sparsity_in(i)) for i in range(f.n_in())]
-    results, found = f.call(arguments), []
-    for port, y in zip(trace.outputs, results, strict=False):
-        for source, u in zip(trace.inputs, arguments[2:], strict=False):
-            if u.numel() and y.numel() and ca.depends_on(y, u):
-                slopes: list[Any] = ca.jacobian(y, u).nonzeros()
-                if all(e.is_zero() for e in slopes):
-                    found.append((port, source))
-    return found

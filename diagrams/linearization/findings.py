@@ -1,37 +1,102 @@
 """Findings about a linear model: the effects that it leaves out.
 
 A finding has its facts as fields, and its text as ``str(…)``. `Linearization.findings` holds all of them; select a kind
-by its class: ``[f for f in model.findings if isinstance(f, StepsOnly)]``.
+by its class: ``[f for f in model.findings if isinstance(f, StepsOnly)]``. Those that lie on a loop are carried by the
+loop, and by every number that is made from it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
+
+from ...blocks.core import Finding
 
 
 @dataclass(frozen=True)
-class Finding:
-    """A limit of a linear model; the classes below are its kinds."""
-
-
-@dataclass(frozen=True)
-class StepsOnly(Finding):
-    """An output that depends on an input only in steps, such as a quantizer's: its slope is zero.
+class BlockFinding(Finding):
+    """A finding about the way from one signal of a block to another.
 
     Attributes
     ----------
     block, port : str
-        Path of the block, and its output.
+        Path of the block, and its output or its state.
     source : str
-        Input that the output depends on.
+        Input or state that the port depends on.
     """
 
     block: str
     port: str
     source: str
 
+
+@dataclass(frozen=True)
+class StepsOnly(BlockFinding):
+    """An output or a state that depends on an input only in steps, such as a quantizer's: its slope is zero."""
+
     def __str__(self) -> str:
         return f"{self.block}.{self.port} follows {self.source!r} in steps only: it linearizes to zero"
+
+
+@dataclass(frozen=True)
+class MeanSlope(BlockFinding):
+    """An output or a state that depends on an input in stairs, which the model replaces by their mean slope.
+
+    Attributes
+    ----------
+    slope : float
+        Largest entry of the mean slope.
+    """
+
+    slope: float
+
+    def __str__(self) -> str:
+        return f"{self.block}.{self.port} follows {self.source!r} in stairs: taken as their mean slope {self.slope:.6g}"
+
+
+@dataclass(frozen=True)
+class Kink(BlockFinding):
+    """A point at which the slopes to both sides differ, or the value jumps; the model has one of the slopes.
+
+    Attributes
+    ----------
+    below, above : float
+        Slopes to smaller and to larger values of the source, of the pair of entries that differs most.
+    jump : float
+        Change of the value at the point, 0 where it has none.
+    """
+
+    below: float
+    above: float
+    jump: float = 0.0
+
+    def __str__(self) -> str:
+        where = f"{self.block}.{self.port} is at a kink of its dependence on {self.source!r}"
+        if self.jump:
+            return f"{where}: it jumps by {self.jump:.6g} there, and the model leaves the jump out"
+        return f"{where}: slope {self.below:.6g} below the point and {self.above:.6g} above; the model has one of them"
+
+
+@dataclass(frozen=True)
+class ZeroSlope(BlockFinding):
+    """A slope that is zero at the point, although the value changes over the nominal range of the source.
+
+    Attributes
+    ----------
+    span : float
+        Distance to both sides that the source was moved by: the port's nominal value, or 1 + its size without one.
+    change : float
+        Change of the port from the lower to the upper end.
+    """
+
+    span: float
+    change: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.block}.{self.port} has the slope zero by {self.source!r} at this point, but changes by "
+            f"{self.change:.3g} from {self.span:.3g} below to {self.span:.3g} above it"
+        )
 
 
 @dataclass(frozen=True)
@@ -69,6 +134,7 @@ class MemoryActs(Finding):
         Largest derivative of a state by the memory.
     """
 
+    limits_numbers: ClassVar[bool] = False
     block: str
     slope: float
 
@@ -99,6 +165,7 @@ class EntryTaken(Finding):
         Numbers of the entry, counted from 1.
     """
 
+    limits_numbers: ClassVar[bool] = False
     name: str
     entry: tuple[int, ...]
 

@@ -10,18 +10,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, OptionError, WiringError
+from ...blocks.core import Finding, LoopwrightError, OptionError
 from ...fmus.running import Derivation, DerivativeMethod
-from ..flat import NONE, FlatDiagram, TickPattern, WiredDiagram
+from ..flat import NONE, TickPattern, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import exact_time
+from .checks import check_loop, check_opening, refuse_transport_delays, replace_stairs
 from .continuous_model import model_continuous
-from .derivatives import LocalDerivatives, Signal, find_signal, find_steps_only
-from .findings import EntryTaken, Finding
+from .derivatives import LocalDerivatives, find_signal
+from .findings import EntryTaken
+from .kinks import find_kinks
 from .loops_over_a_period import (
     advance_point,
     confirm_loop,
@@ -30,7 +33,8 @@ from .loops_over_a_period import (
     ticks_to_renewal,
 )
 from .operating_points import PointLike, check_options, operating_point
-from .over_a_period import EQUILIBRIUM, Model, find_moving, model_period, period_of
+from .over_a_period import EQUILIBRIUM, Model, model_period, period_of
+from .signal_paths import SignalPaths
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -64,12 +68,18 @@ class Linearization:
     openings : tuple of str
         Wires that were cut.
     findings : tuple of Finding
-        Effects that the model leaves out: outputs that change in steps only, events within the period, a start that is
-        unlike every later tick. Select by class, ``isinstance(finding, StepsOnly)``; ``str(finding)`` is the text.
+        Effects that the model leaves out: stairs and relays (`StepsOnly`), kinks and jumps at the point (`Kink`),
+        slopes of zero where the nominal range is not flat (`ZeroSlope`), events within the period, a start that is
+        unlike every later tick. Select by class, ``isinstance(finding, Kink)``; ``str(finding)`` is the text. A loop
+        has those that lie on it as its attribute ``findings``, and so has every number that is made from it.
+    carried : tuple of Finding
+        Those of the findings that limit the numbers between the model's inputs and outputs.
     plants : str or None
         Method for FMUs that was asked for; the loops of this model use it too.
     step : float, Fraction or None
         Communication step that was asked for; the loops of this model use it too.
+    stairs : str or None
+        Treatment of stairs that was asked for; the loops of this model use it too.
     """
 
     diagram: WiredDiagram
@@ -88,8 +98,10 @@ class Linearization:
     memory: tuple[str, ...] = ()
     openings: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
+    carried: tuple[Finding, ...] = ()
     plants: str | None = field(default=None, repr=False)
     step: float | Fraction | None = field(default=None, repr=False)
+    stairs: str | None = field(default=None, repr=False)
 
     @property
     def how(self) -> dict[str, str]:
@@ -126,9 +138,17 @@ class Linearization:
             key: [e.replace(".", "_") for e in labels]
             for key, labels in (("inputs", self.inputs), ("outputs", self.outputs), ("states", self.states))
         }
-        return StateSpace(
+        system = StateSpace(
             self.A, self.B, C, D, self.dt, name=name.replace(".", "_"), remove_useless_states=False, **names
         )
+        system.findings = self.carried
+        return system
+
+    @cached_property
+    def findings_on_loops(self) -> tuple[Finding, ...]:
+        """Those of the findings that limit numbers about all loops together, such as the poles."""
+        flat = self.diagram.flatten(self.point.base)
+        return SignalPaths(flat, [find_signal(flat, wire).port for wire in self.openings]).on_loops(self.findings)
 
     @property
     def poles(self) -> np.ndarray:
@@ -213,7 +233,8 @@ class Linearization:
         if self.dt and period_of(flat) > 1:
             shift = ticks_to_renewal(flat, ports, at.tick)
             at = advance_point(flat, at, self.plants, shift)
-        how: dict[str, Any] = {"plants": self.plants, "step": self.step, "frozen": frozen}
+        how: dict[str, Any] = {"plants": self.plants, "step": self.step, "stairs": self.stairs}
+        how |= {"frozen": frozen, "findings": self.findings}
         made = _linearize(self.diagram, at, wires, wires, openings, loop=loop, **how)
         if loop:
             own = not shift and not self.openings and not frozen
@@ -231,13 +252,14 @@ def linearize(
     outputs: str | Iterable[str] = (),
     openings: str | Iterable[str] = (),
     plants: str | None = None,
+    stairs: str | None = None,
     **options: Any,
 ) -> Linearization:
     """Linearize a diagram; see `Diagram.linearize`."""
     check_options(diagram, options, "linearize")
     at = operating_point(diagram, point, options)
     diagram = diagram.replace(at.parameters) if at.parameters else diagram  # parameters that a trim has found
-    return _linearize(diagram, at, inputs, outputs, openings, plants=plants, step=options.get("step"))
+    return _linearize(diagram, at, inputs, outputs, openings, plants=plants, stairs=stairs, step=options.get("step"))
 
 
 def _linearize(
@@ -249,8 +271,10 @@ def _linearize(
     *,
     plants: str | None,
     step: float | Fraction | None,
+    stairs: str | None = None,
     loop: str = "",
     frozen: frozenset[TickPattern] = NONE,
+    findings: tuple[Finding, ...] | None = None,
 ) -> Linearization:
     if step is not None and exact_time(step, block=diagram.name) != at.base and (diagram.has_clock or diagram.has_fmu):
         raise OptionError(
@@ -262,14 +286,15 @@ def _linearize(
     names = [_as_list(n) for n in (inputs, outputs, openings)]
     flat = diagram.flatten(at.base)
     at.check_fits(flat, diagram.name)
-    _refuse_transport_delays(flat)
+    refuse_transport_delays(flat)
     found = [[find_signal(flat, n) for n in group] for group in names]
     for signal in found[2]:
-        _check_opening(flat, signal)
-    local, channels = LocalDerivatives(flat, found[0], found[1], found[2]), list[str]()
+        check_opening(flat, signal)
+    means = replace_stairs(diagram, flat, at, stairs)
+    local, channels = LocalDerivatives(flat, found[0], found[1], found[2], stairs=means), list[str]()
     if diagram.has_clock or (diagram.has_fmu and step is not None):
         if loop:
-            _check_loop(flat, local, at)
+            check_loop(flat, local, at)
         if loop and period_of(flat) > 1:
             model, channels = model_loop(flat, local, at, plants, lifted=loop == "lifted", frozen=frozen)
         else:
@@ -280,7 +305,10 @@ def _linearize(
     n, ins, outs = len(A), *(tuple(e for s in group for e in s.labels) for group in found[:2])
     if channels:
         ins = outs = tuple(channels)
-    entries = dict.fromkeys(EntryTaken(s.name, s.entry) for group in found for s in group if s.entry)
+    known = means.replace_findings(find_kinks(flat, at)) if findings is None else findings
+    entries = (EntryTaken(s.name, s.entry) for group in found for s in group if s.entry)
+    every = tuple(dict.fromkeys((*known, *model.findings, *entries)))
+    ways = SignalPaths(flat, [s.port for s in found[2]])
     opaque = {p: Derivation(DerivativeMethod.BLOCK_DIFFERENCES) for p, b in flat.table.blocks.items() if b.opaque}
     return Linearization(
         diagram,
@@ -298,48 +326,16 @@ def _linearize(
         uncertainty=model.uncertainty,
         memory=model.memory,
         openings=tuple(names[2]),
-        findings=(*find_steps_only(flat), *model.findings, *entries),
+        findings=every,
+        carried=ways.between(every, *([s.port for s in group] for group in found[:2])),
         plants=plants,
         step=step,
+        stairs=stairs,
     )
-
-
-def _check_loop(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> None:
-    """Refuse the loop of a wire that changes between ticks and acts there."""
-    moving = find_moving(flat, local, at)
-    if moving:
-        raise OptionError(
-            f"{moving[0]!r} changes between ticks, and blocks in continuous time use it there; expected a loop that is "
-            "closed at ticks. Take the loop at a sampled signal, or that of diagram.continuous().",
-            block=local.inputs[0].port[0],
-            port=local.inputs[0].port[1],
-        )
 
 
 def _as_list(given: str | Iterable[str]) -> list[str]:
     return [given] if isinstance(given, str) else list(given)
-
-
-def _refuse_transport_delays(flat: FlatDiagram) -> None:
-    """Refuse a diagram with transport delays in continuous time."""
-    for path in sorted(flat.table.blocks):
-        if flat.table.blocks[path].transport and path not in flat.checked.traced:
-            raise WiringError(
-                "found a transport delay in continuous time, which has no finite linear model; expected none. Put it "
-                "into a sampled subsystem, where it is a delay of whole samples, or take PadeDelay(delay=…, order=…).",
-                block=path,
-            )
-
-
-def _check_opening(flat: FlatDiagram, signal: Signal) -> None:
-    """Refuse to cut a port without consumers."""
-    if signal.port in {(w.block, w.port) for w in flat.table.wires.values()}:
-        return
-    raise WiringError(
-        f"found nothing wired to it; expected a wire to cut at {signal.name!r}. Name a wire that closes a loop.",
-        block=signal.port[0],
-        port=signal.port[1],
-    )
 
 
 def linearize_batch(

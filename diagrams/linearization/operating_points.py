@@ -22,7 +22,7 @@ OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start")
 """Options of a run to an operating point."""
 AGAIN = 1e-3
 """Largest deviation of a repeated run, whose solver takes other steps, relative to 1 + the size of a state."""
-MORE = {"linearize": ("inputs", "outputs", "openings", "plants"), "operating_point": ("t",)}
+MORE = {"linearize": ("inputs", "outputs", "openings", "plants", "stairs"), "operating_point": ("t",)}
 """Further arguments of methods that run to an operating point."""
 
 

@@ -15,12 +15,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ...blocks.core import Block, left_of
+from ...blocks.core import Block, Finding, left_of
 from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
 from .derivatives import LocalDerivatives, Numbers, Signal
-from .findings import EventWithinPeriod, Finding, MemoryActs, UnusualStart
+from .findings import EventWithinPeriod, MemoryActs, UnusualStart
 from .plant_models import PlantModel, fmu_at, inputs_before, join_matrices, model_steps, states_of
 
 EQUILIBRIUM = 1e-9

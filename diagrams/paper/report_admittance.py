@@ -19,7 +19,7 @@ from ..admittance import (
     target_admittance,
 )
 from ..document import Plot, Section, Table, Texts
-from ..frequency import Number
+from ..frequency import Number, with_findings
 from ..report import Implementation
 from .reduced_loops import ReducedLoops, each_implementation
 from .report_case import Fig3Case
@@ -85,7 +85,7 @@ def _passivity(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Ta
                 how = f"Re Y ≥ 0 on the whole scan up to {p.scanned[1]:.6g} rad/s"
             path = f"first_non_passive.{name}{suffix}"
             error = p.tolerance * p.frequency if math.isfinite(p.frequency) else 0.0
-            numbers[path] = Number(p.frequency, "rad/s", error, how)
+            numbers[path] = Number(p.frequency, "rad/s", error, how, findings=p.findings)
             spans = ", ".join(f"{low:.5g} … {high:.5g}" for low, high in p.intervals) or "none"
             rows.append((name + suffix, numbers[path], spans, "yes" if p.stable else "no"))
     columns = ("variant", "first Re Y < 0 at", "all of Re Y < 0 [rad/s]", "stable alone")
@@ -101,7 +101,9 @@ def _limits(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Itera
                 rule = Number(found.rule_of_thumb, "N/m", 0.0, "closed form (d + b_e)/T_d")
                 frequency = None
                 if math.isfinite(found.frequency):
-                    frequency = Number(found.frequency, "rad/s", 1e-6 * found.frequency, found.confirmed_by)
+                    frequency = with_findings(
+                        Number(found.frequency, "rad/s", 1e-6 * found.frequency, found.confirmed_by), found.findings
+                    )
                 shown = {"ke_limit": found.number, "rule_of_thumb": rule, "ke_frequency": frequency}
                 place = f"{name}.be_{b:g}"
                 numbers |= {f"{kind.key_of(of)}.{place}": n for of, n in shown.items() if n is not None}

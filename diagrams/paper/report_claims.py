@@ -10,7 +10,7 @@ from ...blocks import PlanarModel
 from ...blocks.core import LoopwrightError
 from ...fmus.models import Gantry
 from ..document import Section, Table, Texts
-from ..frequency import Number, relative_difference
+from ..frequency import Number, relative_difference, with_findings
 from ..report import POLES_TITLE, Implementation, Variant, in_s, scatter, without_memory
 from .report_case import COORDINATES, Fig3Case, linearization_of
 
@@ -84,6 +84,7 @@ class _Claims:
         if base is not None and len(self.matched.get(base, ())) == len(at):
             away = max(relative_difference(p, q) for p, q in zip(polynomials, self.matched[base], strict=True))
             found["from_matched"] = Number(away, "1", 1e-9, "characteristic polynomials at all the points")
+        found = with_findings(found, tuple(f for w in at for f in w.model.findings_on_loops))
         self.numbers |= {f"{key}.{name}": number for name, number in found.items()}
         shown = (found.get(name) for name in ("coupling", "polynomial_spread", "from_matched", "slowest"))
         self.rows.append((title, *shown, len(at)))

@@ -10,8 +10,8 @@ import numpy as np
 from ...blocks import ErrorDynamics
 from ...blocks.core import LoopwrightError
 from ..document import Section, Table, Texts
-from ..frequency import Number, Realization, relative_difference, sampled_gains, sampled_poles
-from ..report import POLES_TITLE, in_s
+from ..frequency import Number, Realization, relative_difference, sampled_gains, sampled_poles, with_findings
+from ..report import POLES_TITLE, Variant, in_s
 from .report_case import Fig3Case
 
 TEXTS = Texts(__package__, "poles")
@@ -36,6 +36,10 @@ def _asked(case: Fig3Case, side: str, wire: str, block: ErrorDynamics, numbers: 
     wanted = np.sort_complex(np.roots(asked))
     centre = -float(block.a2) / 3
     numbers[f"{side}.asked.mean"] = Number(centre, "1/s", 1e-15 * abs(centre), "given: −a₂/3", given=True)
+
+    def keep(v: Variant, name: str, number: Number) -> None:
+        numbers[f"{side}.{v.key}.{name}"] = with_findings(number, v.findings(wire))
+
     rows: list[tuple[Any, ...]] = [("asked", _listed(_cleaned(asked, wanted)), "")]
     gains: list[tuple[Any, ...]] = []
     for v in case.usable():
@@ -50,9 +54,9 @@ def _asked(case: Fig3Case, side: str, wire: str, block: ErrorDynamics, numbers: 
             if len(got) != len(asked) and not off <= SAME:  # the plant has dynamics of its own
                 rows.append((v.title, _listed(np.roots(got)), ""))
                 continue
-            numbers[f"{side}.{v.key}.polynomial_difference"] = Number(off, "1", 1e-9, how)
+            keep(v, "polynomial_difference", Number(off, "1", 1e-9, how))
             if len(got) == len(asked):
-                numbers[f"{side}.{v.key}.mean"] = Number(-got[1] / 3, "1/s", 1e-9 * abs(got[1]), "the trace of A")
+                keep(v, "mean", Number(-got[1] / 3, "1/s", 1e-9 * abs(got[1]), "the trace of A"))
             rows.append((v.title, _listed(np.roots(got)), numbers[f"{side}.{v.key}.polynomial_difference"]))
             continue
         if not v.is_design:
@@ -67,10 +71,10 @@ def _asked(case: Fig3Case, side: str, wire: str, block: ErrorDynamics, numbers: 
         if not off <= SAME:
             rows.append((v.title, _listed(in_s(1 + np.linalg.eigvals(r.closed_matrix()), r.dt)), ""))
             continue
-        numbers[f"{side}.{v.key}.polynomial_difference"] = Number(off, "1", 1e-9, how)
+        keep(v, "polynomial_difference", Number(off, "1", 1e-9, how))
         for i, s in enumerate(design.poles[:3], 1):
-            numbers[f"{side}.{v.key}.pole_{i}_real"] = Number(s.real, "1/s", 1e-6 * abs(s), how)
-            numbers[f"{side}.{v.key}.pole_{i}_imag"] = Number(abs(s.imag), "rad/s", 1e-6 * abs(s), how)
+            keep(v, f"pole_{i}_real", Number(s.real, "1/s", 1e-6 * abs(s), how))
+            keep(v, f"pole_{i}_imag", Number(abs(s.imag), "rad/s", 1e-6 * abs(s), how))
         rows.append((v.title, _listed(design.poles), numbers[f"{side}.{v.key}.polynomial_difference"]))
         try:
             better = sampled_gains(tuple(_cleaned(asked, wanted)), r.dt, delay=v.implementation.delay)

@@ -47,6 +47,7 @@ def analyse(
     loops: Iterable[str] | None = None,
     experiment: ReportedExperiment | None = None,
     only: tuple[str, ...] | None = None,
+    stairs: str | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Report:
     """Analyse a diagram, and return the content of its report.
@@ -70,6 +71,9 @@ def analyse(
         Where the diagram comes from, for the report's heading.
     only : tuple of str, optional
         The sections that are made, by their keys; all without it.
+    stairs : {"gain"}, optional
+        "gain" takes the stairs of quantizers and encoders as their mean slope in all linear models; without it their
+        slope is zero.
     progress : callable, optional
         Told the key of each section before it is made.
 
@@ -95,7 +99,7 @@ def analyse(
     for wire in wires or ():
         find_signal(diagram.flatten(None if diagram.has_clock else STEP), wire)
     tell = progress or (lambda key: None)
-    case, sections = kind.sections(diagram, point, experiment, wires, only, tell)
+    case, sections = kind.sections(diagram, point, experiment, wires, only, tell, stairs)
     name = diagram.name if experiment is None else f"Experiment {experiment.letter}: {diagram.name}"
     meta: dict[str, Any] = {
         "diagram": diagram.name,

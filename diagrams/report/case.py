@@ -69,6 +69,8 @@ class Case:
         Where the diagram comes from.
     wires : tuple of str, optional
         Wires at which loops are looked at, instead of all named ones on loops.
+    stairs : {"gain"}, optional
+        Treatment of stairs in the linear models, as of `Diagram.linearize`.
 
     Attributes
     ----------
@@ -91,8 +93,10 @@ class Case:
         point: Any = None,
         experiment: ReportedExperiment | None = None,
         wires: tuple[str, ...] | None = None,
+        stairs: str | None = None,
     ):
         self.diagram, self.point, self.experiment, self.wires = diagram, point, experiment, wires
+        self.stairs = stairs
         self.notes: list[str] = []
         self.keys: tuple[str, ...] = ()
         self.variants: dict[str, Variant] = {}
@@ -145,6 +149,7 @@ class Case:
                 source=self.diagram,
                 inputs=self.inputs,
                 outputs=self.outputs,
+                stairs=self.stairs,
             )
 
         found = variant(self.diagram, self.point)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from ...blocks.core import LoopwrightError, PeriodicLoopError
 from ..document import Section, Table
-from ..frequency import DiskMargin, Number, mimo_disk_margin
+from ..frequency import DiskMargin, Number, mimo_disk_margin, with_findings
 from .case import Case
 from .uncertainty import LoopPart, cut_key
 from .variant import Cut, Variant
@@ -42,13 +42,14 @@ def several(case: Case, key: str, wire: str) -> LoopPart | None:
 def disk_numbers(disk: DiskMargin) -> dict[str, Number]:
     """Return the numbers of a disk margin by the ends of their paths."""
     how = disk.alpha.confirmed_by
-    return {
+    found = {
         "disk_margin": disk.alpha,
         "frequency": disk.frequency,
         "gain_low": Number(disk.gain_low, "1", disk.alpha.tolerance, how),
         "gain_high": Number(disk.gain_high, "1", disk.alpha.tolerance * disk.gain_high**2, how),
         "phase_deg": Number(disk.phase_deg, "deg", 60 * disk.alpha.tolerance, how),
     }
+    return with_findings(found, disk.findings)
 
 
 def disk_range(disk: DiskMargin) -> str:

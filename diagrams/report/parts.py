@@ -63,6 +63,7 @@ class MakesSections(Protocol):
         wires: tuple[str, ...] | None,
         only: Iterable[str] | None,
         tell: Callable[[str], None],
+        stairs: str | None = None,
     ) -> tuple[Case, tuple[Section, ...]]:
         """Return the case of a diagram, and its sections."""
 
@@ -90,7 +91,7 @@ class ReportKind(Generic[C]):
         Definitions of the terms in the paths of numbers.
     """
 
-    case: Callable[[WiredDiagram, Any, ReportedExperiment | None, tuple[str, ...] | None], C]
+    case: Callable[[WiredDiagram, Any, ReportedExperiment | None, tuple[str, ...] | None, str | None], C]
     parts: tuple[ReportPart[C], ...]
     definitions: Mapping[str, str] = field(default_factory=dict)
 
@@ -119,12 +120,13 @@ class ReportKind(Generic[C]):
         wires: tuple[str, ...] | None,
         only: Iterable[str] | None,
         tell: Callable[[str], None],
+        stairs: str | None = None,
     ) -> tuple[Case, tuple[Section, ...]]:
         """Return the case of a diagram, and its sections.
 
         Parameters
         ----------
-        diagram, point, experiment, wires
+        diagram, point, experiment, wires, stairs
             As `Case` takes them.
         only : iterable of str, optional
             Keys of the sections that are made; all without it.
@@ -132,7 +134,7 @@ class ReportKind(Generic[C]):
             Told "variants" before the case is made, and the key of each section before it is made.
         """
         tell("variants")
-        case = self.case(diagram, point, experiment, wires)
+        case = self.case(diagram, point, experiment, wires, stairs)
         wanted = set(self.keys if only is None else only)
         case.keys = tuple(key for key in self.keys if key in wanted)
         return case, tuple(self._made(case, tell))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ...blocks import AdmittanceFilter, Backlash, DeadZone, Encoder, Quantizer, RateLimiter, Relay, Saturation
 from ..document import Section, Texts
+from ..linearization import MeanSlope
 from .case import Case
 
 TEXTS = Texts(__package__, "limits")
@@ -17,8 +18,9 @@ def not_modelled(case: Case) -> Section:
     text = [TEXTS.line("small_motions")]
     for v in case.usable():
         text += [f"{v.title}: {finding}" for finding in v.model.findings]
+    means = {f.block for v in case.usable() for f in v.model.findings if isinstance(f, MeanSlope)}
     for path, block in sorted(case.diagram.blocks.items()):
-        if isinstance(block, NOT_SMOOTH):
+        if isinstance(block, NOT_SMOOTH) and path not in means:
             text.append(TEXTS.line("slope", block=path, kind=type(block).__name__))
         if isinstance(block, AdmittanceFilter) and block.has_limits:
             text.append(TEXTS.line("reference_limits", block=path))

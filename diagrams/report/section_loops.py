@@ -19,6 +19,7 @@ from ..frequency import (
     compare_margins,
     margins,
     periodic_margins,
+    with_findings,
 )
 from . import plots as figures
 from .case import Case
@@ -86,7 +87,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
         at = cut_key(v, cut)
         found[at], loops[at], titles[at] = m, L, title
         designs += [at] if v.is_design else []
-        own[v, cut] = _numbers(m)
+        own[v, cut] = with_findings(_numbers(m), m.findings)
         numbers |= {f"{at}.{name}": number for name, number in own[v, cut].items()}
         if m.hidden_unstable:
             shown = _poles(m.hidden_unstable, L.dt)
@@ -98,7 +99,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
                 notes.append(f"{v.title}: {error.message}")
             else:
                 periodic[v.title] = p
-                own[v, Cut.PERIODIC] = _periodic_numbers(p)
+                own[v, Cut.PERIODIC] = with_findings(_periodic_numbers(p), p.findings)
                 where = cut_key(v, Cut.PERIODIC)
                 numbers |= {f"{where}.{name}": number for name, number in own[v, Cut.PERIODIC].items()}
                 if not p.stable:
@@ -115,7 +116,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
                 notes.append(TEXTS.line("not_compared", variant=title, error=str(error)))
                 continue
             for c in rows:
-                numbers[f"{at}.control.{c.name}"] = _theirs(m, c)
+                numbers[f"{at}.control.{c.name}"] = with_findings(_theirs(m, c), m.findings)
                 beside.append((title, c.name, c.value, c.control, c.function, c.right, c.why))
     if not found:
         return None

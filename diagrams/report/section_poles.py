@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..document import Section, Table, Texts
-from ..frequency import Number
+from ..frequency import Number, with_findings
 from .case import Case
 from .stability import ON_THE_LIMIT, Stability, scatter
 from .variant import in_s
@@ -23,6 +23,7 @@ def closed_loops(case: Case) -> Section:
         if s.size:
             slowest, fastest = float(np.max(s.real)), float(np.min(s.real))
             number = Number(slowest, "1/s", scatter(v), "eigenvalues; tolerance by perturbing the matrix")
+            number = with_findings(number, v.model.findings_on_loops)
             numbers[f"{v.key}.slowest"] = number
             rows.append((v.title, len(s), Stability.of(v), number, f"{fastest:.6g} 1/s"))
     columns = ("variant", "poles", "stable", "largest Re s", "smallest Re s")

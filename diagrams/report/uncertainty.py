@@ -135,7 +135,7 @@ def _relative_error(v: Variant, wire: str, cut: Cut, w: np.ndarray) -> tuple[flo
     if not any(d.method is DerivativeMethod.STEP_DIFFERENCES for d in v.model.derivations.values()):
         return error, ""
     try:
-        held = cut.loop(linearize(v.diagram, v.point, plants="equations"), wire)
+        held = cut.loop(linearize(v.diagram, v.point, plants="equations", stairs=v.stairs), wire)
     except LoopwrightError:
         return error, TEXTS.line("no_equations")
     solver = off(held)

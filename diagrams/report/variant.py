@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError
+from ...blocks.core import Finding, LoopwrightError
 from ..flat import WiredDiagram
 from ..linearization import Linearization, linearize
 from ..results import OperatingPoint
@@ -90,6 +90,8 @@ class Variant:
         The diagram of an operating point that is taken over.
     inputs, outputs : tuple of str
         Inputs and outputs of the linear model.
+    stairs : {"gain"}, optional
+        Treatment of stairs in the linear model.
     """
 
     key: str
@@ -102,6 +104,7 @@ class Variant:
     source: WiredDiagram | None = None
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
+    stairs: str | None = None
     _loops: dict[tuple[Any, ...], Any] = field(default_factory=dict, repr=False)
 
     @cached_property
@@ -112,13 +115,18 @@ class Variant:
     @cached_property
     def model(self) -> Linearization:
         """Its linear model."""
-        return linearize(self.diagram, self.point, inputs=self.inputs, outputs=self.outputs)
+        return linearize(self.diagram, self.point, inputs=self.inputs, outputs=self.outputs, stairs=self.stairs)
 
     def loop(self, *wires: str, cut: Cut = Cut.PLAIN) -> Any:
         """Return the loop transfer function at wires, computed once."""
         if (wires, cut) not in self._loops:
             self._loops[wires, cut] = cut.loop(self.model, *wires)
         return self._loops[wires, cut]
+
+    def findings(self, *wires: str) -> tuple[Finding, ...]:
+        """Return the findings that limit the numbers of the loop at wires."""
+        found: tuple[Finding, ...] = self.loop(*wires).findings
+        return found
 
     @property
     def rests(self) -> bool:
@@ -149,6 +157,7 @@ class Variant:
             source=self.source,
             inputs=self.inputs,
             outputs=self.outputs,
+            stairs=self.stairs,
         )
 
 

@@ -347,7 +347,7 @@ def test_a_mode_that_only_events_change_is_no_state():
     lin = Diagram("d", x(Sum(signs="++")(relay, box(x.y)))).linearize()
     assert lin.states == ("integrator.y",)
     assert pytest.approx(np.array([[1 - T]]), rel=1e-13) == lin.A
-    assert lin.notes == ()
+    assert lin.findings == (StepsOnly("relay", "y", "u"),)
 
 
 def test_an_event_within_the_period_is_told():
@@ -359,11 +359,12 @@ def test_an_event_within_the_period_is_told():
 
     relay = Relay(on_point=1.0, off_point=-1.0, on_value=-2.0, off_value=1.0)(x.y)
     lin = Diagram("d", x(Sum(signs="++")(relay, box(x.y)))).linearize()
-    (note,) = lin.notes
+    steps, note = lin.notes
+    assert steps == "relay.y follows 'u' in steps only: it linearizes to zero"
     assert re.match(
         r"relay: its event '\w+' fires within the period from t = 0 s; the model is that of the motion", note
     )
-    (finding,) = lin.findings
+    finding = lin.findings[1]
     assert isinstance(finding, EventWithinPeriod)
     assert (finding.block, finding.t, str(finding)) == ("relay", 0.0, note)
 

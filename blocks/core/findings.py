@@ -1,0 +1,24 @@
+"""Findings: facts that limit a number, carried beside it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A fact that limits a result; subclasses are its kinds, with the facts as fields and the text as ``str(…)``.
+
+    Attributes
+    ----------
+    limits_numbers : bool
+        Whether numbers that are made from the result may be wrong because of it. Only such findings are carried to
+        numbers.
+    """
+
+    limits_numbers: ClassVar[bool] = True
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the kind, the fields and the text by name, as in a report's JSON."""
+        return {"kind": type(self).__name__, **asdict(self), "text": str(self)}

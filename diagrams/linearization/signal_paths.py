@@ -1,0 +1,122 @@
+"""Ways of signals through a diagram: which findings lie between two ports, or on a loop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import cached_property
+from typing import NamedTuple
+
+from ...blocks.core import Finding
+from ..flat import FlatDiagram
+from .block_slopes import slopes_of
+from .findings import BlockFinding, EventWithinPeriod
+
+
+class Node(NamedTuple):
+    """An input or an output of a block."""
+
+    block: str
+    port: str
+    is_output: bool
+
+
+class SignalPaths:
+    """The ways of signals: along wires, and through blocks from the inputs to the outputs that follow them.
+
+    An output follows an input at once, by states, or by events. Outputs of an FMU follow all its inputs; those of the
+    blocks in an enabled or triggered subsystem follow its control.
+
+    Parameters
+    ----------
+    flat : FlatDiagram
+        Diagram with its traced blocks.
+    cut : iterable of (str, str)
+        Ports behind which the wire is cut.
+    """
+
+    def __init__(self, flat: FlatDiagram, cut: Iterable[tuple[str, str]] = ()):
+        self.flat, self.cut = flat, frozenset(cut)
+
+    @cached_property
+    def _wires(self) -> dict[Node, set[Node]]:
+        """From outputs to the inputs of their consumers, and to what a subsystem's control acts on; none is cut."""
+        table = self.flat.table
+        edges: dict[Node, set[Node]] = {}
+        for (block, port), wire in table.wires.items():
+            edges.setdefault(Node(wire.block, wire.port, True), set()).add(Node(block, port, False))
+        for subsystem, wire in table.controls.items():
+            inside = (p for p, s in table.subsystem_of.items() if f"{s}.".startswith(f"{subsystem}."))
+            edges.setdefault(Node(wire.block, wire.port, True), set()).update(
+                Node(path, port, True) for path in inside for port in table.blocks[path].outputs
+            )
+        return edges
+
+    @cached_property
+    def _forward(self) -> dict[Node, set[Node]]:
+        traced = self.flat.checked.traced
+        edges = {node: set(to) for node, to in self._wires.items() if (node.block, node.port) not in self.cut}
+        for path, block in self.flat.table.blocks.items():
+            for source in block.inputs:
+                for port in block.outputs:
+                    if path not in traced or slopes_of(traced[path]).follows(port, source):
+                        edges.setdefault(Node(path, source, False), set()).add(Node(path, port, True))
+        return edges
+
+    @cached_property
+    def _backward(self) -> dict[Node, set[Node]]:
+        found: dict[Node, set[Node]] = {}
+        for node, following in self._forward.items():
+            for other in following:
+                found.setdefault(other, set()).add(node)
+        return found
+
+    def after(self, ports: Iterable[tuple[str, str]]) -> set[Node]:
+        """Return the inputs and outputs that follow what the consumers of ports get."""
+        return _reach(self._forward, {n for port in ports for n in self._wires.get(Node(*port, True), ())})
+
+    def before(self, ports: Iterable[tuple[str, str]]) -> set[Node]:
+        """Return the ports, and the inputs and outputs that they follow."""
+        return _reach(self._backward, {Node(*port, True) for port in ports})
+
+    def between(
+        self, findings: Iterable[Finding], sources: Iterable[tuple[str, str]], sinks: Iterable[tuple[str, str]]
+    ) -> tuple[Finding, ...]:
+        """Return the findings that limit what is between the wires behind ``sources`` and the ports ``sinks``."""
+        after, before = self.after(sources), self.before(sinks)
+        return tuple(f for f in findings if f.limits_numbers and self._is_between(f, after, before))
+
+    def on_loops(self, findings: Iterable[Finding]) -> tuple[Finding, ...]:
+        """Return the findings that limit numbers about all loops together, such as the poles."""
+        return tuple(f for f in findings if f.limits_numbers and self._is_on_loop(f))
+
+    def _is_on_loop(self, finding: Finding) -> bool:
+        ends = self._ends(finding)
+        if ends is None:
+            return True
+        return bool(_reach(self._forward, ends[1]) & ends[0])
+
+    def _is_between(self, finding: Finding, after: set[Node], before: set[Node]) -> bool:
+        ends = self._ends(finding)
+        return ends is None or bool(ends[0] & after and ends[1] & before)
+
+    def _ends(self, finding: Finding) -> tuple[set[Node], set[Node]] | None:
+        """Return the inputs and the outputs of a block that a finding concerns; None where it concerns everything."""
+        if not isinstance(finding, BlockFinding | EventWithinPeriod) or finding.block not in self.flat.table.blocks:
+            return None
+        path, block = finding.block, self.flat.table.blocks[finding.block]
+        inputs = {Node(path, port, False) for port in block.inputs}
+        outputs = {Node(path, port, True) for port in block.outputs}
+        if isinstance(finding, BlockFinding):
+            inputs &= {Node(path, finding.source, False)} if finding.source in block.inputs else inputs
+            outputs &= {Node(path, finding.port, True)} if finding.port in block.outputs else outputs
+        return inputs, outputs
+
+
+def _reach(edges: Mapping[Node, set[Node]], starts: Iterable[Node]) -> set[Node]:
+    """Return the nodes that are reached from some, themselves among them."""
+    found, todo = set(starts), list(starts)
+    while todo:
+        new = edges.get(todo.pop(), set()) - found
+        found |= new
+        todo += new
+    return found
