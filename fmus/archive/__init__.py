@@ -1,9 +1,10 @@
 """FMU files: their description, read and checked."""
 
-from .description import FmuDescription, FmuVariable, read_description
+from .description import FmuDescription, FmuVariable, OtherVariable, read_description
 
 __all__ = [
     "FmuDescription",
     "FmuVariable",
+    "OtherVariable",
     "read_description",
 ]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import zipfile
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -42,6 +44,18 @@ class FmuVariable:
         return int(np.prod(self.shape, dtype=int))
 
 
+@dataclass(frozen=True)
+class OtherVariable:
+    """Variable of an FMU that is no Float64: it is neither read nor set."""
+
+    name: str
+    type: str
+    causality: str
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.type})"
+
+
 @dataclass(frozen=True, eq=False)
 class FmuDescription:
     """Content of ``modelDescription.xml``, as far as a diagram needs it."""
@@ -53,8 +67,8 @@ class FmuDescription:
     identifier: str
     token: str
     variables: dict[str, FmuVariable]
-    other: dict[str, str]
-    """Type of each variable that is no Float64, by name."""
+    other: dict[str, OtherVariable]
+    """Variables that are no Float64, by name."""
     can_save: bool = False
     """Whether the state of an instance can be saved and restored (canGetAndSetFMUState)."""
     can_serialize: bool = False
@@ -79,6 +93,10 @@ class FmuDescription:
     def of(self, causality: str) -> dict[str, FmuVariable]:
         """Return the variables of a causality, in the file's order."""
         return {name: v for name, v in self.variables.items() if v.causality == causality}
+
+    def other_ports(self, causality: str) -> list[OtherVariable]:
+        """Return the inputs or outputs that are no Float64, in the file's order."""
+        return [v for v in self.other.values() if v.causality == causality]
 
     @property
     def discrete_states(self) -> tuple[str, ...]:
@@ -109,23 +127,12 @@ def read_description(file: str | os.PathLike[str]) -> FmuDescription:
 def _read(path: Path, mtime: int, length: int) -> FmuDescription:
     import fmpy
 
-    data = path.read_bytes()
-    try:
-        with zipfile.ZipFile(path) as archive:
-            entries = set(archive.namelist())
-            text = archive.read("modelDescription.xml") if "modelDescription.xml" in entries else b""
-    except zipfile.BadZipFile:
-        raise FmuFileError(
-            f"{str(path)!r} is no FMU: it is no zip archive (it starts with {data[:8]!r}). Give the .fmu that the "
-            f"tool exported."
-        ) from None
-    if "modelDescription.xml" not in entries:
-        raise FmuFileError(f"{str(path)!r} is a zip archive without modelDescription.xml, so it is no FMU.")
+    data, entries, text = _read_archive(path)
     try:
         model = fmpy.read_model_description(str(path))
     except Exception as error:  # FMPy raises bare exceptions
         raise FmuFileError(f"the modelDescription.xml of {str(path)!r} can't be read: {error}") from error
-    if not model.fmiVersion.startswith("3."):
+    if not re.fullmatch(r"3\.0(\.\d+)?", model.fmiVersion):
         raise FmuFileError(
             f"{str(path)!r} is an FMU of FMI {model.fmiVersion}; expected FMI 3.0. Export it again with FMI 3.0 "
             f"co-simulation."
@@ -144,7 +151,7 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
         if v.causality == "independent":
             continue
         if v.type != "Float64":
-            other[v.name] = v.type
+            other[v.name] = OtherVariable(v.name, v.type, v.causality or "local")
             continue
         shape = _shape(v, model)
         start = None if v.start is None else _start(v.start, shape)
@@ -157,6 +164,37 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
         path, hashlib.sha256(data).hexdigest(), model.modelName, identifier, model.instantiationToken, variables, other,
         states=_states(model, variables), **_capabilities(text),
     )  # fmt: skip
+
+
+def _read_archive(path: Path) -> tuple[bytes, set[str], bytes]:
+    """Return the content of a file, the names in its archive, and the text of its description."""
+    data = b""
+    try:
+        data = path.read_bytes()
+        with zipfile.ZipFile(path) as archive:
+            entries = set(archive.namelist())
+            text = archive.read("modelDescription.xml") if "modelDescription.xml" in entries else b""
+    except zipfile.BadZipFile as error:
+        raise FmuFileError(
+            f"{str(path)!r} is no FMU: it is no zip archive (it starts with {data[:8]!r}), or a damaged one ({error}). "
+            "Give the .fmu that the tool exported."
+        ) from None
+    except MemoryError:
+        raise FmuFileError(
+            f"{str(path)!r} can't be read: its content does not fit into memory; expected an FMU of a few MB. Look at "
+            "the sizes of the files in it, or export it again."
+        ) from None
+    except RuntimeError as error:  # of an archive that asks for a password, or is packed in an unknown way
+        raise FmuFileError(
+            f"{str(path)!r} can't be read: {error}. Pack it again without a password, by the usual compression."
+        ) from None
+    except (OSError, EOFError, zlib.error) as error:
+        raise FmuFileError(
+            f"{str(path)!r} can't be read: {error}. Check its permissions, or copy or export it again."
+        ) from None
+    if "modelDescription.xml" not in entries:
+        raise FmuFileError(f"{str(path)!r} is a zip archive without modelDescription.xml, so it is no FMU.")
+    return data, entries, text
 
 
 def _capabilities(text: bytes) -> dict[str, Any]:

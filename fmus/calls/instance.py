@@ -18,6 +18,7 @@ from .loaded_library import LoadedFmu, status_of
 _HEADER = struct.Struct("<8s32s24sd?")  # of a serialized state: magic, FMU's digest, platform, time, running
 _MAGIC = b"lw-fmu-1"
 _DISCARD = 2
+_BEYOND = 1.0 + 1e-6  # end of a step, in steps, beyond which more than rounding has been added
 
 
 class FmuState:
@@ -105,7 +106,7 @@ class FmuInstance(LoadedFmu):
             now.value, width.value = t, h
             if (status := do_step(*step_arguments)) > 1:
                 raise self._step_error(status, t, h)
-            if any_flag.value:
+            if any_flag.value or reached.value > t + h * _BEYOND:
                 self._check_flags(flags, reached.value, t, h)
             if has_outputs and (status := get_values(*get_arguments)) > 1:
                 raise self._error("reading the outputs", status, t)
@@ -166,6 +167,14 @@ class FmuInstance(LoadedFmu):
                 f"the step from t = {t:.9g} s by {h:g} s returned early, at {reached:.9g} s (earlyReturn), though the "
                 f"FMU was told that it must not (earlyReturnAllowed = false){self._quote_messages()} Take steps that "
                 "end where its events are, or export it without early return.",
+                block=self.block.label,
+                t=t,
+            )
+        if reached > t + h * _BEYOND + 1e-12 * abs(t):
+            raise FmuRuntimeError(
+                f"the step from t = {t:.9g} s by {h:g} s ended at {reached:.9g} s (lastSuccessfulTime); expected "
+                f"{t + h:.9g} s{self._quote_messages()} Its outputs belong to another time than the diagram's: report "
+                "it to its makers.",
                 block=self.block.label,
                 t=t,
             )

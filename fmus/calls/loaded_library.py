@@ -29,7 +29,8 @@ class LoadedFmu:
 
         self.block, self.description = block, block.description
         self.model_exchange, self.failed, self.fatal = model_exchange, False, False
-        self.messages: list[str] = []
+        self.messages: list[str] = self._list_limits()
+        self._limits = len(self.messages)
         self._open = self._running = False
         self._began = 0.0
         description, folder = self.description, Path.cwd()
@@ -46,7 +47,10 @@ class LoadedFmu:
                 unzipDirectory=str(files),
                 instanceName=block.label,
             )
+            self._check_version()
             self._fmu.instantiate(logMessage=self._log, loggingOn=True)
+        except FmuFileError:
+            raise
         except Exception as error:
             raise FmuFileError(
                 f"the FMU {str(description.file)!r} can't be loaded: {error}{self._quote_messages()} Check it with "
@@ -57,13 +61,31 @@ class LoadedFmu:
             os.chdir(folder)  # FMPy stays in the binary's folder if loading fails
         self._open = True
 
+    def _check_version(self) -> None:
+        """Refuse a library of another version of FMI than the description says (FMI 3.0, 2.3.1)."""
+        version = str(self._fmu.getVersion())
+        if not version.startswith("3.0"):
+            raise FmuFileError(
+                f"the library of {str(self.description.file)!r} says that it is of FMI {version!r} (fmi3GetVersion); "
+                "expected '3.0', as its description says. Export it again.",
+                block=self.block.label,
+            )
+
+    def _list_limits(self) -> list[str]:
+        """Return a message on the ports that are neither read nor set; none if all are Float64."""
+        ins, outs = (self.description.other_ports(causality) for causality in ("input", "output"))
+        parts = [f"the outputs {', '.join(map(str, outs))} are not recorded"] if outs else []
+        parts += [f"the inputs {', '.join(map(str, ins))} keep their start values"] if ins else []
+        return [f"{self.block.label}: only Float64 is read and set yet: {'; '.join(parts)}"] if parts else []
+
     def _log(self, environment: Any, status: int, category: bytes | None, message: bytes | None) -> None:
         text = (message or b"").decode(errors="replace")
         if status and len(self.messages) < 1000:
             self.messages.append(f"{self.block.label}: {_STATUS[status]}: {text}")
 
     def _quote_messages(self) -> str:
-        return f". The FMU says: {' / '.join(m.rstrip('.') for m in self.messages[-5:])}." if self.messages else "."
+        said = self.messages[self._limits :][-5:]
+        return f". The FMU says: {' / '.join(m.rstrip('.') for m in said)}." if said else "."
 
     @property
     def t(self) -> float:

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -137,7 +138,15 @@ def read_archive(file: Path) -> tuple[list[str], Any]:
             f"{str(file)!r} is no FMU: it can't be read as a zip archive ({error}; it starts with {found!r}). Give the "
             ".fmu that the tool exported."
         ) from None
-    except OSError as error:
+    except MemoryError:
+        raise FmuFileError(
+            f"{str(file)!r} can't be read: its modelDescription.xml does not fit into memory. Export the FMU again."
+        ) from None
+    except RuntimeError as error:  # of an archive that asks for a password, or is packed in an unknown way
+        raise FmuFileError(
+            f"{str(file)!r} can't be read: {error}. Pack it again without a password, by the usual compression."
+        ) from None
+    except (OSError, EOFError, zlib.error) as error:
         raise FmuFileError(f"{str(file)!r} can't be read: {error}. Check the path and its permissions.") from error
     try:
         root = etree.fromstring(text, etree.XMLParser(resolve_entities=False, no_network=True))

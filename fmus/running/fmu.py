@@ -12,6 +12,7 @@ import numpy as np
 
 from ...blocks.core import (
     Block,
+    Call,
     FmuError,
     FmuFileError,
     FrozenMapping,
@@ -62,6 +63,13 @@ class Fmu(Block):
             error.at(block=who)
             raise
         ports = {**description.of("input"), **description.of("output")}
+        others = description.other_ports("output")
+        if others and not description.of("output"):
+            raise FmuFileError(
+                f"found only outputs that are no Float64, which are not read yet: {', '.join(map(str, others))}; "
+                "expected a Float64 among them. Add one in its tool, such as the same signal as a real number.",
+                block=who,
+            )
         for old in self.rename:
             if old not in ports:
                 raise UnknownNameError(
@@ -87,8 +95,8 @@ class Fmu(Block):
         who, port = self.label, f"start.{name}"
         if name in description.other:
             raise ParameterError(
-                f"found a variable of type {description.other[name]}; expected Float64, which alone can be set. Leave "
-                "it out.",
+                f"found a variable of type {description.other[name].type}; expected Float64, which alone can be set. "
+                "Leave it out.",
                 block=who,
                 port=port,
             )
@@ -194,19 +202,40 @@ class Fmu(Block):
             for n, v in self.description.of("output").items()
         }
 
+    def __call__(self, *args: Any, **kwargs: Any) -> Call:
+        """Wire the FMU: signals by position in the order of the inputs, or by keyword.
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that is no input, and for an input that is no Float64.
+        """
+        others = self.description.other
+        for name in kwargs:
+            if name in others and name not in self.inputs:
+                raise UnknownNameError(self._no_port(name), block=self.label)
+        return super().__call__(*args, **kwargs)
+
     def __getattr__(self, name: str) -> Signal:
         if name.startswith("_") or "file" not in self.__dict__:
             raise AttributeError(name)
         outputs = self.outputs
         if name in outputs:
             return Signal(self, name)
-        raise UnknownAttributeError(f"it has no output {name!r}. {near(name, outputs)}", block=self.label)
+        raise UnknownAttributeError(self._no_port(name), block=self.label)
+
+    def _no_port(self, name: str) -> str:
+        """Return the text of an error: it has no such output, or a port that is neither read nor set."""
+        other = self.description.other.get(name)
+        if other is None:
+            return f"it has no output {name!r}. {near(name, self.outputs)}"
+        return f"its {other.causality} {name!r} is of type {other.type}; expected Float64, others are not read yet."
 
     def __getitem__(self, name: Any) -> Signal:
         if isinstance(name, str):
             if name in self.outputs:
                 return Signal(self, name)
-            raise UnknownNameError(f"it has no output {name!r}. {near(name, self.outputs)}", block=self.label)
+            raise UnknownNameError(self._no_port(name), block=self.label)
         return super().__getitem__(name)
 
     def linear_model(

@@ -416,6 +416,16 @@ def test_a_step_that_returns_early_is_named(ending):
         ending(early=True, reached=2.5e-4).instance.step(0.0, T)
 
 
+def test_a_step_that_ends_beyond_its_end_is_named(ending):
+    with pytest.raises(
+        FmuRuntimeError,
+        match=r"^plant, t = 0 s: the step from t = 0 s by 0\.001 s ended at 0\.0015 s \(lastSuccessfulTime\); expected 0\.001 s",
+    ):
+        ending(reached=1.5e-3).instance.step(0.0, T)
+    ending(reached=T).instance.step(0.0, T)  # as it should be
+    ending(reached=T * (1 + 1e-12)).instance.step(0.0, T)  # but for rounding
+
+
 def test_the_fmu_is_told_whether_it_may_forget_the_past(ending):
     one = ending()
     one.instance.step(0.0, T)

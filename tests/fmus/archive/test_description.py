@@ -1,0 +1,175 @@
+"""Reading of FMU files: types that are not read are said, and files that can't be read are errors of ours."""
+
+import struct
+import zipfile
+
+import pytest
+
+from loopwright.blocks import Constant, FmuFileError, ParameterError, UnknownNameError
+from loopwright.diagrams import Diagram
+from loopwright.diagrams.cli import main
+from loopwright.fmus import Fmu
+from loopwright.fmus.models import mass_spring_damper
+
+COUNT = (
+    b'<Int32 name="count" valueReference="9001" causality="output" variability="discrete" initial="exact" start="0"/>'
+)
+MODE = b'<Boolean name="mode" valueReference="9002" causality="input" variability="discrete" start="false"/>'
+
+
+@pytest.fixture(scope="module")
+def file(cache):
+    return mass_spring_damper.build()
+
+
+def changed(file, path, *changes, entries=()):
+    """Return a copy of an FMU with texts of its description replaced."""
+    with zipfile.ZipFile(file) as old, zipfile.ZipFile(path, "w") as new:
+        for item in old.namelist():
+            data = old.read(item)
+            if item == "modelDescription.xml":
+                for before, after in changes:
+                    assert before in data, before
+                    data = data.replace(before, after)
+            new.writestr(item, data)
+    return path
+
+
+# --- types --------------------------------------------------------------------------------------------------------------
+
+
+def test_ports_that_are_no_float64_are_said_in_the_runs_messages(file, tmp_path):
+    more = changed(file, tmp_path / "more.fmu", (b"</ModelVariables>", COUNT + MODE + b"</ModelVariables>"))
+    plant = Fmu(more, name="plant", start={"force": 1.0})
+    run = Diagram("d", plant()).simulate(0.01, step=1e-3, progress=False)
+    (message,) = run.messages
+    assert message == (
+        "plant: only Float64 is read and set yet: the outputs count (Int32) are not recorded; the inputs mode "
+        "(Boolean) keep their start values"
+    )
+    assert (
+        Diagram("d", Fmu(file, name="plant", start={"force": 1.0})()).simulate(0.01, step=1e-3, progress=False).messages
+        == ()
+    )
+
+
+def test_using_such_a_port_says_its_type(file, tmp_path):
+    plant = Fmu(
+        changed(file, tmp_path / "more.fmu", (b"</ModelVariables>", COUNT + MODE + b"</ModelVariables>")), name="plant"
+    )
+    with pytest.raises(AttributeError, match=r"plant: its output 'count' is of type Int32; expected Float64"):
+        _ = plant.count
+    with pytest.raises(UnknownNameError, match=r"plant: its output 'count' is of type Int32; expected Float64"):
+        _ = plant["count"]
+    with pytest.raises(UnknownNameError, match=r"plant: its input 'mode' is of type Boolean; expected Float64"):
+        plant(mode=Constant(value=1.0))
+    with pytest.raises(ParameterError, match=r"plant\.start\.mode: found a variable of type Boolean"):
+        Fmu(plant.file, name="plant", start={"mode": 1})
+
+
+def test_an_fmu_whose_outputs_are_all_of_other_types_is_refused(file, tmp_path):
+    none = changed(
+        file,
+        tmp_path / "none.fmu",
+        (b'causality="output"', b'causality="local"'),
+        (b"</ModelVariables>", COUNT + b"</ModelVariables>"),
+    )
+    with pytest.raises(
+        FmuFileError, match=r"^plant: found only outputs that are no Float64.*: count \(Int32\); expected"
+    ):
+        Fmu(none, name="plant")
+
+
+# --- versions -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("version", [b"3.9", b"3.0-beta.5", b"31.0", b"9.9"])
+def test_another_version_in_the_description_is_refused(file, tmp_path, version):
+    other = changed(file, tmp_path / "other.fmu", (b'fmiVersion="3.0"', b'fmiVersion="' + version + b'"'))
+    with pytest.raises(FmuFileError, match=r"FMI|can't be read"):
+        Fmu(other)
+
+
+def test_a_patch_of_fmi_3_0_is_read(file, tmp_path):
+    Fmu(changed(file, tmp_path / "patch.fmu", (b'fmiVersion="3.0"', b'fmiVersion="3.0.2"')))
+
+
+def test_a_library_of_another_version_is_refused(file, monkeypatch):
+    from fmpy.fmi3 import FMU3Slave
+
+    monkeypatch.setattr(FMU3Slave, "getVersion", lambda self: "9.9")
+    plant = Fmu(file, name="plant", start={"force": 1.0})
+    with pytest.raises(
+        FmuFileError, match=r"^plant.*: the library of .* says that it is of FMI '9\.9' .*expected '3\.0'"
+    ):
+        Diagram("d", plant()).simulate(0.01, step=1e-3, progress=False)
+
+
+# --- files that can't be read -------------------------------------------------------------------------------------------
+
+
+def encrypted(path):
+    """Set the flag of an encrypted file in both headers."""
+    data = bytearray(path.read_bytes())
+    for magic, offset in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        at = data.index(magic) + offset
+        struct.pack_into("<H", data, at, struct.unpack_from("<H", data, at)[0] | 1)
+    path.write_bytes(data)
+
+
+def damaged(path):
+    """Damage the compressed text itself."""
+    data = bytearray(path.read_bytes())
+    at = 30 + len("modelDescription.xml")
+    data[at : at + 40] = b"\xff" * 40
+    path.write_bytes(data)
+
+
+def of_unknown_compression(path):
+    data = bytearray(path.read_bytes())
+    for magic, offset in ((b"PK\x03\x04", 8), (b"PK\x01\x02", 10)):
+        struct.pack_into("<H", data, data.index(magic) + offset, 99)
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("break_it", "text"),
+    [(encrypted, "encrypted"), (damaged, "can't be read|no FMU"), (of_unknown_compression, "compression")],
+)
+def test_archives_that_cannot_be_read(tmp_path, capsys, break_it, text):
+    path = tmp_path / "broken.fmu"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("modelDescription.xml", "<fmiModelDescription" + 1000 * " abc")
+    break_it(path)
+    with pytest.raises(FmuFileError, match=text):
+        Fmu(path)
+    for command in ("inspect", "validate"):
+        assert main([command, str(path)]) == 1
+        assert "Traceback" not in "".join(capsys.readouterr())
+
+
+def test_a_description_that_does_not_fit_into_memory(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "large.fmu"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", "<a/>")
+
+    def read(self, name):
+        raise MemoryError
+
+    monkeypatch.setattr(zipfile.ZipFile, "read", read)
+    with pytest.raises(FmuFileError, match="does not fit into memory"):
+        Fmu(path)
+    assert main(["inspect", str(path)]) == 1
+    assert "does not fit into memory" in capsys.readouterr().err
+
+
+def test_a_file_that_may_not_be_read(tmp_path, monkeypatch):
+    path = tmp_path / "secret.fmu"
+    path.write_bytes(b"PK")
+
+    def read_bytes(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(type(path), "read_bytes", read_bytes)
+    with pytest.raises(FmuFileError, match=r"can't be read: .*Permission denied"):
+        Fmu(path)
