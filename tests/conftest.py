@@ -46,14 +46,14 @@ def pytest_pycollect_makeitem(collector, name, obj):
 def pytest_xdist_make_scheduler(config, log):
     """Give each file to one worker, so that what its tests share is made once; the longest first.
 
-    Few workers take all files on exported FMUs as one, since they share builds.
+    Few workers take all files on FMUs as one, since they share builds.
     """
     from xdist.scheduler import LoadFileScheduling
 
     class Scheduling(LoadFileScheduling):
         def _split_scope(self, nodeid):
-            exported = nodeid.startswith("tests/fmus/export/") and self.numnodes <= 3
-            return "tests/fmus/export" if exported else super()._split_scope(nodeid)
+            exported = nodeid.startswith("tests/fmus/") and self.numnodes <= 3
+            return "tests/fmus" if exported else super()._split_scope(nodeid)
 
     config.option.loadscopereorder = False
     return Scheduling(config, log)
@@ -61,7 +61,7 @@ def pytest_xdist_make_scheduler(config, log):
 
 def pytest_collection_modifyitems(items):
     """Sort by file, so that all workers have one order; before the others those that take longest."""
-    longest = ("tests/test_project.py", "tests/fmus/export/", "tests/test_pages.py")
+    longest = ("tests/test_project.py", "tests/fmus/", "tests/test_pages.py")
 
     def place(item):
         first = next((i for i, name in enumerate(longest) if item.nodeid.startswith(name)), len(longest))
@@ -89,6 +89,21 @@ def uncompiled(tmp_path_factory, monkeypatch):
     """Builds have an empty file as their binary, in a cache of their own: for tests of what else is in the file."""
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path_factory.mktemp("uncompiled")))
     monkeypatch.setattr("loopwright.fmus.export.package.compile_shared", lambda sources, out, **options: out.touch())
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Figures are empty files: for runs of which the files are counted and no figure is looked at."""
+
+    def save(figure, stem):
+        files = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
+        for file in files:
+            file.touch()
+        return files
+
+    for name in ("plot_path", "plot_experiment"):
+        monkeypatch.setattr(f"loopwright.diagrams.paper.{name}", lambda *_: None)
+    monkeypatch.setattr("loopwright.diagrams.results.save", save)
 
 
 @pytest.fixture(scope="session")

@@ -125,6 +125,7 @@ def from_the_start(model, push, ticks, **environment):
     return np.array(found)
 
 
+@pytest.mark.drawn(6)
 @SIDE
 @pytest.mark.parametrize("name", VARIANTS)
 def test_the_reduced_model_moves_as_the_running_co_simulation(side, name):
@@ -184,6 +185,7 @@ def test_python_controls_interconnection_has_the_same_growth(name):
 CONTINUOUS = {"implementation": "continuous"}
 
 
+@pytest.mark.drawn(4)
 @pytest.mark.parametrize("side", ["par", "perp"])
 @pytest.mark.parametrize("implementation", ["ideal", "continuous"])
 @pytest.mark.parametrize("over", ["stiffness", "mass", "tool_mass"])

@@ -166,6 +166,7 @@ def test_the_rigid_gantrys_limits_are_not_those_of_the_other_plants(side):
         assert sticking / rigid == pytest.approx(48.08, abs=0.01)  # on the safe side, and of no use
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("kind", ["rigid", "elastic", "stiction"])
 def test_the_matrices_of_these_tests_are_those_of_the_plants(kind):
     plant = {"rigid": gantry, "elastic": gantry_elastic, "stiction": gantry_stiction}[kind]
@@ -196,6 +197,7 @@ def test_bristles_and_amplifiers_are_hidden_states():
     assert "plant: found 6 states (position, velocity, amplified); expected 4" in refusal(own(Amplified()))
 
 
+@pytest.mark.slow
 def test_a_wall_is_seen_in_contact_and_not_away_from_it():
     away = AdmittanceLoop.of(diagram(gantry_contact))
     assert away == AdmittanceLoop.of(diagram())
@@ -245,6 +247,7 @@ def test_a_soft_spring_in_the_plant_is_a_stiffness():
     assert "plant.position: found the stiffness 5 N/m along and 5 N/m across the path" in refusal(own(Sprung()))
 
 
+@pytest.mark.slow
 def test_other_coordinates_are_the_plants_own_matter():
     made = own(Placed(), carriage=(1.0, 1.6))
     assert AdmittanceLoop.of(made, "par", eta=0.2, xi=0.01) == AdmittanceLoop.of(diagram(), "par", eta=0.2, xi=0.01)
@@ -291,6 +294,7 @@ def test_a_block_as_plant_is_differentiated():
     assert refusal(diagram().replace({"plant": elastic})) == ELASTIC
 
 
+@pytest.mark.slow
 def test_an_arm_is_no_gantry():
     arm = Fmu(scara.build(), rename={"motor_torque": "motor_force"}, name="plant")
     with pytest.raises(ParameterError, match=r"^plant"):
@@ -352,6 +356,7 @@ def test_a_report_of_the_time_runs_alone_says_why_there_are_none():
     assert not found.numbers()
 
 
+@pytest.mark.slow
 def test_poles_and_gains_of_the_chain_of_integrators_are_not_told_of_another_loop():
     paths = report(gantry_elastic, *PARTS).numbers()
     assert not [p for p in paths if re.match(r"poles\.(par|perp)\.sampled_d\d\.", p)]

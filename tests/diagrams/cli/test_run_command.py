@@ -35,21 +35,6 @@ def finite(text):
     raise AssertionError(f"{text} is no strict JSON")
 
 
-@pytest.fixture
-def undrawn(monkeypatch):
-    """Figures are empty files: for runs of which the files are counted and no figure is looked at."""
-
-    def save(figure, stem):
-        files = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
-        for file in files:
-            file.touch()
-        return files
-
-    for name in ("plot_path", "plot_experiment"):
-        monkeypatch.setattr(f"loopwright.diagrams.paper.{name}", lambda *_: None)
-    monkeypatch.setattr("loopwright.diagrams.results.save", save)
-
-
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
     """Run experiment A once by the command; give the folder and what the same experiment gives in Python."""

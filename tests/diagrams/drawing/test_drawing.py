@@ -107,7 +107,7 @@ def anything(seed, count):
     return nodes, [Net(f"{a} {b}", (a, b), ends, chance.choice([0.0, 40.0])) for (a, b), ends in sinks.items()]
 
 
-@pytest.mark.drawn(12)
+@pytest.mark.drawn(8)
 @pytest.mark.parametrize("seed", range(60))
 def test_wires_reach_their_ends_and_lie_on_nothing_else(seed):
     nodes, nets = anything(seed, 3 + seed % 12 if seed < 50 else 40)
@@ -264,7 +264,7 @@ def test_unknown_boxes_are_refused_with_a_near_name():
             diagram.draw(**options)
 
 
-def test_an_fmu_is_the_end_of_the_forward_path():
+def test_an_fmu_is_the_end_of_the_forward_path(uncompiled):
     motor = Fmu(dc_motor.build(), name="motor")
     error = Sum(signs="+-", name="error")(Sine(frequency=1.0, name="wish"), motor[next(iter(motor.outputs))])
     first, *others = motor.inputs

@@ -46,22 +46,22 @@ def check(spec):
     return worst
 
 
-@random_cases(5, 200, specs(least=12), fresh=True)
+@random_cases(3, 200, specs(least=12), fresh=True)
 def test_nested_flattened_and_matrix_exponential_agree(spec):
     check(spec)
 
 
-@random_cases(5, 40, specs(least=12, clocked=False))
+@random_cases(3, 40, specs(least=12, clocked=False))
 def test_without_any_clock_it_is_one_matrix_exponential(spec):
     check(spec)
 
 
-@random_cases(5, 40, specs(least=12, continuous=False))
+@random_cases(3, 40, specs(least=12, continuous=False))
 def test_without_anything_continuous_it_is_a_product_of_matrices(spec):
     check(spec)
 
 
-@random_cases(5, 40, specs(least=12), st.integers(0, 2**32 - 1))
+@random_cases(3, 40, specs(least=12), st.integers(0, 2**32 - 1))
 def test_shuffled_definitions_give_the_same_bits(spec, seed):
     spec, oracle = bounded(spec)
     order = np.random.default_rng(seed)

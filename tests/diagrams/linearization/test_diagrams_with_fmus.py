@@ -328,7 +328,7 @@ def test_the_frictionless_loops_at_rest_have_the_known_margins():
     assert phase_margin(lin.loop("v_perp")) == pytest.approx(67.88699231, abs=1e-7)
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(("theta", "offset"), PLACES)
 def test_with_matched_parameters_poles_are_those_asked_for_at_every_point_and_offset(theta, offset):
     ideal = at_rest(theta, offset).continuous().linearize()

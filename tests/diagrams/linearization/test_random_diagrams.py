@@ -109,7 +109,7 @@ def all_of(net, diagram, **options):
     check(cut, (A, B[:, e], C[e], D[np.ix_(e, e)]))
 
 
-@random_cases(4, 30, seeds, fresh=True)
+@random_cases(3, 30, seeds, fresh=True)
 def test_continuous_diagrams(seed):
     net = Net(seed)
     diagram = Diagram("net", *net.wire(StateSpace))
@@ -120,7 +120,7 @@ def test_continuous_diagrams(seed):
     close(np.poly(lin.poles), np.poly(net.model()[0]))
 
 
-@random_cases(4, 30, seeds, fresh=True)
+@random_cases(3, 30, seeds, fresh=True)
 def test_sampled_diagrams(seed):
     net = Net(seed)
     diagram = Diagram("net", sampled(net)())
@@ -136,7 +136,7 @@ def sampled(net):
     return box
 
 
-@random_cases(4, 30, seeds, fresh=True)
+@random_cases(3, 30, seeds, fresh=True)
 def test_solved_algebraic_loops(seed):
     net = Net(seed, loops=True)
     all_of(net, Diagram("net", *net.wire(StateSpace), loops="solve"))
@@ -237,7 +237,7 @@ class Loop:
         return lin, M
 
 
-@random_cases(4, 30, seeds, st.booleans(), fresh=True)
+@random_cases(3, 30, seeds, st.booleans(), fresh=True)
 def test_a_sampled_controller_around_a_continuous_plant(seed, deep):
     loop = Loop(seed, [(1, 0)])
     lin, M = loop.check(deep=deep)
@@ -254,7 +254,7 @@ RATES = st.lists(st.integers(1, 4), min_size=2, max_size=3).flatmap(
 )
 
 
-@random_cases(4, 30, seeds, RATES, fresh=True)
+@random_cases(3, 30, seeds, RATES, fresh=True)
 def test_several_rates_and_offsets(seed, clocks):
     loop = Loop(seed, clocks)
     for cut in ((0,), (0, 1)):
@@ -264,7 +264,7 @@ def test_several_rates_and_offsets(seed, clocks):
     close(poles, want[: len(poles)], 1e-9)
 
 
-@random_cases(4, 30, seeds, fresh=True)
+@random_cases(3, 30, seeds, fresh=True)
 def test_the_poles_do_not_depend_on_the_tick_at_which_the_period_begins(seed):
     diagram = Loop(seed, [(2, 1), (3, 0)]).diagram()
     found = [diagram.linearize(k * 1e-2, step=1e-2).A for k in range(6)]
@@ -295,7 +295,7 @@ def test_bent_ones_on_the_move_against_differences_of_the_simulation(seed, clock
 
 @pytest.mark.parametrize("T", [None, 0.01], ids=["continuous", "sampled"])
 @pytest.mark.parametrize("on", [0.0, 1.0])
-@random_cases(4, 30, seed=seeds, fresh=True)
+@random_cases(3, 30, seed=seeds, fresh=True)
 def test_an_enabled_box_counts_as_it_is_at_the_operating_point(T, on, seed):
     net, kind = Net(seed), StateSpace if T is None else DiscreteStateSpace
     first, second = net.nodes[:2]

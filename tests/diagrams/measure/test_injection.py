@@ -78,7 +78,7 @@ def test_a_sampled_loop_has_its_closed_form(kind):
     np.testing.assert_allclose(found.omega, [2.0, 20.0, 90.0], rtol=0.01)
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     "options", [{}, {"xi": 0.03}, {"friction": False}, {"xi": 0.03, "friction": False}, {"delay": 1}], ids=str
 )
@@ -113,6 +113,7 @@ def test_both_motor_forces_are_a_matrix():
     assert found.compare(diagram.linearize(point)) <= 1e-5
 
 
+@pytest.mark.slow
 def test_a_wire_out_of_an_fmu_is_one_like_any_other():
     diagram = fig3_loop()
     point = diagram.trim()

@@ -173,6 +173,7 @@ def test_an_unlimited_limit_is_none_where_there_is_nothing_to_limit():
 # --- what an experiment is -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("letter", EXPERIMENTS)
 def test_an_experiment_can_be_pickled(letter, runs):
     experiment, run = runs(letter)
@@ -250,7 +251,7 @@ def test_help_tells_the_exit_statuses_and_what_becomes_of_files(capsys):
     assert "path=" not in text
 
 
-def test_never_is_told_apart_from_not_applicable_after_a_failure(tmp_path):
+def test_never_is_told_apart_from_not_applicable_after_a_failure(tmp_path, undrawn):
     assert main(["run", "B", "--out", str(tmp_path), "--option", "tool_mass=5"]) == 1
     content = json.loads((tmp_path / "B.json").read_text(encoding="utf-8"))
     assert content["never"] == []

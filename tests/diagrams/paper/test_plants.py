@@ -66,11 +66,6 @@ def carriage():
     return build(Carriage(), internal_step=gantry.INTERNAL_STEP)
 
 
-@pytest.fixture(scope="module")
-def pendulum():
-    return build(Pendulum())
-
-
 NEEDED = (
     "Fig. 3 needs a plant with the inputs motor_force [2] in N, external_force [2] in N, and the outputs "
     "position [2] in m, velocity [2] in m/s, acceleration [2] in m/s2; contact_force [2] in N is optional (axes y and "
@@ -78,7 +73,8 @@ NEEDED = (
 )
 
 
-def test_a_plant_of_another_kind(pendulum, tmp_path, capsys):
+def test_a_plant_of_another_kind(tmp_path, capsys, uncompiled):
+    pendulum = build(Pendulum())
     assert main(["run", "A", "--plant", str(pendulum), "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert error.startswith(
@@ -91,7 +87,7 @@ def test_a_plant_of_another_kind(pendulum, tmp_path, capsys):
         path_following(plant=pendulum)
 
 
-def test_a_port_of_another_shape(pendulum):
+def test_a_port_of_another_shape(uncompiled):
     class Volume(Pendulum):
         """Ports with the right names."""
 
@@ -161,7 +157,7 @@ def test_a_position_that_can_not_be_set(carriage, runs):
         path_following(plant=Fmu(carriage, start={"carriage": (0.4, 0.3)})).simulate(progress=False)
 
 
-def test_a_plants_own_values_stay_unless_an_option_is_given():
+def test_a_plants_own_values_stay_unless_an_option_is_given(uncompiled):
     file = gantry.build(gantry.nominal.replace(coulomb_scale=1.5))
     plant = path_following(plant=file).diagram["plant"]
     assert set(plant.start) == {"position"}

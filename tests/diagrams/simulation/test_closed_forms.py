@@ -38,7 +38,7 @@ from support.hybrid_blocks import TIGHT, Ball
 # --- bouncing ball -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("solver", ["DOP853", "RK45", "Radau", "auto"])
 def test_a_bouncing_ball_meets_its_first_twenty_bounces_and_then_its_zeno_point(solver):
     e, g = 0.8, 9.81

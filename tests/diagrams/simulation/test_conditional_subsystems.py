@@ -296,7 +296,7 @@ def test_a_triggered_counter_counts_edges_in_continuous_time():
 # --- what can't stand there -------------------------------------------------------------------------------------------
 
 
-def test_an_fmu_in_an_enabled_box_is_refused():
+def test_an_fmu_in_an_enabled_box_is_refused(uncompiled):
     ball = Fmu(bouncing_ball.build(), name="ball")
 
     @subsystem(enabled="held")

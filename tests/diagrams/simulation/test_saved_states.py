@@ -76,7 +76,7 @@ def assert_same_bits(diagram, cut, rest, **options):
     return straight
 
 
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize(
     "solver", ["auto", "RK45", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "euler", "heun", "rk4"]
 )
@@ -97,6 +97,7 @@ def test_where_nothing_acts_it_goes_on_within_the_tolerance():
         assert np.max(np.abs(second["ball.height"] - straight["ball.height"][at:])) < 1000 * rtol
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("cut", [0.1, 0.2, 0.5])
 def test_in_the_middle_of_a_transport_delay_what_is_under_way_comes_out(cut):
     late = TransportDelay(delay=0.35, initial_value=-2.0, name="late")

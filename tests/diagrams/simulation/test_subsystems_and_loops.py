@@ -288,7 +288,7 @@ def test_a_trial_of_a_solver_neither_ends_a_run_with_a_loop_nor_leads_it_to_anot
     assert run["z.y"][-1] == pytest.approx(z, abs=2e-8)
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("solver", ["rk4", "RK45", "Radau", "BDF", "LSODA", "CVODE_BDF"])
 def test_a_loop_whose_solution_ends_is_told_as_such(solver):
     loop = Cubic(name="c")

@@ -140,7 +140,7 @@ def test_the_global_error_scales_with_the_tolerance(name, pendulum):
     assert 0.7 < slope(tolerances, errors) < (1.5 if name == "auto" else 1.3), errors
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("name", STIFF)
 def test_a_stiff_van_der_pol_oscillator_is_followed_through_its_jumps(name):
     solver = make_solver(name, VAN_DER_POL, rtol=1e-8, atol=1e-11)
@@ -379,7 +379,7 @@ def test_an_unstable_fixed_step_ends_in_an_error_that_names_the_state(name):
         run(make_solver(name, of, step=0.1), [0.0, 1.0], [30.0])
 
 
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("name", VARIABLE)
 def test_a_jump_that_is_no_event_ends_in_an_error_not_in_a_hang(name):
     of = problem(lambda t, x: -np.sign(x), lambda t, x: np.zeros((1, 1)), 1)

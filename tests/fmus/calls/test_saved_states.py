@@ -131,6 +131,7 @@ def test_a_state_restored_from_bytes_into_a_fresh_instance_goes_on_bit_by_bit(lo
         assert np.array_equal(three.go(CUT, N), straight[CUT:])
 
 
+@pytest.mark.drawn(2)
 def test_another_process_goes_on_from_the_bytes(loop):
     with loop.open() as one:
         one.go(0, CUT)

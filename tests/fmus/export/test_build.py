@@ -24,14 +24,12 @@ from support.exported import mass_spring_damper
 from support.instances import run
 
 
-def test_same_input_same_bytes(tmp_path, monkeypatch):
-    built = []
-    for name in ("a", "b"):
-        monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / name))
-        monkeypatch.setenv("ZIG_LOCAL_CACHE_DIR", str(tmp_path / name / "local"))  # the model is compiled anew
-        built.append(build_fmu(mass_spring_damper(), tmp_path / f"{name}.fmu"))
-    assert built[0].read_bytes() == built[1].read_bytes()
-    with zipfile.ZipFile(built[0]) as archive:
+def test_same_input_same_bytes(msd, tmp_path, monkeypatch):
+    monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("ZIG_LOCAL_CACHE_DIR", str(tmp_path / "local"))  # the model is compiled anew
+    again = build_fmu(mass_spring_damper(), tmp_path / "again.fmu")
+    assert again.read_bytes() == msd.read_bytes()
+    with zipfile.ZipFile(again) as archive:
         assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 
 
@@ -80,12 +78,12 @@ def test_key_depends_on_everything(msd):
 def test_builds_at_once_in_threads(tmp_path, monkeypatch):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
     built, spec = [], mass_spring_damper()
-    threads = [threading.Thread(target=lambda: built.append(build_fmu(spec))) for _ in range(3)]
+    threads = [threading.Thread(target=lambda: built.append(build_fmu(spec))) for _ in range(2)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(built) == 3
+    assert len(built) == 2
     assert len(set(built)) == 1
     assert validate_fmu(str(built[0])) == []
     assert [p.name for p in built[0].parent.iterdir()] == ["mass_spring_damper.fmu"]

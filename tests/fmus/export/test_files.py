@@ -264,6 +264,7 @@ def test_binaries_are_where_the_standard_wants_them(uncompiled, fmi):
     assert [name.split("/")[1] for name in found] == [two.get(native_platform(), native_platform())]
 
 
+@pytest.mark.drawn(1)
 @version
 def test_fmpy_compiles_it_from_its_sources(fmi, tmp_path, instance):
     """All that is needed is in `sources/`; FMPy brings FMI's headers, and asks CMake for a compiler."""
@@ -294,6 +295,7 @@ def test_compiles_from_its_sources_without_warnings(uncompiled, fmi, tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_the_gantry_runs_alike_in_both_versions():
     two = build(gantry.nominal, fmi=2, internal_step=2e-4)
     assert validate_fmu(str(two)) == []

@@ -202,11 +202,15 @@ def test_an_input_that_goes_on_is_no_jump(instance):
     assert abs(found[2] - found[0]) > 5e-9  # a jump: other steps, other errors
 
 
+def passes():
+    """Counts the events at u = 1, and remembers the time of the last one."""
+    return counter(lambda t, x, u, p, fired: [t, x[1] + 1.0], z=lambda t, x, u, p: [u[0] - 1.0])
+
+
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_events_by_a_moving_input(instance, integrator):
     """The input passes 1 upwards and comes back within one internal step; x remembers when."""
-    spec = counter(lambda t, x, u, p, fired: [t, x[1] + 1.0], z=lambda t, x, u, p: [u[0] - 1.0])
-    item = instance(build_fmu(spec, fmi=2))
+    item = instance(build_fmu(passes(), fmi=2))
     item.initialize(integrator=integrator, internal_step=10.0)
     item["u"] = 0.0
     move(item, 2.0)
@@ -238,7 +242,7 @@ def test_what_is_refused(integrators2, instance):
     fails(
         item, lambda: item.fmu.setRealInputDerivatives([99], [1], [1.0]), "no Float64 variable with value reference 99"
     )
-    item = instance(build_fmu(counter(lambda t, x, u, p, fired: [x[0], x[1]]), fmi=2)).initialize()
+    item = instance(build_fmu(passes(), fmi=2)).initialize()
     fails(item, lambda: move(item, 1.0, name="v"), "v is no continuous input")
     item = instance(build_fmu(van_der_pol(), fmi=2)).initialize()
     fails(item, lambda: item.fmu.setRealInputDerivatives([0], [1], [1.0]), "this FMU has no inputs")

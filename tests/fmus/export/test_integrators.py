@@ -146,9 +146,9 @@ def test_an_input_that_jumps_restarts_the_integrator(instance, integrator):
 
 
 @pytest.mark.parametrize("integrator", [DOPRI5, RODAS])
-def test_an_input_that_jumps(instance, integrator):
+def test_an_input_that_jumps(msd, instance, integrator):
     """Long after the step has grown: what is lost to a jump stays within the tolerance."""
-    item = instance(build_fmu(mass_spring_damper(tolerance=1e-9))).initialize(integrator=integrator)
+    item = instance(msd).initialize(integrator=integrator, tolerance=1e-9)
     x = np.array([0.1, 0.0])
     for t, force in ((0.0, 0.0), (30.0, 1000.0), (30.5, -1000.0), (31.0, 0.0)):
         item.step(t, 30.0 if t == 0.0 else 0.5, force=force)
@@ -198,6 +198,7 @@ def test_a_solution_that_ends_stops_the_step(instance, integrator):
     assert "x (element 0)" in message
 
 
+@pytest.mark.slow
 def test_large_models_keep_their_scratch_elsewhere(instance):
     """100 states, a heat equation: beyond 64 they are not on the stack; the Jacobian is a band."""
     n, t, p, u = 100, ca.SX.sym("t"), ca.SX.sym("p", 0), ca.SX.sym("u", 0)

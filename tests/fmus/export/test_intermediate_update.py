@@ -64,6 +64,7 @@ def test_what_is_read_belongs_to_the_time(msd, instance, integrator):
         assert a == rate == pytest.approx((5.0 - D * v - K * x) / M, rel=1e-13, abs=1e-14)
 
 
+@pytest.mark.drawn(4)
 @pytest.mark.parametrize("make", [mass_spring_damper, driven, bouncing_ball, thermostat])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_reading_changes_no_bit(instance, make, integrator):

@@ -78,6 +78,7 @@ def test_model_exchange_in_pathsim(fmi):
     np.testing.assert_allclose(y, np.stack([s, v, 5.0 - v - 100.0 * s], axis=1), rtol=0, atol=1e-11)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("fmi", FMI)
 def test_vectors_in_pathsim_as_scalars(fmi):
     path, force = gantry.build(fmi=fmi, arrays=False), np.array([120.0, 90.0])

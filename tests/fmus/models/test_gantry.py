@@ -131,6 +131,7 @@ def test_the_block_the_fmu_and_the_nominal_model_are_one_definition(file):
     assert outputs[4:] == pytest.approx(newton, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_another_plant_file_under_the_unchanged_controller(tmp_path):
     heavier = gantry.build(gantry.Gantry(translational_mass=(9.0, 5.0)), tmp_path / "heavier.fmu")
     run = experiments.path_following(plant=heavier).simulate(progress=False)

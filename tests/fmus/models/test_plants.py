@@ -59,6 +59,7 @@ def pushes(n, T, amplitude):
     return motor, np.stack([np.cos(29.0 * t), np.sin(23.0 * t)], axis=1) * 0.1 * np.mean(amplitude)
 
 
+@pytest.mark.drawn(7)
 @pytest.mark.parametrize("fmi", [3, 2])
 @pytest.mark.parametrize("name", PLANTS)
 def test_every_plant_passes_fmpys_validation_and_says_what_its_variables_are(uncompiled, build, name, fmi):
@@ -146,6 +147,7 @@ def test_a_stiff_screw_is_the_gantry(build):
 # --- gantry_stiction --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("scales", [(1.0, 1.0), (0.6, 2.0)])
 def test_the_gantry_with_stiction_obeys_the_lugre_model(build, scales):
     T, n = 1e-3, 400

@@ -52,7 +52,7 @@ COST = {
 }
 
 
-@pytest.mark.drawn(6)
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize(("plant", "letter"), COST, ids=lambda v: getattr(v, "__name__", v).rpartition(".")[2])
 def test_what_another_plant_costs_in_tracking(runs, plant, letter):
     nominal = rms(runs(letter)[1])
@@ -124,6 +124,7 @@ class Sticking(Elastic):
         return np.concatenate([state, [0.0, 0.0]])
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     ("plant", "exact", "bound"), [(gantry_elastic, Elastic, 1e-9), (gantry_stiction, Sticking, 1e-8)]
 )
