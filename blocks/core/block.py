@@ -135,6 +135,14 @@ class Block(Value, Wireable):
             if not isinstance(getattr(cls, attribute), property):  # ports that follow from the parameters
                 setattr(cls, attribute, chosen)
             cls.__doc__ = with_section(cls.__doc__ or "", attribute.capitalize(), port_section(chosen))
+        for name, port in ports.items():
+            tracked = getattr(port, "tracks", None)
+            if tracked is not None and not (tracked in ports and _is_kind(ports[tracked], "outputs")):
+                raise DefinitionError(
+                    f"found tracks={tracked!r}; expected an output of this block. {near(tracked, cls.outputs)}",
+                    block=cls.__name__,
+                    port=name,
+                )
         if isinstance(cls.inputs, Mapping):
             for name, port in ports.items():
                 like = getattr(port, "like", None)

@@ -83,7 +83,14 @@ def check_port_names(cls: type) -> None:
 
 
 class Input(Port):
-    """An input. With ``default`` it may stay unwired. It takes ``nominal``, ``minimum`` and ``maximum`` of `Port`."""
+    """An input. With ``default`` it may stay unwired. It takes ``nominal``, ``minimum`` and ``maximum`` of `Port`.
+
+    Parameters
+    ----------
+    tracks : str, optional
+        Name of the block's own output whose true value comes back at this input, as for anti-windup by tracking. A loop
+        that is cut between the two says so.
+    """
 
     def __init__(
         self,
@@ -92,10 +99,12 @@ class Input(Port):
         description: str = "",
         *,
         default: Any = None,
+        tracks: str | None = None,
         name: str = "",
         **limits: float | None,
     ):
         super().__init__(shape, unit, description, name, **limits)
+        self.tracks = tracks
         self.default = None if default is None else np.asarray(default, dtype=float)
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:

@@ -65,7 +65,7 @@ class PID(Block):
     initial_output: float | None = parameter(default=None, description="u at the start; None: the integral is zero")
     r = Input(description="set-point")
     y = Input(description="measured value")
-    actual = Input(description="true control signal, in the unit of u; with tracking only")
+    actual = Input(description="true control signal, in the unit of u; with tracking only", tracks="u")
     u = Output(description="control signal")
     excess = Output(secondary=True, description="the part that the limits cut off, v − u")
     integral = State(start=lambda block: block.initial_output or 0.0, description="I")

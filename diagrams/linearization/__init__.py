@@ -1,7 +1,18 @@
 """Linear models, operating points and trim."""
 
 from .derivatives import Signal, find_signal
-from .findings import BlockFinding, EntryTaken, EventWithinPeriod, Kink, MeanSlope, StepsOnly, UnusualStart, ZeroSlope
+from .findings import (
+    BlockFinding,
+    CutFromTracking,
+    EntryTaken,
+    EventWithinPeriod,
+    InertConsumer,
+    Kink,
+    MeanSlope,
+    StepsOnly,
+    UnusualStart,
+    ZeroSlope,
+)
 from .kinks import find_kinks_between
 from .linear_model import Linearization, linearize, linearize_batch
 from .loops_over_a_period import ticks_to_renewal
@@ -10,8 +21,10 @@ from .trim_search import point_from_states, trim
 
 __all__ = [
     "BlockFinding",
+    "CutFromTracking",
     "EntryTaken",
     "EventWithinPeriod",
+    "InertConsumer",
     "Kink",
     "Linearization",
     "MeanSlope",

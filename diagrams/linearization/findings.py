@@ -100,6 +100,64 @@ class ZeroSlope(BlockFinding):
 
 
 @dataclass(frozen=True)
+class CutFromTracking(Finding):
+    """A cut that separates a block's tracking input from the output that it follows in the closed loop.
+
+    Attributes
+    ----------
+    wire : str
+        The cut wire.
+    block, port, output : str
+        Path of the block, its tracking input, and the output that this input has the true value of.
+    offered : str
+        Wire that feeds the tracking input.
+    to : tuple of str
+        Its other consumers on the loop: ``loop(offered, to=to)`` leaves the tracking as it is.
+    """
+
+    wire: str
+    block: str
+    port: str
+    output: str
+    offered: str
+    to: tuple[str, ...]
+
+    def __str__(self) -> str:
+        to = repr(self.to[0]) if len(self.to) == 1 else repr(self.to)
+        step = f" For the loop without it take loop({self.offered!r}, to={to})." if self.to else ""
+        return (
+            f"the cut at {self.wire!r} separates {self.block}.{self.port} from {self.block}.{self.output}, which it "
+            f"follows in the closed loop: L contains the controller's own tracking.{step}"
+        )
+
+
+@dataclass(frozen=True)
+class InertConsumer(Finding):
+    """A consumer of a cut wire from which nothing follows at the operating point: L is the loop through the others.
+
+    Attributes
+    ----------
+    wire : str
+        The cut wire.
+    block, port : str
+        Path of the block, and its input.
+    to : tuple of str
+        The other consumers on the loop.
+    """
+
+    wire: str
+    block: str
+    port: str
+    to: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return (
+            f"{self.wire!r} also feeds {self.block}.{self.port}, from which nothing follows at this point: L is the "
+            f"loop through {', '.join(self.to) or 'nothing else'}"
+        )
+
+
+@dataclass(frozen=True)
 class EventWithinPeriod(Finding):
     """An event within the period of the model; the model is that of the motion without it.
 

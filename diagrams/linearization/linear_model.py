@@ -8,7 +8,7 @@ least common period. Hold and delay are exact (`over_a_period`).
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
@@ -21,6 +21,7 @@ from ..flat import NONE, TickPattern, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import exact_time
 from .checks import check_loop, check_opening, refuse_transport_delays, replace_stairs
+from .consumers import find_cut_findings, split_consumers
 from .continuous_model import model_continuous
 from .derivatives import LocalDerivatives, find_signal
 from .findings import EntryTaken
@@ -162,7 +163,13 @@ class Linearization:
         """Whether the operating point is an equilibrium."""
         return bool(np.max(np.abs(self.affine), initial=0.0) <= EQUILIBRIUM)
 
-    def loop(self, *wires: str, lifted: bool = False, slow: Literal["closed", "open"] = "closed") -> StateSpace:
+    def loop(
+        self,
+        *wires: str,
+        to: str | Iterable[str] = (),
+        lifted: bool = False,
+        slow: Literal["closed", "open"] = "closed",
+    ) -> StateSpace:
         """Return the loop transfer function L at a wire, all other loops closed: S = 1/(1 + L).
 
         The wire is cut behind the port, for all consumers: L = −(returning signal)/(injected signal). With several
@@ -173,6 +180,8 @@ class Linearization:
         ----------
         *wires : str
             Names of wires, paths of ports, or entries of them: ``"motor_force"``, ``"motor_force[1]"``.
+        to : str or iterable of str
+            Inputs of blocks, ``"tank.valve"``: the wire is cut ahead of these consumers only.
         lifted : bool, default: False
             Whether a wire that is renewed several times in the model's period gets one channel for each renewal:
             ``"u@0"``, ``"u@1"``, …. A factor common to all of them is a gain in the wire: see `periodic_margins`.
@@ -190,6 +199,8 @@ class Linearization:
         OptionError
             If no wire is named or, in a discrete model, a wire changes between ticks and acts there: it has no loop at
             ticks. Also if there is no such ``slow``, or no clock behind the wire or its readers.
+        UnknownNameError, WiringError
+            If there is no input of ``to``, or it is fed by another wire.
         PeriodicLoopError
             If a wire is renewed several times in the model's period, unless ``lifted``: its loop is periodic.
         ConfirmationError
@@ -197,6 +208,9 @@ class Linearization:
         """
         if slow not in ("closed", "open"):
             raise OptionError(f"found slow={slow!r}; expected 'closed' or 'open'. Choose one of them.", port="slow")
+        if to:
+            diagram, point, port = split_consumers(self.diagram, self.point, wires, _as_list(to))
+            return replace(self, diagram=diagram, point=point).loop(port, lifted=lifted, slow=slow)
         cut = self._make_at(wires, openings=wires, loop="lifted" if lifted else "one", slow=slow)
         return cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})")
 
@@ -309,6 +323,9 @@ def _linearize(
     entries = (EntryTaken(s.name, s.entry) for group in found for s in group if s.entry)
     every = tuple(dict.fromkeys((*known, *model.findings, *entries)))
     ways = SignalPaths(flat, [s.port for s in found[2]])
+    carried = ways.between(every, *([s.port for s in group] for group in found[:2]))
+    if loop:
+        carried += find_cut_findings(flat, at, [s.port for s in found[2]], carried)
     opaque = {p: Derivation(DerivativeMethod.BLOCK_DIFFERENCES) for p, b in flat.table.blocks.items() if b.opaque}
     return Linearization(
         diagram,
@@ -326,8 +343,8 @@ def _linearize(
         uncertainty=model.uncertainty,
         memory=model.memory,
         openings=tuple(names[2]),
-        findings=every,
-        carried=ways.between(every, *([s.port for s in group] for group in found[:2])),
+        findings=tuple(dict.fromkeys((*every, *carried))),
+        carried=carried,
         plants=plants,
         step=step,
         stairs=stairs,

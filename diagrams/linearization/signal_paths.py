@@ -74,6 +74,10 @@ class SignalPaths:
         """Return the inputs and outputs that follow what the consumers of ports get."""
         return _reach(self._forward, {n for port in ports for n in self._wires.get(Node(*port, True), ())})
 
+    def follow(self, port: tuple[str, str]) -> set[Node]:
+        """Return the inputs and outputs that follow a port as far as nothing is cut."""
+        return _reach(self._forward, {Node(*port, True)})
+
     def before(self, ports: Iterable[tuple[str, str]]) -> set[Node]:
         """Return the ports, and the inputs and outputs that they follow."""
         return _reach(self._backward, {Node(*port, True) for port in ports})

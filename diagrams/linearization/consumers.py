@@ -1,0 +1,188 @@
+"""Consumers of a cut wire: a cut at some of them only, and inputs that make the cut answer another question.
+
+A cut behind a port changes the signal of all its consumers. Two kinds of inputs deserve a word then:
+
+- *Tracking.* An input with ``tracks``, such as `PID.actual`, gets the true value of its own block's output, for
+  anti-windup or bumpless transfer. In the closed loop it follows that output. A cut between the two separates them: L
+  then contains the controller's own correction, which the running loop never makes.
+- *Inert inputs.* At the operating point nothing follows from them, as from a saturation's excess within the limits.
+
+The loop to one consumer is cut at an inserted block that passes the signal on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from ...blocks.core import Finding, Gain, OptionError, UnknownNameError, WiringError, elements, near
+from ..flat import FlatDiagram, WiredDiagram
+from ..results import OperatingPoint, layout_of
+from ..wiring import Wire, join
+from .block_slopes import slopes_of
+from .derivatives import find_signal
+from .findings import BlockFinding, CutFromTracking, InertConsumer
+from .kinks import read_arguments, read_log
+from .signal_paths import Node, SignalPaths
+
+D = TypeVar("D", bound=WiredDiagram)
+Port = tuple[str, str]
+
+
+def split_consumers(
+    diagram: D, point: OperatingPoint, wires: Sequence[str], to: Iterable[str]
+) -> tuple[D, OperatingPoint, str]:
+    """Return the diagram with a block ahead of some consumers of a wire, its operating point, and the block's port.
+
+    The block passes the signal on.
+
+    Raises
+    ------
+    OptionError
+        If there is not exactly one wire, or algebraic loops are solved for other signals with the block.
+    UnknownNameError
+        If there is no such input.
+    WiringError
+        If an input has another source, or consumers stand in several subsystems.
+    """
+    if len(wires) != 1:
+        raise OptionError(
+            f"found {len(wires)} wires with to=…; expected one. Name the wire of these inputs.",
+            block=diagram.name,
+            port="to",
+        )
+    flat = diagram.flatten(point.base)
+    signal, table = find_signal(flat, wires[0]), diagram.structure.copy()
+    inputs = [_find_input(diagram, name) for name in to]
+    for block, port in inputs:
+        source = table.wires[block, port]
+        found = find_signal(flat, f"{source.block}.{source.port}")
+        entries = np.array(found.entries).reshape(flat.checked.shapes[found.port])
+        part = tuple(np.ravel(entries if source.index is None else entries[source.index]).tolist())
+        if found.port != signal.port or part != signal.entries:
+            raise WiringError(
+                f"found {source} wired to it; expected {wires[0]!r}. Name the wire that feeds this input, or one of "
+                f"its consumers: {', '.join(join(*c) for c in _consumers(table.wires, signal.port)) or 'it has none'}.",
+                block=block,
+                port=port,
+            )
+    subsystems = {table.subsystem_of[block] for block, _ in inputs}
+    if len(subsystems) != 1:
+        shown = ", ".join(repr(s or diagram.name) for s in sorted(subsystems))
+        raise WiringError(
+            f"found consumers in several subsystems, {shown}; expected one. Cut the wire to each of them alone.",
+            block=inputs[0][0],
+            port=inputs[0][1],
+        )
+    subsystem = subsystems.pop()
+    path = join(subsystem, "_".join(["to", *(f"{b.rpartition('.')[2]}_{p}" for b, p in inputs)]).replace(".", "_"))
+    while path in table.blocks:
+        path += "_"
+    table.blocks[path] = Gain(gain=1.0, name=path.rpartition(".")[2])
+    table.subsystem_of[path] = subsystem
+    table.wires[path, "u"] = table.wires[inputs[0]]
+    for each in inputs:
+        table.wires[each] = Wire(path, "y")
+        table.handed.pop(each, None)
+    split = diagram.with_structure(table)
+    value = read_log(flat, point)[flat.log.slices[join(*signal.port)]][list(signal.entries)]
+    return split, _carry_point(flat, split.flatten(point.base), point, path, value), f"{path}.y"
+
+
+def _carry_point(
+    flat: FlatDiagram, split: FlatDiagram, point: OperatingPoint, path: str, value: np.ndarray
+) -> OperatingPoint:
+    """Return the operating point of the diagram with the inserted block, which passes on ``value``."""
+    known = dict(zip(flat.labels, point.x, strict=True))
+    labels = elements(f"{path}.y", split.checked.shapes[path, "y"])
+    own = {f"{kind}({label})": v for kind in ("held", "loop") for label, v in zip(labels, value, strict=True)}
+    missing = [label for label in split.labels if label not in known and label not in own]
+    if missing or len(known) + sum(label in own for label in split.labels) != split.width:
+        raise OptionError(
+            f"found other signals in the state where the wire is split ({', '.join(missing) or 'fewer'}), as of a "
+            "solved algebraic loop; expected those of the operating point. Cut the whole wire.",
+            block=path,
+            port="to",
+        )
+    x = np.array([known[label] if label in known else own[label] for label in split.labels])
+    return replace(point, x=x, layout=layout_of(split))
+
+
+def _find_input(diagram: WiredDiagram, name: str) -> Port:
+    known = {join(*port): port for port in diagram.structure.wires}
+    found = [name] if name in known else [n for n in known if n.endswith("." + name)]
+    if len(found) != 1:
+        several = f"several inputs end with {name!r}: {', '.join(found)}" if found else f"there is no input {name!r}"
+        raise UnknownNameError(f"{several}. {near(name, known)}", block=diagram.name, port="to")
+    return known[found[0]]
+
+
+def _consumers(wires: dict[Port, Wire], port: Port) -> list[Port]:
+    return sorted(to for to, wire in wires.items() if (wire.block, wire.port) == port)
+
+
+def find_cut_findings(
+    flat: FlatDiagram, at: OperatingPoint, cut: Sequence[Port], carried: Sequence[Finding]
+) -> tuple[Finding, ...]:
+    """Return the findings about inputs that a cut wire also feeds; those of ``carried`` are told already."""
+    ways = SignalPaths(flat, cut)
+    after, before = ways.after(cut), ways.before(cut)
+    on_loop = {
+        (n.block, n.port)
+        for n in after
+        if not n.is_output and any(Node(n.block, p, True) in before for p in flat.table.blocks[n.block].outputs)
+    }
+    told = {(f.block, f.source) for f in carried if isinstance(f, BlockFinding)}
+    return (*_find_tracking(flat, ways, cut, on_loop, before), *_find_inert(flat, at, cut, on_loop - told))
+
+
+def _find_tracking(
+    flat: FlatDiagram, ways: SignalPaths, cut: Sequence[Port], on_loop: set[Port], before: set[Node]
+) -> tuple[Finding, ...]:
+    table, found = flat.table, list[Finding]()
+    for path, port in sorted(on_loop):
+        tracked = table.blocks[path].inputs[port].tracks
+        if tracked is None or Node(path, tracked, True) not in before:
+            continue
+        if Node(path, port, False) in ways.follow((path, tracked)):
+            continue  # it follows its output with the cut as well
+        source = table.wires[path, port]
+        others = [
+            join(*c)
+            for c in _consumers(table.wires, (source.block, source.port))
+            if c in on_loop and table.blocks[c[0]].inputs[c[1]].tracks is None
+        ]
+        at = ", ".join(_name_of(flat, c) for c in cut)
+        found.append(
+            CutFromTracking(at, path, port, tracked, _name_of(flat, (source.block, source.port)), tuple(others))
+        )
+    return tuple(found)
+
+
+def _find_inert(flat: FlatDiagram, at: OperatingPoint, cut: Sequence[Port], on_loop: set[Port]) -> tuple[Finding, ...]:
+    """Return the consumers of a cut wire on the loop from which nothing follows at the operating point."""
+    found: list[Finding] = []
+    log: np.ndarray | None = None
+    for wire in dict.fromkeys(cut):
+        consumers = _consumers(flat.table.wires, wire)
+        for path, port in consumers:
+            if len(consumers) < 2 or (path, port) not in on_loop or path not in flat.checked.traced:
+                continue
+            slopes = slopes_of(flat.checked.traced[path])
+            if not slopes.rows.total:
+                continue
+            log = read_log(flat, at) if log is None else log
+            z, p = read_arguments(flat, at, path, slopes, log)
+            if not np.any(slopes.slopes(at.t, z, p)[1][:, slopes.columns.slices[f"u {port}"]]):
+                others = tuple(join(*c) for c in consumers if c in on_loop and c != (path, port))
+                found.append(InertConsumer(_name_of(flat, wire), path, port, others))
+    return tuple(found)
+
+
+def _name_of(flat: FlatDiagram, port: Port) -> str:
+    """Return the name of the wire behind a port, its path without one."""
+    names = [n for n, w in flat.table.names.items() if (w.block, w.port) == port and w.index is None]
+    return min(names, key=len, default=join(*port))
