@@ -5,7 +5,7 @@ from .equations import initial_state, start_shapes, start_values
 from .numpy_check import GUARDS, NEXT, evaluate
 from .opaque_equations import raise_failure
 from .structure import is_traced_by, traced_parameters
-from .symbols import bundle, flat_column, size, with_values, wrap
+from .symbols import bundle, flat_column, has_large_product, size, with_values, wrap
 from .traced import Traced, constants_of, trace
 from .traced_array import as_traced
 
@@ -19,6 +19,7 @@ __all__ = [
     "constants_of",
     "evaluate",
     "flat_column",
+    "has_large_product",
     "hold",
     "initial_state",
     "is_traced_by",

@@ -7,6 +7,7 @@ import inspect
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import casadi as ca
 import numpy as np
 
 from ..core import Block, LoopwrightError, Shape, TraceError
@@ -55,7 +56,7 @@ def compare(
     """
     T = 1.0 if sampled else float("nan")
     p = np.concatenate([*(np.ravel(v) for _, v in entries), [T], *map(np.ravel, constants.values())])
-    p = np.concatenate([p, np.zeros(function.numel_in(2 + len(shapes)) - p.size)])
+    numbers_of_p = ca.DM(np.concatenate([p, np.zeros(function.numel_in(2 + len(shapes)) - p.size)]))  # converted once
     numbers = {k: np.float64(v) if np.ndim(v) == 0 else v for k, v in [*entries, *constants.items()]}
     rng = np.random.default_rng(20140)
     _refuse_rounding(block, next(_special_points(shapes, starts, block)), np.float64(T), numbers, names)
@@ -72,7 +73,11 @@ def compare(
             expected = evaluate_with_numpy(point)
             if not expected:
                 continue
-            arguments = [*point.flatten(), p, *([np.array(list(point.fired.values()))] if "jump" in names else [])]
+            arguments = [
+                *point.flatten(),
+                numbers_of_p,
+                *([np.array(list(point.fired.values()))] if "jump" in names else []),
+            ]
             traced = {n: np.ravel(np.array(c)) for n, c in zip(names, function.call(arguments), strict=True)}
             if GUARDS in expected:  # the discretization may add guards behind those of the equations
                 traced[GUARDS] = traced[GUARDS][: expected[GUARDS].size]

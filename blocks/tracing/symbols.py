@@ -14,6 +14,9 @@ from casadi import ArrayInterface
 from ..core import Shape, ShapeError
 from .traced_array import as_traced
 
+LARGE = 64 * 64
+"""Entries of a matrix above which a product with it is one operation, and not one for each entry."""
+
 
 def size(shape: Shape) -> int:
     """Return the number of entries of a shape."""
@@ -30,8 +33,25 @@ def bundle(kind: str, values: Mapping[str, Any]) -> Any:
     return _tuple_type(kind, tuple(values))(*values.values())
 
 
+def has_large_product(function: Any) -> bool:
+    """Whether a CasADi function multiplies a matrix of more than `LARGE` entries: that stays one operation."""
+    if not function.is_a("MXFunction"):
+        return False
+    for k in range(function.n_instructions()):
+        if function.instruction_id(k) == ca.OP_MTIMES:
+            product = function.instruction_MX(k)
+            if max(product.dep(1).numel(), product.dep(2).numel()) > LARGE:
+                return True
+    return False
+
+
 def expand(function: Any) -> Any:
-    """Return the function in scalar (SX) operations, each done once; with a table lookup in it, unchanged."""
+    """Return the function in scalar (SX) operations, each done once.
+
+    With a table lookup in it, or a product with a large matrix, it is returned unchanged.
+    """
+    if has_large_product(function):
+        return function
     try:
         scalar = function.expand()
     except RuntimeError:
@@ -54,6 +74,14 @@ def with_values(block: Any, values: Mapping[str, Any]) -> Any:
     for head, inner in nested.items():
         copy.__dict__[head] = with_values(block.__dict__[head], inner)
     return copy
+
+
+def with_zeros(column: Any, zero: np.ndarray) -> Any:
+    """Return a flat CasADi column with zeros as structure: numbers in a small one, left out of a large one."""
+    if len(zero) <= LARGE:
+        return ca.vertcat(*(ca.MX(0.0) if z else column[i] for i, z in enumerate(zero)))
+    kept = np.flatnonzero(~zero).tolist()
+    return ca.MX(ca.Sparsity(len(zero), 1, [0, len(kept)], kept), column[kept])
 
 
 def wrap(flat: Any, shape: Shape) -> Any:

@@ -29,7 +29,7 @@ from .equations import check_definition, guards_of, match_ports, start_values, t
 from .numpy_check import GUARDS, NEXT, compare
 from .opaque_equations import Foreign
 from .structure import structure, traced_parameters
-from .symbols import bundle, expand, flat_column, size, with_values, wrap
+from .symbols import bundle, expand, flat_column, size, with_values, with_zeros, wrap
 from .trapezoid import trapezoidal_step
 
 
@@ -218,7 +218,7 @@ class _Tracer:
         for (name, value), where in zip(numbers, slices.values(), strict=True):
             part, zero = self.p[where], np.ravel(value) == 0
             if self.zeros and zero.any() and name not in self.constants:
-                part = ca.vertcat(*(ca.MX(0.0) if z else part[i] for i, z in enumerate(zero)))
+                part = with_zeros(part, zero)
             values[name] = wrap(part, np.shape(value))
         del values[""]
         shadow: Block = with_values(self.block, values)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ...blocks.tracing import GUARDS, NEXT, Traced
+import casadi as ca
+
+from ...blocks.tracing import GUARDS, NEXT, Traced, has_large_product
 
 
 class BlockFunctions:
@@ -40,3 +42,13 @@ class BlockFunctions:
             f = trace.function
             self._parts[key] = f.slice("block", list(range(f.n_in())), [every.index(n) for n in names])
         return self._parts[key]
+
+
+def call_block(function: Any, arguments: Sequence[Any]) -> list[Any]:
+    """Call a block's function; one with a product with a large matrix is written out in place of the call.
+
+    The derivative of a call has a direction for every parameter, thus for every entry of the matrix.
+    """
+    symbolic = any(isinstance(argument, ca.MX) for argument in arguments)
+    made: list[Any] = function.call([*arguments], symbolic and has_large_product(function), False)
+    return made

@@ -16,7 +16,7 @@ import numpy as np
 from ...blocks.core import Layout, SimulationError
 from ...blocks.tracing import GUARDS, NEXT, size
 from ..wiring import Step, Wire, join
-from .block_functions import BlockFunctions
+from .block_functions import BlockFunctions, call_block
 from .layout import FlatLayout, TickPattern
 from .logic import choose, is_true, logic_and, logic_not, logic_or, to_number
 
@@ -214,13 +214,13 @@ class Instant:
         if path in self.layout.apart:
             return self._call_apart(path, (name,), state, [*inputs, *more])[0]
         function = trace.indicators if name == INDICATORS else trace.jump
-        return function.call([t, state, *inputs, p, *more])[0]
+        return call_block(function, [t, state, *inputs, p, *more])[0]
 
     def _evaluate(self, path: str, names: tuple[str, ...], inputs: dict[str, Any]) -> list[Any]:
         t, state, columns, p = self._arguments(path, inputs)
         if path in self.layout.apart:
             return self._call_apart(path, names, state, columns)
-        made = self.functions.of(path, names).call([t, state, *columns, p])
+        made = call_block(self.functions.of(path, names), [t, state, *columns, p])
         return [ca.densify(m) for m in made]
 
     def _arguments(self, path: str, inputs: dict[str, Any]) -> tuple[Any, Any, list[Any], Any]:

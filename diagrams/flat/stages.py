@@ -40,6 +40,7 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import Layout
+from ...blocks.tracing import has_large_product
 from .evaluation import Apart, Instant, no_evaluator
 
 
@@ -299,10 +300,13 @@ def bind_function(function: Any, arguments: Sequence[np.ndarray], results: Seque
 
 
 def speed_up(function: Any) -> Any:
-    """Return a function in the form that is evaluated fastest: scalar operations where no block looks up a table.
+    """Return a function in the form that is evaluated fastest: scalar operations.
 
-    The results are the same to the last bit.
+    Where a block looks up a table, or multiplies a large matrix, it is returned unchanged. The results are the same to
+    the last bit.
     """
+    if has_large_product(function):
+        return function
     try:
         return function.expand()
     except RuntimeError:

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import Block, Layout
-from ...blocks.tracing import NEXT, Traced, size
+from ...blocks.tracing import NEXT, Traced, has_large_product, size
 
 BRANCHES = frozenset(
     {
@@ -62,6 +62,8 @@ class BlockSlopes:
         Names of the columns and rows.
     is_opaque : bool
         Whether the equations are any Python, without exact derivatives.
+    is_large : bool
+        Whether the equations multiply a large matrix, and are not written out entry by entry.
     """
 
     def __init__(self, trace: Traced):
@@ -73,16 +75,18 @@ class BlockSlopes:
         advance = trace.states if trace.function.numel_out(len(trace.outputs)) else {}
         self.rows = _side(trace.outputs, advance, states_first=False)
         self._sizes = [Layout.of(trace.states).total, *(size(s) for s in trace.inputs.values())]
+        self.is_large = has_large_product(trace.function)
         try:
-            self.scalar: Any = trace.function.expand()
+            self.scalar: Any = None if self.is_large else trace.function.expand()
         except RuntimeError:  # a table, or an opaque block
             self.scalar = None
 
     @cached_property
     def has_branches(self) -> bool:
         """Whether an operation of the equations is not smooth, or can't be looked at."""
-        f = self.scalar
-        return f is None or any(f.instruction_id(k) in BRANCHES for k in range(f.n_instructions()))
+        f = self.function if self.is_large else self.scalar
+        unsmooth = {*BRANCHES, ca.OP_CALL}
+        return f is None or any(f.instruction_id(k) in unsmooth for k in range(f.n_instructions()))
 
     @cached_property
     def is_simple(self) -> bool:
@@ -98,7 +102,7 @@ class BlockSlopes:
         f = self.function if self.scalar is None else self.scalar
         symbol = ca.MX if self.scalar is None else ca.SX
         z, t, p = symbol.sym("z", self.columns.total), symbol.sym("t"), symbol.sym("p", f.numel_in(f.n_in() - 1))
-        made = f.call(self.split_symbols(t, z, p))
+        made = f.call(self.split_symbols(t, z, p), self.is_large, False)
         return z, ca.vertcat(*(ca.densify(y) for y in made[: len(self.outputs) + 1])), t, p
 
     def split_symbols(self, t: Any, z: Any, p: Any) -> list[Any]:
@@ -214,7 +218,7 @@ class BlockSlopes:
         return self.scalar is not None and rounds and bool(self.steps_of_equations or self.steps_of_events)
 
     def _find_steps_of_equations(self) -> Iterator[tuple[str, str]]:
-        if self.scalar is None or not self.has_branches:
+        if (self.scalar is None and not self.is_large) or not self.has_branches:
             return
         z, results, _, _ = self._expressions
         for row, rows in self.rows.slices.items():
@@ -222,7 +226,8 @@ class BlockSlopes:
             for column in self.columns.ports:
                 u = z[self.columns.slices[column]]
                 if u.numel() and y.numel() and ca.depends_on(y, u):
-                    entries: list[Any] = ca.jacobian(y, u).nonzeros()
+                    slope = ca.jacobian(y, u)
+                    entries: list[Any] = [slope] if self.is_large else slope.nonzeros()
                     if all(e.is_zero() for e in entries):
                         yield row, column
 

@@ -17,8 +17,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
+import casadi as ca
 import numpy as np
 
 from ...blocks.core import Block, Finding, Output, State
@@ -107,7 +108,7 @@ class _BlockAtPoint:
     slopes: BlockSlopes
     t: float
     z: np.ndarray
-    p: np.ndarray
+    p: Any
     span: np.ndarray
     wired: set[str]
     used: frozenset[str]
@@ -125,7 +126,8 @@ class _BlockAtPoint:
             if given:
                 span[where] = given
         used = frozenset(w.port for w in (*flat.table.wires.values(), *flat.table.names.values()) if w.block == path)
-        return cls(path, block, slopes, at.t, z, p, span, wired, used)
+        numbers = ca.DM(p) if slopes.is_large else p  # converted once
+        return cls(path, block, slopes, at.t, z, numbers, span, wired, used)
 
     def find(self) -> Iterator[Finding]:
         """Yield the kinks and zero slopes of the block."""
@@ -176,7 +178,8 @@ class _BlockAtPoint:
 
     def _find_kinks(self, column: int, f0: np.ndarray, J0: np.ndarray) -> Iterator[tuple[int, Kink]]:
         h = NEAR * self.span[column]
-        if self.slopes.is_opaque or any(self._moved(column, by)[1] for by in (h, -h)):
+        by_values = self.slopes.is_opaque or self.slopes.is_large
+        if by_values or any(self._moved(column, by)[1] for by in (h, -h)):
             yield from self._find_by_values(column, h, f0)
         elif self.slopes.has_branches:
             yield from self._find_by_slopes(column, h)
