@@ -93,7 +93,8 @@ class Diagram(SimulatedDiagram):
 
         Every state of a block or an FMU is unknown, unless it is fixed, and is asked to stay: rates are zero, sampled
         states repeat. The equations are solved by least squares within bounds, with the exact derivatives of the
-        diagram and the linear models of its FMUs. A state that nothing determines stays near where the search begins.
+        diagram and the linear models of its FMUs. A state that nothing determines stays near where the search begins:
+        ``free`` of the result says so.
 
         Parameters
         ----------

@@ -14,11 +14,13 @@ from ...blocks.core import ConfirmationError, ParameterError
 from .polynomials import divide, eulerian_polynomial, real_polynomial, relative_difference, remainder
 
 Integral = Literal["forward", "backward", "trapezoidal"]
+REACH = 1e-8
+"""Distance from an uncontrollable pair below which gains are refused: about the root of the rounding."""
 AGREE = 1e-6
 """Largest difference of characteristic polynomials that agree, relative to the largest scaled coefficient."""
 
 
-def place(A: ArrayLike, B: ArrayLike, poles: Sequence[complex]) -> np.ndarray:
+def place(A: ArrayLike, B: ArrayLike, poles: Sequence[complex], *, reach: float = REACH) -> np.ndarray:
     """Return K that gives A − B K the poles, multiple ones included.
 
     SciPy places distinct poles, and as many coinciding ones as there are inputs. Ackermann's formula places those of a
@@ -32,6 +34,9 @@ def place(A: ArrayLike, B: ArrayLike, poles: Sequence[complex]) -> np.ndarray:
         Continuous or sampled system, controllable; shapes (n, n) and (n, m).
     poles : sequence of complex
         n poles, complex ones in conjugate pairs.
+    reach : float
+        Least relative distance of A and B, with balanced states, from a pair with a mode that no input reaches. Nearer
+        to it the gains are large, and a tiny error of the model is enough to make them useless; 0 accepts them.
 
     Returns
     -------
@@ -41,7 +46,7 @@ def place(A: ArrayLike, B: ArrayLike, poles: Sequence[complex]) -> np.ndarray:
     Raises
     ------
     ParameterError
-        If shapes or conjugate pairs don't fit, entries are not finite, or the system is not controllable.
+        If shapes or conjugate pairs don't fit, entries are not finite, or the system is not, or hardly, controllable.
     ConfirmationError
         If the polynomials differ: the problem is too ill-conditioned.
 
@@ -51,7 +56,44 @@ def place(A: ArrayLike, B: ArrayLike, poles: Sequence[complex]) -> np.ndarray:
     array([[4., 4.]])
     """
     system, inputs = np.atleast_2d(np.asarray(A, dtype=float)), np.asarray(B, dtype=float)
-    return _place(system, inputs[:, None] if inputs.ndim == 1 else inputs, np.asarray(poles, dtype=complex))
+    inputs = inputs[:, None] if inputs.ndim == 1 else inputs
+    wanted = np.asarray(poles, dtype=complex)
+    try:
+        K = _place(system, inputs, wanted)
+    except ConfirmationError as error:
+        distance, mode = _find_weakest_mode(system, inputs)
+        if distance < reach:
+            raise _make_weak_error(distance, mode, reach, "no gains that give these poles") from error
+        raise
+    distance, mode = _find_weakest_mode(system, inputs) if len(system) else (np.inf, 0j)
+    if distance < reach:
+        raise _make_weak_error(distance, mode, reach, f"gains up to {np.max(np.abs(K)):.3g}")
+    return K
+
+
+def _find_weakest_mode(A: np.ndarray, B: np.ndarray) -> tuple[float, complex]:
+    """Return the smallest relative distance from a pair with a mode that no input reaches, and that mode.
+
+    The states are balanced, and B is taken relative to its size, so that units don't matter.
+    """
+    from scipy.linalg import matrix_balance
+
+    d = np.asarray(matrix_balance(A, permute=False, separate=True)[1][0])
+    M, b = A * d / d[:, None], B / d[:, None]
+    M, b = M / (np.linalg.norm(M) or 1.0), b / (np.linalg.norm(b) or 1.0)
+    modes = np.linalg.eigvals(M)
+    found = [np.linalg.svd(np.hstack([M - s * np.eye(len(M)), b]), compute_uv=False)[-1] for s in modes]
+    weakest = int(np.argmin(found))
+    return float(found[weakest]), complex(modes[weakest] * np.linalg.norm(A * d / d[:, None]))
+
+
+def _make_weak_error(distance: float, mode: complex, reach: float, found: str) -> ParameterError:
+    return ParameterError(
+        f"found {found}: the inputs hardly reach a mode at {mode:.6g}, as a change of A and B by {distance:.2g} of "
+        f"their size takes it out of reach; expected at least {reach:.2g}. Leave that mode where it is, on a reduced "
+        "model, or accept these gains with place(…, reach=0).",
+        block="place",
+    )
 
 
 def _place(A: np.ndarray, B: np.ndarray, wanted: np.ndarray) -> np.ndarray:

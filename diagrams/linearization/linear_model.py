@@ -321,7 +321,7 @@ def _linearize(
         ins = outs = tuple(channels)
     known = means.replace_findings(find_kinks(flat, at)) if findings is None else findings
     entries = (EntryTaken(s.name, s.entry) for group in found for s in group if s.entry)
-    every = tuple(dict.fromkeys((*known, *model.findings, *entries)))
+    every = tuple(dict.fromkeys((*known, *model.findings, *at.free, *entries)))
     ways = SignalPaths(flat, [s.port for s in found[2]])
     carried = ways.between(every, *([s.port for s in group] for group in found[:2]))
     if loop:

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import Layout, OptionError, SimulationError
+from ...blocks.core import Layout, OptionError, SimulationError, elements
 from ..flat import (
     Apart,
     Derivative,
@@ -30,11 +30,13 @@ from ..flat import (
     rates,
     trace_schedule,
 )
-from ..results import OperatingPoint, PointOrigin
+from ..results import FreeDirection, OperatingPoint, PointOrigin
 from .operating_points import PointLike, operating_point, with_residual
 from .trim_plants import Plants
 from .trim_request import Free, Target, free_parameters, index_states, read_targets, set_states
 
+UNDETERMINED = 1e-10
+"""Relative size of a singular value of the equations' derivative up to which a direction counts as free."""
 TOLERANCE = 1e-9
 """Largest residual of a solved equation, relative to 1 + the size of its quantity."""
 Residual: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -115,6 +117,18 @@ class _Equations:
         ]
         wanted, keep = (np.concatenate([g[i] for g in groups]) for i in (0, 1))
         return names, wanted, keep.astype(bool)
+
+    @property
+    def unknown_names(self) -> list[str]:
+        """Names of the unknowns; empty for signals, which follow from states and parameters."""
+        states = len(self.flat.states.labels)
+        parameters = [label for f in self.parameters for label in elements(f.name, np.shape(f.shape_value(f.start)))]
+        return [
+            *(self.flat.labels[i] if i < states else "" for i in self.free_x),
+            *([""] * self.at.w.size),
+            *(self.plants.states.labels[i] for i in self.free_p),
+            *parameters,
+        ]
 
     def start(self) -> np.ndarray:
         """Return the unknowns at the beginning of the search."""
@@ -239,6 +253,37 @@ def solve(equations: _Equations) -> np.ndarray:
     return best
 
 
+def find_free_directions(equations: _Equations, unknown: np.ndarray) -> tuple[FreeDirection, ...]:
+    """Return the directions of states and parameters along which all equations stay solved, to first order.
+
+    They are the null space of the derivative, relative to the sizes of unknowns and rows, in reduced echelon form.
+    """
+    low, high = equations.bounds()
+    moves = np.flatnonzero(low < high)
+    J = equations.residual_at(unknown)[1][:, moves]
+    if not moves.size:
+        return ()
+    sizes = 1.0 + np.abs(unknown[moves])
+    scaled = J * sizes
+    scaled = scaled / np.maximum(np.max(np.abs(scaled), axis=1, initial=0.0), 1e-300)[:, None]
+    _, values, rows = np.linalg.svd(scaled)
+    rank = int(np.sum(values > UNDETERMINED * max(1.0, float(values.max(initial=0.0)))))
+    basis = rows[rank:] * sizes
+    for k in range(len(basis)):
+        pivot = int(np.argmax(np.abs(basis[k] / sizes)))
+        basis[k] = basis[k] / basis[k, pivot]
+        others = [i for i in range(len(basis)) if i != k]
+        basis[others] -= np.outer(basis[others, pivot], basis[k])
+    names = [equations.unknown_names[i] for i in moves]
+    found = []
+    for direction in basis:
+        share = direction / direction[np.argmax(np.abs(direction))]
+        entries = [(n, round(float(v), 12)) for n, v in zip(names, share, strict=True) if abs(v) > 1e-9 and n]
+        if entries:
+            found.append(FreeDirection(tuple(sorted(entries, key=lambda e: (-abs(e[1]), e[0])))))
+    return tuple(sorted(found, key=lambda f: f.entries[0][0]))
+
+
 def trim(
     diagram: WiredDiagram,
     free: Mapping[str, Any] | Iterable[str] | None = None,
@@ -299,6 +344,7 @@ def _solve_trim(
     residuals = {equations.names[i]: float(left[i]) for i in order}
     worst = float(left[order[0]]) if order else 0.0
     x, w, xp, q = equations.split(unknown)
+    free = find_free_directions(equations, unknown) if how is PointOrigin.TRIM else ()
     if not worst <= tolerance:
         shown = "; ".join(f"{name}: {value:.3g}" for name, value in list(residuals.items())[:5])
         stuck = [f.name for f, v in zip(parameters, q, strict=True) if f.is_at_bound(v)]
@@ -316,7 +362,7 @@ def _solve_trim(
         xp, equations.residual_at(unknown)[2], equations.plants.change_blocks(parameters, q)
     )
     return _complete_point(final, guess, x, w, plants, {
-        "parameters": {**guess.parameters, **values}, "residuals": residuals, "how": how,
+        "parameters": {**guess.parameters, **values}, "residuals": residuals, "how": how, "free": free,
     })  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from ...blocks import ErrorDynamics
 from ...blocks.core import LoopwrightError
 from ..document import Section, Table, Texts
 from ..frequency import Number, Realization, relative_difference, sampled_gains, sampled_poles, with_findings
-from ..report import POLES_TITLE, Variant, in_s
+from ..report import POLES_TITLE, Variant, in_s, list_poles
 from .report_case import Fig3Case
 
 TEXTS = Texts(__package__, "poles")
@@ -40,7 +40,7 @@ def _asked(case: Fig3Case, side: str, wire: str, block: ErrorDynamics, numbers: 
     def keep(v: Variant, name: str, number: Number) -> None:
         numbers[f"{side}.{v.key}.{name}"] = with_findings(number, v.findings(wire))
 
-    rows: list[tuple[Any, ...]] = [("asked", _listed(_cleaned(asked, wanted)), "")]
+    rows: list[tuple[Any, ...]] = [("asked", list_poles(_cleaned(asked, wanted)), "")]
     gains: list[tuple[Any, ...]] = []
     for v in case.usable():
         try:
@@ -52,15 +52,15 @@ def _asked(case: Fig3Case, side: str, wire: str, block: ErrorDynamics, numbers: 
             how = "characteristic polynomials of the loop at the virtual input"
             off = _off(got, asked)
             if len(got) != len(asked) and not off <= SAME:  # the plant has dynamics of its own
-                rows.append((v.title, _listed(np.roots(got)), ""))
+                rows.append((v.title, list_poles(np.roots(got)), ""))
                 continue
             keep(v, "polynomial_difference", Number(off, "1", 1e-9, how))
             if len(got) == len(asked):
                 keep(v, "mean", Number(-got[1] / 3, "1/s", 1e-9 * abs(got[1]), "the trace of A"))
-            rows.append((v.title, _listed(np.roots(got)), numbers[f"{side}.{v.key}.polynomial_difference"]))
+            rows.append((v.title, list_poles(np.roots(got)), numbers[f"{side}.{v.key}.polynomial_difference"]))
             continue
         if not v.is_design:
-            rows.append((v.title, _listed(in_s(1 + np.linalg.eigvals(r.closed_matrix()), r.dt)), ""))
+            rows.append((v.title, list_poles(in_s(1 + np.linalg.eigvals(r.closed_matrix()), r.dt), r.dt), ""))
             continue
         design = sampled_poles([block.a0, block.a1, block.a2], r.dt, delay=v.implementation.delay)
         got = np.poly(r.closed_matrix())
@@ -69,13 +69,13 @@ def _asked(case: Fig3Case, side: str, wire: str, block: ErrorDynamics, numbers: 
         off = _off(got, formula)
         how = "closed form of the sampled chain of integrators against the diagram's own loop"
         if not off <= SAME:
-            rows.append((v.title, _listed(in_s(1 + np.linalg.eigvals(r.closed_matrix()), r.dt)), ""))
+            rows.append((v.title, list_poles(in_s(1 + np.linalg.eigvals(r.closed_matrix()), r.dt), r.dt), ""))
             continue
         keep(v, "polynomial_difference", Number(off, "1", 1e-9, how))
         for i, s in enumerate(design.poles[:3], 1):
             keep(v, f"pole_{i}_real", Number(s.real, "1/s", 1e-6 * abs(s), how))
             keep(v, f"pole_{i}_imag", Number(abs(s.imag), "rad/s", 1e-6 * abs(s), how))
-        rows.append((v.title, _listed(design.poles), numbers[f"{side}.{v.key}.polynomial_difference"]))
+        rows.append((v.title, list_poles(design.poles, r.dt), numbers[f"{side}.{v.key}.polynomial_difference"]))
         try:
             better = sampled_gains(tuple(_cleaned(asked, wanted)), r.dt, delay=v.implementation.delay)
         except LoopwrightError as error:
@@ -116,18 +116,3 @@ def _cleaned(polynomial: np.ndarray, roots: np.ndarray) -> np.ndarray:
     p = -polynomial[1] / 3
     exact = np.array([p, p, p], dtype=complex)
     return exact if relative_difference(np.poly(exact), polynomial) < 1e-12 else roots
-
-
-def _listed(values: Any) -> str:
-    values = np.asarray(values, dtype=complex)
-    values = values[np.isfinite(values)]
-    values = values[np.lexsort((-values.imag, np.abs(values)))]
-    shown = []
-    for v in values:
-        if abs(v.imag) <= 1e-9 * abs(v):
-            shown.append(f"{v.real:.6g}")
-        elif v.imag > 0:
-            shown.append(f"{v.real:.6g} ± {v.imag:.6g}j")
-        elif not np.any(np.abs(values - v.conjugate()) < 1e-6 * abs(v)):
-            shown.append(f"{v.real:.6g} − {-v.imag:.6g}j")
-    return ", ".join(shown)

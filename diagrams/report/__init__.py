@@ -19,6 +19,7 @@ from .drawings import with_drawing
 from .parts import MakesSections, ReportKind, ReportPart
 from .plots import look_of
 from .points import point_of
+from .pole_texts import list_poles
 from .section_limits import LIMITS_TITLE
 from .section_poles import POLES_TITLE
 from .section_subject import SUBJECT_TITLE
@@ -51,6 +52,7 @@ __all__ = [
     "disk_numbers",
     "disk_range",
     "in_s",
+    "list_poles",
     "look_of",
     "point_of",
     "scatter",

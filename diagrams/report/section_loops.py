@@ -24,6 +24,7 @@ from ..frequency import (
 from . import plots as figures
 from .case import Case
 from .disks import several
+from .pole_texts import list_poles
 from .uncertainty import LoopPart, cut_key, left_out, widened
 from .variant import Cut, Variant, in_s
 from .wires import blocks_on_loops
@@ -207,18 +208,4 @@ def _crossings(found: Mapping[str, Margins], titles: Mapping[str, str]) -> Itera
 
 
 def _poles(poles: Iterable[complex], dt: float) -> str:
-    values = in_s(list(poles), dt)
-    values = values[np.lexsort((-values.imag, np.abs(values)))]
-    shown, skip = [], False
-    for v in values:
-        if skip:
-            skip = False
-            continue
-        if abs(v.imag) <= 1e-9 * max(abs(v), 1e-300) or not np.isfinite(v):
-            shown.append(f"{v.real:.6g}")
-        elif dt and abs(abs(v.imag) - np.pi / dt) < 1e-6 / dt:
-            shown.append(f"{v.real:.6g} ± jπ/T")
-        else:
-            shown.append(f"{v.real:.6g} ± {abs(v.imag):.6g}j")
-            skip = True
-    return ", ".join(shown) or "none"
+    return list_poles(in_s(list(poles), dt), dt)

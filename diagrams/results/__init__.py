@@ -1,6 +1,6 @@
 """Results of runs: recording, storage, plots and exports."""
 
-from .operating_point import OperatingPoint, PointOrigin
+from .operating_point import FreeDirection, OperatingPoint, PointOrigin
 from .plots import (
     BLUE,
     DARK,
@@ -32,6 +32,7 @@ __all__ = [
     "PURPLE",
     "VERMILION",
     "WIDTH",
+    "FreeDirection",
     "Occurrence",
     "OperatingPoint",
     "PointOrigin",

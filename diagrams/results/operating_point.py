@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from fractions import Fraction
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from ...blocks.core import OptionError
+from ...blocks.core import Finding, OptionError
 from ..flat import FlatDiagram
 from .saved_state import StateLayout, layout_of
 
@@ -24,6 +24,26 @@ class PointOrigin(StrEnum):
     """A trim has found it."""
     GIVEN = "given"
     """Its states were given."""
+
+
+@dataclass(frozen=True)
+class FreeDirection(Finding):
+    """A direction in which a trim is not unique: states and parameters that may change together.
+
+    Attributes
+    ----------
+    entries : tuple of (str, float)
+        Name and share of each; the largest share is 1.
+    """
+
+    limits_numbers: ClassVar[bool] = False
+    entries: tuple[tuple[str, float], ...]
+
+    def __str__(self) -> str:
+        shares = ", ".join(f"{name} by {share:.6g}" for name, share in self.entries)
+        return (
+            f"the trim is not unique: nothing determines the change of {shares}; it stays near where the search began"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,5 +112,7 @@ class OperatingPoint:
 
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """Parameters that a trim has found with it, by path, as `Diagram.replace` takes them."""
+    free: tuple[FreeDirection, ...] = ()
+    """Directions that a trim left free, to first order: with targets or fixed states for them it is unique."""
     residuals: Mapping[str, float] = field(default_factory=dict, repr=False)
     """Remainder of each equation of a trim by name, largest first, relative to 1 + the size of its quantity."""

@@ -204,3 +204,29 @@ def test_sampled_gains_refuse_nan_and_say_which_poles_a_delay_adds():
         sampled_gains([np.nan] * 3, 1e-3)
     with pytest.raises(ParameterError, match="the delay adds others"):
         sampled_gains([-1000.0] * 3, 1e-3, delay=2)
+
+
+@pytest.mark.parametrize(
+    ("A", "B", "gain"),
+    [
+        (np.diag([-1.0, -2.0]), [[1.0], [1e-10]], 2e10),  # −2 is reached by 1e-10 only: K₂ = (−3 + 2)(−4 + 2) / 1e-10
+        (np.diag([-1.0, -2.0, -3.0]), [[1.0, 0.0], [1e-9, 0.0], [0.0, 1.0]], None),
+        (np.diag([-1.0, -1.0 - 1e-9]), [[1.0], [1.0]], None),  # two modes that one input can't tell apart
+    ],
+)
+def test_a_pair_that_is_hardly_controllable_is_refused_with_the_mode_and_the_gain(A, B, gain):
+    wanted = -3.0 - np.arange(len(A))
+    with pytest.raises(
+        ParameterError, match=r"the inputs hardly reach a mode at -[12].* accept these gains with place"
+    ) as e:
+        place(A, B, wanted)
+    if gain is not None:
+        assert f"found gains up to {gain:.3g}: " in str(e.value)
+        K = place(A, B, wanted, reach=0)
+        assert np.max(np.abs(K)) == pytest.approx(gain, rel=1e-6)
+        assert same_polynomial(A - np.array(B) @ K, wanted)
+
+
+def test_fast_modes_beside_slow_ones_are_not_hardly_controllable():
+    A, B = np.array([[0.0, 1, 0], [0, 0, 1], [0, -1e6, -1e3]]), np.array([[0.0], [0], [1e3]])
+    assert same_polynomial(A - B @ place(A, B, [-10.0, -20, -30]), [-10.0, -20, -30], 1e-6)

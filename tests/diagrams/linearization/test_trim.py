@@ -15,6 +15,7 @@ from loopwright.blocks import (
     ParameterError,
     Reference,
     SimulationError,
+    Sum,
     UnitDelay,
     UnknownNameError,
 )
@@ -240,3 +241,48 @@ def test_a_run_from_a_point_on_other_ticks_is_refused():
         diagram.simulate(0.1, step=2e-3, start=point, progress=False)
     with pytest.raises(OptionError, match="another diagram"):
         fig3_at_rest().simulate(0.1, start=diagram.operating_point(step=1e-3), progress=False)
+
+
+# --- trims that are not unique ------------------------------------------------------------------------------------------
+
+
+def two_torques():
+    """J ω̇ = motor − 2 load − 0.3 ω, φ̇ = ω: one equation for two torques, none for the angle."""
+    angle, speed = Integrator(name="angle"), Integrator(name="speed")
+    motor, load = Constant(value=1.0, name="motor"), Constant(value=0.5, name="load")
+    total = Sum(signs="+--", name="sum")(motor, Gain(gain=2.0, name="two")(load), Gain(gain=0.3, name="damp")(speed.y))
+    return Diagram("shaft", angle(speed.y), speed(total))
+
+
+def test_a_trim_that_is_not_unique_names_the_directions_that_are_free():
+    diagram = two_torques()
+    point = diagram.trim(free=["motor.value", "load.value"])
+    angle, torques = point.free
+    assert dict(torques.entries) == pytest.approx({"motor.value": 1.0, "load.value": 0.5})  # 1 = 2 · 0.5
+    assert dict(angle.entries) == {"angle.y": 1.0}
+    assert "nothing determines the change of motor.value by 1, load.value by 0.5" in str(torques)
+    model = diagram.linearize(point)
+    assert model.findings == point.free
+    assert model.carried == ()
+    for share in (2.0, -3.0):  # every point along the direction is a trim
+        moved = {name: point.parameters[name] + share * v for name, v in torques.entries}
+        assert diagram.replace(moved).linearize(at_rest := diagram.replace(moved).trim()).point is at_rest
+        assert at_rest.residual < 1e-12
+
+
+def test_what_a_target_or_a_fixed_state_determines_is_not_free():
+    diagram = two_torques()
+    assert [f.entries for f in diagram.trim(free=["motor.value"]).free] == [(("angle.y", 1.0),)]
+    assert diagram.trim(free=["motor.value"], targets={"angle.y": 0.3}).free == ()
+    assert diagram.trim(free=["motor.value"], fixed=["angle.y"]).free == ()
+    (torques,) = diagram.trim(free={"motor.value": (0, 5), "load.value": (0, 5)}, fixed=["angle.y"]).free
+    assert {name for name, _ in torques.entries} == {"motor.value", "load.value"}
+
+
+def test_a_free_direction_does_not_depend_on_units():
+    """The angle in other units, 1e6 and 1e-6 of it, is as free as before, and nothing else is."""
+    for unit in (1e-6, 1e6):
+        angle, speed = Integrator(name="angle"), Integrator(name="speed")
+        drive = speed(Sum(signs="+-")(Constant(value=0.0, name="u"), Gain(gain=0.3)(speed.y)))
+        point = Diagram("d", angle(Gain(gain=unit)(speed.y)), drive).trim()
+        assert [f.entries for f in point.free] == [(("angle.y", 1.0),)]
