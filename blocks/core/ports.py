@@ -205,7 +205,9 @@ class Event(Port):
     """An event of a continuous block: one of its ``indicators`` crosses zero in a direction.
 
     An indicator is in one of two domains, z > 0 or z ≤ 0. A change of domain in the declared direction fires the event,
-    and the block's ``jump`` gives the states after it. No event fires at the start, whatever the domains are.
+    and the block's ``jump`` gives the states after it. No event fires at the start, whatever the domains are. One that
+    is exactly 0 at the start, or that its own event's jump leaves in contact, is in neither: the direction in which it
+    leaves 0 fires the event if it is the declared one.
 
     Parameters
     ----------

@@ -4,7 +4,7 @@ from ...blocks.core import Layout
 from .evaluation import Apart, Instant, evaluate
 from .flat_diagram import FlatDiagram
 from .functions import indicators_of
-from .layout import NONE, StateLayout, TickPattern
+from .layout import NONE, FlatEvent, StateLayout, TickPattern
 from .logic import TRUE, is_true
 from .stages import Bound, Evaluators, Schedule, evaluate_apart
 from .total_derivative import Derivative
@@ -20,6 +20,7 @@ __all__ = [
     "Derivative",
     "Evaluators",
     "FlatDiagram",
+    "FlatEvent",
     "Instant",
     "Layout",
     "Schedule",

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Block, NonFiniteError, OptionError, SimulationError, is_before, left_of
+from ..events import Domains
 from ..results import Occurrence
 from ..solvers import Problem, Step, make_solver
 from .diagnosis import forget_trials, opaque_failure, state_values
-from .events import Domains
 from .left_of_start import domains_from_left
-from .solver_setup import absolute_tolerances, remembers, time_scale_of
+from .solver_setup import absolute_tolerances, next_instant, remembers, time_scale_of
 from .transport_delays import delays_of, keep_step
 from .workspace import Workspace
 
@@ -93,7 +93,7 @@ class Continuous:
         self.domains: Domains | None = None
         if flat.events:
             self._indicators, self._opened = workspace.indicators()
-            self.domains = Domains(flat, self._g, self._opened, self.time_scale)
+            self.domains = Domains(flat, self._g, self._g_many, self._rate, self._opened, self.time_scale)
             self._jump = workspace.bind_jump()
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
@@ -131,9 +131,21 @@ class Continuous:
 
     def _g(self, t: float, x: np.ndarray) -> np.ndarray:
         g = self._indicators(self._time(t), x)
-        if not np.all(np.isfinite(g[self._opened > 0.5])):
+        if not math.isfinite(g.sum()) and not np.all(np.isfinite(g[self._opened > 0.5])):
             raise self._not_finite(t, x, g)
         return g
+
+    def _g_many(self, times: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the indicators at several times, one row each, NaN beyond a failure, and which are open there."""
+        n = len(self.flat.events)
+        z, opened = np.full((len(times), n), math.nan), np.ones((len(times), n))
+        try:
+            for k, t in enumerate(times.tolist()):
+                z[k] = self._indicators(self._time(t), states[k])
+                opened[k] = self._opened
+        except SimulationError:  # a loop without a solution: whoever needs that instant evaluates it again
+            z[k:], opened[k:] = math.nan, 1.0
+        return z, opened
 
     def _not_finite(self, t: float, x: np.ndarray, g: np.ndarray) -> SimulationError:
         """Return the error of an indicator that is not finite: that of the block which made the first such value."""
@@ -198,7 +210,7 @@ class Continuous:
         if self.domains is not None:
             self.domains.begin(float(self.workspace.here.t[0]), self.workspace.here.x[self.where])
             if at_start:
-                self.domains.above = domains_from_left(self.workspace, self.domains.above)
+                self.domains.domain = domains_from_left(self.workspace, self.domains.domain)
         if self.delays is not None:
             self.delays.note_edge(float(self.workspace.here.t[0]))
 
@@ -217,12 +229,14 @@ class Continuous:
         workspace, domains = self.workspace, self.domains
         for _ in range(domains.most):
             before = workspace.here.x.copy()
+            motion = domains.motion(t, before[self.where], fired)
             self._jump(fired)
             for i in np.flatnonzero(fired):
                 self._tell(t, self.flat.events[int(i)], before)
                 self._reset_domains(self.flat.events[int(i)])
-            domains.count(t, fired, self.name)
+            domains.count(t, fired)
             self._synchronize()
+            domains.land(motion, t, workspace.here.x[self.where], fired)
             fired = domains.update(t, workspace.here.x[self.where])
             if not fired.any():
                 if self.delays is not None:
@@ -277,7 +291,7 @@ class Continuous:
             while found is None and t < edge:
                 step = self._step()
                 if self.domains is not None:
-                    found = self.domains.locate(step.t_old, step.t, step.interpolate)
+                    found = self.domains.locate(step)
                     solved = workspace.trial.x[self._loops]
                 t = step.t if found is None else found[0]
                 while pending < t or (pending == t < edge and found is None):
@@ -345,7 +359,7 @@ class Continuous:
         return self.is_stopped() and (sample(t) or True)
 
     def _next_edge(self, t: float) -> float:
-        self._sources_edge = min((_next_instant(path, source, t) for path, source in self.sources), default=math.inf)
+        self._sources_edge = min((next_instant(path, source, t) for path, source in self.sources), default=math.inf)
         return min(self._sources_edge, math.inf if self.delays is None else self.delays.next_edge(t))
 
     # --- saved states ------------------------------------------------------------------------------------------------
@@ -365,24 +379,3 @@ class Continuous:
         if self.delays is not None and saved["delays"] is not None:
             self.delays.restore(saved["delays"])
         self.solver.restore(saved["solver"])
-
-
-def _next_instant(path: str, block: Block, t: float) -> float:
-    """Return the next instant of a block; one that does not come after t would keep the run where it is."""
-    try:
-        found = block.next_instant(t)
-        later = found > t
-    except Exception as error:
-        raise SimulationError(
-            f"its next_instant({t!r}) failed: {type(error).__name__}: {error}. Expected a time after that, or math.inf "
-            "if there is none.",
-            block=path,
-            t=t,
-        ) from error
-    if not later:
-        raise SimulationError(
-            f"its next_instant({t!r}) is {found!r}; expected a time after that, or math.inf if there is none.",
-            block=path,
-            t=t,
-        )
-    return found

@@ -55,17 +55,17 @@ def _jumps_at_start(block: Block) -> bool:
         return False
 
 
-def domains_from_left(workspace: Workspace, above: np.ndarray) -> np.ndarray:
-    """Return whether the indicators of all events are above 0 just before t = 0.
+def domains_from_left(workspace: Workspace, domains: np.ndarray) -> np.ndarray:
+    """Return the domains of the indicators of all events just before t = 0: 1 above 0, −1 below, 0 on the border.
 
     Parameters
     ----------
-    above : ndarray of bool
-        Whether they are at t = 0: the answer for those that no jump of a source changes.
+    domains : ndarray of int
+        Those at t = 0: the answer for those that no jump of a source changes.
     """
     taps = values_from_left(workspace)
     if not taps:
-        return above
+        return domains
     flat, here, apart = workspace.flat, workspace.here, evaluate_apart(workspace.evaluators)
 
     def at(taps: Taps) -> np.ndarray:
@@ -73,4 +73,4 @@ def domains_from_left(workspace: Workspace, above: np.ndarray) -> np.ndarray:
         return np.array([float(np.ravel(np.array(g))[0]) for g in indicators_of(instant)[0]])
 
     left, right = at(taps), at({})
-    return np.where((left == right) | ~np.isfinite(left), above, left > 0.0)
+    return np.where((left == right) | ~np.isfinite(left), domains, np.where(left > 0.0, 1, -1))

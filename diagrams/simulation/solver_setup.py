@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ...blocks.core import Block, SimulationError
 from ..flat import FlatDiagram
 
 
@@ -32,3 +33,24 @@ def absolute_tolerances(flat: FlatDiagram, atol: float) -> Any:
             scale[where] = 1.0 if nominal is None else nominal
     scale = scale[flat.continuous]
     return atol if np.all(scale == 1.0) or np.ndim(atol) else atol * scale
+
+
+def next_instant(path: str, block: Block, t: float) -> float:
+    """Return the next instant of a block; one that does not come after t would keep the run where it is."""
+    try:
+        found = block.next_instant(t)
+        later = found > t
+    except Exception as error:
+        raise SimulationError(
+            f"its next_instant({t!r}) failed: {type(error).__name__}: {error}. Expected a time after that, or math.inf "
+            "if there is none.",
+            block=path,
+            t=t,
+        ) from error
+    if not later:
+        raise SimulationError(
+            f"its next_instant({t!r}) is {found!r}; expected a time after that, or math.inf if there is none.",
+            block=path,
+            t=t,
+        )
+    return found

@@ -94,6 +94,15 @@ class Step:
             self._dense = self._prepare()
         return self._dense(t)
 
+    def interpolate_many(self, times: np.ndarray) -> np.ndarray:
+        """Return the states at several such times, one row each; to rounding those of `interpolate`."""
+        if self._dense is None:
+            self._dense = self._prepare()
+        many = getattr(self._dense, "many", None)
+        found = np.array([self._dense(float(t)) for t in times]) if many is None else many(times)
+        found[times == self.t] = self.x
+        return np.asarray(found)
+
 
 class Solver(ABC):
     """The interface of all solvers: `restart`, then `step` until ``t == stop``."""

@@ -28,7 +28,7 @@ import numpy as np
 
 from ...blocks.core import NonFiniteError, OptionError
 from .base import Dense, Problem, Statistics, Step, VariableStep
-from .from_start import from_derivatives
+from .dense_output import from_derivatives
 
 _ADAMS, _BDF, _ONE_STEP = 1, 2, 2
 _MEMORY = -20  # this code and those below are misuse or lack of memory, not mathematics

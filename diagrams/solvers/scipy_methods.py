@@ -25,7 +25,7 @@ import numpy as np
 
 from ...blocks.core import SimulationError
 from .base import Dense, Problem, Step, VariableStep
-from .from_start import from_differences, from_nordsieck
+from .dense_output import OneStepDense, from_differences, from_nordsieck
 
 _ATTEMPT = {"RK23": 3, "RK45": 6, "DOP853": 12}  # evaluations of the rates per attempted step
 _MULTISTEP = {"BDF": from_differences, "LSODA": from_nordsieck}
@@ -186,7 +186,7 @@ class SciPySolver(VariableStep):
     def _prepare_dense(self, t_old: float, x_old: np.ndarray) -> Dense:
         dense = self._inner.dense_output()
         expand = _MULTISTEP.get(self.name)
-        return dense if expand is None else expand(dense, t_old, x_old)
+        return OneStepDense(dense, self.name) if expand is None else expand(dense, t_old, x_old)
 
 
 _STABLE = {"RK45": 3.25, "DOP853": 6.1}  # h|λ| at the border of the stable region on the real axis

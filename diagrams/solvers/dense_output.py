@@ -1,4 +1,4 @@
-"""Dense output of the multistep methods, as a polynomial from the start of its step.
+"""Dense output of SciPy's and SUNDIALS' methods: polynomials from the start of a step.
 
 A multistep method keeps a polynomial about the end of a step. Near the start its value is the state there plus rounding
 errors of the terms, a few ulps, which can carry an indicator that has just crossed zero back across it: an event that
@@ -39,6 +39,37 @@ class FromStart:
         for c in self._coefficients:
             change = (change + c) * u
         return np.asarray(self._x + change)
+
+    def many(self, times: np.ndarray) -> np.ndarray:
+        """Return the states at several times, one row each."""
+        u = ((times - self._t) / self._h)[:, None]
+        change = np.zeros((len(times), len(self._x)))
+        for c in self._coefficients:
+            change = (change + c) * u
+        return np.asarray(self._x + change)
+
+
+class OneStepDense:
+    """Dense output of one of SciPy's one-step methods, with less work per call and to the last bit its value."""
+
+    def __init__(self, dense: Any, method: str):
+        self.many = lambda times: dense(times).T
+        self._dense, self._powers = dense, method in ("RK23", "RK45", "Radau")
+        if self._powers:
+            self._scale = 1.0 if method == "Radau" else dense.h
+
+    def __call__(self, t: float) -> np.ndarray:
+        """Return the state at a time within the step."""
+        dense = self._dense
+        if not self._powers:
+            return np.asarray(dense(t))
+        u = (t - dense.t_old) / dense.h
+        powers = [u]
+        for _ in range(dense.order):
+            powers.append(powers[-1] * u)
+        found: np.ndarray = self._scale * np.dot(dense.Q, np.array(powers))
+        found += dense.y_old
+        return found
 
 
 def from_nordsieck(dense: Any, t_old: float, x_old: np.ndarray) -> FromStart:

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Compare, Counter, Integrator
+from loopwright.blocks import Compare, Counter, Gain, Integrator, PulseTrain, Relay, TransportDelay
 from loopwright.diagrams import Diagram
 from loopwright.diagrams.solvers import Problem, make_solver
+from support.hybrid_blocks import Lag
 
 
 def oscillator(level, start=(1.0, 0.0)):
@@ -55,3 +56,18 @@ def test_the_dense_output_leaves_the_start_of_a_step_along_the_rates(name):
         if step.t == 12.25:
             break
     assert steps > 100
+
+
+@pytest.mark.parametrize("solver", ["BDF", "LSODA", "CVODE_BDF", "CVODE_Adams", "auto"])
+def test_rounding_of_an_indicator_itself_fires_nothing(solver):
+    """A delay's output is interpolated: just after a crossing it may be an ulp on the other side again."""
+    lag, relay = Lag(name="lag", k=1.5), Relay(name="relay", on_point=0.45, off_point=0.3)
+    late = TransportDelay(delay=0.23, name="late")(lag.y)
+    heat = 1.0 - relay(late) + PulseTrain(period=0.77, amplitude=0.2)
+    diagram = Diagram("d", lag(heat + Gain(gain=0.1, name="k")(late)))
+    for rtol in (1e-5, 1e-6, 1e-7):
+        run = diagram.simulate(6.0, step=0.1, solver=solver, rtol=rtol, progress=False)
+        assert [e.event for e in run.events] == ["rise", "fall"] * (len(run.events) // 2) + ["rise"] * (
+            len(run.events) % 2
+        )
+        assert np.min(np.diff([e.t for e in run.events])) > 0.23

@@ -1,0 +1,244 @@
+"""Events in continuous time: the domains of indicators, and the events that changes of them fire.
+
+**Domains.** An indicator z is in one of two domains, z > 0 or z ≤ 0; with a hysteresis δ it leaves the first at z ≤ −δ
+and the second at z > δ. A change in the declared direction fires the event.
+
+**Contact.** Zero itself is the border. An indicator that is exactly 0 at the start is in neither domain, and so is one
+that the jump of its own event leaves in contact: on 0, or where the event found it, with its motion changed, as an
+impact does. The direction in which it leaves 0 decides: down is falling, up is rising, and that fires the event if it
+is declared. So a ball that starts on the floor and moves down, or would fall, hits the floor at the start, one that
+moves up does not; sin ωt rises at the start, −sin ωt falls. An indicator that comes to 0 by itself has changed its
+domain, and going on from there fires nothing.
+
+**Rest.** A jump whose motion leads back beyond contact at once, again and again, rests there. That is an error which
+names the event: its block needs a state of rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import SimulationError
+from ..flat import FlatDiagram
+from ..solvers import Step
+from .limits import EventLimits
+from .search import EventSearch, Many
+
+_SAME_INSTANT = 100  # events that fire each other at one instant
+
+_ROUNDING = 1e-13  # of an indicator near the border, relative to its values in a step
+_SCATTER = (
+    8.0  # rounding errors of an indicator that has just crossed zero, relative to those seen, or its values there
+)
+_CONTINUOUS = 1e-9  # they are at most this part of its values in the step: else it jumps there
+
+Indicators = Callable[[float, np.ndarray], np.ndarray]
+
+
+class Domains:
+    """The domains of all indicators, and the events that changes of them fire.
+
+    Parameters
+    ----------
+    flat : FlatDiagram
+        The diagram.
+    g : callable
+        ``g(t, x)``: the indicators, at a time and the continuous states.
+    many : callable
+        ``many(times, states)``: the indicators at several times, one row each, and which subsystems are open there.
+    rates : callable
+        ``rates(t, x)``: the derivative of the continuous states.
+    opened : ndarray
+        Written by ``g``: 1 where the subsystem around an event is open.
+    time_scale : float
+        Shortest time in s within which a source changes.
+    """
+
+    def __init__(
+        self,
+        flat: FlatDiagram,
+        g: Indicators,
+        many: Many,
+        rates: Indicators,
+        opened: np.ndarray,
+        time_scale: float = math.inf,
+    ):
+        n = len(flat.events)
+        self.events, self.g, self._open, self._rates = flat.events, g, opened, rates
+        self._spacing = min(float(flat.base), time_scale)
+        self.rising = np.array([e.direction != "falling" for e in flat.events])
+        self.falling = np.array([e.direction != "rising" for e in flat.events])
+        self._hysteresis = np.array([e.hysteresis for e in flat.events])
+        self._gates = np.array([e.subsystem for e in flat.events], dtype=bool)
+        self.domain = np.zeros(n, dtype=int)
+        """1 above, −1 below, 0 on the border."""
+        self._low, self._high = -self._hysteresis, self._hysteresis.copy()
+        self._first = self.domain
+        self._least = np.nextafter(-self._hysteresis, math.inf)
+        self._size, self._rounding = np.zeros(n), np.zeros(n)
+        """Distance from the border within which the direction of leaving it may be one of rounding."""
+        self._slack = np.zeros(n)
+        """Distance beyond zero to which an indicator that has just crossed it counts as beyond: that of rounding."""
+        self.limits = EventLimits(flat.events)
+        self._many, self.search = many, EventSearch(self, many, self._spacing)
+        self._moves = np.array([_has_continuous_states(flat, e) for e in flat.events], dtype=bool)
+
+    # --- the rule ----------------------------------------------------------------------------------------------------
+
+    def bounds(self, domain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the least and the largest value of each indicator that leaves it in its domain."""
+        above, below = domain > 0, domain < 0
+        low = np.where(above, self._least - self._slack, np.where(below, -math.inf, self._low - self._rounding))
+        high = np.where(below, self._hysteresis + self._slack, np.where(above, math.inf, self._high + self._rounding))
+        return low, high
+
+    def domains_of(self, z: np.ndarray, before: np.ndarray, opened: np.ndarray | None = None) -> np.ndarray:
+        """Return the domains at the values z of the indicators, which come from the domains ``before``."""
+        low, high = self.bounds(before)
+        now = np.where(z > high, 1, np.where(z < low, -1, before))
+        return np.where((self._open if opened is None else opened) > 0.5, now, before)  # a closed subsystem holds them
+
+    def fires(self, before: np.ndarray, now: np.ndarray) -> np.ndarray:
+        """Return which events a change of domains fires."""
+        changed = now != before
+        return np.array(changed & ((self.rising & (now > 0)) | (self.falling & (now < 0))))
+
+    def take(self, now: np.ndarray) -> None:
+        """Take over the domains at an instant or between events."""
+        self.limits.note(now)
+        self.domain = now
+
+    # --- one instant -------------------------------------------------------------------------------------------------
+
+    def begin(self, t: float, x: np.ndarray) -> None:
+        """Take the domains as they are; nothing fires."""
+        z = np.array(self.g(t, x))
+        on_border = (z == 0.0) & ~self._gates
+        self.domain = self._first = np.where(z > 0.0, 1, np.where(on_border, 0, -1))
+        self._low, self._high = -self._hysteresis, self._hysteresis.copy()
+        self._slack[:] = 0.0
+
+    def reset(self, subsystem: str) -> None:
+        """Go back to the domains of the start for the blocks in a subsystem whose states have done so."""
+        inside = np.array([e.path.startswith(f"{subsystem}.") and not e.subsystem for e in self.events])
+        self.domain = np.where(inside, self._first, self.domain)
+
+    def update(self, t: float, x: np.ndarray) -> np.ndarray:
+        """Take over the domains at one instant, and return which events their changes fire."""
+        now = self.domains_of(self.g(t, x), self.domain)
+        fired = self.fires(self.domain, now)
+        self.take_fired(fired, now)
+        return fired
+
+    def take_fired(self, fired: np.ndarray, now: np.ndarray) -> None:
+        """Take over the domains at an instant at which events fire."""
+        self.limits.note_left_border(fired, self.domain, now)
+        self.take(now)
+
+    def locate(self, step: Step) -> tuple[float, np.ndarray] | None:
+        """Return the first instant in a step at which events fire, and which; None if none does."""
+        found = self.search.first_event(step)
+        if found is None:
+            return None
+        fired = self.fires(found.before, found.now)
+        self.limits.note(found.before)
+        self.domain = found.before
+        self.take_fired(fired, found.now)
+        self._slack = np.where(fired, np.minimum(_SCATTER * found.values, _CONTINUOUS * self._size), self._slack)
+        return found.t, fired
+
+    def look_at(self, size: np.ndarray, scatter: np.ndarray) -> None:
+        """Note the largest values of the indicators in a step that is searched, and how they scatter at its start."""
+        self._size, self._rounding = size, _ROUNDING * size
+        self._slack = np.maximum(self._slack, np.minimum(_SCATTER * scatter, _CONTINUOUS * size))
+
+    def settle(self, z: np.ndarray) -> int:
+        """Note values of the indicators, one instant a row: one that was far from zero has crossed it.
+
+        Returns the number of rows until the first such instant, that one included; 0 if there is none.
+        """
+        if not self._slack.any():
+            return 0
+        far = (np.abs(z) > self._slack) & (self._slack > 0.0)
+        rows = np.flatnonzero(far.any(axis=1))
+        if not rows.size:
+            return 0
+        self._slack = np.where(far[rows[0]], 0.0, self._slack)
+        return int(rows[0]) + 1
+
+    # --- contact -----------------------------------------------------------------------------------------------------
+
+    def motion(self, t: float, x: np.ndarray, fired: np.ndarray) -> Any:
+        """Return what `land` compares of the instant before a jump; None if no block that jumps moves by itself."""
+        if not np.any(fired & self._moves):
+            return None
+        there = x + self._spacing * self._rates(t, x)
+        z, _ = self._many(np.array([t, t]), np.array([x, there]))
+        return z[0], z[1] - z[0]
+
+    def land(self, before: Any, t: float, x: np.ndarray, fired: np.ndarray) -> None:
+        """Put those indicators on the border that their own jumps leave in contact.
+
+        Parameters
+        ----------
+        before : tuple or None
+            `motion` before the jumps.
+        t, x
+            The instant after them.
+        fired : ndarray
+            The events that have fired.
+        """
+        if before is None:
+            return
+        z0, slope0 = before
+        z1, slope1 = self.motion(t, x, fired)
+        for i in np.flatnonzero(fired & self._moves):
+            side = self.domain[i]
+            if side * z1[i] < 0.0 or abs(z1[i]) > abs(z0[i]):
+                continue  # the jump has moved it elsewhere
+            turned = slope1[i] != slope0[i] and math.isfinite(slope0[i]) and math.isfinite(slope1[i])
+            if turned or (z1[i] == 0.0 and z0[i] != 0.0) or self.limits.rests(int(i)):
+                self.domain = self.domain.copy()
+                self.domain[i] = 0
+                self._low[i] = min(z1[i], -self._hysteresis[i])
+                self._high[i] = max(z1[i], self._hysteresis[i])
+                self.limits.note_contact(int(i), int(side))
+
+    # --- never a hang ------------------------------------------------------------------------------------------------
+
+    def count(self, t: float, fired: np.ndarray) -> None:
+        """Note that events fired; raise if they pile up: chattering, Zeno behaviour, or a rest in contact."""
+        self.search.fresh = True
+        self.limits.count(t, fired)
+
+    def too_many(self, t: float, fired: np.ndarray) -> SimulationError:
+        """Return the error of events that fire each other at one instant for ever."""
+        return self.limits.endless(t, fired, _SAME_INSTANT)
+
+    @property
+    def most(self) -> int:
+        """Most rounds of events that may follow each other at one instant."""
+        return _SAME_INSTANT
+
+    def save(self) -> Any:
+        """Return what is needed to go on from here."""
+        domains = self.domain.copy(), self._first.copy(), self._low.copy(), self._high.copy(), self._slack.copy()
+        return domains, self.search.fresh, self.limits.save()
+
+    def restore(self, saved: Any) -> None:
+        """Go back to what `save` returned."""
+        domains, self.search.fresh, limits = saved
+        self.domain, self._first, self._low, self._high, self._slack = (part.copy() for part in domains)
+        self.limits.restore(limits)
+
+
+def _has_continuous_states(flat: FlatDiagram, event: Any) -> bool:
+    """Return whether an event's block has states that move by themselves."""
+    if event.subsystem or event.path not in flat.states.slices:
+        return False
+    where = flat.states.slices[event.path]
+    return bool(np.any((flat.continuous >= where.start) & (flat.continuous < where.stop)))

@@ -1,0 +1,139 @@
+"""Errors of runs that can't go on because of their events: chattering, Zeno behaviour, a rest in contact."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import SimulationError
+from ..flat import FlatEvent
+
+_CHATTER, _SPAN = 500, 1e-8  # so many events within so many seconds (relative to 1 + |t|)
+_ZENO, _SHRUNK = 8, 1e-6  # intervals that shrink from one to the next, down to this part of the largest one
+_RESTS = 20  # events in a row that lead back into contact; colliding bodies pass an impact on a few times
+
+
+class EventLimits:
+    """Counts of events that have fired, and the errors where they pile up."""
+
+    def __init__(self, events: Sequence[FlatEvent]):
+        self.events = events
+        self._times = [deque[float](maxlen=_ZENO + 1) for _ in events]
+        self._largest = np.zeros(len(events))
+        self._recent = deque[tuple[float, tuple[int, ...]]](maxlen=_CHATTER)
+        self._side = np.zeros(len(events), dtype=int)
+        """The side from which each indicator on the border is held: 1, −1; 0 for none."""
+        self._stuck = np.zeros(len(events), dtype=int)
+        """Events in a row that led back into contact."""
+
+    # --- a rest in contact -------------------------------------------------------------------------------------------
+
+    def note_contact(self, i: int, side: int) -> None:
+        """Note that event ``i``, which has led to that side, has left its indicator in contact."""
+        self._side[i] = side
+
+    def note(self, now: np.ndarray) -> None:
+        """Note the domains: one that is back on the free side has left contact."""
+        free = now * self._side < 0
+        if free.any():
+            self._side[free] = self._stuck[free] = 0
+
+    def note_left_border(self, fired: np.ndarray, before: np.ndarray, now: np.ndarray) -> None:
+        """Note that events fire: from the border to the side that their jump has held them from, they rest."""
+        self._stuck += fired & (before == 0) & (now == self._side)
+
+    def rests(self, i: int) -> bool:
+        """Return whether event ``i`` has led back into a contact that its jump made."""
+        return bool(self._stuck[i])
+
+    # --- counts ------------------------------------------------------------------------------------------------------
+
+    def count(self, t: float, fired: np.ndarray) -> None:
+        """Note that events fired.
+
+        Raises
+        ------
+        SimulationError
+            If they pile up.
+        """
+        for i in np.flatnonzero(fired):
+            if self._stuck[i] >= _RESTS:
+                raise self._rests(t, int(i))
+            times = self._times[i]
+            if times:
+                self._largest[i] = max(self._largest[i], t - times[-1])
+            times.append(t)
+            self._look_for_zeno(int(i))
+        self._recent.append((t, tuple(np.flatnonzero(fired).tolist())))
+        if len(self._recent) == _CHATTER and t - self._recent[0][0] < _SPAN * (1.0 + abs(t)):
+            raise self._chatters(t)
+
+    def _rests(self, t: float, i: int) -> SimulationError:
+        event = self.events[i]
+        return SimulationError(
+            f"the event {event.name!r} rests in contact: its jump leaves its indicator at zero, and the motion leads "
+            f"it back beyond at once, {_RESTS} times in a row. Nothing in the equations holds it there; going on would "
+            "let it pass through. Give the block a state of rest: a discrete state that the jump sets and that holds "
+            "the rates, and an event that ends it.",
+            block=event.path,
+            t=t,
+        )
+
+    def _chatters(self, t: float) -> SimulationError:
+        counts = np.bincount([i for _, together in self._recent for i in together])
+        event = self.events[int(np.argmax(counts))]
+        return SimulationError(
+            f"the event {event.name!r} chatters: {_CHATTER} times events fired within "
+            f"{t - self._recent[0][0]:.2g} s, so the run would not go on. "
+            "What it switches drives the indicator back across zero at once. Declare "
+            "a hysteresis, Event(hysteresis=…), or take a block that has one, such as Relay.",
+            block=event.path,
+            t=t,
+        )
+
+    def _look_for_zeno(self, i: int) -> None:
+        times = self._times[i]
+        if len(times) <= _ZENO or times[-1] - times[-2] > _SHRUNK * self._largest[i]:
+            return
+        intervals = np.diff(np.array(times))
+        if not np.all(intervals > 0.0):
+            return
+        r = float((intervals[-1] / intervals[0]) ** (1.0 / (len(intervals) - 1)))
+        if r < 0.9999 and np.all(intervals[1:] < 1.5 * intervals[:-1]):  # by one ratio, but for what the solver adds
+            event, t = self.events[i], times[-1]
+            limit = t + intervals[-1] * r / (1.0 - r)
+            raise SimulationError(
+                f"the event {event.name!r} shows Zeno behaviour: it fires at intervals that shrink by {r:.4g} each "
+                f"time, the last one {intervals[-1]:.2g} s, and would fire infinitely often before t = {limit:.9g} s. "
+                "Give the model a state of rest: let its jump stop the motion below a small speed, or end the run "
+                "before.",
+                block=event.path,
+                t=t,
+            )
+
+    def endless(self, t: float, fired: np.ndarray, rounds: int) -> SimulationError:
+        """Return the error of events that fire each other at one instant for ever."""
+        names = ", ".join(f"{self.events[int(i)].path}.{self.events[int(i)].name}" for i in np.flatnonzero(fired))
+        event = self.events[int(np.flatnonzero(fired)[0])]
+        return SimulationError(
+            f"events fire each other without end at one instant: after {rounds} rounds {names} still fires. "
+            "Let a jump change what the other's indicator looks at only once, or declare a hysteresis, "
+            "Event(hysteresis=…).",
+            block=event.path,
+            t=t,
+        )
+
+    def save(self) -> Any:
+        """Return what is needed to go on from here."""
+        times = [list(d) for d in self._times]
+        return times, self._largest.copy(), list(self._recent), self._side.copy(), self._stuck.copy()
+
+    def restore(self, saved: Any) -> None:
+        """Go back to what `save` returned."""
+        times, largest, recent, side, stuck = saved
+        self._largest, self._side, self._stuck = largest.copy(), side.copy(), stuck.copy()
+        self._times = [deque(d, maxlen=_ZENO + 1) for d in times]
+        self._recent = deque(recent, maxlen=_CHATTER)
