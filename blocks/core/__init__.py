@@ -33,7 +33,7 @@ from .errors import (
 )
 from .findings import Finding
 from .frozen import FrozenMapping
-from .instants import is_before, left_of, move_earlier, next_edge, period_of
+from .instants import FINEST, is_before, left_of, move_earlier, next_edge, period_of, read_time
 from .layout import Layout, elements, lay_out
 from .parameters import ParameterSpec
 from .ports import Event, Input, Output, Port, PortUnit, Shape, State
@@ -44,6 +44,7 @@ from .values import Array, Value, identity, parameter, shorten
 
 __all__ = [
     "BASE_UNITS",
+    "FINEST",
     "SOLVED",
     "AlgebraicLoopError",
     "Array",
@@ -111,6 +112,7 @@ __all__ = [
     "parse_unit",
     "period_of",
     "rate_of",
+    "read_time",
     "recorder",
     "same_unit",
     "shape_of",

@@ -9,6 +9,9 @@ import numpy as np
 
 from .values import Array
 
+FINEST = Fraction(1, 10**9)
+"""Times that are multiples of it, 1 ns, are read as decimal numbers."""
+_LARGEST_DENOMINATOR = 10**6
 _TOLERANCE = 4.0 * float(np.finfo(float).eps)  # of t: t, the period and their ratio are rounded once each
 
 
@@ -41,12 +44,30 @@ def period_of(t: Array, period: Array, delay: Array) -> tuple[Array, Array, Arra
     return number, passed - number, tolerance
 
 
+def read_time(value: float) -> Fraction | None:
+    """Return the exact seconds that a floating-point number stands for; None where that can't be told.
+
+    A number that is a multiple of 1 ns is that decimal number: 0.0007 is 7/10000. Else it is p/q with q up to 10⁶, if
+    that is the number when it is rounded: 1/3, 1/44100.
+
+    Examples
+    --------
+    >>> read_time(0.0007), read_time(1 / 44100), read_time(0.1 + 0.2)
+    (Fraction(7, 10000), Fraction(1, 44100), None)
+    """
+    decimal = Fraction(repr(float(value)))
+    if (decimal / FINEST).denominator == 1:
+        return decimal
+    found = Fraction(float(value)).limit_denominator(_LARGEST_DENOMINATOR)
+    return found if float(found) == float(value) else None
+
+
 def next_edge(t: float, period: float, *offsets: float) -> float:
-    """Return the first time after t that is one of the offsets plus k ≥ 0 periods, each number taken as decimal."""
-    exact = Fraction(repr(float(period)))
+    """Return the first time after t that is one of the offsets plus k ≥ 0 periods, each number read by `read_time`."""
+    exact = read_time(period) or Fraction(repr(float(period)))
     best = math.inf
     for offset in offsets:
-        first = Fraction(repr(float(offset)))
+        first = read_time(offset) or Fraction(repr(float(offset)))
         k = max(math.floor((Fraction(t) - first) / exact), 0)
         while float(first + k * exact) <= t:
             k += 1

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..core import Array, Block, Input, Output, SampleTimeError, Shape, ShapeError, State, parameter
+from ..core import Array, Block, Input, Output, SampleTimeError, Shape, ShapeError, State, parameter, read_time
 
 
 class History(State):
@@ -106,10 +106,10 @@ class TransportDelay(Block):
         Raises
         ------
         SampleTimeError
-            If the delay is no multiple of the sample time. A float is read as its shortest decimal.
+            If the delay is no multiple of the sample time. A float is read as a sample time is.
         """
-        T = sample_time if isinstance(sample_time, Fraction) else Fraction(repr(float(sample_time)))
-        ratio = Fraction(repr(self.delay)) / T
+        T = sample_time if isinstance(sample_time, Fraction) else _exact(float(sample_time))
+        ratio = _exact(self.delay) / T
         n = round(ratio)
         if n < 1 or abs(ratio / n - 1) > Fraction(1, 10**9):
             low, high = max(int(ratio), 1), int(ratio) + 1
@@ -133,6 +133,10 @@ class TransportDelay(Block):
 
     def _delay_text(self) -> str:
         return f"{self.delay:g}" if isinstance(self.delay, float) else "…"
+
+
+def _exact(time: float) -> Fraction:
+    return read_time(time) or Fraction(repr(time))
 
 
 @lru_cache(maxsize=64)

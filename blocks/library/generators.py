@@ -15,7 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..core import Array, Output, ParameterError, Source, move_earlier, next_edge, parameter, period_of
+from ..core import Array, Output, ParameterError, Source, move_earlier, next_edge, parameter, period_of, read_time
 from .piecewise_functions import piecewise
 
 _HALF = 2.0**24  # counters are mixed in two halves, since products of two such numbers are exact
@@ -142,7 +142,7 @@ class PulseTrain(Source):
 
     def next_instant(self, t: float) -> float:
         """Return the next edge."""
-        period, delay, duty = (Fraction(repr(v)) for v in (self.period, self.delay, self.duty))
+        period, delay, duty = (read_time(v) or Fraction(repr(v)) for v in (self.period, self.delay, self.duty))
         return next_edge(t, self.period, self.delay, float(delay + duty * period))
 
     def output(self, t: Array, x: Any, u: Any) -> Array:

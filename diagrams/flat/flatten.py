@@ -154,7 +154,8 @@ def _clocks(table: Structure, step: Fraction | None, name: str) -> tuple[Fractio
                 block=name or None,
             )
         times = [t for c in used.values() for t in (c.sample_time, c.offset) if t]
-        base = Fraction(math.gcd(*(r.numerator * (10**9 // r.denominator) for r in times)), 10**9)
+        whole = math.lcm(*(t.denominator for t in times))
+        base = Fraction(math.gcd(*(int(t * whole) for t in times)), whole)
     for subsystem in used.values():
         for what, time in (("sample time", subsystem.sample_time), ("offset", subsystem.offset)):
             if time is not None and (time / base).denominator != 1:

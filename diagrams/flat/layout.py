@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from ...blocks.core import Layout, Shape
-from ..wiring import Order, Structure, join
+from ..wiring import Order, Structure, join, stepped_blocks
 
 
 @dataclass(frozen=True)
@@ -172,6 +172,22 @@ class FlatLayout:
         """Whether something happens between ticks: continuous states, events, or a transport delay."""
         delayed = any(self.table.blocks[self.ports[name][0]].transport for name in self.plant_inputs.slices)
         return bool(self.continuous.size or self.events or delayed)
+
+    @cached_property
+    def plants_at_every_tick(self) -> bool:
+        """Whether what is stepped from outside, such as FMUs, steps at every tick, and not only where a clock acts.
+
+        It does where the base was asked for, finer than the clocks need, and where one of them takes steps of one
+        length only.
+        """
+        plants = stepped_blocks(self.table).values()
+        numbers = [n for clock in self.distinct for n in (clock.every, clock.offset)]
+        if not plants or math.gcd(*numbers) != 1:
+            return bool(plants)
+        return not all(
+            getattr(plant, "variable_step", False) and getattr(plant, "fixed_internal_step", None) is None
+            for plant in plants
+        )
 
     def acting(self, k: int) -> frozenset[TickPattern]:
         """Return the clocks that tick at tick ``k``."""

@@ -83,9 +83,9 @@ def model_period(
 def ticks_of_period(flat: FlatDiagram, first: int, period: int) -> Iterator[tuple[int, int]]:
     """Yield the ticks of a period, each with the next one.
 
-    They are all ticks if there is an FMU, else the first one and those at which a clock acts.
+    They are the first one, and those at which a clock acts or an FMU steps.
     """
-    every = bool(flat.plant_outputs.total or flat.plant_inputs.total)
+    every = flat.plants_at_every_tick
     ticks = [k for k in range(first, first + period) if every or k == first or flat.acting(k)]
     yield from zip(ticks, [*ticks[1:], first + period], strict=True)
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from ...blocks import Ellipse, OptionError, Path
-from ...blocks.core import SampleTimeError, near
-from ..wiring import FINEST, exact_time
+from ...blocks.core import FINEST, SampleTimeError, near
+from ..wiring import exact_time
 
 ELLIPSE = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))
 """The path of the experiments, equation (16)."""

@@ -65,11 +65,6 @@ class Stepped(Protocol):
         """Load the plant for a run; see `loopwright.blocks.Block`."""
 
 
-def has_plants(flat: FlatDiagram) -> bool:
-    """Whether a plant is in a diagram."""
-    return bool(stepped_blocks(flat.table))
-
-
 def load_plants(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) -> Iterator[tuple[str, Plant]]:
     """Yield the plants by path, each as soon as it is loaded; ``stack`` unloads them.
 

@@ -29,7 +29,6 @@ from ..results import (
 from .duration import default_step, ticks_in
 from .engine import Engine
 from .interrupted import Interrupted
-from .plants import has_plants
 from .progress import progress_bar
 from .run_options import RunOptions
 from .save import can_save, restore_state, save_state
@@ -84,7 +83,7 @@ class Simulation:
         )
         self._stack = ExitStack()
         self._start_state = saved
-        every_tick = base is not None or has_plants(self.flat)
+        every_tick = base is not None or self.flat.plants_at_every_tick
         self._last: int | None = None
         if duration is not None:
             self._last = ticks_in(duration, self.flat.base, diagram.name)

@@ -49,8 +49,12 @@ def run_ticks(
     only = plants[0].step if len(plants) == 1 else None
     n, d, h = flat.base.numerator, flat.base.denominator, float(flat.base)
     always = workspace.bind_tick(flat.acting(0)) if all(c == TickPattern() for c in flat.distinct) else None
-    count, now = 0, k * n / d
+    count, now, before, width = 0, k * n / d, k, 1
     for k in flat.ticks(k, last, every=every):  # noqa: B020
+        if k - before != width:
+            width = k - before
+            h = float(flat.base * width)
+        before = k
         try:
             if only is not None:
                 only(now, h)
@@ -99,7 +103,7 @@ def run_hybrid(
         Time in s at which a stop condition has ended the run between two ticks.
     """
     flat, time_of = workspace.flat, position.time_of
-    clocks, count, samples, width = flat.distinct, 0, 0, float(flat.base)
+    clocks, count, samples = flat.distinct, 0, 0
 
     def sample(t: float) -> bool:
         nonlocal samples
@@ -112,7 +116,7 @@ def run_hybrid(
     while position.tick < last:
         k = position.tick
         sampled = every or not clocks
-        lands = continuous.fixed or plants or (continuous.lands and sampled)
+        lands = continuous.fixed or (plants and sampled) or (continuous.lands and sampled)
         following = k + 1 if lands else min([*(c.after(k) for c in clocks), last])
         between = range(k + 1, following) if sampled else range(0)
         now = time_of(k)
@@ -120,7 +124,7 @@ def run_hybrid(
         if ended is not None:
             return ended
         for plant in plants.values():
-            plant.step(now, width)
+            plant.step(now, float(flat.base * (following - k)))
         take_tick(workspace, continuous, plants, time_of(following), flat.acting(following))
         row(time_of(following), workspace.log)
         if arrived(following):

@@ -5,11 +5,10 @@ from .checked_diagram import CheckedDiagram
 from .cycles import find_cyclic_parts
 from .order import Order, Step, evaluation_order
 from .structure import Collector, Structure, SubsystemSettings, Wire, join, stepped_blocks
-from .subsystems import FINEST, Subsystem, exact_time, subsystem
+from .subsystems import Subsystem, exact_time, subsystem
 from .variants import change_parameter, split_path
 
 __all__ = [
-    "FINEST",
     "Checked",
     "CheckedDiagram",
     "Collector",

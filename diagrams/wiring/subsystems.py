@@ -20,34 +20,36 @@ from ...blocks.core import (
     as_signal,
     check_name,
     near,
+    read_time,
     recorder,
 )
 from ...blocks.tracing import check_method
 
-FINEST = Fraction(1, 10**9)
 ENABLED, TRIGGERED = ("held", "reset"), ("rising", "falling", "both")
 
 
 def exact_time(value: SupportsFloat | str, *, block: str = "") -> Fraction:
-    """Return a sample time as an exact fraction of a second: a float is read as its shortest decimal.
+    """Return a sample time as an exact fraction of a second: a Fraction as it is, a float as `read_time` reads it.
 
     Raises
     ------
     SampleTimeError
-        If it is not positive, or finer than 1 ns.
+        If it is not positive, or a float that is neither a multiple of 1 ns nor a fraction with a denominator up to
+        10⁶, such as 1/3.
     """
     try:
-        time = value if isinstance(value, Fraction) else Fraction(repr(float(value)))
+        time = value if isinstance(value, Fraction) else read_time(float(value))
     except (TypeError, ValueError, OverflowError):
         raise SampleTimeError(
             f"found the sample time {value!r}; expected seconds, such as 1e-3.", block=block
         ) from None
-    if time <= 0:
-        raise SampleTimeError(f"found a sample time of {float(time):g} s; expected a positive one.", block=block)
-    if (time / FINEST).denominator != 1:
+    if float(value) <= 0:
+        raise SampleTimeError(f"found a sample time of {float(value):g} s; expected a positive one.", block=block)
+    if time is None:
         raise SampleTimeError(
-            f"found a sample time of {float(time)!r} s, which is no multiple of 1 ns; round it, for instance to "
-            f"{round(float(time), 9)!r}.",
+            f"found a sample time of {float(value)!r} s, which is neither a multiple of 1 ns nor a fraction with a "
+            f"denominator up to 1,000,000. Give a Fraction, which is taken exactly, or round it"
+            f"{f', for instance to {near!r}' if (near := round(float(value), 9)) else ''}.",
             block=block,
         )
     return time
@@ -307,7 +309,9 @@ def subsystem(
     ----------
     sample_time : float or Fraction, optional
         Sample time in s. Inputs are sampled at its ticks, outputs held between them, continuous blocks inside
-        discretized. A float is read as its shortest decimal. Without one, the sample time of the surroundings holds.
+        discretized. A Fraction is taken exactly. A float that is a multiple of 1 ns is that decimal, another the
+        fraction with a denominator up to 10⁶ that it is when rounded, such as 1/3 or 1/44100. Without one, the sample
+        time of the surroundings holds.
     method : {"exact", "forward", "semi_implicit", "trapezoidal"}
         Discretization of continuous blocks inside. ``exact`` is the zero-order hold for blocks that are linear in
         their states, forward Euler for others. ``trapezoidal`` is of second order; where a block is not linear,
@@ -335,8 +339,8 @@ def subsystem(
     Raises
     ------
     SampleTimeError
-        A sample time that is not positive, or no multiple of 1 ns; an unknown method; an offset or a delay without a
-        sample time.
+        A sample time that is not positive, or a float that is no such number; an unknown method; an offset or a delay
+        without a sample time.
     WiringError
         Another word for ``enabled`` or ``triggered``, or both.
 
