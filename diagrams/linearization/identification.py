@@ -120,10 +120,10 @@ class _Runner:
 
     def __init__(self, block: Fmu, point: Mapping[str, Any], h: float):
         self.block, self.about, self.h, self.t0 = block, block.description, h, float(point["t"])
-        back = {new: old for old, new in block.rename.items()}
-        self.inputs = {back.get(port, port): np.array(v, dtype=float) for port, v in point["inputs"].items()}
-        self.start = {n: v for n, v in point["state"].items() if self.about.variables[n].initial == "exact"}
-        self.outputs = list(self.about.of("output"))
+        variables = block.input_variables
+        self.inputs = {variables[port].name: np.array(v, dtype=float) for port, v in point["inputs"].items()}
+        self.start = {n: v for n, v in point["state"].items() if self.about.find(n).initial == "exact"}
+        self.outputs = [v.name for v in block.output_variables.values()]
         self.instance = LoadedFmu(block)
         self._steps, self._fresh = 0, True
         self._saved: Any = None
@@ -132,7 +132,7 @@ class _Runner:
     def close(self) -> None:
         """Free the instance."""
         if self._saved is not None:
-            self.instance.call("freeing its saved state", "freeFMUState", self._saved)
+            self.instance.free_state(self._saved)
         self.instance.close()
 
     def _begin(self) -> None:
@@ -145,10 +145,8 @@ class _Runner:
 
     def step(self) -> np.ndarray:
         """Step once, and return the outputs."""
-        _, terminate, early, _ = self.instance.call(
-            f"a step by {self.h:g} s", "doStep", self.t0 + self._k * self.h, self.h, not self.about.can_save
-        )
-        if terminate or early:
+        t, final = self.t0 + self._k * self.h, not self.about.can_save
+        if self.instance.call(f"a step by {self.h:g} s", self.instance.fmi.do_step, t, self.h, final):
             raise FmuError(
                 f"found a step of {self.h:g} s that it ends early; expected whole steps. Take a smaller step.",
                 block=self.block.label,
@@ -172,13 +170,13 @@ class _Runner:
             last = y
         self._steps = self._k
         if self.about.can_save:
-            self._saved = self.instance.call("saving its state", "getFMUState")
+            self._saved = self.instance.call("saving its state", self.instance.fmi.save_state)
         return last
 
     def return_to_rest(self) -> None:
         """Go back to the rest that `settle` has found."""
         if self._saved is not None:
-            self.instance.call("restoring its state", "setFMUState", self._saved)
+            self.instance.call("restoring its state", self.instance.fmi.set_state, self._saved)
             self._k = self._steps
         else:
             self._begin()
@@ -199,9 +197,9 @@ def _measure_markov(runner: _Runner, samples: int) -> tuple[np.ndarray, np.ndarr
     """Return the Markov parameters G, by step, output and input, and their estimated error by output and input."""
     found, errors = [], []
     for name, value in runner.inputs.items():
-        nominal = abs(runner.about.variables[name].nominal or 1.0)
+        nominals = runner.about.find(name).nominals
         for index in np.ndindex(*value.shape):
-            d = PULSE * max(nominal, abs(float(value[index])))
+            d = PULSE * max(float(nominals[index]), abs(float(value[index])))
             pulse = np.zeros(value.shape)
             pulse[index] = d
             one, two = (

@@ -91,13 +91,13 @@ class Plants:
         """Return time, states and inputs of an FMU, the arguments of its linear models."""
         start, flat = self.at_start.plants[path], self.flat
         state, inputs = {**start["state"], **self.states.of_block[path].split(xp)}, dict(start["inputs"])
-        back = {new: old for old, new in block.rename.items()}
+        variables = block.input_variables
         for port in block.inputs:
             where = flat.plant_inputs.slices.get(join(path, port))
             if where is not None:
                 inputs[port] = z[where].reshape(np.shape(inputs[port]))
-            elif back.get(port, port) in block.start:
-                inputs[port] = np.reshape(block.start[back.get(port, port)], np.shape(inputs[port]))
+            elif variables[port].name in block.start:
+                inputs[port] = np.reshape(block.start[variables[port].name], np.shape(inputs[port]))
         return {"t": start["t"], "state": state, "inputs": inputs}
 
     def points(self, xp: np.ndarray, z: np.ndarray, changed: Mapping[str, Fmu]) -> dict[str, Any]:

@@ -129,7 +129,7 @@ def _plant(letter: str, options: Mapping[str, Any], given: Collection[str], posi
     plant = plant.replace(name="plant") if isinstance(plant, Fmu) else Fmu(plant, name="plant")
     check_plant(plant)
     variables = plant.description.variables
-    place = {new: old for old, new in plant.rename.items()}.get("position", "position")
+    place = plant.output_variables["position"].name
     start: dict[str, Any] = {}
     if variables[place].start is not None:
         start[place] = position

@@ -7,8 +7,8 @@ import os
 import re
 import zipfile
 import zlib
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,59 +16,40 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from ...blocks.core import FmuFileError, Layout, UnitError, parse_unit
+from ...blocks.core import FmuFileError, Layout
 from ..platform import native_platform
+from .gathering import Elements, gather
+from .states import find_states
+from .variables import WIRE_TYPES, FmuVariable, OtherVariable, fmi3_type, read_variable
 
-
-@dataclass(frozen=True, eq=False)
-class FmuVariable:
-    """Float64 variable of an FMU."""
-
-    name: str
-    reference: int
-    causality: str
-    shape: tuple[int, ...]
-    unit: str | None
-    start: Any
-    description: str
-    minimum: float | None
-    maximum: float | None
-    nominal: float | None = None
-    variability: str = "continuous"
-    initial: str = "exact"
-    """FMI's ``initial``; "exact" means that the variable starts at its start value (FMI 3.0, 2.4.7.4)."""
-
-    @property
-    def size(self) -> int:
-        """Number of elements."""
-        return int(np.prod(self.shape, dtype=int))
-
-
-@dataclass(frozen=True)
-class OtherVariable:
-    """Variable of an FMU that is no Float64: it is neither read nor set."""
-
-    name: str
-    type: str
-    causality: str
-
-    def __str__(self) -> str:
-        return f"{self.name} ({self.type})"
+_FOLDERS2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"}
+"""Folders of binaries in FMI 2.0 (2.3.1), where they differ from FMI 3.0's platform tuples."""
+_SUFFIXES = (".so", ".dll", ".dylib")
 
 
 @dataclass(frozen=True, eq=False)
 class FmuDescription:
     """Content of ``modelDescription.xml``, as far as a diagram needs it."""
 
+    fmi: str
+    """Version of FMI, such as "2.0" or "3.0"."""
     file: Path
     digest: str
     """SHA-256 of the file."""
     model_name: str
     identifier: str
     token: str
+    """The instantiationToken, FMI 2.0's guid."""
+    binary: str
+    """The library for this platform, as its path in the archive."""
     variables: dict[str, FmuVariable]
+    """Variables with numbers as values; scalars ``s[1]``, ``s[2]`` are gathered into an array ``s``."""
     other: dict[str, OtherVariable]
-    """Variables that are no Float64, by name."""
+    """Other variables, by name: texts, binaries and clocks, which no wire carries."""
+    elements: Elements = field(default_factory=dict)
+    """Array and index, from 0 on, of each scalar that was gathered."""
+    texts: dict[str, int] = field(default_factory=dict)
+    """Value reference of each variable that is a text, by name."""
     can_save: bool = False
     """Whether the state of an instance can be saved and restored (canGetAndSetFMUState)."""
     can_serialize: bool = False
@@ -78,25 +59,71 @@ class FmuDescription:
     variable_step: bool = False
     """Whether communication steps may differ in length (canHandleVariableCommunicationStepSize)."""
     fixed_internal_step: float | None = None
-    """Fixed step of the FMU's own integrator in s (fixedInternalStepSize), or None; steps must be multiples of it."""
+    """Fixed step of the FMU's own integrator in s (fixedInternalStepSize of FMI 3.0), or None; steps must be multiples
+    of it."""
     states: dict[str, str] = field(default_factory=dict)
     """Continuous states that are variables, with their derivatives' names, in the order of the model structure."""
+    state_order: tuple[int, ...] = ()
+    """Place of each of the FMU's continuous states among the elements of `states`; FMI sets them in its own order."""
     model_exchange: str | None = None
     """Model identifier of the model-exchange interface; None without that interface."""
+    model_exchange_binary: str = ""
+    """The library of the model-exchange interface for this platform, as its path in the archive."""
     model_exchange_has_derivatives: bool = False
     """Whether the FMU computes directional derivatives in model exchange."""
 
     def layout(self, names: Iterable[str]) -> Layout:
         """Return the layout of some variables in a flat vector, one after the other."""
-        return Layout.of({name: self.variables[name].shape for name in names})
+        return Layout.of({name: self.find(name).shape for name in names})
+
+    def find(self, name: str) -> FmuVariable:
+        """Return a variable, or a scalar that was gathered into an array.
+
+        Raises
+        ------
+        KeyError
+            If the FMU has no such variable with numbers as values.
+        """
+        return self.element(name) if name in self.elements and name not in self.variables else self.variables[name]
+
+    @property
+    def names(self) -> set[str]:
+        """Names of all variables with numbers as values, and of scalars that were gathered."""
+        return {*self.variables, *self.elements}
 
     def of(self, causality: str) -> dict[str, FmuVariable]:
         """Return the variables of a causality, in the file's order."""
         return {name: v for name, v in self.variables.items() if v.causality == causality}
 
     def other_ports(self, causality: str) -> list[OtherVariable]:
-        """Return the inputs or outputs that are no Float64, in the file's order."""
+        """Return the inputs or outputs that no wire carries, in the file's order."""
         return [v for v in self.other.values() if v.causality == causality]
+
+    def element(self, name: str) -> FmuVariable:
+        """Return a scalar that was gathered into an array."""
+        array, index = self.elements[name]
+        v = self.variables[array]
+
+        def at(values: Any) -> Any:
+            return None if values is None else float(np.broadcast_to(values, v.shape)[index])
+
+        reference = v.references[int(np.ravel_multi_index(index, v.shape))]
+        start = None if v.start is None else np.array(v.start[index])
+        return replace(
+            v, name=name, references=(reference,), shape=(), start=start, minimum=at(v.minimum), maximum=at(v.maximum),
+            nominal=at(v.nominal),
+        )  # fmt: skip
+
+    @property
+    def derivatives_flag(self) -> str:
+        """Name of the capability flag of directional derivatives."""
+        return "providesDirectionalDerivative" if self.fmi.startswith("2.") else "providesDirectionalDerivatives"
+
+    @property
+    def state_flags(self) -> tuple[str, str]:
+        """Names of the capability flags of saving and of serializing the state."""
+        state = "FMUstate" if self.fmi.startswith("2.") else "FMUState"
+        return f"canGetAndSet{state}", f"canSerialize{state}"
 
     @property
     def discrete_states(self) -> tuple[str, ...]:
@@ -114,7 +141,7 @@ def read_description(file: str | os.PathLike[str]) -> FmuDescription:
     Raises
     ------
     FmuFileError
-        If the file is missing, is no FMU, or has no FMI 3.0 co-simulation or no binary for this platform.
+        If the file is missing, is no FMU, or has no co-simulation of FMI 2.0 or 3.0 or no binary for this platform.
     """
     path = Path(file).expanduser()
     if not path.is_file():
@@ -132,37 +159,35 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
         model = fmpy.read_model_description(str(path))
     except Exception as error:  # FMPy raises bare exceptions
         raise FmuFileError(f"the modelDescription.xml of {str(path)!r} can't be read: {error}") from error
-    if not re.fullmatch(r"3\.0(\.\d+)?", model.fmiVersion):
+    if not re.fullmatch(r"2\.0|3\.0(\.\d+)?", model.fmiVersion):
         raise FmuFileError(
-            f"{str(path)!r} is an FMU of FMI {model.fmiVersion}; expected FMI 3.0. Export it again with FMI 3.0 "
-            f"co-simulation."
+            f"{str(path)!r} is an FMU of FMI {model.fmiVersion}; expected FMI 2.0 or 3.0. Export it again with one of "
+            "them, for co-simulation."
         )
     if model.coSimulation is None:
         raise FmuFileError(f"{str(path)!r} has no co-simulation interface; export it with one.")
-    identifier, platform = model.coSimulation.modelIdentifier, native_platform()
-    if not any(e.startswith(f"binaries/{platform}/{identifier}.") for e in entries):
-        found = sorted({e.split("/")[1] for e in entries if e.startswith("binaries/") and e.count("/") > 1})
-        raise FmuFileError(
-            f"{str(path)!r} has no binary for this platform, {platform} (it has: {', '.join(found) or 'none'}). Export "
-            "or build it for this platform."
-        )
-    variables, other = {}, {}
+    version, identifier = model.fmiVersion, model.coSimulation.modelIdentifier
+    binary = _find_binary(path, entries, version, identifier)
+    root = ET.fromstring(text)
+    flags = _capabilities(root, version)
+    if flags["model_exchange"] is not None:
+        flags["model_exchange_binary"] = _find_binary(path, entries, version, flags["model_exchange"])
+    bounds = _unsigned_bounds(root)
+    scalars, other, texts = {}, {}, {}
     for v in model.modelVariables:
         if v.causality == "independent":
             continue
-        if v.type != "Float64":
+        if fmi3_type(v.type) in WIRE_TYPES:
+            scalars[v.name] = read_variable(v, bounds)
+        else:
             other[v.name] = OtherVariable(v.name, v.type, v.causality or "local")
-            continue
-        shape = _shape(v, model)
-        start = None if v.start is None else _start(v.start, shape)
-        variables[v.name] = FmuVariable(
-            v.name, v.valueReference, v.causality or "local", shape, _unit(v.unit), start, v.description or "",
-            _number(v.min), _number(v.max), _number(v.nominal), v.variability or "continuous",
-            v.initial or ("calculated" if v.causality in ("output", "local", None) else "exact"),
-        )  # fmt: skip
+            if v.type == "String" and not v.shape:
+                texts[v.name] = v.valueReference
+    variables, elements = gather(scalars, frozenset(other))
+    states, order = find_states(model, scalars, variables, elements)
     return FmuDescription(
-        path, hashlib.sha256(data).hexdigest(), model.modelName, identifier, model.instantiationToken, variables, other,
-        states=_states(model, variables), **_capabilities(text),
+        version, path, hashlib.sha256(data).hexdigest(), model.modelName, identifier, model.instantiationToken, binary,
+        variables, other, elements, texts, states=states, state_order=order, **flags,
     )  # fmt: skip
 
 
@@ -197,19 +222,45 @@ def _read_archive(path: Path) -> tuple[bytes, set[str], bytes]:
     return data, entries, text
 
 
-def _capabilities(text: bytes) -> dict[str, Any]:
-    """Return the interfaces' flags (FMI 3.0, 3.4 and 4.4); FMPy drops providesDirectionalDerivatives of FMI 3.0."""
-    root = ET.fromstring(text)
+def _find_binary(path: Path, entries: set[str], version: str, identifier: str) -> str:
+    """Return the library for this platform: that of the model identifier, else the only one in the folder."""
+    platform = native_platform()
+    folder = _FOLDERS2.get(platform, platform) if version.startswith("2.") else platform
+    here = sorted(e for e in entries if e.startswith(f"binaries/{folder}/") and e.endswith(_SUFFIXES))
+    named = [e for e in here if e.rpartition("/")[2].rpartition(".")[0] == identifier]
+    direct = named or [e for e in here if e.count("/") == 2]
+    if len(direct) == 1 or named:
+        return direct[0]
+    found = sorted(
+        {e.split("/")[1] for e in entries if e.startswith("binaries/") and e.count("/") > 1 and e[-1] != "/"}
+    )
+    if direct:
+        names = ", ".join(e.rpartition("/")[2] for e in direct)
+        raise FmuFileError(
+            f"{str(path)!r} has several libraries in binaries/{folder}, none with its model identifier: found {names}; "
+            f"expected {identifier}. Export it again."
+        )
+    raise FmuFileError(
+        f"{str(path)!r} has no binary for this platform, {folder} (it has: {', '.join(found) or 'none'}). Export "
+        "or build it for this platform."
+    )
+
+
+def _capabilities(root: ET.Element, version: str) -> dict[str, Any]:
+    """Return the interfaces' flags (FMI 2.0, 3.3.1 and 4.3.1; FMI 3.0, 3.4 and 4.4), some of which FMPy drops."""
     steps, exchange = root.find("CoSimulation"), root.find("ModelExchange")
-    fixed = None if steps is None else steps.get("fixedInternalStepSize")
+    two = version.startswith("2.")
+    state = "FMUstate" if two else "FMUState"
+    derivative = "providesDirectionalDerivative" if two else "providesDirectionalDerivatives"
+    fixed = None if steps is None or two else steps.get("fixedInternalStepSize")
     return {
-        "can_save": _flag(steps, "canGetAndSetFMUState"),
-        "can_serialize": _flag(steps, "canGetAndSetFMUState") and _flag(steps, "canSerializeFMUState"),
-        "has_derivatives": _flag(steps, "providesDirectionalDerivatives"),
+        "can_save": _flag(steps, f"canGetAndSet{state}"),
+        "can_serialize": _flag(steps, f"canGetAndSet{state}") and _flag(steps, f"canSerialize{state}"),
+        "has_derivatives": _flag(steps, derivative),
         "variable_step": _flag(steps, "canHandleVariableCommunicationStepSize"),
-        "fixed_internal_step": _number(fixed),
+        "fixed_internal_step": None if fixed is None else float(fixed),
         "model_exchange": None if exchange is None else exchange.get("modelIdentifier"),
-        "model_exchange_has_derivatives": _flag(exchange, "providesDirectionalDerivatives"),
+        "model_exchange_has_derivatives": _flag(exchange, derivative),
     }
 
 
@@ -217,42 +268,8 @@ def _flag(interface: ET.Element | None, name: str) -> bool:
     return interface is not None and interface.get(name) in ("true", "1")
 
 
-def _states(model: Any, variables: dict[str, FmuVariable]) -> dict[str, str]:
-    """Return derivatives and their states (FMI 3.0, 2.4.8); none if one is missing or no Float64."""
-    pairs = {
-        u.variable.derivative.name: u.variable.name for u in model.derivatives if u.variable.derivative is not None
-    }
-    complete = len(pairs) == len(model.derivatives) and all(a in variables and b in variables for a, b in pairs.items())
-    return pairs if complete else {}
-
-
-def _number(text: Any) -> float | None:
-    return None if text is None else float(text)
-
-
-def _shape(variable: Any, model: Any) -> tuple[int, ...]:
-    sizes = []
-    for dimension in variable.dimensions or ():
-        if dimension.start is not None:
-            sizes.append(int(dimension.start))
-        else:
-            parameters = {v.valueReference: v for v in model.modelVariables}
-            sizes.append(int(parameters[dimension.valueReference].start))
-    return tuple(sizes)
-
-
-def _start(text: Any, shape: tuple[int, ...]) -> np.ndarray:
-    values = np.array([float(x) for x in (text.split() if isinstance(text, str) else np.ravel(text))])
-    full = np.broadcast_to(values, (int(np.prod(shape, dtype=int)),)) if values.size == 1 else values
-    return np.array(full).reshape(shape)
-
-
-def _unit(text: str | None) -> str | None:
-    """Return a unit that this library can read, else None."""
-    if text is None:
-        return None
-    try:
-        parse_unit(text)
-    except UnitError:
-        return None
-    return text
+def _unsigned_bounds(root: ET.Element) -> dict[int, Mapping[str, str]]:
+    """Return the attributes of unsigned integers of FMI 3.0 by value reference; FMPy drops their bounds."""
+    variables = root.find("ModelVariables")
+    found = [] if variables is None else [e for e in variables if e.tag.startswith("UInt")]
+    return {int(e.attrib["valueReference"]): e.attrib for e in found}

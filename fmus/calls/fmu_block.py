@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from ..archive import FmuDescription
+from ..archive import FmuDescription, FmuVariable
 
 
 class FmuBlock(Protocol):
-    """A block of an FMU: its file, its start values and the names of its ports."""
+    """A block of an FMU: its file, its start values and its ports."""
 
     @property
     def label(self) -> str:
@@ -24,8 +24,12 @@ class FmuBlock(Protocol):
         """Start values by the FMU's names."""
 
     @property
-    def rename(self) -> Mapping[str, str]:
-        """Names of ports by the FMU's names."""
+    def input_variables(self) -> Mapping[str, FmuVariable]:
+        """Variables that are set in a run, by their ports."""
+
+    @property
+    def output_variables(self) -> Mapping[str, FmuVariable]:
+        """Variables that are read in a run, by their ports."""
 
     @property
     def variable_step(self) -> bool:

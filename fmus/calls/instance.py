@@ -5,20 +5,27 @@ from __future__ import annotations
 import ctypes
 import struct
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ...blocks.core import FmuError, FmuRuntimeError
+from ..archive import FmuVariable
 from ..platform import native_platform
+from .fmi_calls import DISCARD, ERROR, FATAL, StepCall
 from .fmu_block import FmuBlock
-from .loaded_library import LoadedFmu, status_of
+from .loaded_library import LoadedFmu
+from .transfer import Transfer, UnfitError
 
 _HEADER = struct.Struct("<8s32s24sd?")  # of a serialized state: magic, FMU's digest, platform, time, running
 _MAGIC = b"lw-fmu-1"
-_DISCARD = 2
 _BEYOND = 1.0 + 1e-6  # end of a step, in steps, beyond which more than rounding has been added
+_Bound = tuple[Callable[[float, float], None], Callable[[], None], Callable[[float], None]]
+
+
+def _succeed() -> int:
+    return 0
 
 
 class FmuState:
@@ -59,11 +66,11 @@ class FmuInstance(LoadedFmu):
 
     def __init__(self, block: FmuBlock, wired: Sequence[str]):
         super().__init__(block)
-        back = {new: old for old, new in block.rename.items()}
-        self._inputs = [self.description.variables[back.get(name, name)] for name in wired]
-        self._outputs = list(self.description.of("output").values())
+        variables = block.input_variables
+        self._inputs, self._outputs = {port: variables[port] for port in wired}, dict(block.output_variables)
         self._now, self._width = ctypes.c_double(), ctypes.c_double()
-        self._final = ctypes.c_bool(True)  # noSetFMUStatePriorToCurrentPoint, until a state has been saved
+        self._final = self.fmi.final  # noSetFMUStatePriorToCurrentPoint, until a state has been saved
+        self._vector = np.zeros(0)
         self._handles: dict[int, Any] = {}
         self._read: Callable[[float], None] = lambda t: None
 
@@ -80,34 +87,29 @@ class FmuInstance(LoadedFmu):
 
     def bind(self, inputs: np.ndarray, outputs: np.ndarray) -> None:
         """Bind the vectors of the inputs to set and of the outputs to get, and get the outputs once."""
-        lib, component = self._fmu.dll, ctypes.c_void_p(self._fmu.component)
-        set_values, get_values, do_step = lib["fmi3SetFloat64"], lib["fmi3GetFloat64"], lib["fmi3DoStep"]
-        for function in (set_values, get_values, do_step):
-            function.restype = ctypes.c_int  # arguments are made once, so that no call checks their types
-        flags = (ctypes.c_bool * 4)()  # event, terminate, early return, and one that is never set
-        any_flag = ctypes.c_uint32.from_buffer(flags)
-        reached = ctypes.c_double()
-        ins = (ctypes.c_uint * max(1, len(self._inputs)))(*[v.reference for v in self._inputs])
-        outs = (ctypes.c_uint * max(1, len(self._outputs)))(*[v.reference for v in self._outputs])
-        self._kept = (ins, outs, flags, reached, inputs, outputs)  # kept alive as long as their addresses are used
-        address, size, now, width = ctypes.c_void_p, ctypes.c_size_t, self._now, self._width
-        set_arguments = (component, ins, size(len(self._inputs)), address(inputs.ctypes.data), size(inputs.size))
-        get_arguments = (component, outs, size(len(self._outputs)), address(outputs.ctypes.data), size(outputs.size))
-        at = ctypes.addressof(flags)
-        step_arguments = (
-            *(component, now, width, self._final),
-            *(address(at), address(at + 1), address(at + 2), ctypes.byref(reached)),
-        )
-        has_inputs, has_outputs = bool(self._inputs), bool(self._outputs)
+        self._vector = inputs
+        ins, outs = Transfer(self.fmi, "Set", self._inputs, inputs), Transfer(self.fmi, "Get", self._outputs, outputs)
+        call = self.fmi.step_call(self._now, self._width, self._final)
+        plain = ins.is_plain and outs.is_plain
+        self.step, self.exchange, self._read = (self._bind_plain if plain else self._bind_typed)(ins, outs, call)
+        self._read(self._began)
+
+    def _bind_plain(self, ins: Transfer, outs: Transfer, call: StepCall) -> _Bound:
+        """Return step, exchange and reading where all ports are Float64: one call each way, on the vectors."""
+        set_values, set_arguments = ins.plain_call or (_succeed, ())
+        get_values, get_arguments = outs.plain_call or (_succeed, ())
+        do_step, step_arguments, any_flag, reached = call.function, call.arguments, call.any_flag, call.reached
+        now, width = self._now, self._width
+        has_inputs, has_outputs = ins.plain_call is not None, outs.plain_call is not None
 
         def step(t: float, h: float) -> None:
             if has_inputs and (status := set_values(*set_arguments)) > 1:
                 raise self._error("setting the inputs", status, t)
             now.value, width.value = t, h
             if (status := do_step(*step_arguments)) > 1:
-                raise self._step_error(status, t, h)
+                self._end_step(status, t, h)
             if any_flag.value or reached.value > t + h * _BEYOND:
-                self._check_flags(flags, reached.value, t, h)
+                self._check_flags(call, t, h)
             if has_outputs and (status := get_values(*get_arguments)) > 1:
                 raise self._error("reading the outputs", status, t)
 
@@ -120,30 +122,75 @@ class FmuInstance(LoadedFmu):
                 raise self._error("setting the inputs", status, self._began)
             read(self._began)
 
-        self.step, self.exchange, self._read = step, exchange, read
-        read(self._began)
+        return step, exchange, read
 
-    # ---- failures of a step (FMI 3.0, 2.2.3 and 4.2.1) ----
+    def _bind_typed(self, ins: Transfer, outs: Transfer, call: StepCall) -> _Bound:
+        """Return step, exchange and reading where ports have several types."""
+
+        def write(t: float) -> None:
+            try:
+                status = ins.set()
+            except UnfitError as error:
+                raise self._unfit(error, t, "Convert the signal before this input, with Quantizer, say.") from None
+            if status > 1:
+                raise self._error("setting the inputs", status, t)
+
+        def read(t: float) -> None:
+            try:
+                status = outs.get()
+            except UnfitError as error:
+                self.failed = True
+                raise self._unfit(error, t, "Leave this output out, by ports=.") from None
+            if status > 1:
+                raise self._error("reading the outputs", status, t)
+
+        def step(t: float, h: float) -> None:
+            write(t)
+            self._now.value, self._width.value = t, h
+            if (status := call.function(*call.arguments)) > 1:
+                self._end_step(status, t, h)
+            if call.any_flag.value or call.reached.value > t + h * _BEYOND:
+                self._check_flags(call, t, h)
+            read(t + h)
+
+        def exchange() -> None:
+            write(self._began)
+            read(self._began)
+
+        return step, exchange, read
+
+    def _unfit(self, error: UnfitError, t: float, advice: str) -> FmuRuntimeError:
+        return FmuRuntimeError(f"{error.reason}. {advice}", block=self.block.label, port=error.port, t=t)
+
+    # ---- failures of a step (FMI 2.0, 2.1.3 and 4.2.2; FMI 3.0, 2.2.3 and 4.2.1) ----
 
     def _mark_failure(self, status: int) -> None:
-        self.failed = status > _DISCARD  # a call that is discarded changes nothing
-        self.fatal = status > _DISCARD + 1
+        self.failed = status >= ERROR  # a call that is discarded changes nothing
+        self.fatal = status >= FATAL
 
     def _error(self, action: str, status: int, t: float, advice: str = "") -> FmuRuntimeError:
         self._mark_failure(status)
-        inputs = ", ".join(f"{v.name}" for v in self._inputs)
-        values = self._kept[4].tolist()
         return FmuRuntimeError(
-            f"{action} failed with {status_of(status)}{self._quote_messages()} The inputs ({inputs}) were {values}. "
+            f"{action} failed with {self.fmi.status_name(status)}{self._quote_messages()} The inputs "
+            f"({', '.join(v.name for v in self._inputs.values())}) were {self._vector.tolist()}. "
             f"{advice or 'Look at the last samples of error.run, or take a smaller step.'}",
             block=self.block.label,
             t=t,
         )
 
+    def _end_step(self, status: int, t: float, h: float) -> None:
+        """Wait for the end of a step that is pending, and raise the error of one that has failed."""
+        status, ends = self.fmi.end_step(status)
+        if ends:
+            self._width.value = 0.0
+            raise self._termination(t, h)
+        if status > 1:
+            raise self._step_error(status, t, h)
+
     def _step_error(self, status: int, t: float, h: float) -> FmuRuntimeError:
         self._width.value = 0.0  # the instance stays where it was
         action = f"the step from t = {t:.9g} s by {h:g} s"
-        if status != _DISCARD:
+        if status != DISCARD:
             return self._error(action, status, t)
         steps = "" if self.block.variable_step else " from the start: this FMU takes steps of one length only"
         return self._error(
@@ -153,43 +200,47 @@ class FmuInstance(LoadedFmu):
             f"Take a smaller step{steps}, or check the FMU's inputs there.",
         )
 
-    def _check_flags(self, flags: Any, reached: float, t: float, h: float) -> None:
-        _, terminate, early, _ = flags
+    def _termination(self, t: float, h: float) -> FmuRuntimeError:
+        return FmuRuntimeError(
+            f"the FMU asks to end the simulation (terminateSimulation) in the step from t = {t:.9g} s by {h:g} s"
+            f"{self._quote_messages()} End the run there, or look up the reason in the FMU's documentation.",
+            block=self.block.label,
+            t=t,
+        )
+
+    def _check_flags(self, call: StepCall, t: float, h: float) -> None:
+        _, terminate, early, _ = call.flags
         if terminate:
-            raise FmuRuntimeError(
-                f"the FMU asks to end the simulation (terminateSimulation) in the step from t = {t:.9g} s by {h:g} s"
-                f"{self._quote_messages()} End the run there, or look up the reason in the FMU's documentation.",
-                block=self.block.label,
-                t=t,
-            )
+            raise self._termination(t, h)
         if early:
             raise FmuRuntimeError(
-                f"the step from t = {t:.9g} s by {h:g} s returned early, at {reached:.9g} s (earlyReturn), though the "
-                f"FMU was told that it must not (earlyReturnAllowed = false){self._quote_messages()} Take steps that "
-                "end where its events are, or export it without early return.",
+                f"the step from t = {t:.9g} s by {h:g} s returned early, at {call.reached.value:.9g} s (earlyReturn), "
+                f"though the FMU was told that it must not (earlyReturnAllowed = false){self._quote_messages()} Take "
+                "steps that end where its events are, or export it without early return.",
                 block=self.block.label,
                 t=t,
             )
-        if reached > t + h * _BEYOND + 1e-12 * abs(t):
+        if call.reached.value > t + h * _BEYOND + 1e-12 * abs(t):
             raise FmuRuntimeError(
-                f"the step from t = {t:.9g} s by {h:g} s ended at {reached:.9g} s (lastSuccessfulTime); expected "
-                f"{t + h:.9g} s{self._quote_messages()} Its outputs belong to another time than the diagram's: report "
-                "it to its makers.",
+                f"the step from t = {t:.9g} s by {h:g} s ended at {call.reached.value:.9g} s (lastSuccessfulTime); "
+                f"expected {t + h:.9g} s{self._quote_messages()} Its outputs belong to another time than the "
+                "diagram's: report it to its makers.",
                 block=self.block.label,
                 t=t,
             )
 
     def operating_point(self) -> dict[str, Any]:
         """Return the present ``t``, ``state`` and ``inputs``, for `Fmu.linear_model` and `Fmu.step_difference`."""
-        about, rename = self.description, self.block.rename
+        about = self.description
 
-        def read(names: Iterable[str]) -> dict[str, np.ndarray]:
-            return {name: self.values([name]).reshape(about.variables[name].shape) for name in names}
+        def read(variable: FmuVariable) -> np.ndarray:
+            return self.read_variables([variable]).reshape(variable.shape)
 
-        inputs = {rename.get(name, name): value for name, value in read(about.of("input")).items()}
-        return {"t": self.t, "state": read((*about.states, *about.discrete_states)), "inputs": inputs}
+        state = {name: read(about.variables[name]) for name in (*about.states, *about.discrete_states)}
+        inputs = {port: read(variable) for port, variable in self.block.input_variables.items()}
+        return {"t": self.t, "state": state, "inputs": inputs}
 
-    # ---- saved states (FMI 3.0, 2.2.6.4) ----
+    # ---- saved states (FMI 2.0, 2.1.8; FMI 3.0, 2.2.6.4) ----
 
     @property
     def can_save(self) -> bool:
@@ -216,8 +267,8 @@ class FmuInstance(LoadedFmu):
         FmuRuntimeError
             If the FMU's function fails.
         """
-        self._check_can("canGetAndSetFMUState", "saved", self.can_save)
-        return self._keep(self.call("saving its state", "getFMUState"), self.t, self._running)
+        self._check_can(self.description.state_flags[0], "saved", self.can_save)
+        return self._keep(self.call("saving its state", self.fmi.save_state), self.t, self._running)
 
     def restore(self, state: FmuState) -> None:
         """Restore a saved state, earlier or later, and get the outputs there; this is allowed after an error, too.
@@ -230,7 +281,7 @@ class FmuInstance(LoadedFmu):
             If the FMU's function fails.
         """
         self._check_state(state)
-        self.call("restoring its state", "setFMUState", state._handle)
+        self.call("restoring its state", self.fmi.set_state, state._handle)
         self.failed, self._running = False, state.running
         self._now.value, self._width.value = state.t, 0.0
         self._read(state.t)
@@ -247,11 +298,11 @@ class FmuInstance(LoadedFmu):
         FmuRuntimeError
             If the FMU's function fails.
         """
-        self._check_can("canSerializeFMUState", "turned into bytes", self.can_serialize)
+        self._check_can(self.description.state_flags[1], "turned into bytes", self.can_serialize)
         if state is None:
             state = self.save()
         self._check_state(state)
-        data = self.call("serializing its state", "serializeFMUState", state._handle)
+        data = self.call("serializing its state", self.fmi.serialize_state, state._handle)
         return _HEADER.pack(_MAGIC, *self._identity(), state.t, state.running) + bytes(data)
 
     def deserialize(self, data: bytes) -> FmuState:
@@ -264,7 +315,7 @@ class FmuInstance(LoadedFmu):
         FmuRuntimeError
             If the FMU's function fails.
         """
-        self._check_can("canSerializeFMUState", "made from bytes", self.can_serialize)
+        self._check_can(self.description.state_flags[1], "made from bytes", self.can_serialize)
         head, rest = data[: _HEADER.size], data[_HEADER.size :]
         if len(head) < _HEADER.size or not head.startswith(_MAGIC):
             raise FmuError(
@@ -281,7 +332,7 @@ class FmuInstance(LoadedFmu):
                 "was saved.",
                 block=self.block.label,
             )
-        return self._keep(self.call("reading a serialized state", "deserializeFMUState", rest), t, running)
+        return self._keep(self.call("reading a serialized state", self.fmi.deserialize_state, rest), t, running)
 
     def _identity(self) -> tuple[bytes, bytes]:
         return bytes.fromhex(self.description.digest), native_platform().encode().ljust(24, b"\0")
@@ -307,7 +358,7 @@ class FmuInstance(LoadedFmu):
             )
 
     def _check_state(self, state: FmuState) -> None:
-        self._check_can("canGetAndSetFMUState", "restored", self.can_save)
+        self._check_can(self.description.state_flags[0], "restored", self.can_save)
         if state.instance is not self:
             raise FmuError(
                 f"found a state of another instance, {state!r}. Carry it over: restore(deserialize(data)) with the "

@@ -5,28 +5,31 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ...blocks.core import FmuError, FmuFileError, FmuRuntimeError, UnknownNameError, near
-from ..archive import FmuDescription
+from ..archive import FmuDescription, FmuVariable, inexact
 from ..platform import cache_folder, check_cache
+from .fmi2 import Fmi2Calls
+from .fmi3 import Fmi3Calls
+from .fmi_calls import FATAL, STATUS, FmiCalls
 from .fmu_block import FmuBlock
 
-_STATUS = ("OK", "warning", "discard", "error", "fatal")
-_FATAL = 4
+_CALLS: dict[str, type[FmiCalls]] = {"2": Fmi2Calls, "3": Fmi3Calls}
+"""Functions by the major version of FMI."""
+R = TypeVar("R")
 
 
 class LoadedFmu:
     """Instance of an FMU: log, initialization, variables, end."""
 
     def __init__(self, block: FmuBlock, *, model_exchange: bool = False):
-        from fmpy.fmi3 import FMU3Model, FMU3Slave
-
         self.block, self.description = block, block.description
         self.model_exchange, self.failed, self.fatal = model_exchange, False, False
         self.messages: list[str] = self._list_limits()
@@ -39,16 +42,17 @@ class LoadedFmu:
         except FmuError as error:
             error.at(block=block.label)
             raise
-        identifier = description.model_exchange if model_exchange else description.identifier
         try:
-            self._fmu: Any = (FMU3Model if model_exchange else FMU3Slave)(
-                guid=description.token,
-                modelIdentifier=identifier,
-                unzipDirectory=str(files),
-                instanceName=block.label,
+            self.fmi = _CALLS[description.fmi[0]](
+                name=block.label,
+                token=description.token,
+                folder=files,
+                library=files / (description.model_exchange_binary if model_exchange else description.binary),
+                model_exchange=model_exchange,
             )
+            self._fmu = self.fmi.fmu
             self._check_version()
-            self._fmu.instantiate(logMessage=self._log, loggingOn=True)
+            self.fmi.instantiate(self._log)
         except FmuFileError:
             raise
         except Exception as error:
@@ -62,26 +66,26 @@ class LoadedFmu:
         self._open = True
 
     def _check_version(self) -> None:
-        """Refuse a library of another version of FMI than the description says (FMI 3.0, 2.3.1)."""
-        version = str(self._fmu.getVersion())
-        if not version.startswith("3.0"):
+        """Refuse a library of another version of FMI than the description says (FMI 2.0, 2.1.4; FMI 3.0, 2.3.1)."""
+        version, expected = self.fmi.version(), self.description.fmi[:3]
+        if not version.startswith(expected):
             raise FmuFileError(
-                f"the library of {str(self.description.file)!r} says that it is of FMI {version!r} (fmi3GetVersion); "
-                "expected '3.0', as its description says. Export it again.",
+                f"the library of {str(self.description.file)!r} says that it is of FMI {version!r} "
+                f"({self.fmi.prefix}GetVersion); expected {expected!r}, as its description says. Export it again.",
                 block=self.block.label,
             )
 
     def _list_limits(self) -> list[str]:
-        """Return a message on the ports that are neither read nor set; none if all are Float64."""
+        """Return a message on the ports that are neither read nor set; none if wires carry all."""
         ins, outs = (self.description.other_ports(causality) for causality in ("input", "output"))
         parts = [f"the outputs {', '.join(map(str, outs))} are not recorded"] if outs else []
         parts += [f"the inputs {', '.join(map(str, ins))} keep their start values"] if ins else []
-        return [f"{self.block.label}: only Float64 is read and set yet: {'; '.join(parts)}"] if parts else []
+        return [f"{self.block.label}: no wire carries texts, binaries and clocks: {'; '.join(parts)}"] if parts else []
 
-    def _log(self, environment: Any, status: int, category: bytes | None, message: bytes | None) -> None:
-        text = (message or b"").decode(errors="replace")
+    def _log(self, status: int, text: str) -> None:
         if status and len(self.messages) < 1000:
-            self.messages.append(f"{self.block.label}: {_STATUS[status]}: {text}")
+            kind = STATUS[status] if 0 <= status < len(STATUS) else f"status {status}"
+            self.messages.append(f"{self.block.label}: {kind}: {text}")
 
     def _quote_messages(self) -> str:
         said = self.messages[self._limits :][-5:]
@@ -111,8 +115,9 @@ class LoadedFmu:
         """
         self._began = start_time
         try:
+            self.fmi.set_up(start_time, stop_time, None)
             self.set_values({**self.block.start, **(values or {})})
-            self._fmu.enterInitializationMode(startTime=start_time, stopTime=stop_time)
+            self.fmi.enter_initialization_mode(start_time, stop_time, None)
         except Exception as error:
             raise self._initialization_error(error) from error
 
@@ -125,22 +130,22 @@ class LoadedFmu:
         )
 
     def reset(self) -> None:
-        """Return to the state before the initialization (FMI 3.0, 2.3.1)."""
-        self.call("resetting it", "reset")
+        """Return to the state before the initialization (FMI 2.0, 2.1.6; FMI 3.0, 2.3.1)."""
+        self.call("resetting it", self.fmi.reset)
         self.failed = self._running = False
 
     def begin(self) -> None:
         """Leave Initialization Mode."""
         try:
-            self._fmu.exitInitializationMode()
+            self.fmi.exit_initialization_mode()
         except Exception as error:
             raise self._initialization_error(error) from error
         self._running = True
 
-    # ---- calls by names, which are not made at each step ----
+    # ---- calls that are not made at each step ----
 
-    def call(self, purpose: str, name: str, *arguments: Any) -> Any:
-        """Call a function of FMPy's interface; an error begins with the purpose of the call.
+    def call(self, purpose: str, function: Callable[..., R], *arguments: Any) -> R:
+        """Call a method of `fmi`; an error begins with the purpose of the call.
 
         Raises
         ------
@@ -148,7 +153,7 @@ class LoadedFmu:
             If the FMU's function returns an error.
         """
         try:
-            return getattr(self._fmu, name)(*arguments)
+            return function(*arguments)
         except Exception as error:
             self._note(error)
             raise FmuRuntimeError(
@@ -160,33 +165,60 @@ class LoadedFmu:
 
     def _note(self, error: Exception) -> None:
         self.failed = True
-        self.fatal = self.fatal or getattr(error, "status", None) == _FATAL
+        self.fatal = self.fatal or getattr(error, "status", None) == FATAL
 
     def set_values(self, values: Mapping[str, Any]) -> None:
         """Set variables, by the FMU's names."""
         for name, value in values.items():
-            reference = self.description.variables[name].reference
-            self._fmu.setFloat64([reference], [float(v) for v in np.ravel(value)])
+            if name in self.description.texts:
+                self.fmi.set_text(self.description.texts[name], value)
+                continue
+            variable = self.description.find(name)
+            as_type = int if variable.is_integer else float
+            self.fmi.set(variable.type, variable.references, [as_type(v) for v in np.ravel(value)])
 
     def free_state(self, handle: Any) -> None:
-        """Free a state that getFMUState gave; after a fatal error nothing is called any more (FMI 3.0, 2.3)."""
+        """Free a saved state; after a fatal error nothing is called any more (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)."""
         if not self.fatal:
             with suppress(Exception):
-                self._fmu.freeFMUState(handle)
+                self.fmi.free_state(handle)
 
     def values(self, names: Iterable[str]) -> np.ndarray:
         """Return the elements of variables, one after the other."""
-        variables = [self.description.variables[name] for name in names]
-        n = sum(v.size for v in variables)
-        if not n:
-            return np.zeros(0)
-        found = self.call(f"reading {', '.join(names)}", "getFloat64", [v.reference for v in variables], n)
-        return np.array(found, dtype=float)
+        return self.read_variables([self.description.find(name) for name in names])
+
+    def read_variables(self, variables: Iterable[FmuVariable]) -> np.ndarray:
+        """Return the elements of variables, one after the other.
+
+        Raises
+        ------
+        FmuRuntimeError
+            If the FMU's function fails, or a value is an integer that a float64 can't hold.
+        """
+        found: list[np.ndarray] = []
+        for type_, group in groupby(variables, key=lambda v: v.type):
+            alike = list(group)
+            n = sum(v.size for v in alike)
+            if not n:
+                continue
+            purpose = f"reading {', '.join(v.name for v in alike)}"
+            values = np.array(self.call(purpose, self.fmi.get, type_, [r for v in alike for r in v.references], n))
+            if alike[0].is_integer and inexact(values):
+                raise FmuRuntimeError(
+                    f"{purpose}: found {values[[inexact(v) for v in values]][0]}; expected at most 2**53 in size, up "
+                    "to which a signal holds every integer. Leave this variable out.",
+                    block=self.block.label,
+                    t=self.t,
+                )
+            found.append(values.astype(float))
+        return np.concatenate(found) if found else np.zeros(0)
 
     def directional_derivative(
         self, unknowns: Sequence[str], knowns: Sequence[str], seed: Sequence[float]
     ) -> np.ndarray:
-        """Return the change of outputs and state derivatives for a change of knowns (FMI 3.0, 2.2.11).
+        """Return the change of outputs and state derivatives for a change of knowns.
+
+        Clauses are FMI 2.0, 2.1.9, and FMI 3.0, 2.2.11.
 
         The derivative is taken at the present time, states and inputs, with discrete states frozen.
 
@@ -216,22 +248,28 @@ class LoadedFmu:
         about = self.description
         if not (about.model_exchange_has_derivatives if self.model_exchange else about.has_derivatives):
             raise FmuError(
-                "it has no directional derivatives: providesDirectionalDerivatives is false in its description. Use "
+                f"it has no directional derivatives: {about.derivatives_flag} is false in its description. Use "
                 "linear_model(), which falls back on differences.",
                 block=self.block.label,
             )
         for name in (*unknowns, *knowns):
-            if name not in about.variables:
+            if name not in about.names:
                 raise UnknownNameError(
-                    f"it has no variable {name!r}. {near(name, about.variables)}", block=self.block.label
+                    f"it has no variable {name!r}. {near(name, about.names)}", block=self.block.label
                 )
-        of, by = ([about.variables[name] for name in names] for names in (unknowns, knowns))
+        of, by = ([about.find(name) for name in names] for names in (unknowns, knowns))
         n = sum(v.size for v in of)
         if not n:
             return np.zeros(0)
         changes = [float(c) for c in np.ravel(seed)]
-        arguments = ([v.reference for v in of], [v.reference for v in by], changes, n)
-        return np.array(self.call("a directional derivative", "getDirectionalDerivative", *arguments), dtype=float)
+        arguments = ([r for v in of for r in v.references], [r for v in by for r in v.references], changes, n)
+        found = self.call("a directional derivative", self.fmi.directional_derivative, *arguments)
+        return np.array(found, dtype=float)
+
+    def set_continuous_states(self, x: np.ndarray) -> None:
+        """Set all continuous states in model exchange, in the order of the description's `states`."""
+        order = np.array(self.description.state_order, dtype=int)
+        self.call("setting the continuous states", self.fmi.set_continuous_states, x[order])
 
     # ---- the end ----
 
@@ -240,13 +278,13 @@ class LoadedFmu:
         if not self._open:
             return
         self._open = False
-        if self.fatal:  # no function may be called any more, not even to free it (FMI 3.0, 2.2.3)
+        if self.fatal:  # nothing may be called any more, not even to free it (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)
             return
         with suppress(Exception):
             if self._running and not self.failed:
-                self._fmu.terminate()
+                self.fmi.terminate()
         with suppress(Exception):
-            self._fmu.freeInstance()
+            self.fmi.free_instance()
 
 
 def unpack(description: FmuDescription) -> Path:
@@ -261,7 +299,7 @@ def unpack(description: FmuDescription) -> Path:
     """
     import fmpy
 
-    folder = cache_folder() / "unpacked" / description.digest[:32]
+    folder = cache_folder().absolute() / "unpacked" / description.digest[:32]
     if folder.is_dir():
         return folder
     check_cache()
@@ -285,8 +323,3 @@ def unpack(description: FmuDescription) -> Path:
         if fresh.is_dir():
             shutil.rmtree(fresh, ignore_errors=True)
     return folder
-
-
-def status_of(code: int) -> str:
-    """Return the name of a status in FMI 3.0 (2.2.3), such as ``fmi3Discard``."""
-    return f"fmi3{_STATUS[code].capitalize()}" if 0 <= code < len(_STATUS) else f"status {code}"

@@ -28,7 +28,7 @@ class Column:
     """
 
     def __init__(self, about: FmuDescription, names: list[str], at: np.ndarray, relative: float):
-        self.variables, self.at, self.relative = {name: about.variables[name] for name in names}, at, relative
+        self.variables, self.at, self.relative = {name: about.find(name) for name in names}, at, relative
         self._slices = Layout.of({n: v.shape for n, v in self.variables.items()}).slices
 
     def part(self, name: str, values: np.ndarray) -> np.ndarray:
@@ -38,11 +38,11 @@ class Column:
     def __iter__(self) -> Iterator[tuple[str, int, float, int]]:
         """Yield variable, element, distance and side: 0 for both sides, ±1 if a bound leaves one only."""
         for name, variable in self.variables.items():
-            low = -np.inf if variable.minimum is None else variable.minimum
-            high = np.inf if variable.maximum is None else variable.maximum
-            for i in range(self._slices[name].start, self._slices[name].stop):
+            where = self._slices[name]
+            bounds = (np.ravel(values).tolist() for values in (*variable.limits, variable.nominals))
+            for i, low, high, nominal in zip(range(where.start, where.stop), *bounds, strict=True):
                 x = float(self.at[i])
-                d = self.relative * max(abs(x), abs(variable.nominal or 1.0))
+                d = self.relative * max(abs(x), nominal)
                 d = (x + d) - x  # the distance of two floating-point numbers near x
                 up, down = x + 4 * d <= high, x - 4 * d >= low
                 yield name, i, d, 0 if up and down else 1 if up else -1

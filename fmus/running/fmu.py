@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ...blocks.core import (
     Block,
     Call,
@@ -28,16 +26,23 @@ from ...blocks.core import (
 from ..archive import FmuDescription, FmuVariable, read_description
 from ..calls import FmuInstance
 from .linearization import STEP, FmuLinearization, linear_model, step_difference
-
-_STATUS = ("OK", "warning", "discard", "error", "fatal")
+from .ports import FmuPorts, choose_ports
+from .start_values import check_start, check_value
 
 
 class Fmu(Block):
-    """Co-simulation FMU (FMI 3.0, Float64 variables) as a block; its ports are the FMU's inputs and outputs.
+    """Co-simulation FMU of FMI 2.0 or 3.0 as a block; its ports are the FMU's inputs and outputs.
 
     Outputs are attributes (``plant.position``). A port whose name is no identifier is read by index
     (``plant["axis.phi"]``), or gets another name by ``rename``. Between communication points the inputs are held, and
     the outputs are those at the end of the last step. Wire each input, or give it a value in ``start``.
+
+    Scalars ``s[1]``, ``s[2]``, as FMI 2.0 writes an array, are one port ``s``, if they are complete from 0 or 1 and
+    alike; ``plant["s[1]"]`` reads one of them, ``start`` takes both names, and scalars that ``rename`` or ``ports``
+    name are ports of their own.
+
+    A wire carries numbers: integers and enumerations as such, a Boolean as 0 or 1. An input of one of these types
+    refuses other numbers in a run. Texts, binaries and clocks are no ports (`left_out`); ``start`` takes texts.
 
     The file is checked when the block is made, and loaded only for the duration of a run. The SHA-256 digest of its
     content belongs to the block: two blocks are equal only if the contents were equal, and a file that has changed
@@ -51,38 +56,41 @@ class Fmu(Block):
         default={}, description="start values of parameters, states and inputs, by the FMU's names"
     )
     rename: Mapping[str, str] = parameter(default={}, description="FMU's name → name of the port")
+    ports: Sequence[str] | None = parameter(
+        default=None,
+        description="FMU's names of the variables that are ports: inputs, outputs, local variables, tunable "
+        "parameters as inputs; None for all inputs and outputs",
+    )
 
     def check(self) -> None:
-        """Check the file, and names, shapes and values of ``start`` and ``rename``."""
+        """Check the file, the names of ``ports`` and ``rename``, and names, shapes and values of ``start``."""
         who = self.label
         if not isinstance(self.file, str | os.PathLike):
             raise ParameterError(f"found {self.file!r}; expected the path of an .fmu file.", block=who, port="file")
+        if self.ports is not None and (
+            isinstance(self.ports, str) or not all(isinstance(name, str) for name in self.ports)
+        ):
+            raise ParameterError(
+                f"found {self.ports!r}; expected a list of names of variables.", block=who, port="ports"
+            )
         try:
             description = read_description(self.file)
         except FmuError as error:
             error.at(block=who)
             raise
-        ports = {**description.of("input"), **description.of("output")}
-        others = description.other_ports("output")
-        if others and not description.of("output"):
+        object.__setattr__(self, "_content", description.digest)
+        ports, others = self._choose_ports(description), description.other_ports("output")
+        if others and not ports.outputs:
             raise FmuFileError(
-                f"found only outputs that are no Float64, which are not read yet: {', '.join(map(str, others))}; "
-                "expected a Float64 among them. Add one in its tool, such as the same signal as a real number.",
+                f"found only outputs that no wire carries: {', '.join(map(str, others))}; expected a number among "
+                "them. Add one in its tool, or choose a local variable by ports=.",
                 block=who,
             )
-        for old in self.rename:
-            if old not in ports:
-                raise UnknownNameError(
-                    f"it has no port {old!r} to rename. {near(old, ports)}", block=who, port="rename"
-                )
-        start = {k: self.start_value(description, k, v) for k, v in self.start.items()}
-        object.__setattr__(self, "start", FrozenMapping(start))
-        object.__setattr__(self, "_content", description.digest)
-        new = [self.rename.get(name, name) for name in ports]
-        if len(set(new)) < len(new):
-            raise ParameterError(
-                "found one name for two ports; rename them to different names.", block=who, port="rename"
-            )
+        object.__setattr__(self, "start", FrozenMapping(check_start(description, self.start, who)))
+
+    def _choose_ports(self, description: FmuDescription) -> FmuPorts:
+        chosen = None if self.ports is None else tuple(self.ports)
+        return choose_ports(description, tuple(self.rename.items()), chosen, self.label)
 
     def start_value(self, description: FmuDescription, name: str, value: Any) -> Any:
         """Return a start value in the variable's shape, after checking it.
@@ -90,42 +98,33 @@ class Fmu(Block):
         Raises
         ------
         UnknownNameError, ParameterError
-            For an unknown variable, one that can't be set, another shape, and a value out of its range.
+            For an unknown variable, one that can't be set, another shape or type, and a value out of its range.
         """
-        who, port = self.label, f"start.{name}"
-        if name in description.other:
-            raise ParameterError(
-                f"found a variable of type {description.other[name].type}; expected Float64, which alone can be set. "
-                "Leave it out.",
-                block=who,
-                port=port,
-            )
-        variable = description.variables.get(name)
-        if variable is None:
-            raise UnknownNameError(
-                f"the FMU has no variable {name!r}. {near(name, description.variables)}", block=who, port="start"
-            )
-        if variable.causality in ("output", "local") and variable.start is None:
-            raise ParameterError(
-                "found a variable that is computed and has no start value; set the states and parameters that it "
-                "depends on.",
-                block=who,
-                port=port,
-            )
+        return check_value(description, name, value, self.label)
+
+    @property
+    def input_variables(self) -> Mapping[str, FmuVariable]:
+        """The FMU's variables that are input ports, by the ports' names."""
+        return self._choose_ports(self.description).inputs
+
+    @property
+    def output_variables(self) -> Mapping[str, FmuVariable]:
+        """The FMU's variables that are output ports, by the ports' names."""
+        return self._choose_ports(self.description).outputs
+
+    @property
+    def left_out(self) -> Mapping[str, str]:
+        """Types of the variables that no wire carries, by name: texts, binaries and clocks."""
+        return {name: v.type for name, v in self.description.other.items()}
+
+    def __repr__(self) -> str:
+        text = super().__repr__()
         try:
-            array = np.array(np.broadcast_to(np.asarray(value, dtype=float), variable.shape))
-        except (TypeError, ValueError):
-            raise ParameterError(
-                f"found {value!r}; expected numbers of shape {variable.shape}.", block=who, port=port
-            ) from None
-        if not np.all(np.isfinite(array)):
-            raise ParameterError(
-                f"found {value!r}; expected finite numbers{_unit_text(variable)}.", block=who, port=port
-            )
-        for bound, wrong in ((variable.minimum, np.less), (variable.maximum, np.greater)):
-            if bound is not None and np.any(wrong(array, bound)):
-                raise ParameterError(f"found {value!r}; the FMU allows {_range_text(variable)}.", block=who, port=port)
-        return array
+            shown = [str(v) for v in self.description.other.values()]
+        except FmuError:
+            return text
+        more = f" and {len(shown) - 5} more" if len(shown) > 5 else ""
+        return f"{text} without ports for {', '.join(shown[:5])}{more}" if shown else text
 
     @property
     def description(self) -> FmuDescription:
@@ -186,21 +185,25 @@ class Fmu(Block):
 
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
-        """The FMU's inputs."""
+        """The FMU's inputs, and the parameters among ``ports``."""
         return {
-            self.rename.get(n, n): Input(
-                v.shape, v.unit, v.description, default=self.start.get(n), name=self.rename.get(n, n)
-            )
-            for n, v in self.description.of("input").items()
+            port: Input(v.shape, v.unit, v.description, default=self._default(v), name=port)
+            for port, v in self.input_variables.items()
         }
+
+    def _default(self, v: FmuVariable) -> Any:
+        """Return the value of an input that is not wired; None where one must be."""
+        if v.name in self.start:
+            return self.start[v.name]
+        array, index = self.description.elements.get(v.name, ("", ()))
+        if array in self.start:
+            return self.start[array][index]
+        return v.start if v.causality == "parameter" else None
 
     @property
     def outputs(self) -> Mapping[str, Output]:  # type: ignore[override]
-        """The FMU's outputs."""
-        return {
-            self.rename.get(n, n): Output(v.shape, v.unit, v.description, name=self.rename.get(n, n))
-            for n, v in self.description.of("output").items()
-        }
+        """The FMU's outputs, and the local variables among ``ports``."""
+        return {port: Output(v.shape, v.unit, v.description, name=port) for port, v in self.output_variables.items()}
 
     def __call__(self, *args: Any, **kwargs: Any) -> Call:
         """Wire the FMU: signals by position in the order of the inputs, or by keyword.
@@ -208,7 +211,7 @@ class Fmu(Block):
         Raises
         ------
         UnknownNameError
-            For a name that is no input, and for an input that is no Float64.
+            For a name that is no input, and for an input that no wire carries.
         """
         others = self.description.other
         for name in kwargs:
@@ -225,16 +228,26 @@ class Fmu(Block):
         raise UnknownAttributeError(self._no_port(name), block=self.label)
 
     def _no_port(self, name: str) -> str:
-        """Return the text of an error: it has no such output, or a port that is neither read nor set."""
+        """Return the text of an error: it has no such output, or a port that no wire carries."""
         other = self.description.other.get(name)
         if other is None:
             return f"it has no output {name!r}. {near(name, self.outputs)}"
-        return f"its {other.causality} {name!r} is of type {other.type}; expected Float64, others are not read yet."
+        return f"its {other.causality} {name!r} is of type {other.type}; expected numbers, which alone a wire carries."
 
     def __getitem__(self, name: Any) -> Signal:
         if isinstance(name, str):
             if name in self.outputs:
                 return Signal(self, name)
+            array, index = self.description.elements.get(name, ("", ()))
+            ports = [port for port, v in self.output_variables.items() if v.name == array]
+            if ports and len(index) == 1:
+                return Signal(self, ports[0])[index[0]]
+            if ports:
+                raise UnknownNameError(
+                    f"found {name!r}, an element of the matrix {ports[0]!r}, and a wire takes rows alone. Wire "
+                    f"plant[{ports[0]!r}][{index[0]}], or make its elements ports: rename={{{name!r}: …}}.",
+                    block=self.label,
+                )
             raise UnknownNameError(self._no_port(name), block=self.label)
         return super().__getitem__(name)
 
@@ -251,8 +264,8 @@ class Fmu(Block):
 
         The method is the first of these that the FMU supports: directional derivatives in model exchange
         (Continuous-Time Mode), in co-simulation (Step Mode); differences in model exchange, in co-simulation
-        (Initialization Mode; FMI 3.0, 2.2.11, 2.3.3, 3.2, 4.2). It loads an instance of its own. Discrete states and
-        parameters are constant.
+        (Initialization Mode). The clauses are FMI 2.0, 2.1.9, 3.2.3, 4.2.4, and FMI 3.0, 2.2.11, 2.3.3, 3.2, 4.2. It
+        loads an instance of its own. Discrete states and parameters are constant.
 
         Parameters
         ----------
@@ -290,9 +303,9 @@ class Fmu(Block):
         """Linearize a communication step: states and outputs after it, by the states before it and the held inputs.
 
         The method is differences of ``doStep`` in co-simulation. States are moved by their start values, the only way
-        that is allowed there (FMI 3.0, 4.2), inputs in Step Mode, from a saved state if the FMU can save one. Impacts
-        and switches within the step count. Memory that is no variable of the FMU starts anew with each difference, such
-        as that of its solver, or the side of a threshold.
+        that is allowed there (FMI 2.0, 4.2.4; FMI 3.0, 4.2), inputs between steps, from a saved state if the FMU can
+        save one. Impacts and switches within the step count. Memory that is no variable of the FMU starts anew with
+        each difference, such as that of its solver, or the side of a threshold.
 
         Parameters
         ----------
@@ -341,14 +354,3 @@ class Fmu(Block):
             yield instance
         finally:
             instance.close()
-
-
-def _unit_text(variable: FmuVariable) -> str:
-    return f" in {variable.unit}" if variable.unit else ""
-
-
-def _range_text(variable: FmuVariable) -> str:
-    low, high = variable.minimum, variable.maximum
-    if low is not None and high is not None:
-        return f"{low:g} to {high:g}{_unit_text(variable)}"
-    return f"at least {low:g}{_unit_text(variable)}" if low is not None else f"at most {high:g}{_unit_text(variable)}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -71,10 +70,13 @@ class _OperatingPoint:
         self.block, self.about, self.t = block, block.description, float(t)
         about = self.about
         self.states = list(about.states)
-        self.inputs, self.outputs = list(about.of("input")), list(about.of("output"))
+        self.port_of = {v.name: port for port, v in {**block.input_variables, **block.output_variables}.items()}
+        self.inputs, self.outputs = (
+            [v.name for v in chosen.values()] for chosen in (block.input_variables, block.output_variables)
+        )
         if not np.isfinite(self.t):
             raise ParameterError(f"found {t!r}; expected a time in s.", block=block.label, port="t")
-        ports = {block.rename.get(name, name): name for name in self.inputs}
+        ports = {self.port_of[name]: name for name in self.inputs}
         given_state = self._match_names(
             state, {name: name for name in self.states}, "state", block.description.discrete_states
         )
@@ -90,7 +92,7 @@ class _OperatingPoint:
                 if name not in known:
                     raise UnknownNameError(f"found {name!r}. {near(name, known)}", block=self.block.label, port=port)
             return {known[name]: value for name, value in given.items()}
-        vector, variables = np.ravel(np.asarray(given, dtype=float)), [self.about.variables[n] for n in names.values()]
+        vector, variables = np.ravel(np.asarray(given, dtype=float)), [self.about.find(n) for n in names.values()]
         sizes = [v.size for v in variables]
         if vector.size != sum(sizes):
             raise ParameterError(
@@ -114,8 +116,7 @@ class _OperatingPoint:
 
     def elements(self, names: list[str], *, ports: bool = False) -> tuple[str, ...]:
         """Return the names of all elements of variables."""
-        rename = self.block.rename if ports else {}
-        shapes = ((rename.get(n, n), self.about.variables[n].shape) for n in names)
+        shapes = ((self.port_of[n] if ports else n, self.about.find(n).shape) for n in names)
         return tuple(label for name, shape in shapes for label in elements(name, shape))
 
     def model(self, J: np.ndarray, x: np.ndarray, u: np.ndarray, values: np.ndarray, **more: Any) -> FmuLinearization:
@@ -149,7 +150,7 @@ def linear_model(
             "equations can't be linearized. Use step_difference(), or identify it from a run.",
             block=block.label,
         )
-    settable = all(about.variables[name].initial == "exact" for name in about.states)
+    settable = all(about.find(name).initial == "exact" for name in about.states)
     ways = (
         (True, True, about.model_exchange_has_derivatives and about.model_exchange is not None),
         (False, True, about.has_derivatives and settable),
@@ -181,7 +182,7 @@ def _initialize(point: _OperatingPoint, exchange: bool) -> Iterator[LoadedFmu]:
     """Load the FMU and enter Initialization Mode at the operating point."""
     instance = LoadedFmu(point.block, model_exchange=exchange)
     try:
-        exact = {n: v for n, v in point.given.items() if point.about.variables[n].initial == "exact"}
+        exact = {n: v for n, v in point.given.items() if point.about.find(n).initial == "exact"}
         instance.initialize(None, start_time=point.t, values=exact)
         yield instance
     finally:
@@ -192,26 +193,21 @@ def _enter_continuous_time(point: _OperatingPoint, instance: LoadedFmu) -> None:
     """Settle the events at the start, then set the states without an exact start value (FMI 3.0, 3.2)."""
     instance.begin()
     for _ in range(100):
-        if not instance.call("the events at the start", "updateDiscreteStates")[0]:
+        if not instance.call("the events at the start", instance.fmi.update_discrete_states):
             break
     else:
         raise FmuError(
             "the events at the start don't settle in 100 rounds. Choose another operating point.",
             block=point.block.label,
         )
-    instance.call("entering Continuous-Time Mode", "enterContinuousTimeMode")
-    guessed = [n for n in point.states if n in point.given and point.about.variables[n].initial != "exact"]
+    instance.call("entering Continuous-Time Mode", instance.fmi.enter_continuous_time_mode)
+    guessed = [n for n in point.states if n in point.given and point.about.find(n).initial != "exact"]
     if guessed:
         x = instance.values(point.states)
         where = point.about.layout(point.states).slices
         for name in guessed:
             x[where[name]] = np.ravel(point.given[name])
-        _set_states(instance, x)
-
-
-def _set_states(instance: LoadedFmu, x: np.ndarray) -> None:
-    vector = (ctypes.c_double * x.size)(*x)
-    instance.call("setting the continuous states", "setContinuousStates", vector, x.size)
+        instance.set_continuous_states(x)
 
 
 def _values(point: _OperatingPoint, instance: LoadedFmu) -> np.ndarray:
@@ -232,7 +228,7 @@ def _linearize_by_directions(point: _OperatingPoint, instance: LoadedFmu) -> Fmu
     found = []
     for name in (*point.states, *point.inputs):
         with _mode_of(point, instance, name):
-            size = about.variables[name].size
+            size = about.find(name).size
             found += [instance.directional_derivative(unknowns, [name], seed) for seed in np.eye(size).tolist()]
     J = np.array(found).reshape(len(found), values.size).T
     derivation = Derivation(DerivativeMethod.DIRECTIONAL, _interface_name(instance.model_exchange))
@@ -242,13 +238,13 @@ def _linearize_by_directions(point: _OperatingPoint, instance: LoadedFmu) -> Fmu
 @contextmanager
 def _mode_of(point: _OperatingPoint, instance: LoadedFmu, name: str) -> Iterator[None]:
     """Enter Event Mode for a discrete input of model exchange, and leave it again (FMI 3.0, 2.2.11)."""
-    discrete = instance.model_exchange and point.about.variables[name].variability == "discrete"
+    discrete = instance.model_exchange and point.about.find(name).variability == "discrete"
     if discrete:
-        instance.call("entering Event Mode", "enterEventMode")
+        instance.call("entering Event Mode", instance.fmi.enter_event_mode)
     yield
     if discrete:
-        instance.call("the events", "updateDiscreteStates")
-        instance.call("entering Continuous-Time Mode", "enterContinuousTimeMode")
+        instance.call("the events", instance.fmi.update_discrete_states)
+        instance.call("entering Continuous-Time Mode", instance.fmi.enter_continuous_time_mode)
 
 
 def _linearize_by_differences(point: _OperatingPoint, instance: LoadedFmu) -> FmuLinearization:
@@ -263,12 +259,12 @@ def _linearize_by_differences(point: _OperatingPoint, instance: LoadedFmu) -> Fm
     def evaluate(name: str, moved: np.ndarray) -> np.ndarray:
         with _mode_of(point, instance, name):
             if instance.model_exchange and name in point.states:
-                _set_states(instance, moved[: x.size])
+                instance.set_continuous_states(moved[: x.size])
             else:
                 instance.set_values({name: column.part(name, moved)})
             found = _values(point, instance)
             if instance.model_exchange and name in point.states:
-                _set_states(instance, x)
+                instance.set_continuous_states(x)
             else:
                 instance.set_values({name: column.part(name, column.at)})
         return found
@@ -291,7 +287,7 @@ def step_difference(
     point = _OperatingPoint(block, t, state, inputs)
     about = point.about
     for name in point.states:
-        if about.variables[name].initial != "exact":
+        if about.find(name).initial != "exact":
             raise FmuError(
                 "its state has no exact start value, and co-simulation allows to set it at the start only. Use "
                 "linear_model() through model exchange, or identify it from a run.",
@@ -308,21 +304,20 @@ def _linearize_step(point: _OperatingPoint, instance: LoadedFmu, h: float, relat
     x, u = instance.values(point.states), instance.values(point.inputs)
     point.check(x)
     at = about.layout(known).split(np.concatenate([x, u]))
-    saved = instance.call("saving its state", "getFMUState") if about.can_save else None
+    saved = instance.call("saving its state", instance.fmi.save_state) if about.can_save else None
 
     def step_from_point(
         set_before: Mapping[str, Any], set_after: Mapping[str, Any], *, first: bool = False
     ) -> np.ndarray:
         """Take a step from the operating point; states are set by the initialization, inputs in Step Mode."""
         if not first and saved is not None and not set_before:
-            instance.call("restoring its state", "setFMUState", saved)
+            instance.call("restoring its state", instance.fmi.set_state, saved)
         elif not first:
             instance.reset()
             instance.initialize(None, start_time=point.t, values={**point.given, **at, **set_before})
             instance.begin()
         instance.set_values(set_after)
-        _, terminate, early, _ = instance.call(f"a step by {h:g} s", "doStep", point.t, h, saved is None)
-        if terminate or early:
+        if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, saved is None):
             raise FmuError(
                 f"it ends its step from t = {point.t:.9g} s by {h:g} s early, so the step has no derivative. Take a "
                 "smaller h.",

@@ -11,10 +11,10 @@ from loopwright.diagrams.cli import main
 from loopwright.fmus import Fmu
 from loopwright.fmus.models import mass_spring_damper
 
-COUNT = (
-    b'<Int32 name="count" valueReference="9001" causality="output" variability="discrete" initial="exact" start="0"/>'
+COUNT = b'<Binary name="count" valueReference="9001" causality="output" variability="discrete"/>'
+MODE = (
+    b'<String name="mode" valueReference="9002" causality="input" variability="discrete"><Start value="off"/></String>'
 )
-MODE = b'<Boolean name="mode" valueReference="9002" causality="input" variability="discrete" start="false"/>'
 
 
 @pytest.fixture(scope="module")
@@ -38,14 +38,14 @@ def changed(file, path, *changes, entries=()):
 # --- types --------------------------------------------------------------------------------------------------------------
 
 
-def test_ports_that_are_no_float64_are_said_in_the_runs_messages(file, tmp_path):
+def test_ports_that_no_wire_carries_are_said_in_the_runs_messages(file, tmp_path):
     more = changed(file, tmp_path / "more.fmu", (b"</ModelVariables>", COUNT + MODE + b"</ModelVariables>"))
     plant = Fmu(more, name="plant", start={"force": 1.0})
     run = Diagram("d", plant()).simulate(0.01, step=1e-3, progress=False)
     (message,) = run.messages
     assert message == (
-        "plant: only Float64 is read and set yet: the outputs count (Int32) are not recorded; the inputs mode "
-        "(Boolean) keep their start values"
+        "plant: no wire carries texts, binaries and clocks: the outputs count (Binary) are not recorded; the inputs mode "
+        "(String) keep their start values"
     )
     assert (
         Diagram("d", Fmu(file, name="plant", start={"force": 1.0})()).simulate(0.01, step=1e-3, progress=False).messages
@@ -57,13 +57,15 @@ def test_using_such_a_port_says_its_type(file, tmp_path):
     plant = Fmu(
         changed(file, tmp_path / "more.fmu", (b"</ModelVariables>", COUNT + MODE + b"</ModelVariables>")), name="plant"
     )
-    with pytest.raises(AttributeError, match=r"plant: its output 'count' is of type Int32; expected Float64"):
+    with pytest.raises(AttributeError, match=r"plant: its output 'count' is of type Binary; expected numbers"):
         _ = plant.count
-    with pytest.raises(UnknownNameError, match=r"plant: its output 'count' is of type Int32; expected Float64"):
+    with pytest.raises(UnknownNameError, match=r"plant: its output 'count' is of type Binary; expected numbers"):
         _ = plant["count"]
-    with pytest.raises(UnknownNameError, match=r"plant: its input 'mode' is of type Boolean; expected Float64"):
+    with pytest.raises(UnknownNameError, match=r"plant: its input 'mode' is of type String; expected numbers"):
         plant(mode=Constant(value=1.0))
-    with pytest.raises(ParameterError, match=r"plant\.start\.mode: found a variable of type Boolean"):
+    with pytest.raises(
+        ParameterError, match=r"plant\.start\.mode: found 1 for a variable of type String; expected a text"
+    ):
         Fmu(plant.file, name="plant", start={"mode": 1})
 
 
@@ -75,7 +77,7 @@ def test_an_fmu_whose_outputs_are_all_of_other_types_is_refused(file, tmp_path):
         (b"</ModelVariables>", COUNT + b"</ModelVariables>"),
     )
     with pytest.raises(
-        FmuFileError, match=r"^plant: found only outputs that are no Float64.*: count \(Int32\); expected"
+        FmuFileError, match=r"^plant: found only outputs that no wire carries: count \(Binary\); expected"
     ):
         Fmu(none, name="plant")
 

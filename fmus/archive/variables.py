@@ -1,0 +1,189 @@
+"""Variables of an FMU, of FMI 2.0 or 3.0, in one form."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import UnitError, parse_unit
+
+_FMI2_TYPES = {"Real": "Float64", "Integer": "Int32"}
+_INTEGERS = {
+    f"{sign}Int{bits}": (0, 2**bits - 1) if sign else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+    for sign in ("", "U")
+    for bits in (8, 16, 32, 64)
+}
+_EXACT = 2**53
+"""Largest integer up to which a float64 holds every integer."""
+WIRE_TYPES = ("Float64", "Float32", *_INTEGERS, "Boolean", "Enumeration")
+"""Types that a wire carries, as FMI 3.0 names them."""
+
+
+@dataclass(frozen=True, eq=False)
+class FmuVariable:
+    """Variable of an FMU with numbers as values: a scalar, an array, or scalars that were gathered into an array."""
+
+    name: str
+    references: tuple[int, ...]
+    """Value references: one of a variable of the FMU, one for each element where scalars were gathered."""
+    causality: str
+    shape: tuple[int, ...]
+    unit: str | None
+    start: Any
+    description: str
+    minimum: float | np.ndarray | None
+    maximum: float | np.ndarray | None
+    nominal: float | np.ndarray | None = None
+    variability: str = "continuous"
+    initial: str = "exact"
+    """FMI's ``initial``; "exact" means that it starts at its start value (FMI 2.0, 2.2.7; FMI 3.0, 2.4.7.4)."""
+    type: str = "Float64"
+    """Type as FMI 3.0 names it; FMI 2.0's Real is Float64, its Integer is Int32."""
+    items: Mapping[str, int] = field(default_factory=dict)
+    """Values of an enumeration by their names."""
+
+    @property
+    def reference(self) -> int:
+        """Value reference, the first one of scalars that were gathered."""
+        return self.references[0]
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return int(np.prod(self.shape, dtype=int))
+
+    @property
+    def is_integer(self) -> bool:
+        """Whether only integers are values of its type; a Boolean has the values 0 and 1."""
+        return self.type not in ("Float64", "Float32")
+
+    @property
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest value of each element, infinite without one, in the variable's shape."""
+        low, high = (
+            np.broadcast_to(np.asarray(default if bound is None else bound, dtype=float), self.shape)
+            for bound, default in ((self.minimum, -np.inf), (self.maximum, np.inf))
+        )
+        return low, high
+
+    @property
+    def nominals(self) -> np.ndarray:
+        """Size of the usual values of each element, 1 where the FMU states none."""
+        given = 1.0 if self.nominal is None else self.nominal
+        found = np.abs(np.broadcast_to(np.asarray(given, dtype=float), self.shape))
+        return np.where(found > 0.0, found, 1.0)
+
+    def complaint(self, values: np.ndarray) -> str:
+        """Return the reason why values can't be those of this type, as "found …; expected …"; empty if they can.
+
+        Examples
+        --------
+        >>> count = FmuVariable("n", (0,), "input", (), None, 0, "", None, None, type="Int8")
+        >>> count.complaint(np.array(0.5))
+        'found 0.5; expected an integer, as it is of type Int8'
+        """
+        if self.type == "Float64":
+            return ""
+        numbers = np.ravel(np.asarray(values, dtype=float))
+        if self.type == "Float32":
+            limit = float(np.finfo(np.float32).max)
+            wrong = np.isfinite(numbers) & (np.abs(numbers) > limit)
+            return f"found {numbers[wrong][0]:.9g}; expected a number of type Float32" if wrong.any() else ""
+        whole = numbers == np.rint(numbers)  # false for NaN
+        if not whole.all():
+            kind = "0 or 1" if self.type == "Boolean" else "an integer"
+            return f"found {numbers[~whole][0]:.9g}; expected {kind}, as it is of type {self.type}"
+        low, high = (0, 1) if self.type == "Boolean" else _INTEGERS.get(self.type, _INTEGERS["Int64"])
+        wrong = (numbers < max(low, -_EXACT)) | (numbers > min(high, _EXACT))
+        if wrong.any():
+            value = numbers[wrong][0]
+            if low <= value <= high:
+                return (
+                    f"found {value:.17g}; expected at most 2**53 in size, up to which a signal holds every integer of "
+                    f"its type {self.type}"
+                )
+            return f"found {value:.17g}; expected {low} to {high}, as it is of type {self.type}"
+        if self.items:
+            wrong = ~np.isin(numbers, list(self.items.values()))
+            if wrong.any():
+                known = ", ".join(f"{value} ({name})" for name, value in self.items.items())
+                return f"found {numbers[wrong][0]:.9g}; expected one of its enumeration: {known}"
+        return ""
+
+
+@dataclass(frozen=True)
+class OtherVariable:
+    """Variable of an FMU that no wire carries: a text, binary data or a clock."""
+
+    name: str
+    type: str
+    causality: str
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.type})"
+
+
+def inexact(values: np.ndarray) -> bool:
+    """Whether integers of 64 bits can't all be held by a float64."""
+    return bool(np.any((values > _EXACT) | (values < -_EXACT)))
+
+
+def read_variable(v: Any, bounds: Mapping[int, Mapping[str, str]]) -> FmuVariable:
+    """Return a variable that FMPy has read; ``bounds`` holds attributes that it drops, by value reference."""
+    declared = v.declaredType
+    given = bounds.get(v.valueReference, {})
+
+    def attribute(name: str) -> Any:
+        found = getattr(v, name, None)
+        found = given.get(name) if found is None else found
+        return getattr(declared, name, None) if found is None else found
+
+    shape, type_ = tuple(v.shape or ()), fmi3_type(v.type)
+    items = {item.name: int(item.value) for item in declared.items} if declared is not None else {}
+    return FmuVariable(
+        v.name,
+        (v.valueReference,),
+        v.causality or "local",
+        shape,
+        _unit(attribute("unit")),
+        None if v.start is None else _start(v.start, shape),
+        v.description or (declared.description if declared is not None else None) or "",
+        _number(attribute("min")),
+        _number(attribute("max")),
+        _number(attribute("nominal")),
+        v.variability or "continuous",
+        v.initial or ("calculated" if v.causality in ("output", "local", None) else "exact"),
+        type_,
+        items if type_ == "Enumeration" else {},
+    )
+
+
+def fmi3_type(name: str) -> str:
+    """Return FMI 3.0's name of a type of FMI 2.0 or 3.0."""
+    return _FMI2_TYPES.get(name, name)
+
+
+def _number(text: Any) -> float | None:
+    return None if text is None else float(text)
+
+
+def _start(text: Any, shape: tuple[int, ...]) -> np.ndarray:
+    words = {"true": 1.0, "false": 0.0}
+    found = text.split() if isinstance(text, str) else np.ravel(text)
+    values = np.array([words[x] if x in words else float(x) for x in found])
+    full = np.broadcast_to(values, (int(np.prod(shape, dtype=int)),)) if values.size == 1 else values
+    return np.array(full).reshape(shape)
+
+
+def _unit(text: str | None) -> str | None:
+    """Return a unit that this library can read, else None."""
+    if text is None:
+        return None
+    try:
+        parse_unit(text)
+    except UnitError:
+        return None
+    return text

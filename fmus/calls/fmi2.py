@@ -1,0 +1,137 @@
+"""Calls of FMI 2.0."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from .fmi_calls import DISCARD, PENDING, FmiCalls, Log, StepCall, TypeCalls, allow_missing
+from .printf import Logger, format_message
+
+_LONGEST_WAIT = 0.01  # s between two looks at a step that is pending
+_REQUIRED = (
+    *("GetVersion", "Instantiate", "FreeInstance", "SetupExperiment"),
+    *("EnterInitializationMode", "ExitInitializationMode", "Terminate"),
+)
+
+
+class Fmi2Calls(FmiCalls):
+    """Functions of a library of FMI 2.0; clauses are those of FMI 2.0.4."""
+
+    prefix = "fmi2"
+    types: ClassVar = {
+        "Float64": TypeCalls("Real", ctypes.c_double),
+        "Int32": TypeCalls("Integer", ctypes.c_int32),
+        "Boolean": TypeCalls("Boolean", ctypes.c_int32),
+        "Enumeration": TypeCalls("Integer", ctypes.c_int32),
+    }
+
+    def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
+        from fmpy.fmi2 import FMU2Model, FMU2Slave
+
+        kind = allow_missing(FMU2Model if model_exchange else FMU2Slave, self.prefix, _REQUIRED)
+        self.fmu = kind(
+            guid=token,
+            modelIdentifier=library.stem,
+            unzipDirectory=str(folder),
+            instanceName=name,
+            libraryPath=str(library),
+        )
+
+    def instantiate(self, log: Log) -> None:
+        """Make the instance; its messages go to ``log``. Memory is the C library's (2.1.5)."""
+        from fmpy import calloc, free
+        from fmpy.fmi2 import (
+            fmi2CallbackAllocateMemoryTYPE,
+            fmi2CallbackFreeMemoryTYPE,
+            fmi2CallbackFunctions,
+            fmi2CallbackLoggerTYPE,
+        )
+
+        def message(
+            environment: Any, name: Any, status: int, category: Any, text: bytes | None, *arguments: Any
+        ) -> None:
+            log(status, format_message(text or b"", arguments))
+
+        self._logger = Logger(message)  # kept as long as the library may call it
+        callbacks = fmi2CallbackFunctions()
+        callbacks.logger = ctypes.cast(self._logger, fmi2CallbackLoggerTYPE)
+        callbacks.allocateMemory = fmi2CallbackAllocateMemoryTYPE(calloc)
+        callbacks.freeMemory = fmi2CallbackFreeMemoryTYPE(free)
+        self.fmu.instantiate(callbacks=callbacks, loggingOn=True)
+
+    def set_up(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
+        """Tell start, end and tolerance (2.1.6)."""
+        self.fmu.setupExperiment(tolerance=tolerance, startTime=start_time, stopTime=stop_time)
+
+    def enter_initialization_mode(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
+        """Enter Initialization Mode (2.1.6)."""
+        self.fmu.enterInitializationMode()
+
+    def _get(self, suffix: str, references: list[int], size: int) -> list[Any]:
+        return list(getattr(self.fmu, f"get{suffix}")(references))
+
+    def value_arguments(self, references: Any, count: int, address: int, size: int) -> tuple[Any, ...]:
+        """Return the arguments of a `value_function` (2.1.7)."""
+        component = ctypes.c_void_p(self.fmu.component)
+        return component, references, ctypes.c_size_t(count), ctypes.c_void_p(address)
+
+    @property
+    def final(self) -> ctypes.c_int:
+        """The flag noSetFMUStatePriorToCurrentPoint."""
+        return ctypes.c_int(True)
+
+    def step_call(self, now: ctypes.c_double, width: ctypes.c_double, final: Any) -> StepCall:
+        """Return fmi2DoStep with its arguments (4.2.2)."""
+        flags, component = (ctypes.c_bool * 4)(), ctypes.c_void_p(self.fmu.component)
+        any_flag = ctypes.c_uint32.from_buffer(flags)
+        arguments = (component, now, width, final)
+        return StepCall(self._function("fmi2DoStep"), arguments, any_flag, flags, ctypes.c_double(-math.inf))
+
+    def end_step(self, status: int) -> tuple[int, bool]:
+        """Wait for a step that is pending, and look whether a discarded one asks to end the simulation (4.2.2, 4.2.3).
+
+        The FMU gets no function stepFinished, so that it is asked for the status of its step.
+        """
+        from fmpy.fmi1 import FMICallException
+        from fmpy.fmi2 import fmi2DoStepStatus, fmi2Terminated
+
+        wait = 1e-5
+        while status == PENDING:
+            time.sleep(wait)
+            wait = min(2 * wait, _LONGEST_WAIT)
+            status = self.fmu.getStatus(fmi2DoStepStatus)
+        if status != DISCARD:
+            return status, False
+        try:
+            return status, bool(self.fmu.getBooleanStatus(fmi2Terminated))
+        except FMICallException:  # it does not say
+            return status, False
+
+    def do_step(self, t: float, h: float, final: bool) -> bool:
+        """Take a step; return whether it asks to end the simulation."""
+        from fmpy.fmi1 import FMICallException
+
+        try:
+            self.fmu.doStep(t, h, int(final))
+        except FMICallException as error:
+            status, ends = self.end_step(error.status)
+            if ends:
+                return True
+            if status > 1:
+                raise FMICallException(function=error.function, status=status) from None
+        return False
+
+    def directional_derivative(
+        self, unknowns: Sequence[int], knowns: Sequence[int], seed: Sequence[float], size: int
+    ) -> list[float]:
+        """Return the change of unknowns by a change of knowns (2.1.9)."""
+        return list(self.fmu.getDirectionalDerivative(list(unknowns), list(knowns), list(seed)))
+
+    def update_discrete_states(self) -> bool:
+        """Take a round of the event iteration (3.2.2)."""
+        return bool(self.fmu.newDiscreteStates()[0])

@@ -1,0 +1,92 @@
+"""Calls of FMI 3.0."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from .fmi_calls import FmiCalls, Log, StepCall, TypeCalls, allow_missing
+
+_INTEGERS = {f"{sign}Int{bits}": getattr(ctypes, f"c_{sign.lower()}int{bits}")
+             for sign in ("", "U") for bits in (8, 16, 32, 64)}  # fmt: skip
+_REQUIRED = ("GetVersion", "FreeInstance", "EnterInitializationMode", "ExitInitializationMode", "Terminate")
+
+
+class Fmi3Calls(FmiCalls):
+    """Functions of a library of FMI 3.0."""
+
+    prefix = "fmi3"
+    types: ClassVar = {
+        "Float64": TypeCalls("Float64", ctypes.c_double),
+        "Float32": TypeCalls("Float32", ctypes.c_float),
+        **{name: TypeCalls(name, ctype) for name, ctype in _INTEGERS.items()},
+        "Boolean": TypeCalls("Boolean", ctypes.c_bool),
+        "Enumeration": TypeCalls("Int64", ctypes.c_int64),
+    }
+
+    def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
+        from fmpy.fmi3 import FMU3Model, FMU3Slave
+
+        kind = allow_missing(FMU3Model if model_exchange else FMU3Slave, self.prefix, _REQUIRED)
+        self.fmu = kind(guid=token, modelIdentifier=library.stem, unzipDirectory=str(folder), instanceName=name)
+
+    def instantiate(self, log: Log) -> None:
+        """Make the instance; its messages go to ``log``."""
+
+        def message(environment: Any, status: int, category: bytes | None, text: bytes | None) -> None:
+            log(status, (text or b"").decode(errors="replace"))
+
+        self.fmu.instantiate(logMessage=message, loggingOn=True)
+
+    def set_up(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
+        """Do nothing: `enter_initialization_mode` takes them."""
+
+    def enter_initialization_mode(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
+        """Enter Initialization Mode (FMI 3.0, 2.3.2)."""
+        self.fmu.enterInitializationMode(tolerance=tolerance, startTime=start_time, stopTime=stop_time)
+
+    def _get(self, suffix: str, references: list[int], size: int) -> list[Any]:
+        return list(getattr(self.fmu, f"get{suffix}")(references, size))
+
+    def value_arguments(self, references: Any, count: int, address: int, size: int) -> tuple[Any, ...]:
+        """Return the arguments of a `value_function`."""
+        component, length = ctypes.c_void_p(self.fmu.component), ctypes.c_size_t
+        return component, references, length(count), ctypes.c_void_p(address), length(size)
+
+    @property
+    def final(self) -> ctypes.c_bool:
+        """The flag noSetFMUStatePriorToCurrentPoint."""
+        return ctypes.c_bool(True)
+
+    def step_call(self, now: ctypes.c_double, width: ctypes.c_double, final: Any) -> StepCall:
+        """Return fmi3DoStep with its arguments (FMI 3.0, 4.2.1)."""
+        flags = (ctypes.c_bool * 4)()  # event, terminate, early return, and one that is never set
+        reached, address, at = ctypes.c_double(-math.inf), ctypes.c_void_p, ctypes.addressof(flags)
+        arguments = (
+            *(ctypes.c_void_p(self.fmu.component), now, width, final),
+            *(address(at), address(at + 1), address(at + 2), ctypes.byref(reached)),
+        )
+        any_flag = ctypes.c_uint32.from_buffer(flags)
+        return StepCall(self._function("fmi3DoStep"), arguments, any_flag, flags, reached)
+
+    def end_step(self, status: int) -> tuple[int, bool]:
+        """Return the status: in FMI 3.0 a step is never pending, and flags ask to end the simulation."""
+        return status, False
+
+    def do_step(self, t: float, h: float, final: bool) -> bool:
+        """Take a step; return whether it ended early or asks to end the simulation."""
+        _, terminate, early, _ = self.fmu.doStep(t, h, final)
+        return bool(terminate or early)
+
+    def directional_derivative(
+        self, unknowns: Sequence[int], knowns: Sequence[int], seed: Sequence[float], size: int
+    ) -> list[float]:
+        """Return the change of unknowns by a change of knowns (FMI 3.0, 2.2.11)."""
+        return list(self.fmu.getDirectionalDerivative(list(unknowns), list(knowns), list(seed), size))
+
+    def update_discrete_states(self) -> bool:
+        """Take a round of the event iteration (FMI 3.0, 2.3.5)."""
+        return bool(self.fmu.updateDiscreteStates()[0])

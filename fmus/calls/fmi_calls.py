@@ -1,0 +1,228 @@
+"""The face that both versions of FMI show to an instance: what differs between them is behind it."""
+
+from __future__ import annotations
+
+import ctypes
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+STATUS = ("OK", "warning", "discard", "error", "fatal", "pending")
+WARNING, DISCARD, ERROR, FATAL, PENDING = range(1, 6)
+
+Log = Callable[[int, str], None]
+"""Takes the status and the text of a message."""
+
+
+@dataclass(frozen=True)
+class TypeCalls:
+    """Functions that get and set variables of a type, and the C type of their values."""
+
+    suffix: str
+    """End of the functions' names, such as ``Float64``."""
+    ctype: type[Any]
+
+
+@dataclass
+class StepCall:
+    """The function that takes a step, with arguments that are made once, so that no call checks their types."""
+
+    function: Callable[..., int]
+    arguments: tuple[Any, ...]
+    any_flag: ctypes.c_uint32
+    """Not zero if the function has set one of its flags."""
+    flags: Any
+    """Flags ``event``, ``terminate``, ``early``; all false in FMI 2.0, which has none."""
+    reached: ctypes.c_double
+    """Time at which a step has ended, in s; −∞ if the FMU does not say it, as in FMI 2.0."""
+
+
+def allow_missing(kind: Any, prefix: str, required: Sequence[str]) -> Any:
+    """Return a class of FMPy's that loads a library without some functions too; their calls return an error.
+
+    Tools leave out functions of capabilities that their FMUs don't have, though the standard asks for all of them.
+
+    Parameters
+    ----------
+    kind : type
+        Class of FMPy's.
+    prefix : str
+        Prefix of the functions' names.
+    required : sequence of str
+        Ends of the names of functions without which an FMU can't run.
+    """
+    needed = {f"{prefix}{name}" for name in required}
+
+    def load(fmu: Any) -> None:
+        for name in dir(fmu):
+            if name.startswith(prefix) and name not in needed and not hasattr(fmu.dll, name):
+                setattr(fmu.dll, name, ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR))
+        kind._loadFunctions(fmu)
+
+    return type(kind.__name__, (kind,), {"_loadFunctions": load})  # FMPy reads the version from the class's name
+
+
+class FmiCalls(ABC):
+    """Functions of an FMU's library for one instance.
+
+    Functions that fail raise an error of FMPy, with a ``status``; those that are not called at each step are methods.
+
+    Attributes
+    ----------
+    fmu : object
+        FMPy's object for the library.
+    """
+
+    prefix: ClassVar[str]
+    """Prefix of the names of functions and statuses: ``fmi2`` or ``fmi3``."""
+    types: ClassVar[dict[str, TypeCalls]]
+    """Functions by type, as FMI 3.0 names types."""
+    fmu: Any
+
+    @abstractmethod
+    def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
+        """Load a library, of an FMU that is unpacked into a folder; a name is given to the instance."""
+
+    # ---- the life of an instance ----
+
+    def version(self) -> str:
+        """Return the version of FMI that the library states."""
+        return str(self.fmu.getVersion())
+
+    @abstractmethod
+    def instantiate(self, log: Log) -> None:
+        """Make the instance; its messages go to ``log``."""
+
+    @abstractmethod
+    def set_up(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
+        """Tell start, end and tolerance before start values are set, where the version does so."""
+
+    @abstractmethod
+    def enter_initialization_mode(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
+        """Enter Initialization Mode."""
+
+    def exit_initialization_mode(self) -> None:
+        """Leave Initialization Mode."""
+        self.fmu.exitInitializationMode()
+
+    def reset(self) -> None:
+        """Return to the state before the initialization."""
+        self.fmu.reset()
+
+    def terminate(self) -> None:
+        """End the run of the instance."""
+        self.fmu.terminate()
+
+    def free_instance(self) -> None:
+        """Free the instance and unload the library."""
+        self.fmu.freeInstance()
+
+    # ---- values ----
+
+    def get(self, type_: str, references: Sequence[int], size: int) -> list[Any]:
+        """Return the values of variables of one type."""
+        return self._get(self.types[type_].suffix, list(references), size)
+
+    def set(self, type_: str, references: Sequence[int], values: Sequence[Any]) -> None:
+        """Set the values of variables of one type."""
+        getattr(self.fmu, f"set{self.types[type_].suffix}")(list(references), list(values))
+
+    def set_text(self, reference: int, text: str) -> None:
+        """Set a variable that is a text."""
+        self.fmu.setString([reference], [text])
+
+    @abstractmethod
+    def _get(self, suffix: str, references: list[int], size: int) -> list[Any]:
+        """Return values by the function with this suffix."""
+
+    def value_function(self, verb: str, type_: str) -> Callable[..., int]:
+        """Return the C function that gets or sets values of a type; it takes `value_arguments`."""
+        return self._function(f"{self.prefix}{verb}{self.types[type_].suffix}")
+
+    @abstractmethod
+    def value_arguments(self, references: Any, count: int, address: int, size: int) -> tuple[Any, ...]:
+        """Return the arguments of a `value_function`: a C array of references, and the address of the values."""
+
+    def _function(self, name: str) -> Callable[..., int]:
+        """Return a C function without declared arguments, which takes those that are made for it."""
+        function = self.fmu.dll[name]
+        function.restype = ctypes.c_int
+        return function  # type: ignore[no-any-return]
+
+    # ---- steps ----
+
+    @property
+    @abstractmethod
+    def final(self) -> Any:
+        """The flag noSetFMUStatePriorToCurrentPoint, as a C value that can be changed."""
+
+    @abstractmethod
+    def step_call(self, now: ctypes.c_double, width: ctypes.c_double, final: Any) -> StepCall:
+        """Return the function that takes a step from ``now`` over ``width``, both in s."""
+
+    @abstractmethod
+    def end_step(self, status: int) -> tuple[int, bool]:
+        """Return the status with which a step has ended, and whether the FMU asks to end the simulation.
+
+        It waits for a step that is pending.
+        """
+
+    @abstractmethod
+    def do_step(self, t: float, h: float, final: bool) -> bool:
+        """Take a step from t over h, both in s; return whether it ended early or asks to end the simulation."""
+
+    # ---- saved states and derivatives ----
+
+    def save_state(self) -> Any:
+        """Return the handle of a copy of the instance's memory."""
+        return self.fmu.getFMUState()
+
+    def set_state(self, handle: Any) -> None:
+        """Restore a saved state."""
+        self.fmu.setFMUState(handle)
+
+    def free_state(self, handle: Any) -> None:
+        """Free a saved state."""
+        self.fmu.freeFMUState(handle)
+
+    def serialize_state(self, handle: Any) -> bytes:
+        """Return a saved state as bytes."""
+        return bytes(self.fmu.serializeFMUState(handle))
+
+    def deserialize_state(self, data: bytes) -> Any:
+        """Return the handle of a state that was made from bytes."""
+        return self.fmu.deserializeFMUState(data)
+
+    @abstractmethod
+    def directional_derivative(
+        self, unknowns: Sequence[int], knowns: Sequence[int], seed: Sequence[float], size: int
+    ) -> list[float]:
+        """Return the change of unknowns by a change of knowns, by their references."""
+
+    # ---- model exchange ----
+
+    @abstractmethod
+    def update_discrete_states(self) -> bool:
+        """Take a round of the event iteration; return whether another one is needed."""
+
+    def enter_event_mode(self) -> None:
+        """Enter Event Mode."""
+        self.fmu.enterEventMode()
+
+    def enter_continuous_time_mode(self) -> None:
+        """Enter Continuous-Time Mode."""
+        self.fmu.enterContinuousTimeMode()
+
+    def set_continuous_states(self, x: np.ndarray) -> None:
+        """Set all continuous states, in the FMU's order."""
+        self.fmu.setContinuousStates((ctypes.c_double * x.size)(*x), x.size)
+
+    # ---- messages ----
+
+    def status_name(self, code: int) -> str:
+        """Return the name of a status (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3), such as ``fmi3Discard``."""
+        return f"{self.prefix}{STATUS[code].capitalize()}" if 0 <= code < len(STATUS) else f"status {code}"

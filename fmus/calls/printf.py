@@ -1,0 +1,101 @@
+"""Log messages of FMI 2.0: a printf format and its arguments (FMI 2.0, 2.1.5), which ctypes has no types for.
+
+On Linux, arguments after the fixed ones are in the registers and on the stack where further fixed ones would be. So the
+callback declares some, integers and floating-point numbers, and the format says which of them are there. A format that
+asks for more than was given shows nonsense or a question mark, but reads no invalid memory and writes none.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+_WORDS, _NUMBERS = 9, 8
+_HAS_ARGUMENTS = sys.platform == "linux" and platform.machine().lower() in ("x86_64", "amd64", "aarch64", "arm64")
+Logger = ctypes.CFUNCTYPE(
+    None,
+    *(ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p),
+    *((ctypes.c_int64,) * _WORDS + (ctypes.c_double,) * _NUMBERS if _HAS_ARGUMENTS else ()),
+)
+"""Type of the callback: environment, instance, status, category, format, and the arguments of the format."""
+
+_DIRECTIVE = re.compile(
+    r"%(?:(?P<percent>%)|(?P<flags>[-+ #0]*)(?P<width>\*|\d+)?(?:\.(?P<precision>\*|\d+)?)?"
+    r"(?P<length>hh|h|ll|l|z|j|t)?(?P<kind>[diouxXcsfFeEgGaAp]))"
+)
+_LONGEST = 2000
+
+
+def format_message(text: bytes, arguments: Sequence[Any]) -> str:
+    """Return the text of a message.
+
+    Parameters
+    ----------
+    text : bytes
+        The format.
+    arguments : sequence
+        Nine integers and eight floating-point numbers that may be its arguments; empty if they aren't known.
+
+    Examples
+    --------
+    >>> format_message(b"100 %% of %d", [7] * 9 + [0.5] * 8)
+    '100 % of 7'
+    """
+    words, numbers = iter(arguments[:_WORDS]), iter(arguments[_WORDS:])
+    return _DIRECTIVE.sub(lambda match: _convert(match, words, numbers), text.decode(errors="replace"))
+
+
+def _convert(match: re.Match[str], words: Iterator[int], numbers: Iterator[float]) -> str:
+    if match["percent"]:
+        return "%"
+    try:
+        width = next(words) if match["width"] == "*" else match["width"] or ""
+        precision = next(words) if match["precision"] == "*" else match["precision"]
+        flags, kind = match["flags"], match["kind"]
+        dot = "" if precision is None else f".{precision}"
+        if kind in "fFeEgG":
+            return f"%{flags}{width}{dot}{kind}" % next(numbers)
+        if kind in "aA":
+            return next(numbers).hex()
+        word = next(words)
+        if kind == "s":
+            return f"%{flags}{width}{dot}s" % _read_text(word)
+        if kind == "p":
+            return hex(word)
+        if kind == "c":
+            return chr(word & 0xFF)
+        bits = {"hh": 8, "h": 16, None: 32}.get(match["length"], 64)
+        word &= (1 << bits) - 1
+        if kind in "di" and word >> (bits - 1):
+            word -= 1 << bits
+        return f"%{flags}{width}{dot}{'d' if kind in 'diu' else kind}" % word
+    except (StopIteration, ValueError, TypeError, OverflowError):
+        return match[0]
+
+
+def _read_text(address: int) -> str:
+    """Return the text at an address, "?" if there is no memory: the system reads it, which can refuse."""
+    if not address:
+        return "(null)"
+    reader, writer = os.pipe()
+    try:
+        write = ctypes.CDLL(None, use_errno=True).write
+        write.restype, write.argtypes = ctypes.c_ssize_t, (ctypes.c_int, ctypes.c_void_p, ctypes.c_size_t)
+        found = b""
+        address &= (1 << 64) - 1
+        while len(found) < _LONGEST and b"\0" not in found:
+            size = 256 - address % 256  # never beyond a page
+            got = write(writer, address, size)
+            if got <= 0:
+                return found.decode(errors="replace") or "?"
+            found += os.read(reader, got)
+            address += got
+        return found.partition(b"\0")[0].decode(errors="replace")
+    finally:
+        os.close(reader)
+        os.close(writer)

@@ -1,0 +1,139 @@
+"""Values of ports between a flat vector of float64 and an FMU's functions for each type."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import Layout
+from ..archive import FmuVariable, inexact
+from .fmi_calls import FmiCalls
+
+
+class Transfer:
+    """Calls that get or set the values of ports, all of one type in one call.
+
+    Float64 values are read and written in the vector itself if all ports are of that type.
+
+    Parameters
+    ----------
+    fmi : FmiCalls
+        Functions of the instance.
+    verb : {"Get", "Set"}
+        Direction.
+    ports : dict
+        Variables by port.
+    vector : array
+        Values of all ports, one after the other.
+    """
+
+    def __init__(self, fmi: FmiCalls, verb: str, ports: dict[str, FmuVariable], vector: np.ndarray):
+        self.groups: list[TypeGroup] = []
+        self.vector = vector
+        places = Layout.of({port: v.shape for port, v in ports.items()}).slices
+        for type_ in dict.fromkeys(v.type for v in ports.values()):
+            chosen = {port: v for port, v in ports.items() if v.type == type_}
+            self.groups.append(TypeGroup(fmi, verb, type_, chosen, {p: places[p] for p in chosen}, vector))
+        self.is_plain = all(group.direct for group in self.groups)
+
+    @property
+    def plain_call(self) -> tuple[Callable[..., int], tuple[Any, ...]] | None:
+        """The one call of a plain transfer; None without ports."""
+        return (self.groups[0].function, self.groups[0].arguments) if self.groups else None
+
+    def set(self) -> int:
+        """Set the values of the vector, and return the first status that is no success.
+
+        Raises
+        ------
+        UnfitError
+            If a value is none of its port's type; nothing of this type has been set then.
+        """
+        for group in self.groups:
+            group.check_and_fill(self.vector)
+        for group in self.groups:
+            if (status := group.function(*group.arguments)) > 1:
+                return status
+        return 0
+
+    def get(self) -> int:
+        """Get the values into the vector, and return the first status that is no success.
+
+        Raises
+        ------
+        UnfitError
+            If a value is an integer that the vector can't hold.
+        """
+        for group in self.groups:
+            if (status := group.function(*group.arguments)) > 1:
+                return status
+            group.spread(self.vector)
+        return 0
+
+
+class UnfitError(Exception):
+    """A value that doesn't fit: its port, and the reason, as "found …; expected …"."""
+
+    def __init__(self, port: str, reason: str):
+        super().__init__(port, reason)
+        self.port, self.reason = port, reason
+
+
+class TypeGroup:
+    """Ports of one type: the buffer of their values, and their places in the vector."""
+
+    def __init__(
+        self,
+        fmi: FmiCalls,
+        verb: str,
+        type_: str,
+        ports: dict[str, FmuVariable],
+        places: dict[str, slice],
+        vector: np.ndarray,
+    ):
+        self.ports, self.places = ports, places
+        references = [r for v in ports.values() for r in v.references]
+        self.size = sum(v.size for v in ports.values())
+        self.direct = type_ == "Float64" and self.size == vector.size
+        self.is_integer = any(v.is_integer for v in ports.values())
+        self.index = np.concatenate([np.arange(s.start, s.stop) for s in places.values()])
+        kept = (ctypes.c_uint * max(1, len(references)))(*references)
+        if self.direct:
+            self.buffer: np.ndarray = vector
+        else:
+            self.buffer = np.zeros(max(1, self.size), dtype=fmi.types[type_].ctype)
+        self._kept = kept  # as long as its address is in the arguments
+        self.function = fmi.value_function(verb, type_)
+        self.arguments = fmi.value_arguments(kept, len(references), self.buffer.ctypes.data, self.size)
+
+    def check_and_fill(self, vector: np.ndarray) -> None:
+        """Copy the values of the vector into the buffer."""
+        if self.direct:
+            return
+        for port, where in self.places.items():
+            if reason := self.ports[port].complaint(vector[where]):
+                raise UnfitError(port, reason)
+        self.buffer[: self.size] = vector[self.index]
+
+    def spread(self, vector: np.ndarray) -> None:
+        """Copy the values of the buffer into the vector."""
+        if self.direct:
+            return
+        if self.is_integer and self.buffer.itemsize == 8 and inexact(self.buffer):
+            port, value = next(
+                (port, value)
+                for port, values in zip(self.ports, self._split(), strict=True)
+                for value in values
+                if inexact(value)
+            )
+            raise UnfitError(
+                port, f"found {value}; expected at most 2**53 in size, up to which a signal holds every integer"
+            )
+        vector[self.index] = self.buffer[: self.size]
+
+    def _split(self) -> Sequence[np.ndarray]:
+        ends = np.cumsum([v.size for v in self.ports.values()])[:-1]
+        return np.split(self.buffer[: self.size], ends)

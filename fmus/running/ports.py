@@ -1,0 +1,115 @@
+"""Ports of an FMU's block: which of its variables they are, and their names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+from ...blocks.core import ParameterError, UnknownNameError, near
+from ..archive import FmuDescription, FmuVariable
+
+
+@dataclass(frozen=True, eq=False)
+class FmuPorts:
+    """Variables of an FMU by the names of their ports, in the order of the file."""
+
+    inputs: dict[str, FmuVariable]
+    outputs: dict[str, FmuVariable]
+
+
+@lru_cache(maxsize=64)
+def choose_ports(
+    description: FmuDescription, rename: tuple[tuple[str, str], ...], chosen: tuple[str, ...] | None, label: str
+) -> FmuPorts:
+    """Return the ports of a block.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU's description.
+    rename : tuple of pairs of str
+        Variables and the names of their ports. Scalars of a gathered array that are renamed are ports of their own,
+        and so are the array's other scalars.
+    chosen : tuple of str, optional
+        Variables that are ports; None for all inputs and outputs.
+    label : str
+        The block's name, for messages.
+
+    Raises
+    ------
+    UnknownNameError, ParameterError
+        For a name that is no variable, a variable that can't be a port, and two ports of one name.
+    """
+    names = dict(rename)
+    if chosen is not None:
+        _check_chosen(description, chosen, label)
+    split = {description.elements[n][0] for n in (*names, *(chosen or ())) if _is_part(description, n)}
+    split -= set(chosen or ())
+    both: tuple[dict[str, FmuVariable], dict[str, FmuVariable]] = {}, {}
+    known: list[str] = []
+    for variable in _variables(description, split):
+        name, array = variable.name, description.elements.get(variable.name, ("",))[0]
+        if chosen is None:
+            side = {"input": 0, "output": 1}.get(variable.causality)
+        else:
+            side = _side(variable) if name in chosen or (array in chosen and array in split) else None
+        if side is None:
+            continue
+        known.append(name)
+        port = names.get(name, name)
+        if port in both[0] or port in both[1]:
+            raise ParameterError(
+                "found one name for two ports; rename them to different names.", block=label, port="rename"
+            )
+        both[side][port] = variable
+    for old in names:
+        if old not in known:
+            raise UnknownNameError(f"it has no port {old!r} to rename. {near(old, known)}", block=label, port="rename")
+    return FmuPorts(*both)
+
+
+def _is_part(description: FmuDescription, name: str) -> bool:
+    return name in description.elements and name not in description.variables
+
+
+def _variables(description: FmuDescription, split: set[str]) -> Iterator[FmuVariable]:
+    """Yield all variables, and the scalars of the arrays that are split in their place."""
+    parts: dict[str, list[str]] = {array: [] for array in split}
+    for name, (array, _) in description.elements.items():
+        if array in parts:
+            parts[array].append(name)
+    for name, variable in description.variables.items():
+        if name in parts:
+            yield from (description.element(part) for part in parts[name])
+        else:
+            yield variable
+
+
+def _side(variable: FmuVariable) -> int | None:
+    """Return 0 for a variable that a wire can set, 1 for one that is read, None for others."""
+    if variable.causality == "input" or (variable.causality == "parameter" and variable.variability == "tunable"):
+        return 0
+    return 1 if variable.causality in ("output", "local", "calculatedParameter") else None
+
+
+def _check_chosen(description: FmuDescription, chosen: tuple[str, ...], label: str) -> None:
+    for name in chosen:
+        if name in description.other:
+            raise ParameterError(
+                f"found {name!r} of type {description.other[name].type}, which no wire carries. Leave it out.",
+                block=label,
+                port="ports",
+            )
+        if name not in description.names:
+            raise UnknownNameError(
+                f"the FMU has no variable {name!r}. {near(name, description.names)}", block=label, port="ports"
+            )
+        variable = description.find(name)
+        if _side(variable) is None:
+            raise ParameterError(
+                f"found {name!r}, a {variable.variability} {variable.causality}; expected an input, an output, a local "
+                "variable or a tunable parameter. Give it a value in start= instead.",
+                block=label,
+                port="ports",
+            )

@@ -1,0 +1,125 @@
+"""Start values of an FMU's variables, checked against its description."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import ParameterError, UnknownNameError, near
+from ..archive import FmuDescription, FmuVariable
+
+
+def check_start(description: FmuDescription, start: Mapping[str, Any], label: str) -> dict[str, Any]:
+    """Return start values in their variables' shapes; values of a gathered array's scalars are merged into the array.
+
+    Raises
+    ------
+    UnknownNameError, ParameterError
+        For an unknown variable, one that can't be set, another shape or type, a value out of its range, and an array
+        that is given twice.
+    """
+    found: dict[str, Any] = {}
+    parts: dict[str, dict[str, Any]] = {}
+    for name, value in start.items():
+        checked = check_value(description, name, value, label)
+        array = description.elements[name][0] if name in description.elements else name
+        if array == name or name in description.variables:
+            found[name] = checked
+        else:
+            parts.setdefault(array, {})[name] = checked
+    for array, values in parts.items():
+        if array in found:
+            raise ParameterError(
+                f"found values for {array} and for {', '.join(values)}; give each element once.",
+                block=label,
+                port=f"start.{array}",
+            )
+        whole, total = description.variables[array], sum(1 for a, _ in description.elements.values() if a == array)
+        if whole.start is None and len(values) < total:
+            found.update(values)
+            continue
+        merged = np.zeros(whole.shape) if whole.start is None else np.array(whole.start)
+        for name, value in values.items():
+            merged[description.elements[name][1]] = value
+        found[array] = merged
+    return found
+
+
+def check_value(description: FmuDescription, name: str, value: Any, label: str) -> Any:
+    """Return one start value in its variable's shape, or a text, after checking it; see `check_start`."""
+    port = f"start.{name}"
+    if name in description.other:
+        return _check_text(description, name, value, label)
+    if name not in description.names:
+        known = {*description.names, *description.texts}
+        raise UnknownNameError(f"the FMU has no variable {name!r}. {near(name, known)}", block=label, port="start")
+    variable = description.find(name)
+    if variable.causality in ("output", "local") and variable.start is None:
+        raise ParameterError(
+            "found a variable that is computed and has no start value; set the states and parameters that it "
+            "depends on.",
+            block=label,
+            port=port,
+        )
+    if variable.variability == "constant" or variable.causality in ("calculatedParameter", "structuralParameter"):
+        kind = {"calculatedParameter": "a parameter that is computed", "structuralParameter": "a structural parameter"}
+        raise ParameterError(
+            f"found {kind.get(variable.causality, 'a constant')}, which can't be set; expected a parameter, a state or "
+            "an input. Leave it out.",
+            block=label,
+            port=port,
+        )
+    try:
+        numbers = _number_items(variable, value)
+        array = np.array(np.broadcast_to(np.asarray(numbers, dtype=float), variable.shape))
+    except (TypeError, ValueError):
+        raise ParameterError(
+            f"found {value!r}; expected numbers of shape {variable.shape}.", block=label, port=port
+        ) from None
+    if not np.all(np.isfinite(array)):
+        raise ParameterError(f"found {value!r}; expected finite numbers{_unit_text(variable)}.", block=label, port=port)
+    if reason := variable.complaint(array):
+        raise ParameterError(f"{reason}. Give another value.", block=label, port=port)
+    low, high = variable.limits
+    if np.any((array < low) | (array > high)):
+        raise ParameterError(f"found {value!r}; the FMU allows {_range_text(variable)}.", block=label, port=port)
+    return array
+
+
+def _check_text(description: FmuDescription, name: str, value: Any, label: str) -> str:
+    type_ = description.other[name].type
+    if name in description.texts and isinstance(value, str):
+        return value
+    expected = "a text" if name in description.texts else "numbers or a text, which alone can be set"
+    found = f"{value!r} for" if name in description.texts else ""
+    raise ParameterError(
+        f"found {found} a variable of type {type_}; expected {expected}. "
+        f"{'Give a str' if name in description.texts else 'Leave it out'}.".replace("found  ", "found "),
+        block=label,
+        port=f"start.{name}",
+    )
+
+
+def _number_items(variable: FmuVariable, value: Any) -> Any:
+    """Return numbers for the names of an enumeration."""
+    if isinstance(value, str) and value in variable.items:
+        return variable.items[value]
+    return value
+
+
+def _unit_text(variable: FmuVariable) -> str:
+    return f" in {variable.unit}" if variable.unit else ""
+
+
+def _range_text(variable: FmuVariable) -> str:
+    low, high = variable.limits
+    least, most = float(np.max(low)), float(np.min(high))
+    if np.ptp(np.nan_to_num(low)) or np.ptp(np.nan_to_num(high)):
+        return f"{low.tolist()} to {high.tolist()}{_unit_text(variable)}"
+    if np.isfinite(least) and np.isfinite(most):
+        return f"{least:g} to {most:g}{_unit_text(variable)}"
+    return (
+        f"at least {least:g}{_unit_text(variable)}" if np.isfinite(least) else f"at most {most:g}{_unit_text(variable)}"
+    )
