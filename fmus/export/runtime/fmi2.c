@@ -169,7 +169,7 @@ fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference
 
 /* ---- stepping (FMI 2.0, 4.2.2) ---- */
 
-static bool lw_check_step(lw_instance *self, double t, double h) {
+static inline bool lw_check_step(lw_instance *self, double t, double h) {
     double now = self->s.values[0], tolerance = 1e-12 * fabs(now) + 1e-6 * fabs(h);
     if (!lw_in_mode(self, "fmi2DoStep", LW_STEPPING)) return false;
     if (!(isfinite(h) && h > 0))

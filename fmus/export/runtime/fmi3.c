@@ -164,7 +164,7 @@ fmi3Status fmi3SetFloat64(fmi3Instance instance, const fmi3ValueReference valueR
 
 /* ---- stepping (FMI 3.0, 4.2.1) ---- */
 
-static bool lw_check_step(lw_instance *self, double t, double h) {
+static inline bool lw_check_step(lw_instance *self, double t, double h) {
     double now = self->s.values[0], tolerance = 1e-12 * fabs(now) + 1e-6 * fabs(h);
     if (!lw_in_mode(self, "fmi3DoStep", LW_STEPPING)) return false;
     if (!(isfinite(h) && h > 0))

@@ -32,7 +32,7 @@ static inline int lw_rk4(lw_instance *self, double t, double h, const double *u,
 }
 
 /* Number of equal substeps of at most internal_step in h; negative, and logged, if too many. */
-static long lw_substeps(lw_instance *self, double h) {
+static inline long lw_substeps(lw_instance *self, double h) {
     double step = self->s.values[LW_STEP], count = ceil(h / step - 1e-9);
     if (count <= LW_MAX_SUBSTEPS) return count < 1.0 ? 1 : (long)count;
     lw_fail(self, "internal_step = %g s cuts the communication step of %g s into more than 1e9 pieces. Set a larger one.", step, h);
@@ -55,7 +55,7 @@ static inline bool lw_integrate(lw_instance *self, double t0, double h, long n, 
     return !failed && (!LW_N_X || lw_is_finite(x, LW_N_X));
 }
 
-static bool lw_fixed_steps(lw_instance *self, double t, double h) {
+static inline bool lw_fixed_steps(lw_instance *self, double t, double h) {
     long n = lw_substeps(self, h);
     if (n < 0) return false;
     const double *u = lw_inputs_of_step(self);

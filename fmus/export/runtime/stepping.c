@@ -5,7 +5,7 @@
 #define LW_SAME_INPUT 1e-12 /* an input that has moved to a value and is then set to it is equal but for rounding */
 
 /* Have the inputs jumped since the last step? Then an adaptive integrator starts anew. */
-static bool lw_inputs_jumped(const lw_instance *self) {
+static inline bool lw_inputs_jumped(const lw_instance *self) {
     const double *v = self->s.values;
 #if LW_MOVING_INPUTS
     for (int i = 0; i < LW_N_U && self->s.moved; i++) {
@@ -224,7 +224,7 @@ static bool lw_advance(lw_instance *self, double t, double h, double *end) {
     return true;
 }
 
-static bool lw_try_step(lw_instance *self, double t, double h) {
+static inline bool lw_try_step(lw_instance *self, double t, double h) {
     double *v = self->s.values, end = t + h;
     if (self->update) { /* time, states and held inputs are those of the last update */
         if (!lw_advance(self, t, h, &end)) return false;
@@ -264,7 +264,7 @@ static bool lw_try_step(lw_instance *self, double t, double h) {
 
 /* Step from t over h, or to the first event (self->event_found; the time is then values[0]). A failure changes nothing:
  * time, states, domains and outputs are those before the step. */
-static bool lw_step(lw_instance *self, double t, double h) {
+static inline bool lw_step(lw_instance *self, double t, double h) {
     double step_size = self->s.step_size;
 #if LW_N_Z
     double last_fired[LW_N_Z], last_but_one[LW_N_Z];

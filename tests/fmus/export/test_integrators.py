@@ -71,12 +71,12 @@ def test_the_error_follows_the_tolerance(instance, integrator):
 
 
 @pytest.mark.drawn(1)
-@pytest.mark.parametrize("tolerance", [1e-6, 1e-8, 1e-10])
-def test_a_stiff_model_against_radau(instance, tolerance):
-    """Van der Pol, mu = 1000: two periods and a half, through six layers of width 1/mu."""
+@pytest.mark.parametrize(("tolerance", "end"), [(1e-6, 900.0), (1e-6, 2000.0), (1e-8, 2000.0), (1e-10, 2000.0)])
+def test_a_stiff_model_against_radau(instance, tolerance, end):
+    """Van der Pol, mu = 1000: in 2000 s two periods and a half, through six layers of width 1/mu."""
     item = instance(build_fmu(van_der_pol()))
     item.initialize(tolerance=tolerance)
-    times = np.linspace(0.0, 2000.0, 21)
+    times = np.arange(0.0, end + 50.0, 100.0)
     reference = truth(
         lambda t, x: [x[1], 1000.0 * (1.0 - x[0] ** 2) * x[1] - x[0]], [2.0, 0.0], times, "Radau", 1e-10,
         jac=lambda t, x: [[0.0, 1.0], [-2000.0 * x[0] * x[1] - 1.0, 1000.0 * (1.0 - x[0] ** 2)]],
