@@ -53,7 +53,7 @@ class Texts:
     Examples
     --------
     >>> Texts("loopwright.diagrams.report", "figures").line("sensitivities", wire="u")
-    'Sensitivity S and complementary sensitivity T at u; ○ are M_s and M_t.'
+    'Sensitivity S and complementary sensitivity T at u. ○: M_s and M_t.'
     """
 
     package: str

@@ -121,6 +121,7 @@ def test_it_starts_at_rest_at_its_initial_value():
     np.testing.assert_allclose(got, 2.5, rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_smooth_input_comes_out_later():
     def smooth(t):
         return np.exp(-((t - 1.5) ** 2) / 0.1)

@@ -119,6 +119,7 @@ def test_a_pid_in_continuous_time_settles_after_its_limit(anti_windup):
     assert run["pid.u"].max() == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_a_delay_in_a_loop_is_the_method_of_steps():
     # y' = −y(t − 1), y = 0 before, from y(0) = 1: 1, then 1 − (t − 1), then + (t − 2)²/2, …
     y = Integrator(initial_value=1.0, name="y")
@@ -146,6 +147,7 @@ def test_a_transport_delay_in_a_sampled_box_is_a_delay_by_samples():
         simulate(wrong(Clock()()), duration=1.0)
 
 
+@pytest.mark.slow
 def test_a_pade_delay_of_a_smooth_signal_is_near_the_true_one():
     hump = Function(lambda t: np.exp(-((t - 1.5) ** 2) / 0.1), name="hump")(Clock()())
     run = tight(PadeDelay(delay=0.4, order=8, name="p")(hump), TransportDelay(delay=0.4, name="d")(hump), duration=3.0)

@@ -136,6 +136,7 @@ def test_play_of_a_sine_is_its_closed_form_in_continuous_time():
     assert [n for _, n in log if n != ("turn",)] == [("push",), ("pull",), ("push",), ("pull",), ("push",)]
 
 
+@pytest.mark.slow
 def test_play_at_fine_ticks_comes_to_that_of_continuous_time():
     signal = lambda t: np.sin(3.0 * t) + 0.4 * np.sin(7.3 * t)  # noqa: E731
     rate = lambda t: 3.0 * np.cos(3.0 * t) + 2.92 * np.cos(7.3 * t)  # noqa: E731

@@ -87,6 +87,7 @@ def times(run, event):
 # --- continuous time ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_thermostat_switches_when_its_closed_form_does():
     heater = Relay(on_point=-19.0, off_point=-21.0, on_value=30.0, off_value=10.0, initially_on=True, name="heater")
     room = Lag(time_constant=10.0, start=20.0, name="room")
@@ -101,6 +102,7 @@ def test_a_thermostat_switches_when_its_closed_form_does():
     assert run["room.y"].max() < 21.0 + 1e-9
 
 
+@pytest.mark.slow
 def test_the_area_under_a_quantized_sine_is_that_of_its_steps():
     q, end = 0.25, 2.0
     area = Area()

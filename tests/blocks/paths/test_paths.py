@@ -394,7 +394,7 @@ def test_contact_curvature_is_smooth_where_its_series_takes_over():
             assert value == pytest.approx(float(exact), rel=1e-6)
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("name", ["closed spline", "open spline", "bean", "three points, closed"])
 def test_up_to_its_reach_a_point_is_the_nearest_and_beyond_it_is_not(name):
     path = PATHS[name]
@@ -453,7 +453,7 @@ def test_projection_is_the_global_minimum(path):
         assert 0.0 <= theta < path.period if path.closed else path.domain[0] <= theta <= path.domain[1]
 
 
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(2)
 @EVERY
 def test_projection_undoes_going_off_the_path_within_reach(path):
     rng = np.random.default_rng(4)
@@ -682,7 +682,7 @@ def test_beyond_an_end_there_are_no_path_coordinates(name):
 # --- values -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(1)
 @EVERY
 def test_paths_are_values_whatever_has_been_tabulated(path):
     fresh = path.replace()

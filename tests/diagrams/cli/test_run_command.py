@@ -281,7 +281,7 @@ def test_a_plant_that_is_no_fmu(tmp_path, capsys):
     text.write_text("not a zip archive")
     assert main(["run", "A", "--plant", str(text), "--out", str(tmp_path / "out")]) == 2
     assert (
-        f"plant: {str(text)!r} is no FMU: it is no zip archive (it starts with b'not a zi')." in capsys.readouterr().err
+        f"plant: {str(text)!r} is no FMU: it is no zip archive (it starts with b'not a zi')" in capsys.readouterr().err
     )
 
 

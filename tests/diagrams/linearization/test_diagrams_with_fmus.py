@@ -20,6 +20,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Channel, Diagram, Rig, fig3, subsystem
 from loopwright.fmus import Fmu, dc_motor, gantry, mass_spring_damper
+from support.contact import parameters
 
 T = 1e-3
 WAYS = [("model_exchange", True), ("co_simulation", True), ("model_exchange", False), ("co_simulation", False)]
@@ -231,8 +232,9 @@ def test_a_slow_box_around_an_fmu_that_is_stepped_at_every_tick():
 
 def test_outputs_on_the_move_are_those_at_the_tick_not_after_the_step():
     """The acceleration follows the friction's slope, which changes within a step of 20 ms."""
-    h, model = 0.02, gantry.Gantry(start_velocity=(0.02, 0.03), gravity=0.0)
-    plant = Fmu(gantry.build(model), start={"external_force": (0.0, 0.0)}, name="plant")
+    h, model = 0.02, gantry.Gantry(gravity=0.0)
+    start = {"external_force": (0.0, 0.0), "velocity": (0.02, 0.03), "gravity": 0.0}
+    plant = Fmu(gantry.build(), start=start, name="plant")
 
     @subsystem(sample_time=h)
     def controller(a):
@@ -250,7 +252,7 @@ def test_outputs_on_the_move_are_those_at_the_tick_not_after_the_step():
         v, before = state[:2], state[2:]
         u = -0.5 * acceleration(v, before) + np.array([20.0, 10.0])
         f = lambda t, v: acceleration(v, u + d)  # noqa: E731
-        end = solve_ivp(f, (0, h), v, method="Radau", rtol=1e-12, atol=1e-13).y[:, -1]
+        end = solve_ivp(f, (0, h), v, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
         return np.concatenate([end, u + d, u])
 
     point = lin.point.plants["plant"]
@@ -293,11 +295,10 @@ def at_rest(theta=0.0, offset=0.0, *, model=FREE, plant=FREE, **rig):
     angle = 2 * np.pi * theta
     point = np.array([0.5 + 0.3 * np.cos(angle), 0.5 + 0.15 * np.sin(angle)])
     normal = frame(theta)[:, 1]
-    file = gantry.build(plant)
 
     def diagram(eta):
         return fig3(
-            Fmu(file, start={"position": point + offset * normal}, name="plant"),
+            Fmu(gantry.build(), start=parameters(plant) | {"position": point + offset * normal}, name="plant"),
             PATH,
             Channel(reference=Reference(value=eta)),
             Channel(reference=Reference(value=offset)),

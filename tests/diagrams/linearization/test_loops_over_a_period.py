@@ -72,6 +72,7 @@ def test_the_gain_margin_with_an_offset_is_where_the_diagram_becomes_unstable():
     assert found == pytest.approx(limit(lambda k: offset(0.03, k)), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_wire_that_is_renewed_once_in_the_period_has_the_gain_margin_of_the_diagram():
     model = cascade().linearize()
     L, z = model.loop("reference"), np.exp(0.3j)
@@ -79,6 +80,7 @@ def test_a_wire_that_is_renewed_once_in_the_period_has_the_gain_margin_of_the_di
     assert model.sensitivity("reference")(z) == pytest.approx(1.0 / (1.0 + L(z)), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_a_signal_that_changes_often_but_is_read_once_in_the_period_has_a_loop():
     L = cascade().linearize().loop("mechanic.y")
     assert L.ninputs == 1

@@ -105,6 +105,7 @@ def test_fig3_answers_other_test_signals_alike(kind):
     assert np.all(np.isnan(found.distortion)) == (kind == "chirp")
 
 
+@pytest.mark.slow
 def test_both_motor_forces_are_a_matrix():
     diagram = fig3_loop(xi=0.03)
     point = diagram.trim()

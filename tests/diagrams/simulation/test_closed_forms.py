@@ -130,6 +130,7 @@ class DryFriction(Block):
         return x.x, np.where(fired.stop > 0.5, self.belt + 0.0 * x.v, x.v), mode
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("duration", [20.0, pytest.param(60.0, marks=pytest.mark.slow)])
 def test_stick_slip_on_a_belt_has_the_period_of_its_closed_form(duration):
     m, k, vb, Fs, Fc = 1.0, 4.0, 0.1, 1.5, 1.0
@@ -174,7 +175,7 @@ def forced(F, w, Fs, Fc, end):
     return [(t, m) for t, m in found if t < end]
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("F", "sticks"), [(2.0, True), (6.0, False)])
 def test_a_mass_that_is_pushed_to_and_fro_sticks_and_slips_both_ways(F, sticks):
     """With the larger force it never rests: where it stops, it slips back at the same instant."""
@@ -314,6 +315,7 @@ def test_a_cascade_of_pi_controllers_in_two_rates_is_its_recursion_by_hand(anti_
     assert np.max(np.abs(found - expected) / size) < 1e-10
 
 
+@pytest.mark.slow
 def test_the_ideal_cascade_is_what_scipy_makes_of_its_equations():
     run = drive().continuous().simulate(0.3, step=1e-3, solver="Radau", rtol=1e-10, atol=1e-11, progress=False)
     inner, outer = PI(**CURRENT), PI(**SPEED)
@@ -338,6 +340,7 @@ def test_the_ideal_cascade_is_what_scipy_makes_of_its_equations():
 # --- reset -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_integrator_that_resets_itself_fires_at_the_roots_of_its_closed_form():
     """ẏ = t, back to zero from 1: the k-th time at √(2 k)."""
     y = ResettableIntegrator(name="i")

@@ -379,6 +379,7 @@ def test_linear_blocks_beside_a_sampled_box_agree_with_the_matrix_exponential():
     assert max(np.max(np.abs(a - b)) for a, b in found) < 1e-11
 
 
+@pytest.mark.slow
 def test_a_projection_in_continuous_time_starts_from_the_foot_point_of_the_last_accepted_step():
     """Round an ellipse: the ideal run stays near the finely sampled one."""
     path = Ellipse(semi_axes=(0.3, 0.15), center=(0.5, 0.5))

@@ -88,7 +88,7 @@ def test_a_pulse_between_two_steps_is_not_stepped_over():
     assert run["i.y"].tolist() == pytest.approx([0.0, 1.0, 1.0], rel=1e-9)
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["DOP853", "BDF", "rk4"])
 def test_an_event_with_an_empty_action_does_not_change_the_solution(solver):
     class Watched(Block):
@@ -427,6 +427,7 @@ def test_a_run_can_be_saved_on_the_way_and_continued():
     assert np.array_equal(rest["plant.y"], straight["plant.y"][straight.t >= 1.0])
 
 
+@pytest.mark.slow
 def test_a_diagram_can_be_run_many_times_without_growth():
     diagram = Diagram("d", Lag(name="lag")(Sine(frequency=1.0)))
     for _ in range(3):

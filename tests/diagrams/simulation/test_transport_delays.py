@@ -97,6 +97,7 @@ def test_a_signal_that_is_faster_than_the_steps_of_the_solver_comes_out_as_it_we
     assert np.max(np.abs(run["i.y"] - (1 - np.cos(2 * np.pi * frequency * s)) / (2 * np.pi * frequency))) < 1e-8
 
 
+@pytest.mark.slow
 def test_a_kink_of_what_goes_in_comes_out():
     """A saturated sine is no polynomial anywhere near its kinks."""
     late = TransportDelay(delay=0.7, name="late")(Saturation(lower=-0.5, upper=0.5)(Sine(frequency=3.0)))

@@ -476,6 +476,7 @@ def test_without_sundials_the_error_says_what_to_install(monkeypatch):
         make_solver("cvode", PENDULUM)
 
 
+@pytest.mark.slow
 def test_cvode_frees_its_memory():
     resource = pytest.importorskip("resource")
     of = problem(lambda t, x: -x, lambda t, x: -np.eye(200), 200)
