@@ -97,6 +97,8 @@ class Instant:
         Columns that must be positive.
     mismatch : list
         For each torn port of an algebraic loop: what came round, and what was taken.
+    provisional : set of str
+        Equations of the block at hand that are evaluated again, when more of its inputs are there.
     """
 
     def __init__(
@@ -124,6 +126,7 @@ class Instant:
         self.gates: dict[str, Any] = {}
         self.guards: list[Any] = []
         self.mismatch: list[tuple[Any, Any]] = []
+        self.provisional: set[str] = set()
         self._open: dict[str, Any] = {}
         self._events = {(e.path, e.name): i for i, e in enumerate(layout.events)}
 
@@ -148,7 +151,9 @@ class Instant:
             if acts[path]:
                 torn[path, port] = rows(self.x, where)
                 self._put((path, port), torn[path, port])
-        for path, names in order:
+        steps = [*order]
+        last = {(path, name): i for i, (path, names) in enumerate(steps) for name in names}
+        for i, (path, names) in enumerate(steps):
             if not acts[path]:
                 continue
             trace = traced[path]
@@ -156,6 +161,7 @@ class Instant:
             if before is not None:
                 before(path, inputs)
             made = dict(zip(names, self._evaluate(path, names, inputs), strict=True))
+            self.provisional = {name for name in names if last[path, name] != i}
             if visit is not None:
                 visit(self, path, inputs, made)
             gate = self.gate_of(path)

@@ -129,7 +129,8 @@ def mean_slopes(slopes: BlockSlopes, t: float, z: np.ndarray, p: np.ndarray) -> 
 
 def _mean_of_equations(slopes: BlockSlopes, t: float, z: np.ndarray, p: np.ndarray) -> np.ndarray:
     symbols = ca.SX.sym("t"), ca.SX.sym("z", len(z)), ca.SX.sym("p", len(p))
-    made = _means(slopes.scalar, slopes.split_symbols(*symbols))[: len(slopes.outputs) + 1]
+    scalar = slopes.function.expand() if slopes.scalar is None else slopes.scalar  # of a large matrix it is not kept
+    made = _means(scalar, slopes.split_symbols(*symbols))[: len(slopes.outputs) + 1]
     J = ca.jacobian(ca.vertcat(*map(ca.densify, made)), symbols[1])
     return np.asarray(ca.Function("mean", [*symbols], [ca.densify(J)])(t, z, p))
 

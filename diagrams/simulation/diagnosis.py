@@ -43,7 +43,8 @@ def failure(
 
     def visit(instant: Instant, path: str, inputs: dict[str, Any], made: dict[str, Any]) -> None:
         if not found and instant.gate_of(path) is not False:
-            error = _wrong(flat, here.x, path, inputs, {n: np.ravel(np.array(v)) for n, v in made.items()})
+            known = {n: np.ravel(np.array(v)) for n, v in made.items() if n not in instant.provisional}
+            error = _wrong(flat, here.x, path, inputs, known)
             if error is not None:
                 found.append(error)
 

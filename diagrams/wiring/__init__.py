@@ -3,7 +3,8 @@
 from .check import Checked
 from .checked_diagram import CheckedDiagram
 from .cycles import find_cyclic_parts
-from .order import Order, Step, evaluation_order
+from .entry_order import Step
+from .order import Order, evaluation_order
 from .structure import Collector, Structure, SubsystemSettings, Wire, join, stepped_blocks
 from .subsystems import Subsystem, exact_time, subsystem
 from .variants import change_parameter, split_path

@@ -1,8 +1,9 @@
 """The order of evaluation, from feedthrough between ports.
 
 A block's outputs, its next state and its guards are ordered one by one: each waits only for the inputs that it
-depends on. So a cycle in the drawing is an algebraic loop only if a port waits for itself. Blocks are taken by
-path, so the order never depends on how a diagram was written down.
+depends on. So a cycle in the drawing is an algebraic loop only if a port waits for itself. Where ports wait for each
+other, their entries are ordered one by one (`entry_order`): a loop is one only if an entry waits for itself. Blocks are
+taken by path, so the order never depends on how a diagram was written down.
 
 Where a loop is to be solved, some of its ports are *torn*: their values are taken as known. Newton's method then
 finds the values that the loop gives back unchanged.
@@ -18,11 +19,8 @@ from dataclasses import dataclass
 
 from ...blocks.core import AlgebraicLoopError
 from ...blocks.tracing import GUARDS, NEXT, Traced
+from .entry_order import EntryOrder, Port, Step
 from .structure import Structure
-
-Port = tuple[str, str]
-Step = tuple[str, tuple[str, ...]]
-"""A block's path, and its equations that are evaluated together: outputs by name, next state, guards."""
 
 
 def dependencies(table: Structure, traced: Mapping[str, Traced], *, start: bool = False) -> dict[Port, set[Port]]:
@@ -82,28 +80,28 @@ def evaluation_order(
     steps, stuck = _sort(traced, waits)
     if not stuck:
         return Order(steps)
+    entries = EntryOrder(table, traced, waits, stuck, start=start)
+    more, within = entries.sort()
+    if not within:
+        return Order([*steps, *more])
     if not solve:
-        within = {port: {s for s in waits[port] if s in stuck} for port in stuck}
-        raise _loop_error(table, traced, _find_loop(within, _first_output(stuck)), start)
+        raise _loop_error(table, traced, _find_loop(within, _first_output(within)), start)
     torn: set[Port] = set()
     loops: list[str] = []
-    for loop, port in _tear(traced, waits, stuck):
+    for loop, port in _tear(traced, within):
         torn.add(port)
         loops.append("\n".join(_write_loop(table, traced, loop)))
-    steps, _ = _sort(traced, {port: sources - torn for port, sources in waits.items()})
-    return Order(steps, tuple(sorted(torn)), tuple(loops))
+    return Order([*steps, *entries.sort(torn)[0]], tuple(sorted(torn)), tuple(loops))
 
 
-def _tear(
-    traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]], stuck: set[Port]
-) -> Iterator[tuple[list[Port], Port]]:
+def _tear(traced: Mapping[str, Traced], within: Mapping[Port, set[Port]]) -> Iterator[tuple[list[Port], Port]]:
     """Yield loop after loop among the ports that are stuck, each with the port to tear."""
-    waits = {port: {s for s in waits[port] if s in stuck} for port in stuck}
+    waits = {port: set(sources) for port, sources in within.items()}
     consumers: dict[Port, list[Port]] = defaultdict(list)
     for port, sources in waits.items():
         for source in sources:
             consumers[source].append(port)
-    candidates = sorted((p for p in stuck if p[1] not in (NEXT, GUARDS)), reverse=True)
+    candidates = sorted((p for p in waits if p[1] not in (NEXT, GUARDS)), reverse=True)
     while candidates:
         if not waits[candidates[-1]]:
             candidates.pop()
