@@ -311,6 +311,7 @@ class Diagram(SimulatedDiagram):
         outputs: str | Iterable[str] = (),
         windows: int = 40,
         agreement: float = 1e-6,
+        confirm: bool = True,
         **options: Any,
     ) -> FrequencyResponse:
         """Measure a frequency response on the running diagram: a test signal d is added at a wire.
@@ -339,6 +340,8 @@ class Diagram(SimulatedDiagram):
             Most windows that are waited for.
         agreement : float
             Relative difference of two windows at which a frequency is done.
+        confirm : bool
+            Whether to measure a second time, with half the amplitude and smaller tolerances, for the uncertainty.
         **options
             Of the run, as in `operating_point`. A continuous diagram is run with rtol = 1e-9, atol = 1e-12, and sampled
             16 times in a period of the highest frequency, if nothing else is said.
@@ -360,5 +363,5 @@ class Diagram(SimulatedDiagram):
 
         return frequency_response(
             self, wire, frequencies, amplitude=amplitude, kind=kind, at=at, outputs=outputs, windows=windows,
-            agreement=agreement, **options,
+            agreement=agreement, confirm=confirm, **options,
         )  # fmt: skip

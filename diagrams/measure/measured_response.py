@@ -15,33 +15,43 @@ a held signal then cuts no loop: there is no L.
 **Frequencies** are changed by less than half a sample in a window, so that whole periods fit into it.
 
 **Procedure.** The signal is ramped in over a window. Windows of whole periods follow, until the phasors of two of them
-agree or the largest number of windows is reached. Offset and drift are subtracted. The last window gives the result;
-its distance from the window before estimates the error, due to settling and noise. The rest beside the lines is the
-distortion, a sign of an amplitude that leaves the linear range.
+agree or the largest number of windows is reached. Offset and drift are subtracted. The last window gives the result.
+The rest beside the lines is the distortion, a sign of an amplitude that leaves the linear range.
+
+**Uncertainty.** Three estimates are added up:
+
+- the distance of the last two windows: settling, and noise;
+- twice the distance to a second measurement, with half the amplitude, the frequencies in reverse order, and a solver
+  tolerance ten times smaller: nonlinearity, drift, and the solver's error;
+- the movement of the operating point from before the test signal to after it, less a uniform drift such as that of an
+  angle at constant speed. A movement of more than 1e-3 refutes the measurement: the uncertainty is infinite.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError, SimulationError
+from ...blocks.core import OptionError
 from ..flat import FlatDiagram, WiredDiagram
 from ..linearization import PointLike, find_signal, operating_point, ticks_to_renewal
 from ..results import OperatingPoint, PointOrigin, Snapshot
 from .injection import InjectionRun, inject_signal
-from .waveforms import KINDS, Part, choose_step, compute_phasors, plan_signal
+from .measurement import Measurement, measure_part, refine_tolerances
+from .waveforms import KINDS, Part, choose_step, plan_signal
 
 if TYPE_CHECKING:
     from control import FrequencyResponseData
 
     from ..linearization import Linearization
 
+HALF = 0.5
+"""Factor of the amplitude in the second measurement."""
 GROWN = 1e9
 """Growth of a signal, relative to the test signal and to the states before it, that no stable loop makes."""
 
@@ -68,13 +78,14 @@ class FrequencyResponse:
         Phasors of the port's signal, of its consumers' signal and of the outputs, relative to those of the test signal;
         the axes are entry, injected entry and frequency.
     uncertainty : (K,) ndarray
-        Estimated relative error of L: that of v plus that of u.
+        Estimated relative error of L, that of v plus that of u, with what a second amplitude and the movement of the
+        operating point show; infinite where the operating point has moved.
     distortion : (K,) ndarray
         Rms of the rest of v beside the line, relative to the line; NaN for a chirp, which has all lines.
     windows : (K,) ndarray of int
         Number of windows.
     settled : (K,) ndarray of bool
-        Whether the phasors of the last two windows agreed.
+        Whether the phasors of the last two windows agreed, at an operating point that has not moved.
     moved : float
         Drift of the operating point: the largest change of a block's state or an FMU's output, from before the test
         signal to a window after its end, relative to 1 + its size.
@@ -210,7 +221,8 @@ class FrequencyResponse:
 
 def frequency_response(
     diagram: WiredDiagram, wire: str, frequencies: ArrayLike, *, amplitude: float, kind: str = "sine",
-    at: PointLike = 0.0, outputs: str | Iterable[str] = (), windows: int = 40, agreement: float = 1e-6, **options: Any,
+    at: PointLike = 0.0, outputs: str | Iterable[str] = (), windows: int = 40, agreement: float = 1e-6,
+    confirm: bool = True, **options: Any,
 ) -> FrequencyResponse:  # fmt: skip
     """Measure a frequency response; see `Diagram.frequency_response`."""
     omega = _check_request(diagram, frequencies, amplitude, kind, windows)
@@ -242,21 +254,31 @@ def frequency_response(
     held = (period, ((tick + wait) % every) * flat.base) if discrete else None
     made = inject_signal(diagram, signal, len(plan[0].waveform.amplitude), held)
     lines = np.concatenate([part.omega for part in plan])
-    found = _Measurement(len(lines), len(signal.entries), sum(len(o.entries) for o in measured))
-    for j, entry in enumerate(signal.entries):
-        with InjectionRun(diagram, made, signal, measured, point, chosen) as run:
-            if point is None and t0 > 0:
-                run.simulation.advance(t0)
-            if wait:
-                run.go(wait, 1)
-            before = run.read_states()
-            found.largest = GROWN * max(float(amplitude), float(np.max(np.abs(before), initial=0.0)))
-            for i, part in enumerate(plan):
-                _measure(run, part, entry, j, every, windows, agreement, found, i)
-            run.play(plan[0].silence, entry, ramp=1.0)
-            run.go(plan[0].samples, every)
-            change = np.abs(run.read_states() - before) / (1.0 + np.abs(before))
-            found.moved = max(found.moved, float(np.max(change, initial=0.0)))
+
+    def measure(plan: Sequence[Part], order: Iterable[int], chosen: Mapping[str, Any], amplitude: float) -> Measurement:
+        found = Measurement(len(lines), len(signal.entries), sum(len(o.entries) for o in measured))
+        for j, entry in enumerate(signal.entries):
+            with InjectionRun(diagram, made, signal, measured, point, chosen) as run:
+                if point is None and t0 > 0:
+                    run.simulation.advance(t0)
+                if wait:
+                    run.go(wait, 1)
+                before, began = run.read_states(), run.t
+                found.largest = GROWN * max(amplitude, float(np.max(np.abs(before), initial=0.0)))
+                for i in order:
+                    measure_part(run, plan[i], entry, j, every, windows, agreement, found, i)
+                run.play(plan[0].silence, entry, ramp=1.0)
+                run.go(plan[0].samples, every)
+                found.note_movement(run, before, began, plan[0].samples, every)
+        return found
+
+    found = measure(plan, range(len(plan)), chosen, float(amplitude))
+    if confirm:
+        less = [replace(p, waveform=replace(p.waveform, amplitude=HALF * p.waveform.amplitude)) for p in plan]
+        found.compare(
+            measure(less, range(len(plan) - 1, -1, -1), refine_tolerances(flat, chosen), HALF * float(amplitude))
+        )
+    found.refute_moved()
     labels = tuple(e for o in measured for e in o.labels)
     return FrequencyResponse(
         variant, wire, kind, float(amplitude), lines, dt if discrete else 0.0, found.v, found.u, found.y,
@@ -325,74 +347,3 @@ def _changes_between_ticks(flat: FlatDiagram, port: tuple[str, str]) -> bool:
     """Whether a signal depends on continuous states, or on time, between two ticks."""
     output = flat.output(port)
     return bool(output.depends("y", "x")[:, flat.continuous].any() or output.depends("y", "t").any())
-
-
-class _Measurement:
-    """Results of a measurement; the last axis is that of the lines."""
-
-    def __init__(self, lines: int, n: int, outputs: int):
-        self.v, self.u = np.zeros((n, n, lines), complex), np.zeros((n, n, lines), complex)
-        self.y = np.zeros((outputs, n, lines), complex)
-        self.uncertainty, self.distortion = np.zeros(lines), np.zeros(lines)
-        self.windows, self.settled = np.zeros(lines, int), np.ones(lines, bool)
-        self.moved, self.held = 0.0, True
-        self.largest = np.inf
-        """Size above which a signal shows that the diagram is not stable."""
-
-
-def _check_size(run: InjectionRun, part: Part, v: np.ndarray, largest: float) -> None:
-    """Refuse to go on where a signal grows without end.
-
-    Raises
-    ------
-    SimulationError
-        If the signal at the wire is larger than any stable loop makes it.
-    """
-    size = float(np.max(np.abs(v), initial=0.0))
-    if size <= largest:
-        return
-    block, port = run.signal.port
-    raise SimulationError(
-        f"found a signal that has grown to {size:.3g} under a test signal of "
-        f"{float(np.max(np.abs(part.waveform.amplitude))):.3g}; expected one that settles: the diagram is not stable "
-        "there. Look at linearize().poles.",
-        block=block,
-        port=port,
-        t=run.t,
-    )
-
-
-def _measure(
-    run: InjectionRun, part: Part, entry: int, j: int, every: int, windows: int, agreement: float,
-    found: _Measurement, i: int,
-) -> None:  # fmt: skip
-    """Play part i of the test signal at one entry until two windows agree; write the last one's phasors to ``found``.
-
-    ``j`` is the entry's place among the injected ones.
-    """
-    n = part.samples
-    run.play(part.waveform, entry, ramp=n * every * float(run.flat.base))
-    run.go(n, every)
-    last, error, count = None, np.full(len(part.lines), np.inf), 0
-    while count < windows and not np.all(error <= agreement):
-        v, u, y = run.record(n, every)
-        _check_size(run, part, v, found.largest)
-        here, rest = compute_phasors(part, np.hstack([v, u, y]))
-        count, m = count + 1, v.shape[1]
-        if last is not None:
-            error = np.zeros(len(part.lines))
-            for columns, data in ((slice(0, m), v), (slice(m, 2 * m), u)):
-                size = np.linalg.norm(here[:, columns], axis=1)
-                change = np.linalg.norm((here - last)[:, columns], axis=1) + np.finfo(float).eps * np.max(np.abs(data))
-                error += change / np.where(size > 0.0, size, 1.0)
-        last = here
-    assert last is not None
-    found.held &= run.held
-    where = slice(i, i + 1) if found.v.shape[2] > len(part.lines) else slice(None)
-    d = last[:, m + j] - last[:, j]  # u − v at the entry where it was added
-    scaled = (last / d[:, None]).T
-    found.v[:, j, where], found.u[:, j, where], found.y[:, j, where] = scaled[:m], scaled[m : 2 * m], scaled[2 * m :]
-    found.uncertainty[where] = np.maximum(found.uncertainty[where], error)
-    found.distortion[where] = np.maximum(found.distortion[where], rest)
-    found.windows[where] = np.maximum(found.windows[where], count)
-    found.settled[where] &= error <= agreement

@@ -50,16 +50,20 @@ def injected(case: Case) -> Section | None:
                 text.append(TEXTS.line("failed", variant=v.title, wire=wire, message=error.message))
                 continue
             worst, own = float(np.max(deviation)), float(np.max(found.uncertainty))
-            if worst - 10 * own > REFUTED:
+            if not np.isfinite(own):
+                text.append(TEXTS.line("moved", variant=v.title, wire=wire, moved=found.moved))
+            elif worst - 10 * own > REFUTED:
                 text.append(TEXTS.line("refuted", variant=v.title, wire=wire, deviation=worst))
             where = f"{key}.{v.key}"
             low, high = float(found.omega[0]), float(found.omega[-1])
             how = f"{len(found.omega)} sines from {low:.4g} to {high:.4g} rad/s, amplitude {found.amplitude:g}"
             numbers[f"{where}.deviation"] = Number(worst, "1", max(own, 1e-12), how)
-            numbers[f"{where}.uncertainty"] = Number(own, "1", own, "differences of the last windows")
+            numbers[f"{where}.uncertainty"] = Number(
+                own, "1", own, "the last windows, a second amplitude, and the movement of the operating point"
+            )
             span = f"{low:.4g} … {high:.4g} rad/s"
             shown = (numbers[f"{where}.{n}"] for n in ("deviation", "uncertainty"))
-            verdict = "yes" if worst <= CONFIRMED else "no"
+            verdict = "yes" if worst <= CONFIRMED and own <= CONFIRMED else "no"
             rows.append((wire, v.title, span, *shown, verdict))
             measured[v.title] = (found, L)
         if measured:

@@ -15,6 +15,7 @@ from loopwright.blocks import (
     Integrator,
     OptionError,
     Reference,
+    Step,
     UnitDelay,
     WiringError,
 )
@@ -193,7 +194,70 @@ def test_an_operating_point_that_moves_is_seen():
     ramp = Integrator(name="ramp")(Constant(value=1.0, name="rate"))
     place = Integrator(name="x")
     diagram = Diagram("d", place(Function(lambda x, r: -5.0 * (x - r), name="law")(place.y, ramp)))
-    assert diagram.frequency_response("law.y", [5.0], amplitude=1e-2).moved > 1.0
+    found = diagram.frequency_response("law.y", [5.0], amplitude=1e-2)
+    assert found.moved > 1.0
+    assert np.all(np.isinf(found.uncertainty))
+    assert not found.settled.any()
+
+
+def cubic(step_at=1e9, back_at=2e9):
+    """ẋ = −x³ + u with u = r³ + 2 (r − x): L = 2/(s + 3 r²), and r is 2 between the two times, else 1."""
+    x = Integrator(name="x", initial_value=1.0)
+    r = Step(times=[step_at, back_at], values=[2.0, 1.0], initial_value=1.0, name="r")
+    law = Function(lambda r, x: r**3 + 2.0 * (r - x), name="law")(r, x.y).named("u")
+    return Diagram("cubic", x(Function(lambda x, u: -(x**3) + u, name="rate")(x.y, law)))
+
+
+@pytest.mark.parametrize("step_at", [0.1, 20.0])
+def test_a_step_of_a_source_makes_the_uncertainty_infinite(step_at):
+    found = cubic(step_at).frequency_response("u", [2.0], amplitude=1e-3)
+    w = found.omega[0]
+    assert abs(found.L.frdata[0, 0, 0] / (2.0 / (1j * w + 3.0)) - 1.0) > 0.5  # it is that of the other point
+    assert found.moved == pytest.approx(0.5, rel=1e-3)  # of 1 + 1
+    assert np.isinf(found.uncertainty[0])
+    assert not found.settled[0]
+
+
+def test_a_source_that_steps_and_comes_back_is_in_the_uncertainty():
+    """The first and the second measurement go over the frequencies in opposite orders."""
+    quiet = cubic().frequency_response("u", [2.0, 4.0], amplitude=1e-3)
+    assert np.max(quiet.uncertainty) < 1e-5
+    windows = 2.0 * np.pi * (quiet.windows + 1) * np.array([16 / 2.0, 16 / 4.0])  # s, with that of the ramp
+    found = cubic(0.0, 0.5 * windows[0]).frequency_response("u", [2.0, 4.0], amplitude=1e-3)
+    assert np.max(found.uncertainty) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("options", "omega"),
+    [
+        ({"rtol": 1e-6, "atol": 1e-9}, 1.0),
+        pytest.param({}, 1.0, marks=pytest.mark.slow),
+        pytest.param({"rtol": 1e-8}, 1.0, marks=pytest.mark.slow),
+        pytest.param({"rtol": 1e-7}, 7.0, marks=pytest.mark.slow),
+    ],
+)
+def test_the_uncertainty_bounds_the_error_of_the_solver(options, omega):
+    found = continuous_loop().frequency_response("u", [omega], amplitude=0.1, **options)
+    s = 1j * found.omega
+    error = np.abs(found.L.frdata[0, 0] / ((3 * s + 40) / s**2) - 1.0)
+    assert np.all(error <= found.uncertainty)
+    assert found.uncertainty[0] < 1e-3
+
+
+@pytest.mark.parametrize("amplitude", [0.03, 0.3, 1.0])
+def test_the_uncertainty_bounds_what_the_amplitude_adds(amplitude):
+    """−5 x − 5 x³: by the describing function the slope is 5 + 15/4 a² at the amplitude a of x."""
+    place = Integrator(name="x")
+    diagram = Diagram("d", place(Function(lambda x: -5.0 * x - 5.0 * x**3, name="law")(place.y)))
+    found = diagram.frequency_response("law.y", [5.0], amplitude=amplitude)
+    s = 1j * found.omega[0]
+    error = abs(found.L.frdata[0, 0, 0] / (5.0 / s) - 1.0)
+    a = abs(found.u[0, 0, 0]) * amplitude / abs(s)
+    assert error == pytest.approx(0.75 * a * a, rel=0.25)  # 15/4 a² of 5: the harmonics add a little
+    assert error <= found.uncertainty[0] < 10 * error + 1e-6
+    once = diagram.frequency_response("law.y", [5.0], amplitude=amplitude, confirm=False)
+    assert once.uncertainty[0] < error  # the windows alone don't know
+    np.testing.assert_array_equal(once.v, found.v)
 
 
 def test_an_operating_point_of_a_run_and_a_time_are_the_same():
