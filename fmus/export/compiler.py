@@ -40,6 +40,8 @@ SUFFIXES = {"linux": ".so", "windows": ".dll", "darwin": ".dylib"}
 FLAGS = ("-O2", "-std=c11", "-shared", "-fvisibility=hidden", "-ffp-contract=off", "-g0", "-s")
 # Only what is declared inline is inlined, the integrators and the equations: a fifth of the time of a build less.
 _ZIG_FLAGS = ("-finline-hint-functions",)
+# Models use double and int alone: nothing of zig's own runtime, which takes seconds to build on a machine's first use.
+_ZIG_RUNTIME = ("-rtlib=none",)
 TIMEOUT = 600.0
 """Seconds after which a compilation is stopped. The first one on a machine takes seconds, on a slow one a minute."""
 
@@ -99,9 +101,9 @@ def _version(command: tuple[str, ...]) -> str:
 
 def flags(compiler: Compiler, platform: str) -> tuple[str, ...]:
     """Return all flags for a platform, without sources, include folders and the output."""
-    target = ("-target", TARGETS[platform], *_ZIG_FLAGS) if compiler.zig else ()
-    pic = () if platform.endswith("windows") else ("-fPIC",)
-    return (*target, *FLAGS, *pic)
+    windows = platform.endswith("windows")
+    target = ("-target", TARGETS[platform], *_ZIG_FLAGS, *(() if windows else _ZIG_RUNTIME)) if compiler.zig else ()
+    return (*target, *FLAGS, *(() if windows else ("-fPIC",)))
 
 
 def check_platform(compiler: Compiler, platform: str) -> None:
