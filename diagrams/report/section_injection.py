@@ -52,7 +52,8 @@ def injected(case: Case) -> Section | None:
             worst, own = float(np.max(deviation)), float(np.max(found.uncertainty))
             if not np.isfinite(own):
                 text.append(TEXTS.line("moved", variant=v.title, wire=wire, moved=found.moved))
-            elif worst - 10 * own > REFUTED:
+                continue
+            if worst - 10 * own > REFUTED:
                 text.append(TEXTS.line("refuted", variant=v.title, wire=wire, deviation=worst))
             where = f"{key}.{v.key}"
             low, high = float(found.omega[0]), float(found.omega[-1])

@@ -60,14 +60,14 @@ def value(path):
     return part().numbers()[path].value
 
 
-def speed_control(sample_time=1e-3, voltage=0.0):
+def speed_control(sample_time=1e-3, voltage=0.0, step_at=100.0):
     motor = Fmu(dc_motor.build(), name="motor")
 
     @subsystem(sample_time=sample_time)
     def controller(reference, speed):
         return PID(kp=0.05, ki=2.0, initial_output=voltage, name="pi")(reference, speed).named("voltage")
 
-    wanted = Step(times=0.1, values=100.0, name="wanted")
+    wanted = Step(times=step_at, values=100.0, name="wanted")
     u = controller(wanted, motor.speed.named("speed"))
     return Diagram("speed_control", motor(voltage=u, load_torque=Constant(value=0.0, name="load")))
 
@@ -256,6 +256,13 @@ def test_a_users_loop_around_an_fmu_gets_a_report_without_the_sections_of_fig3()
     assert margin == pytest.approx(180.0 + math.degrees(np.angle(L)), abs=1e-7)
     assert numbers["injection.voltage.sampled_d0.deviation"].value < 1e-3
     assert numbers["injection.voltage.sampled_d1.deviation"].value < 1e-3
+
+
+def test_a_source_that_steps_during_the_injection_leaves_no_number():
+    report = analyse(speed_control(step_at=0.1), loops=["controller.voltage"], only=("injection",))
+    assert not report.numbers()
+    (section,) = report.sections
+    assert all("the operating point moved by" in text for text in section.text)
 
 
 def test_loops_can_be_named():
