@@ -4,11 +4,12 @@
 and the second at z > δ. A change in the declared direction fires the event.
 
 **Contact.** Zero itself is the border. An indicator that is exactly 0 at the start is in neither domain, and so is one
-that the jump of its own event leaves in contact: on 0, or where the event found it, with its motion changed, as an
-impact does. The direction in which it leaves 0 decides: down is falling, up is rising, and that fires the event if it
-is declared. So a ball that starts on the floor and moves down, or would fall, hits the floor at the start, one that
-moves up does not; sin ωt rises at the start, −sin ωt falls. An indicator that comes to 0 by itself has changed its
-domain, and going on from there fires nothing.
+that the jump of its own event leaves in contact by an impact: the jump changes continuous states of the block, and
+with them the motion of the indicator, leaves it on 0 or where the event found it, and the rates lead on beyond. The
+direction in which it leaves decides: down is falling, up is rising, and that fires the event if it is declared. So a
+ball that starts on the floor and moves down, or would fall, hits the floor at the start, one that moves up does not;
+sin ωt rises at the start, −sin ωt falls. An indicator that comes to 0 by itself has changed its domain, and going on
+from there fires nothing.
 
 **Rest.** A jump whose motion leads back beyond contact at once, again and again, rests there. That is an error which
 names the event: its block needs a state of rest.
@@ -18,12 +19,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...blocks.core import SimulationError
-from ..flat import FlatDiagram
+from ..flat import FlatDiagram, FlatEvent
 from ..solvers import Step
 from .limits import EventLimits
 from .search import EventSearch, Many
@@ -37,6 +38,15 @@ _SCATTER = (
 _CONTINUOUS = 1e-9  # they are at most this part of its values in the step: else it jumps there
 
 Indicators = Callable[[float, np.ndarray], np.ndarray]
+
+
+class Motion(NamedTuple):
+    """The continuous states and the indicators at an instant, and its changes in one and two steps of Euler's."""
+
+    x: np.ndarray
+    z: np.ndarray
+    once: np.ndarray
+    twice: np.ndarray
 
 
 class Domains:
@@ -85,7 +95,8 @@ class Domains:
         """Distance beyond zero to which an indicator that has just crossed it counts as beyond: that of rounding."""
         self.limits = EventLimits(flat.events)
         self._many, self.search = many, EventSearch(self, many, self._spacing)
-        self._moves = np.array([_has_continuous_states(flat, e) for e in flat.events], dtype=bool)
+        self._own = [_continuous_states(flat, e) for e in flat.events]
+        self._moves = np.array([where.size > 0 for where in self._own], dtype=bool)
 
     # --- the rule ----------------------------------------------------------------------------------------------------
 
@@ -172,20 +183,25 @@ class Domains:
 
     # --- contact -----------------------------------------------------------------------------------------------------
 
-    def motion(self, t: float, x: np.ndarray, fired: np.ndarray) -> Any:
-        """Return what `land` compares of the instant before a jump; None if no block that jumps moves by itself."""
+    def motion(self, t: float, x: np.ndarray, fired: np.ndarray) -> Motion | None:
+        """Return what `land` compares of the instants before and after a jump; None if no block that jumps moves."""
         if not np.any(fired & self._moves):
             return None
-        there = x + self._spacing * self._rates(t, x)
-        z, _ = self._many(np.array([t, t]), np.array([x, there]))
-        return z[0], z[1] - z[0]
+        h = self._spacing
+        once = x + h * self._rates(t, x)
+        twice = once + h * self._rates(t, once)
+        z, _ = self._many(np.array([t, t, t]), np.array([x, once, twice]))
+        return Motion(x.copy(), z[0], z[1] - z[0], z[2] - z[0])
 
-    def land(self, before: Any, t: float, x: np.ndarray, fired: np.ndarray) -> None:
+    def land(self, before: Motion | None, t: float, x: np.ndarray, fired: np.ndarray) -> None:
         """Put those indicators on the border that their own jumps leave in contact.
+
+        A jump does so if it is an impact, which changes continuous states of its block and with them the motion of the
+        indicator, and if the indicator is no further than where the event has found it and moves on beyond.
 
         Parameters
         ----------
-        before : tuple or None
+        before : Motion or None
             `motion` before the jumps.
         t, x
             The instant after them.
@@ -194,19 +210,19 @@ class Domains:
         """
         if before is None:
             return
-        z0, slope0 = before
-        z1, slope1 = self.motion(t, x, fired)
-        for i in np.flatnonzero(fired & self._moves):
-            side = self.domain[i]
-            if side * z1[i] < 0.0 or abs(z1[i]) > abs(z0[i]):
-                continue  # the jump has moved it elsewhere
-            turned = slope1[i] != slope0[i] and math.isfinite(slope0[i]) and math.isfinite(slope1[i])
-            if turned or (z1[i] == 0.0 and z0[i] != 0.0) or self.limits.rests(int(i)):
+        after = self.motion(t, x, fired)
+        assert after is not None
+        for i in np.flatnonzero(fired & self._moves).tolist():
+            side, own = self.domain[i], self._own[i]
+            away = side * after.z[i] < 0.0 or abs(after.z[i]) > abs(before.z[i])
+            if away or not side * after.twice[i] > 0.0 or np.array_equal(before.x[own], after.x[own]):
+                continue
+            if after.once[i] != before.once[i] or self.limits.rests(i):
                 self.domain = self.domain.copy()
                 self.domain[i] = 0
-                self._low[i] = min(z1[i], -self._hysteresis[i])
-                self._high[i] = max(z1[i], self._hysteresis[i])
-                self.limits.note_contact(int(i), int(side))
+                self._low[i] = min(after.z[i], -self._hysteresis[i])
+                self._high[i] = max(after.z[i], self._hysteresis[i])
+                self.limits.note_contact(i, int(side))
 
     # --- never a hang ------------------------------------------------------------------------------------------------
 
@@ -236,9 +252,9 @@ class Domains:
         self.limits.restore(limits)
 
 
-def _has_continuous_states(flat: FlatDiagram, event: Any) -> bool:
-    """Return whether an event's block has states that move by themselves."""
+def _continuous_states(flat: FlatDiagram, event: FlatEvent) -> np.ndarray:
+    """Return where the states of an event's block are among the continuous ones."""
     if event.subsystem or event.path not in flat.states.slices:
-        return False
+        return np.zeros(0, dtype=int)
     where = flat.states.slices[event.path]
-    return bool(np.any((flat.continuous >= where.start) & (flat.continuous < where.stop)))
+    return np.flatnonzero((flat.continuous >= where.start) & (flat.continuous < where.stop))

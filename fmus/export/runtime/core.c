@@ -142,8 +142,12 @@ static bool lw_update_derivatives(lw_instance *self) {
 static bool lw_update_indicators(lw_instance *self) {
     uint8_t have = self->s.have_indicators;
     if (!lw_update(self, &self->s.have_indicators, lw_indicator, LW_Z, LW_N_Z)) return false;
-    for (size_t i = 0; i < LW_N_Z && !have; i++)
-        self->s.values[LW_Z + i] += (self->s.positive[i] ? LW_HYSTERESIS : -LW_HYSTERESIS) * lw_events[i].nominal;
+    const lw_memory *events = &self->s.events;
+    for (size_t i = 0; i < LW_N_Z && !have; i++) {
+        const bool border = events->domain[i] == LW_BORDER, above = border ? events->lean[i] : events->domain[i] == LW_ABOVE;
+        self->s.values[LW_Z + i] += (above ? LW_HYSTERESIS : -LW_HYSTERESIS) * lw_events[i].nominal;
+        if (border) self->s.values[LW_Z + i] -= events->level[i];
+    }
     return true;
 }
 #else

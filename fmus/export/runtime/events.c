@@ -1,13 +1,31 @@
 /* Events: domains of the indicators, jumps, and location of zero crossings in a step.
  *
  * An indicator has a domain, z > 0 or z <= 0. An event fires when its domain changes in the declared direction. All events
- * that fire at one instant jump at once; a jump may make further events fire at the same instant. */
+ * that fire at one instant jump at once; a jump may make further events fire at the same instant.
+ *
+ * Zero itself is the border. An indicator that is exactly 0 at the start is in neither domain, and so is one that the jump
+ * of its own event leaves in contact: an impact, which changes continuous states and with them the motion of the indicator,
+ * and leaves it on 0, or where the event found it, moving on beyond. The direction in which it leaves decides: down is falling, up is rising. A jump whose motion leads back beyond contact at once, again and
+ * again, rests there; that is an error. Diagrams have this rule, too (diagrams/events/domains.py). */
 #if LW_N_Z
 #define LW_MAX_ITERATIONS 100
 #define LW_MAX_EVENTS 10000
 /* Events accumulate if one fires three times within 2^-35 of the time. Nearer ones would be lost in rounding. */
 #define LW_ZENO 2.9103830456733704e-11
 #define LW_ULPS 2.2204460492503131e-16
+#define LW_PROBE 1e-3 /* s, over which a change of motion is looked for */
+#define LW_RESTS 20 /* events in a row that lead back into contact; colliding bodies pass an impact on a few times */
+
+/* The domain of indicator i at its value z, from the present one. */
+static int lw_domain(const lw_instance *self, int i, double z) {
+    const lw_memory *events = &self->s.events;
+    if (events->domain[i] != LW_BORDER) return z > 0.0 ? LW_ABOVE : LW_BELOW;
+    return z > fmax(events->level[i], 0.0) ? LW_ABOVE : z < fmin(events->level[i], 0.0) ? LW_BELOW : LW_BORDER;
+}
+
+static bool lw_is_declared(int i, int domain) {
+    return !lw_events[i].direction || lw_events[i].direction == (domain == LW_ABOVE ? 1 : -1);
+}
 
 /* The indicators at (t, x, u), and the events whose domains differ from the present ones in the declared direction. */
 static bool lw_find_fired(lw_instance *self, double t, const double *x, const double *u, double *z, double *fired, bool *any) {
@@ -16,15 +34,24 @@ static bool lw_find_fired(lw_instance *self, double t, const double *x, const do
     if (!lw_check_finite(self, z, LW_Z, LW_N_Z, t)) return false;
     *any = false;
     for (int i = 0; i < LW_N_Z; i++) {
-        int change = (z[i] > 0.0) - (int)self->s.positive[i], direction = lw_events[i].direction;
-        fired[i] = change && (!direction || change == direction);
+        int domain = lw_domain(self, i, z[i]);
+        fired[i] = domain != self->s.events.domain[i] && lw_is_declared(i, domain);
         if (fired[i] != 0.0) *any = true;
     }
     return true;
 }
 
+static void lw_set_domain(lw_instance *self, int i, int domain) {
+    lw_memory *events = &self->s.events;
+    if (events->side[i] && domain != LW_BORDER) {
+        if (domain != events->side[i] - 1) events->side[i] = events->resting[i] = 0; /* it has left contact */
+        else if (events->domain[i] == LW_BORDER) events->resting[i]++;
+    }
+    events->domain[i] = (uint8_t)domain;
+}
+
 static void lw_set_domains(lw_instance *self, const double *z) {
-    for (int i = 0; i < LW_N_Z; i++) self->s.positive[i] = z[i] > 0.0;
+    for (int i = 0; i < LW_N_Z; i++) lw_set_domain(self, i, lw_domain(self, i, z[i]));
 }
 
 /* Names of the events that have fired, for a message. */
@@ -51,6 +78,69 @@ static bool lw_apply_jump(lw_instance *self, double t, double *x, const double *
     return true;
 }
 
+/* ---- contact ---- */
+
+#if LW_N_X
+/* The indicators at an instant, and their changes after one and two steps along the rates. */
+typedef struct {
+    double z[LW_N_Z], once[LW_N_Z], twice[LW_N_Z];
+} lw_motion;
+
+/* False if they can't be evaluated. */
+static bool lw_find_motion(lw_instance *self, double t, const double *x, const double *u, lw_motion *motion) {
+    double there[LW_N_S], rates[LW_N_X];
+    memcpy(there, x, sizeof there);
+    if (lw_call(self, lw_indicator, &t, x, u, motion->z)) return false;
+    for (int step = 0; step < 2; step++) {
+        double *change = step ? motion->twice : motion->once;
+        if (lw_rate(self, t, there, u, rates)) return false;
+        for (int i = 0; i < LW_N_X; i++) there[i] += LW_PROBE * rates[i];
+        if (lw_call(self, lw_indicator, &t, there, u, change)) return false;
+        for (int i = 0; i < LW_N_Z; i++) change[i] -= motion->z[i];
+    }
+    return true;
+}
+#endif
+
+/* Put indicator i on the border. It leans to the side from where the importer sees it leave in the declared direction;
+ * if both are declared, to the side from where it will come, after `ahead`. */
+static void lw_set_border(lw_instance *self, int i, double z, double ahead) {
+    lw_memory *events = &self->s.events;
+    events->domain[i] = LW_BORDER;
+    events->level[i] = z;
+    events->lean[i] = lw_events[i].direction ? lw_events[i].direction < 0 : !(ahead > 0.0);
+}
+
+/* The jump of the events that have fired, and the border for those that it leaves in contact. */
+static bool lw_jump_and_land(lw_instance *self, double t, double *x, const double *u, const double *fired) {
+    lw_memory *events = &self->s.events;
+    for (int i = 0; i < LW_N_Z; i++)
+        if (fired[i] != 0.0 && events->resting[i] >= LW_RESTS)
+            return lw_fail(self, "the event %s rests in contact at t = %.9g s: its jump leaves its indicator at zero, and the motion "
+                           "leads it back beyond at once, %d times in a row. Give the block a state of rest: a discrete state that "
+                           "the jump sets and that holds the rates, and an event that ends it.", lw_events[i].name, t, LW_RESTS);
+#if LW_N_X
+    lw_motion before, after;
+    double old[LW_N_X];
+    memcpy(old, x, sizeof old);
+    const bool known = lw_find_motion(self, t, x, u, &before);
+    if (!lw_apply_jump(self, t, x, u, fired)) return false;
+    if (!known || !memcmp(old, x, sizeof old) || !lw_find_motion(self, t, x, u, &after)) return true;
+    for (int i = 0; i < LW_N_Z; i++) {
+        const double side = events->domain[i] == LW_ABOVE ? 1.0 : -1.0;
+        if (fired[i] == 0.0 || side * after.z[i] < 0.0 || fabs(after.z[i]) > fabs(before.z[i])) continue; /* it is elsewhere */
+        if (!(side * after.twice[i] > 0.0) || (after.once[i] == before.once[i] && !events->resting[i])) continue;
+        events->side[i] = (uint8_t)(events->domain[i] + 1);
+        lw_set_border(self, i, after.z[i], after.twice[i]);
+    }
+    return true;
+#else
+    return lw_apply_jump(self, t, x, u, fired);
+#endif
+}
+
+/* ---- one instant ---- */
+
 static bool lw_too_many_iterations(lw_instance *self, double t, const double *fired) {
     char names[256];
     return lw_fail(self, "the events %s fire again and again at t = %.9g s: %d iterations at one instant. Let the jump leave "
@@ -67,20 +157,28 @@ static bool lw_iterate(lw_instance *self, double t, double *x, const double *u, 
         if (again && n == LW_MAX_ITERATIONS) return lw_too_many_iterations(self, t, fired);
         lw_set_domains(self, z);
         if (!again) return true;
-        if (!lw_apply_jump(self, t, x, u, fired)) return false;
+        if (!lw_jump_and_land(self, t, x, u, fired)) return false;
         *any = true;
     }
 }
 
 /* Set the domains at the end of initialization; no event fires. */
 static bool lw_start_domains(lw_instance *self) {
-    double *v = self->s.values;
-    double z[LW_N_Z], fired[LW_N_Z];
-    bool any;
-    if (!lw_find_fired(self, v[0], v + LW_X, v + LW_U, z, fired, &any)) return false;
-    lw_set_domains(self, z);
+    double *v = self->s.values, z[LW_N_Z], *ahead = NULL;
+    memset(&self->s.events, 0, sizeof self->s.events);
+    if (lw_call(self, lw_indicator, v, v + LW_X, v + LW_U, z))
+        return lw_fail(self, "the event indicators can't be evaluated at t = %.9g s.", v[0]);
+    if (!lw_check_finite(self, z, LW_Z, LW_N_Z, v[0])) return false;
+#if LW_N_X
+    lw_motion motion;
+    if (lw_find_motion(self, v[0], v + LW_X, v + LW_U, &motion)) ahead = motion.twice;
+#endif
+    for (int i = 0; i < LW_N_Z; i++) {
+        self->s.events.domain[i] = z[i] > 0.0 ? LW_ABOVE : LW_BELOW;
+        if (z[i] == 0.0) lw_set_border(self, i, 0.0, ahead ? ahead[i] : 0.0);
+        self->s.events.last_fired[i] = self->s.events.last_but_one[i] = -INFINITY;
+    }
     self->s.have_indicators = 0;
-    for (int i = 0; i < LW_N_Z; i++) self->s.last_fired[i] = self->s.last_but_one[i] = -INFINITY;
     return true;
 }
 
@@ -88,12 +186,12 @@ static bool lw_start_domains(lw_instance *self) {
 static bool lw_record(lw_instance *self, double t, double size, const double *fired) {
     for (int i = 0; i < LW_N_Z; i++) {
         if (fired[i] == 0.0) continue;
-        if (t - self->s.last_but_one[i] <= LW_ZENO * size)
+        if (!self->s.events.resting[i] && t - self->s.events.last_but_one[i] <= LW_ZENO * size)
             return lw_fail(self, "the event %s fires faster and faster: 3 times within %.3g s at t = %.9g s, expected events "
                            "apart from each other. Give the model a mode in which it rests (Zeno), or a hysteresis (chattering).",
-                           lw_events[i].name, t - self->s.last_but_one[i], t);
-        self->s.last_but_one[i] = self->s.last_fired[i];
-        self->s.last_fired[i] = t;
+                           lw_events[i].name, t - self->s.events.last_but_one[i], t);
+        self->s.events.last_but_one[i] = self->s.events.last_fired[i];
+        self->s.events.last_fired[i] = t;
     }
     return true;
 }
@@ -147,25 +245,24 @@ static bool lw_evaluate(lw_instance *self, const lw_span *span, double t, lw_poi
                   : lw_check_finite(self, at->z, LW_Z, LW_N_Z, t);
 }
 
-/* The time at which indicator i becomes `positive`, after a and not after b: as near to the crossing as times resolve. */
-static bool lw_locate(lw_instance *self, const lw_span *span, int i, bool positive, double a, double b, double *found) {
+/* The time at which indicator i comes into a domain, after a and not after b: as near to the crossing as times resolve. */
+static bool lw_locate(lw_instance *self, const lw_span *span, int i, int domain, double a, double b, double *found) {
     lw_point at;
     while (b - a > span->resolution) {
         double middle = a + (b - a) / 2.0;
         if (middle <= a || middle >= b) break;
         if (!lw_evaluate(self, span, middle, &at)) return false;
-        if ((at.z[i] > 0.0) == positive) b = middle;
+        if (lw_domain(self, i, at.z[i]) == domain) b = middle;
         else a = middle;
     }
     *found = b;
     return true;
 }
 
-/* Does indicator i, with the same domain at a and b, leave it in between? Its rates show whether it may; bisection finds
- * the extremum. `found` is a time in the other domain, NAN if there is none. */
-static bool lw_find_excursion(lw_instance *self, const lw_span *span, int i, lw_point a, lw_point b, double *found) {
-    bool positive = self->s.positive[i];
-    double towards = positive ? -1.0 : 1.0;
+/* Is indicator i in a domain somewhere between a and b, where it is not? Its rates show whether it may; bisection finds
+ * the extremum. `found` is a time in that domain, NAN if there is none. */
+static bool lw_find_excursion(lw_instance *self, const lw_span *span, int i, int domain, lw_point a, lw_point b, double *found) {
+    const double towards = domain == LW_ABOVE ? 1.0 : -1.0;
     *found = NAN;
     while (towards * a.rate[i] > 0.0 && towards * b.rate[i] < 0.0 && b.t - a.t > span->resolution) {
         double width = b.t - a.t, middle = a.t + width / 2.0;
@@ -173,7 +270,7 @@ static bool lw_find_excursion(lw_instance *self, const lw_span *span, int i, lw_
         if (fabs(a.z[i]) > width * fabs(a.rate[i]) && fabs(b.z[i]) > width * fabs(b.rate[i])) return true;
         lw_point at;
         if (!lw_evaluate(self, span, middle, &at)) return false;
-        if ((at.z[i] > 0.0) != positive) {
+        if (lw_domain(self, i, at.z[i]) == domain) {
             *found = middle;
             return true;
         }
@@ -183,30 +280,35 @@ static bool lw_find_excursion(lw_instance *self, const lw_span *span, int i, lw_
     return true;
 }
 
-static bool lw_is_declared(int i, bool positive) {
-    return !lw_events[i].direction || lw_events[i].direction == (positive ? 1 : -1);
-}
-
 /* The time of the first event between two points, else INFINITY. Changes of domain that fire no event are recorded. */
 static bool lw_first_event(lw_instance *self, const lw_span *span, const lw_point *a, const lw_point *b, double *first) {
     double found[LW_N_Z], flipped[LW_N_Z];
+    int other[LW_N_Z];
     *first = INFINITY;
     for (int i = 0; i < LW_N_Z; i++) {
-        bool positive = self->s.positive[i], crossed = (b->z[i] > 0.0) != positive;
-        double middle = b->t;
+        const int domain = self->s.events.domain[i], end = lw_domain(self, i, b->z[i]);
+        const bool border = domain == LW_BORDER;
+        double middle = NAN;
         found[i] = flipped[i] = INFINITY;
-        if (!crossed && !lw_find_excursion(self, span, i, *a, *b, &middle)) return false;
-        if (isnan(middle)) continue;
-        if (lw_is_declared(i, !positive)) {
-            if (!lw_locate(self, span, i, !positive, a->t, middle, &found[i])) return false;
-        } else if (!crossed) { /* it left and returned */
+        /* an excursion: into the other domain, from the border to that from which it does not end in */
+        other[i] = domain == LW_BELOW || (border && a->rate[i] > 0.0) ? LW_ABOVE : LW_BELOW;
+        if (end != other[i] && !lw_find_excursion(self, span, i, other[i], *a, *b, &middle)) return false;
+        const bool left = !isnan(middle); /* and it is back, or beyond, at b */
+        if (!left) {
+            if (end == domain) continue;
+            other[i] = end;
+            middle = b->t;
+        }
+        if (lw_is_declared(i, other[i])) {
+            if (!lw_locate(self, span, i, other[i], a->t, middle, &found[i])) return false;
+        } else if (left) { /* it left and returned */
             flipped[i] = middle;
-            if (lw_is_declared(i, positive) && !lw_locate(self, span, i, positive, middle, b->t, &found[i])) return false;
+            if (end != LW_BORDER && lw_is_declared(i, end) && !lw_locate(self, span, i, end, middle, b->t, &found[i])) return false;
         }
         *first = fmin(*first, found[i]);
     }
     for (int i = 0; i < LW_N_Z; i++)
-        if (flipped[i] < *first && isfinite(*first)) self->s.positive[i] = !self->s.positive[i];
+        if (flipped[i] < *first && isfinite(*first)) lw_set_domain(self, i, other[i]);
     return true;
 }
 
@@ -249,7 +351,7 @@ static inline bool lw_update_discrete_states(lw_instance *self, const char *func
     lw_set_domains(self, z);
     if (any) {
         self->s.iterations++;
-        if (!lw_apply_jump(self, v[0], x, v + LW_U, fired)) return false;
+        if (!lw_jump_and_land(self, v[0], x, v + LW_U, fired)) return false;
         *moved = memcmp(old, x, LW_N_X * sizeof(double)) != 0;
         self->s.step_size = 0.0;
         if (!lw_find_fired(self, v[0], x, v + LW_U, z, fired, again)) return false;

@@ -74,6 +74,20 @@ typedef enum {
 } lw_mode;
 typedef enum { LW_LOG_WARNING = 1, LW_LOG_ERROR = 2 } lw_category;
 
+#if LW_N_Z
+#define LW_N_Z8 ((LW_N_Z + 7) / 8 * 8) /* no padding */
+/* The domain of an indicator: z <= 0, z > 0, or on the border, from where the direction in which it leaves decides. */
+enum { LW_BELOW, LW_ABOVE, LW_BORDER };
+typedef struct {
+    double last_fired[LW_N_Z], last_but_one[LW_N_Z]; /* times at which doStep has found the event */
+    double level[LW_N_Z];                            /* on the border: the indicator there */
+    uint8_t domain[LW_N_Z8];
+    uint8_t lean[LW_N_Z8];    /* on the border: does the importer see it above zero? */
+    uint8_t side[LW_N_Z8];    /* the domain in which its jump has left it in contact, plus 1; 0 for none */
+    uint8_t resting[LW_N_Z8]; /* events in a row that led back into contact */
+} lw_memory;
+#endif
+
 /* Content of an FMU state, which is copied and serialized unchanged. */
 typedef struct {
     uint64_t magic;
@@ -89,8 +103,7 @@ typedef struct {
     double slopes[LW_MAX_ORDER][LW_N_U]; /* derivatives of the inputs by time at the start of the next step, from order 1 on */
 #endif
 #if LW_N_Z
-    double last_fired[LW_N_Z], last_but_one[LW_N_Z]; /* times at which doStep has found the event */
-    uint8_t positive[(LW_N_Z + 7) / 8 * 8];          /* the domain of each indicator: z > 0? */
+    lw_memory events;
 #endif
 } lw_state;
 

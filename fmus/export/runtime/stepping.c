@@ -267,11 +267,7 @@ static inline bool lw_try_step(lw_instance *self, double t, double h) {
 static inline bool lw_step(lw_instance *self, double t, double h) {
     double step_size = self->s.step_size;
 #if LW_N_Z
-    double last_fired[LW_N_Z], last_but_one[LW_N_Z];
-    uint8_t positive[sizeof self->s.positive];
-    memcpy(last_fired, self->s.last_fired, sizeof last_fired);
-    memcpy(last_but_one, self->s.last_but_one, sizeof last_but_one);
-    memcpy(positive, self->s.positive, sizeof positive);
+    const lw_memory events = self->s.events;
 #endif
     self->event_found = false;
 #if LW_MOVING_INPUTS
@@ -286,9 +282,7 @@ static inline bool lw_step(lw_instance *self, double t, double h) {
     }
     self->s.step_size = step_size;
 #if LW_N_Z
-    memcpy(self->s.last_fired, last_fired, sizeof last_fired);
-    memcpy(self->s.last_but_one, last_but_one, sizeof last_but_one);
-    memcpy(self->s.positive, positive, sizeof positive);
+    self->s.events = events;
 #endif
     return false;
 }

@@ -138,6 +138,62 @@ class Puck(Block):
         return np.where(hit, 0.0, x.h), np.where(hit, 0.0, x.v), np.where(hit, 1.0, 0.0)
 
 
+class Swing(Block):
+    """φ̈ = −φ from φ = 0; at each fall through 0 a clock is set back, and the damping may change with a mode."""
+
+    switches: bool = parameter(default=False, structural=True)
+    phi = State(output=True)
+    rate = State(start=1.0, output=True)
+    clock = State(output=True)
+    mode = State(discrete=True)
+    fall = Event("falling")
+
+    def derivative(self, t, x, u):
+        return x.rate, -x.phi - 0.1 * x.mode * x.rate, 1.0 + 0.0 * t
+
+    def indicators(self, t, x, u):
+        return x.phi
+
+    def jump(self, t, x, u, fired):
+        return x.phi, x.rate, 0.0 * x.clock, (1.0 - x.mode) if self.switches else x.mode
+
+
+@pytest.mark.parametrize("switches", [False, True])
+@pytest.mark.parametrize("solver", ["auto", "BDF", "rk4"])
+def test_a_jump_that_leaves_the_motion_of_its_indicator_alone_is_no_impact(solver, switches):
+    run = Diagram("d", Swing(name="s", switches=switches)).simulate(
+        13.0, step=0.01, rtol=1e-9, atol=1e-11, solver=solver, progress=False
+    )
+    damped = np.pi / np.sqrt(1 - 0.05**2) if switches else np.pi
+    assert [e.t for e in run.events] == pytest.approx([np.pi, np.pi + 2 * damped], abs=1e-6)
+    assert run["s.clock"][-1] == pytest.approx(13.0 - np.pi - 2 * damped, abs=1e-6)
+
+
+def test_a_mass_that_sticks_is_let_go_to_either_side():
+    """A mode holds it at v = 0: leaving that is no impact, though the jump has set v to 0."""
+
+    class Sticks(Block):
+        force = Input()
+        v = State(start=1.0, output=True)
+        stuck = State(discrete=True)
+        stop = Event("falling")
+        slip = Event("rising")
+
+        def derivative(self, t, x, u):
+            return np.where(x.stuck > 0.5, 0.0, u.force)
+
+        def indicators(self, t, x, u):
+            return x.v, np.where(x.stuck > 0.5, np.abs(u.force) - 1.5, -1.0)
+
+        def jump(self, t, x, u, fired):
+            return np.where(fired.stop > 0.5, 0.0, x.v), np.where(fired.stop > 0.5, 1.0, 0.0)
+
+    run = Diagram("d", Sticks(name="m")(Gain(gain=-1.0, name="g")(Clock()))).simulate(2.0, step=0.01, progress=False)
+    assert [e.event for e in run.events] == ["stop", "slip"]
+    assert [e.t for e in run.events] == pytest.approx([np.sqrt(2), 1.5], abs=1e-6)
+    assert run["m.v"][-1] == pytest.approx(-(2.0**2 - 1.5**2) / 2, abs=1e-6)
+
+
 @pytest.mark.parametrize("solver", ["auto", "DOP853", "BDF", "rk4"])
 def test_contact_that_is_held_is_left_when_a_force_lifts(solver):
     """The force is 12 t, from the weight at t₁ = g/12 on ḧ = 12 (t − t₁)."""
