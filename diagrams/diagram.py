@@ -164,11 +164,13 @@ class Diagram(SimulatedDiagram):
         point : OperatingPoint, Snapshot or float, optional
             Where: ``run.at(t)``, a time in s, `operating_point`, `trim`; the start without it.
         inputs : str or list of str
-            Wires or ports at which a signal is injected: added to what the consumers get; over a period it is held.
+            Wires or ports at which a signal is injected: added to what the consumers get; over a period it is held. At
+            an input, such as ``"plant.force"``, it reaches that input alone.
         outputs : str or list of str
-            Wires or ports that are measured: what the block puts out, ahead of an injection there.
+            Wires or ports that are measured: what the block puts out, or arrives at an input, ahead of an injection.
         openings : str or list of str
-            Wires that are cut behind the port, for all its consumers, which get its value at the operating point.
+            Wires that are cut behind the port, for all its consumers, which get its value at the operating point; at an
+            input, for that one alone.
         plants : {"equations", "step", "identified"}, optional
             Linear model of an FMU's step: its equations' Jacobian and a matrix exponential, the default at equilibria;
             differences of the step, elsewhere; or its pulse responses from rest, where it allows neither.

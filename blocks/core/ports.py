@@ -7,7 +7,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from .errors import DefinitionError
+from .errors import DefinitionError, near
 from .signals import Signal, Wireable
 from .units import parse_unit
 
@@ -44,10 +44,8 @@ class Port:
         minimum: float | None = None,
         maximum: float | None = None,
     ):
-        self.shape, self.unit, self.description, self.name = shape, unit, description, name
+        self.shape, self.unit, self.description, self.name = _shape_of(shape), _unit_of(unit), description, name
         self.nominal, self.minimum, self.maximum = nominal, minimum, maximum
-        for one in (unit,) if isinstance(unit, str) else unit or ():
-            parse_unit(one)
         if nominal is not None and not nominal > 0:
             raise DefinitionError(f"found nominal {nominal!r}; expected a positive number.")
 
@@ -59,6 +57,48 @@ class Port:
         return f"{type(self).__name__}({self.name}, shape={self.shape}{unit})"
 
 
+def _shape_of(given: Any) -> Shape | None:
+    """Return a declared shape as a tuple; a number is a vector's length."""
+    if given is None:
+        return None
+    entries = (given,) if isinstance(given, int | np.integer) else given
+    if isinstance(entries, tuple | list) and all(isinstance(n, int | np.integer) and n >= 0 for n in entries):
+        return tuple(int(n) for n in entries)
+    raise DefinitionError(
+        f"found shape {given!r}; expected whole numbers, such as (3,). Give a unit by keyword: unit='m'."
+    )
+
+
+def _unit_of(given: Any) -> PortUnit:
+    """Return a declared unit, one or a tuple of them."""
+    if given is None:
+        return None
+    units = (given,) if isinstance(given, str) else given
+    if not isinstance(units, tuple | list) or not all(isinstance(one, str) for one in units):
+        raise DefinitionError(
+            f"found unit {given!r}; expected a text, such as 'm', or one for each entry. Give a shape by keyword: "
+            "shape=(3,)."
+        )
+    for one in units:
+        parse_unit(one)
+    return given if isinstance(given, str) else tuple(units)
+
+
+def _known(kind: str, limits: Mapping[str, Any], *more: str) -> dict[str, Any]:
+    """Return further arguments of a port, ``nominal``, ``minimum`` and ``maximum``; refuse others.
+
+    Raises
+    ------
+    DefinitionError
+        For an argument that the kind of port does not have.
+    """
+    for name in limits:
+        if name not in LIMITS:
+            raise DefinitionError(f"{kind} has no argument {name!r}. {near(name, (*more, *LIMITS))}")
+    return dict(limits)
+
+
+LIMITS = ("nominal", "minimum", "maximum")
 _TAKEN = frozenset({"name", "inputs", "outputs", "states", "events", "replace", "parameters", "stepped", "drawn_as"})
 
 
@@ -101,8 +141,9 @@ class Input(Port):
         default: Any = None,
         tracks: str | None = None,
         name: str = "",
-        **limits: float | None,
+        **limits: Any,
     ):
+        limits = _known("Input", limits, "shape", "unit", "description", "default", "tracks")
         super().__init__(shape, unit, description, name, **limits)
         self.tracks = tracks
         self.default = None if default is None else np.asarray(default, dtype=float)
@@ -137,8 +178,9 @@ class Output(Port):
         like: str | None = None,
         secondary: bool = False,
         name: str = "",
-        **limits: float | None,
+        **limits: Any,
     ):
+        limits = _known("Output", limits, "shape", "unit", "description", "like", "secondary")
         super().__init__(None if like and shape == () else shape, unit, description, name, **limits)
         self.like, self.secondary = like, secondary
 
@@ -157,9 +199,11 @@ class State(Port):
 
     Parameters
     ----------
+    shape : tuple of int, optional
+        Shape of the state; without it the start value sets it.
     start : float, array_like, str or callable
-        Start value, which sets the shape. A string names the parameter that holds it; a callable computes it from the
-        block.
+        Start value, a number for all entries or one for each. A string names the parameter that holds it; a callable
+        computes it from the block.
     like : str, optional
         Name of the input whose shape the state takes.
     output : bool, optional
@@ -173,15 +217,22 @@ class State(Port):
         unit: PortUnit = None,
         description: str = "",
         *,
+        shape: Shape | None = None,
         start: float | Any | str | Callable[[Any], Any] = 0.0,
         like: str | None = None,
         output: bool = False,
         discrete: bool = False,
         name: str = "",
-        **limits: float | None,
+        **limits: Any,
     ):
+        limits = _known("State", limits, "unit", "description", "shape", "start", "like", "output", "discrete")
         super().__init__(None, unit, description, name, **limits)
+        if shape is not None and like is not None:
+            raise DefinitionError(
+                f"found shape={shape!r} and like={like!r}; expected one of them. Leave out the one that doesn't hold."
+            )
         self.start, self.like, self.output, self.discrete = start, like, output, discrete
+        self.own_shape = _shape_of(shape)
 
     def start_value(self, block: object, shapes: Mapping[str, Shape]) -> np.ndarray:
         """Return the start value for ``block``, with inputs of the given shapes, as a float64 array."""
@@ -191,7 +242,8 @@ class State(Port):
         elif callable(start):
             start = start(block)
         value = np.asarray(0.0 if start is None else start, dtype=float)
-        return np.array(np.broadcast_to(value, shapes[self.like])) if self.like else value
+        shape = shapes[self.like] if self.like else self.own_shape
+        return value if shape is None else np.array(np.broadcast_to(value, shape))
 
     def __get__(self, instance: Any, owner: type | None = None) -> Any:
         if instance is None:

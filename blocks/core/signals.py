@@ -336,6 +336,8 @@ def as_signal(value: Any, *, block: str = "", port: str = "") -> Signal:
 def bind(block: WirableBlock, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Signal]:
     """Match the arguments of a call with the block's inputs.
 
+    Signals by position go to the inputs in their order, or, if they are as many as inputs without a default, to these.
+
     Raises
     ------
     UnwiredInputError, DoubleDriveError, UnknownNameError, WiringError
@@ -344,7 +346,9 @@ def bind(block: WirableBlock, args: tuple[Any, ...], kwargs: dict[str, Any]) -> 
     inputs, who = block.inputs, block.label
     if len(args) > len(inputs):
         raise WiringError(f"{len(args)} signals for {len(inputs)} inputs ({', '.join(inputs) or 'none'}).", block=who)
-    given = dict(zip(inputs, args, strict=False))
+    required = [name for name, port in inputs.items() if port.default is None and name not in kwargs]
+    # as many signals as inputs need are theirs, wherever inputs with a default stand
+    given = dict(zip(required if len(args) == len(required) else inputs, args, strict=False))
     for name, value in kwargs.items():
         if name not in inputs:
             raise UnknownNameError(f"it has no input {name!r}. {near(name, inputs)}", block=who)
@@ -355,7 +359,7 @@ def bind(block: WirableBlock, args: tuple[Any, ...], kwargs: dict[str, Any]) -> 
     if missing:
         raise UnwiredInputError(
             f"nothing is wired to {', '.join(repr(m) for m in missing)}; expected {block.label}"
-            f"({', '.join(f'{name}=…' for name in inputs)}).",
+            f"({', '.join(f'{name}=…' for name, port in inputs.items() if port.default is None or name in given)}).",
             block=who,
             port=missing[0],
         )

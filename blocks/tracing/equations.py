@@ -244,14 +244,15 @@ def start_values(block: Block, shapes: Mapping[str, Shape]) -> dict[str, np.ndar
         except (TypeError, ValueError) as error:
             given = getattr(block, port.start, None) if isinstance(port.start, str) else port.start
             shape = _shape(given)
-            if port.like is None or shape is None:
+            wanted = port.own_shape if port.like is None else shapes[port.like]
+            if wanted is None or shape is None:
                 raise DefinitionError(
                     f"found start={given!r} ({error}); expected numbers. Give a number, a vector or a parameter.",
                     port=name,
                 ) from error
             raise ShapeError(
-                f"found a start value of shape {shape}; expected a number, or shape {shapes[port.like]} as the input "
-                f"{port.like!r} has. Give one of these.",
+                f"found a start value of shape {shape}; expected a number, or shape {wanted} as "
+                f"{'it is declared' if port.like is None else f'the input {port.like!r} has'}. Give one of these.",
                 port=port.start if isinstance(port.start, str) else name,
             ) from error
     return values
@@ -261,7 +262,7 @@ def start_shapes(block: Block) -> list[Shape]:
     """Return the shapes of the start values as they are written, before any is broadcast to an input's shape."""
     shapes = []
     for port in block.states.values():
-        alone = State(start=port.start)
+        alone = State(start=port.start, shape=port.own_shape)
         shapes.append(tuple(alone.start_value(block, {}).shape))
     return shapes
 

@@ -13,18 +13,18 @@ The loop to one consumer is cut at an inserted block that passes the signal on.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 
-from ...blocks.core import Finding, Gain, OptionError, UnknownNameError, WiringError, elements, near
+from ...blocks.core import Finding, OptionError, UnknownNameError, WiringError, near
 from ..flat import FlatDiagram, WiredDiagram
-from ..results import OperatingPoint, layout_of
+from ..results import OperatingPoint
 from ..wiring import Wire, join
 from .block_slopes import slopes_of
 from .derivatives import find_signal
 from .findings import BlockFinding, CutFromTracking, InertConsumer
+from .input_ports import insert_ahead
 from .kinks import read_arguments, read_log
 from .signal_paths import Node, SignalPaths
 
@@ -77,38 +77,7 @@ def split_consumers(
             block=inputs[0][0],
             port=inputs[0][1],
         )
-    subsystem = subsystems.pop()
-    path = join(subsystem, "_".join(["to", *(f"{b.rpartition('.')[2]}_{p}" for b, p in inputs)]).replace(".", "_"))
-    while path in table.blocks:
-        path += "_"
-    table.blocks[path] = Gain(gain=1.0, name=path.rpartition(".")[2])
-    table.subsystem_of[path] = subsystem
-    table.wires[path, "u"] = table.wires[inputs[0]]
-    for each in inputs:
-        table.wires[each] = Wire(path, "y")
-        table.handed.pop(each, None)
-    split = diagram.with_structure(table)
-    value = read_log(flat, point)[flat.log.slices[join(*signal.port)]][list(signal.entries)]
-    return split, _carry_point(flat, split.flatten(point.base), point, path, value), f"{path}.y"
-
-
-def _carry_point(
-    flat: FlatDiagram, split: FlatDiagram, point: OperatingPoint, path: str, value: np.ndarray
-) -> OperatingPoint:
-    """Return the operating point of the diagram with the inserted block, which passes on ``value``."""
-    known = dict(zip(flat.labels, point.x, strict=True))
-    labels = elements(f"{path}.y", split.checked.shapes[path, "y"])
-    own = {f"{kind}({label})": v for kind in ("held", "loop") for label, v in zip(labels, value, strict=True)}
-    missing = [label for label in split.labels if label not in known and label not in own]
-    if missing or len(known) + sum(label in own for label in split.labels) != split.width:
-        raise OptionError(
-            f"found other signals in the state where the wire is split ({', '.join(missing) or 'fewer'}), as of a "
-            "solved algebraic loop; expected those of the operating point. Cut the whole wire.",
-            block=path,
-            port="to",
-        )
-    x = np.array([known[label] if label in known else own[label] for label in split.labels])
-    return replace(point, x=x, layout=layout_of(split))
+    return insert_ahead(diagram, flat, point, inputs, signal.port, signal.entries)
 
 
 def _find_input(diagram: WiredDiagram, name: str) -> Port:

@@ -7,6 +7,7 @@ least common period. Hold and delay are exact (`over_a_period`).
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -25,6 +26,7 @@ from .consumers import find_cut_findings, split_consumers
 from .continuous_model import model_continuous
 from .derivatives import LocalDerivatives, find_signal
 from .findings import EntryTaken
+from .input_ports import name_inputs, split_inputs
 from .kinks import find_kinks
 from .loops_over_a_period import (
     advance_point,
@@ -273,7 +275,11 @@ def linearize(
     check_options(diagram, options, "linearize")
     at = operating_point(diagram, point, options)
     diagram = diagram.replace(at.parameters) if at.parameters else diagram  # parameters that a trim has found
-    return _linearize(diagram, at, inputs, outputs, openings, plants=plants, stairs=stairs, step=options.get("step"))
+    given = [_as_list(names) for names in (inputs, outputs, openings)]
+    diagram, at, ports = split_inputs(diagram, at, itertools.chain(*given))
+    places = [[ports.get(name, name) for name in names] for names in given]
+    made = _linearize(diagram, at, *places, plants=plants, stairs=stairs, step=options.get("step"))
+    return replace(made, inputs=name_inputs(made.inputs, ports), outputs=name_inputs(made.outputs, ports))
 
 
 def _linearize(
