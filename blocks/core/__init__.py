@@ -33,7 +33,7 @@ from .errors import (
 )
 from .findings import Finding
 from .frozen import FrozenMapping
-from .instants import FINEST, is_before, left_of, move_earlier, next_edge, period_of, read_time
+from .instants import FINEST, is_before, left_of, move_earlier, next_edge, period_of, read_time, right_of
 from .layout import Layout, elements, lay_out
 from .parameters import ParameterSpec
 from .ports import Event, Input, Output, Port, PortUnit, Shape, State
@@ -114,6 +114,7 @@ __all__ = [
     "rate_of",
     "read_time",
     "recorder",
+    "right_of",
     "same_unit",
     "shape_of",
     "shorten",

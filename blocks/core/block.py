@@ -22,7 +22,7 @@ from .signals import (
     check_name,
     primary_outputs,
 )
-from .values import Value
+from .values import Array, Value
 
 SOLVED = "trapezoidal step"
 """Name of the guard of a block's trapezoidal step, which fails if Newton's steps don't solve it."""
@@ -176,6 +176,14 @@ class Block(Value, Wireable):
     def next_instant(self, t: float) -> float:
         """Return the next time after t at which the outputs are not smooth in time: never, unless overridden."""
         return math.inf
+
+    def input_breaks(self) -> Mapping[str, Array]:
+        """Return, by input, the values at which the outputs are not smooth, such as the breakpoints of a table.
+
+        In a continuous subsystem, where such an input is the time (a clock, with gains and constants), a solver lands
+        on them.
+        """
+        return {}
 
     def time_scale(self) -> float:
         """Return the time in s within which the outputs change by themselves, such as a tenth of a period.

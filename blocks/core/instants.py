@@ -23,6 +23,11 @@ def left_of(t: float) -> float:
     return t - 4.0 * _TOLERANCE * abs(t)
 
 
+def right_of(t: float) -> float:
+    """Return a time just after t, as far from it as `left_of` is."""
+    return t + 4.0 * _TOLERANCE * abs(t)
+
+
 def is_before(a: float, b: float) -> bool:
     """Whether a comes before b by more than the rounding of both; nearer than that they are one instant."""
     return a < b - 2.0 * _TOLERANCE * abs(b) if b < math.inf else a < b

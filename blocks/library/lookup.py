@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -91,8 +92,8 @@ class Lookup1D(Block):
     holds the last value ("hold"), continues the end piece ("extrapolate"), or stops the run ("error").
 
     The values may be vectors, one row for each breakpoint; a vector u is looked up element by element. NaN passes
-    through. Derivatives of a trace are exact, and a kink needs no event. For a table over time use `PiecewiseLinear` or
-    `Recorded`: a solver lands on their times, while it may step over a short peak of a table that reads a `Clock`.
+    through. Derivatives of a trace are exact, and a kink needs no event. Where the table reads a `Clock`, also one with
+    gains and constants, a solver lands on the breakpoints. `PiecewiseLinear` and `Recorded` are tables over time.
 
     Raises
     ------
@@ -151,6 +152,10 @@ class Lookup1D(Block):
             return found[0]
         return np.stack([value[0] for value in found]) if shape else found[0][0]
 
+    def input_breaks(self) -> Mapping[str, Array]:
+        """Return the breakpoints: a solver lands on them where the table reads the time."""
+        return {"u": self.breakpoints}
+
     def guards(self, t: Array, x: Any, u: Any) -> dict[str, Array]:
         """Return the distances from the ends, if leaving the table is an error."""
         return _margins(self.breakpoints, "u", u.u) if self.beyond == "error" else {}
@@ -201,6 +206,10 @@ class Lookup2D(Block):
         if self.beyond != "extrapolate":
             a, b = _clip(self.rows, a), _clip(self.columns, b)
         return bilinear(self.rows, self.columns, self.values, a, b)
+
+    def input_breaks(self) -> Mapping[str, Array]:
+        """Return the breakpoints: a solver lands on them where the table reads the time."""
+        return {"u1": self.rows, "u2": self.columns}
 
     def guards(self, t: Array, x: Any, u: Any) -> dict[str, Array]:
         """Return the distances from the edges, if leaving the table is an error."""

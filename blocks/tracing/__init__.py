@@ -5,6 +5,7 @@ from .equations import initial_state, start_shapes, start_values
 from .numpy_check import GUARDS, NEXT, evaluate
 from .opaque_equations import raise_failure
 from .structure import is_traced_by, traced_parameters
+from .switching_times import Line, switching_times
 from .symbols import bundle, flat_column, has_large_product, size, with_values, wrap
 from .traced import Traced, constants_of, trace
 from .traced_array import as_traced
@@ -12,6 +13,7 @@ from .traced_array import as_traced
 __all__ = [
     "GUARDS",
     "NEXT",
+    "Line",
     "Traced",
     "as_traced",
     "bundle",
@@ -27,6 +29,7 @@ __all__ = [
     "size",
     "start_shapes",
     "start_values",
+    "switching_times",
     "trace",
     "traced_parameters",
     "with_values",

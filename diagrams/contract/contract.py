@@ -77,6 +77,7 @@ def check_block(
     ticks: int = 100,
     seed: int = 0,
     kinds: Iterable[str] = (),
+    duration: float | None = None,
 ) -> BlockReport:
     """Check that a block keeps the contract of blocks, the library's or one of your own.
 
@@ -110,6 +111,9 @@ def check_block(
     kinds : list of str, optional
         "sampled", "continuous" or both: kinds of subsystems in which the block must stand. Without it, those that it
         doesn't refuse.
+    duration : float, optional
+        Time in s over which jumps in time are looked for: give that of your runs. The length of the runs here without
+        it. An input that is wired to a `Clock` goes with the time.
 
     Returns
     -------
@@ -139,9 +143,10 @@ def check_block(
     checks = {"values": check_values(block)}
     exercise = Exercise.of(block, inputs or {}, shapes or {}, sample_time, ticks, seed)
     checks["ports"] = check_ports(block)
-    announced = find_instants(block, exercise.duration)
-    checks["next_instant"] = f"{len(announced)} within {exercise.duration:g} s"
-    found = _Findings(exercise, announced, checks)
+    span = exercise.duration if duration is None else float(duration)
+    announced = find_instants(block, span)
+    checks["next_instant"] = f"{len(announced)} within {span:g} s"
+    found = _Findings(exercise, announced, checks, span)
     wanted = _choose_kinds(kinds)
     refused = [error for sampled in wanted if (error := found.check_in(sampled)) is not None]
     if refused and (kinds or len(refused) == len(wanted)):
@@ -165,8 +170,8 @@ def _choose_kinds(kinds: Iterable[str]) -> list[bool]:
 class _Findings:
     """Findings about a block, for one kind of subsystem after the other."""
 
-    def __init__(self, exercise: Exercise, announced: list[float], checks: dict[str, str]):
-        self.exercise, self.announced, self.checks = exercise, announced, checks
+    def __init__(self, exercise: Exercise, announced: list[float], checks: dict[str, str], duration: float):
+        self.exercise, self.announced, self.checks, self.duration = exercise, announced, checks, duration
         self.kinds: dict[str, str] = {}
         self.feedthrough: dict[str, frozenset[tuple[str, str]]] = {}
         self.unseen: dict[str, frozenset[tuple[str, str]]] = {}
@@ -202,7 +207,7 @@ class _Findings:
         if guards := check_guards(bench):
             checks[f"{kind}: guards"] = str(guards)
         if not sampled:
-            checks[f"{kind}: smooth"] = f"{check_smooth(bench, self.announced)} intervals"
+            checks[f"{kind}: smooth"] = f"{check_smooth(bench, self.announced, self.duration)} intervals"
             fired, self.quiet = check_events(bench)
             if block.events:
                 checks[f"{kind}: events"] = f"{fired} fired in small steps"

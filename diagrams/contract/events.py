@@ -9,8 +9,9 @@ from typing import Any, TypeVar
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import Block
-from ...blocks.tracing import bundle
+from ...blocks.core import Block, LoopwrightError, is_before, left_of, right_of
+from ...blocks.library import Clock
+from ...blocks.tracing import bundle, switching_times
 from .exercise import Bench, Columns, Point
 from .values import rule_error
 
@@ -19,6 +20,8 @@ N = TypeVar("N", float, np.ndarray)
 _INSTANTS = 200  # looked at, at most
 _SAME_INSTANT = 100  # jumps that may follow each other at one instant
 _FINENESS = 13  # refinements of an interval, by 8 each
+_MANY, _FEW = 20_000, 2_001  # points in time at which equations are looked at, and those of foreign code
+_TIME = np.zeros(1), np.ones(1)  # the time as a straight line
 
 
 def find_instants(block: Block, end: float) -> list[float]:
@@ -51,12 +54,25 @@ def find_instants(block: Block, end: float) -> list[float]:
     return found
 
 
-def check_smooth(bench: Bench, announced: list[float]) -> int:
-    """Look for jumps that nothing announces, in a continuous subsystem, and return the number of intervals searched."""
+def check_smooth(bench: Bench, announced: list[float], duration: float) -> int:
+    """Look for jumps that nothing announces, in a continuous subsystem, and return the number of intervals searched.
+
+    Parameters
+    ----------
+    announced : list of float
+        Instants that the block announces.
+    duration : float
+        Time in s over which jumps in time are looked for.
+    """
     if bench.sampled or not (bench.traced.outputs or bench.traced.states) or bench.block.memory:
         return 0
     searched = 0
-    edges = np.unique([0.0, *announced[:24], bench.exercise.duration])
+    clocks = [name for name, signal in bench.exercise.signals.items() if isinstance(signal.source, Clock)]
+    on_clock = [1 + list(bench.traced.inputs).index(name) for name in clocks]  # inputs that are the time itself
+    hidden = {} if bench.block.opaque else switching_times(bench.traced, bench.p, dict.fromkeys(clocks, _TIME))
+    hidden = {t: late for t, late in hidden.items() if 0.0 < t < duration and not _is_known(t, announced)}
+    edges = np.unique([0.0, *announced[:24], *sorted(hidden)[:24], duration])
+    points = _FEW if bench.block.opaque else _MANY // (len(edges) - 1) + 65
     function = bench.traced.function
     symbols = function.mx_in()
     *outputs, rates, _ = function.call(symbols)
@@ -65,6 +81,15 @@ def check_smooth(bench: Bench, announced: list[float]) -> int:
         rows.append(ca.jacobian(ca.vertcat(*outputs), symbols[0]))
     in_time = ca.Function("in_time", symbols, [ca.densify(ca.vertcat(*rows))])
     rest = bench.points[1].columns()[1:]
+
+    def at(t: np.ndarray) -> Columns:
+        return [t[None] if i in on_clock else column for i, column in enumerate(rest)]
+
+    for t in sorted(hidden):
+        sides = np.array([left_of(t), right_of(t)])
+        before, after = np.array(in_time.call([sides[None], *at(sides), bench.p])[0]).T
+        if np.any(np.abs(after - before) > 1e-7 * (1.0 + np.abs(before))):
+            raise _jump_error(bench, t)
     for left, right in pairwise(edges):
         margin = 1e-6 * (right - left)
 
@@ -72,21 +97,29 @@ def check_smooth(bench: Bench, announced: list[float]) -> int:
             return first + s * span
 
         def values_at(s: np.ndarray, time_at: Callable[[np.ndarray], np.ndarray] = time_at) -> np.ndarray:
-            return np.array(in_time.call([time_at(s)[None], *rest, bench.p])[0])
+            return np.array(in_time.call([time_at(s)[None], *at(time_at(s)), bench.p])[0])
 
         def domains_at(s: float, time_at: Callable[[float], float] = time_at) -> tuple[bool, ...]:
-            return _evaluate_domains(bench, [time_at(s), *rest])
+            return _evaluate_domains(bench, [time_at(s), *at(np.array([time_at(s)]))])
 
-        where = _find_jump(values_at, domains_at)
+        where = _find_jump(values_at, domains_at, points)
         searched += 1
         if where is not None:
-            raise rule_error(
-                "next_instant",
-                f"its outputs, or their rates, jump at t = {time_at(where):.9g} s, and next_instant does not announce "
-                "it; expected smooth outputs between instants. Return this time from next_instant, or make an Event.",
-                bench.block,
-            )
+            raise _jump_error(bench, time_at(where))
     return searched + _search_signals(bench)
+
+
+def _is_known(t: float, announced: list[float]) -> bool:
+    return any(not is_before(t, known) and not is_before(known, t) for known in announced)
+
+
+def _jump_error(bench: Bench, t: float) -> LoopwrightError:
+    return rule_error(
+        "next_instant",
+        f"its outputs, or their rates, jump at t = {t:.9g} s, and next_instant does not announce it; expected smooth "
+        "outputs between instants. Return this time from next_instant, or make an Event.",
+        bench.block,
+    )
 
 
 def _search_signals(bench: Bench) -> int:
@@ -128,14 +161,14 @@ def _evaluate_domains(bench: Bench, columns: Columns) -> tuple[bool, ...]:
 
 
 def _find_jump(
-    values_at: Callable[[np.ndarray], np.ndarray], domains_at: Callable[[float], tuple[bool, ...]]
+    values_at: Callable[[np.ndarray], np.ndarray], domains_at: Callable[[float], tuple[bool, ...]], points: int = 65
 ) -> float | None:
     """Return a place in [0, 1] at which a row of a function jumps without a change of domains, or None.
 
     The part with the largest change is refined again and again. The change of a smooth function shrinks with it, that
     of a jump stays.
     """
-    grid = np.linspace(0.0, 1.0, 65)
+    grid = np.linspace(0.0, 1.0, points)
     coarse = values_at(grid)
     for row in range(len(coarse)):
         s, values = grid, coarse[row]

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, NonFiniteError, OptionError, SimulationError, is_before, left_of
+from ...blocks.core import NonFiniteError, OptionError, SimulationError, is_before, left_of
 from ..events import Domains
 from ..results import Occurrence
 from ..solvers import Problem, Step, make_solver
+from .announced import Times, announcers
 from .diagnosis import forget_trials, opaque_failure, state_values
 from .left_of_start import domains_from_left
 from .solver_setup import absolute_tolerances, next_instant, remembers, time_scale_of
@@ -98,17 +99,13 @@ class Continuous:
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
             self._drive = workspace.plain(flat.driven, [self._driven], workspace.trial)
-        self.sources = [
-            (path, flat.table.blocks[path])
-            for path in sorted(flat.checked.traced)
-            if not flat.table.is_sampled(flat.table.subsystem_of[path])
-            and type(flat.table.blocks[path]).next_instant is not Block.next_instant
-        ]
+        self.sources = announcers(flat)
+        self._late = {t: after for _, one in self.sources if isinstance(one, Times) for t, after in one.late.items()}
 
     # --- functions of a trial: time from the left of the next discontinuity, past inputs of the delays ---------------
 
     def _time(self, t: float) -> float:
-        t = self._left if t >= self._edge else t
+        t = self._left if t >= self._edge else self._late.get(t, t)
         if self.delays is not None:
             self.delays.outputs_at(t, self.workspace.trial.w)
         if self._loops:  # whatever was tried in between: Newton's method starts from the last accepted solution

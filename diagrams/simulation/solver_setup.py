@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, SimulationError
+from ...blocks.core import SimulationError
 from ..flat import FlatDiagram
+from .announced import Announcer
 
 
 def time_scale_of(flat: FlatDiagram) -> float:
@@ -35,7 +36,7 @@ def absolute_tolerances(flat: FlatDiagram, atol: float) -> Any:
     return atol if np.all(scale == 1.0) or np.ndim(atol) else atol * scale
 
 
-def next_instant(path: str, block: Block, t: float) -> float:
+def next_instant(path: str, block: Announcer, t: float) -> float:
     """Return the next instant of a block; one that does not come after t would keep the run where it is."""
     try:
         found = block.next_instant(t)

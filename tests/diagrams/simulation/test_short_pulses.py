@@ -1,0 +1,109 @@
+"""Short pulses of tables and of blocks on a clock: a solver lands on them, and `check_block` finds those that hide."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import (
+    Block,
+    Clock,
+    Constant,
+    DefinitionError,
+    Gain,
+    Input,
+    Integrator,
+    Lookup1D,
+    Lookup2D,
+    Output,
+    PythonFunction,
+    Ramp,
+    parameter,
+)
+from loopwright.diagrams import Diagram, check_block
+
+WIDTH = 1e-3
+
+
+class Pulse(Block):
+    """A pulse of height 1/width in time, which says nothing of its edges."""
+
+    begin: float = parameter(default=3.2, unit="s", description="beginning")
+    y = Output()
+
+    def output(self, t, x, u):
+        return np.where((t > self.begin) & (t < self.begin + WIDTH), 1.0 / WIDTH, 0.0)
+
+
+class OnClock(Block):
+    """The same of an input."""
+
+    u = Input()
+    y = Output()
+
+    def output(self, t, x, u):
+        return np.where(np.logical_and(u.u >= 3.2, u.u <= 3.2 + WIDTH), 1.0 / WIDTH, 0.0)
+
+
+def triangle(**more):
+    """A table with a triangle of area 1 around 3.2, of the width 2 ms."""
+    return Lookup1D(breakpoints=[0.0, 3.2 - WIDTH, 3.2, 3.2 + WIDTH, 10.0], values=[0, 0, 1 / WIDTH, 0, 0], **more)
+
+
+CASES = {
+    "equation": (lambda: Pulse(), 1.0),
+    "on a clock": (lambda: OnClock()(Clock()), 1.0),
+    "on a faster clock": (lambda: OnClock()(Gain(gain=2.0)(Clock())), 0.5),
+    "on a sum": (lambda: OnClock()(2.0 * Clock().y - Constant(value=1.0)), 0.5),
+    "table": (lambda: triangle()(Clock()), 1.0),
+    "table on a later clock": (lambda: triangle()(Clock().y - 2.0), 1.0),
+    "cubic table": (lambda: triangle(interpolation="monotone")(Clock()), 1.0),
+}
+
+
+@pytest.mark.parametrize("solver", ["auto", "DOP853", "Radau", "CVODE_BDF", "rk4"])
+@pytest.mark.parametrize("case", CASES)
+def test_the_integral_of_a_short_pulse_is_its_area(case, solver):
+    source, area = CASES[case]
+    run = Diagram("d", Integrator()(source())).simulate(10.0, step=0.5, solver=solver, progress=False)
+    assert run["integrator.y"][-1] == pytest.approx(area, rel=2e-6)
+
+
+def test_a_table_of_two_arguments_lands_on_its_rows():
+    rows = [0.0, 3.2 - WIDTH, 3.2, 3.2 + WIDTH, 10.0]
+    table = Lookup2D(rows=rows, columns=[0.0, 1.0], values=[[0, 0], [0, 0], [1000, 3000], [0, 0], [0, 0]])
+    run = Diagram("d", Integrator()(table(Clock(), Constant(value=0.5)))).simulate(10.0, step=0.5, progress=False)
+    assert run["integrator.y"][-1] == pytest.approx(2.0, rel=1e-6)
+
+
+def test_a_table_of_a_signal_that_is_not_the_time_is_left_alone():
+    run = Diagram("d", Integrator()(triangle()(Ramp(slope=0.0)))).simulate(1.0, step=0.5, progress=False)
+    assert run["integrator.y"][-1] == 0.0
+
+
+# --- check_block --------------------------------------------------------------------------------------------------------
+
+
+class Narrow(Block):
+    """A pulse once in 10 s, where the sine is almost one: no line in time, so nothing can be read from it."""
+
+    y = Output()
+
+    def output(self, t, x, u):
+        return np.where(np.sin(2 * np.pi * t / 10.0) > 0.999999, 1.0, 0.0)
+
+
+@pytest.mark.parametrize("block", [Pulse(), Pulse(begin=7.77), Narrow()])
+def test_a_pulse_anywhere_in_the_runs_duration_is_found(block):
+    check_block(block)  # it is smooth in the first second
+    with pytest.raises(DefinitionError, match=r"jump at t = .* s, and next_instant does not announce it"):
+        check_block(block, duration=10.0)
+
+
+def test_a_block_on_a_clock_is_looked_at_along_it():
+    with pytest.raises(DefinitionError, match=r"jump at t = 3\.2 s, and next_instant does not announce it"):
+        check_block(OnClock(), {"u": Clock()}, duration=10.0)
+
+
+def test_foreign_code_on_a_clock_is_looked_at_along_it():
+    function = PythonFunction(lambda u: 1.0 if 3.2 < u < 3.25 else 0.0, results={"y": ()})
+    with pytest.raises(DefinitionError, match=r"jump at t = 3\.2"):
+        check_block(function, {"u": Clock()}, duration=10.0)
