@@ -195,9 +195,14 @@ class _Runner:
 
 def _measure_markov(runner: _Runner, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the Markov parameters G, by step, output and input, and their estimated error by output and input."""
-    found, errors = [], []
+    found, errors, n = [], [], len(runner.instance.values(runner.outputs))
     for name, value in runner.inputs.items():
-        nominals = runner.about.find(name).nominals
+        variable = runner.about.find(name)
+        if variable.is_integer:  # it has no derivatives
+            found += [np.zeros((samples, n))] * variable.size
+            errors += [np.zeros(n)] * variable.size
+            continue
+        nominals = variable.nominals
         for index in np.ndindex(*value.shape):
             d = PULSE * max(float(nominals[index]), abs(float(value[index])))
             pulse = np.zeros(value.shape)
@@ -209,7 +214,6 @@ def _measure_markov(runner: _Runner, samples: int) -> tuple[np.ndarray, np.ndarr
             )
             found.append((4.0 * one - two) / 3.0)
             errors.append(np.max(np.abs(two - one), axis=0) / 3.0)
-    n = len(runner.instance.values(runner.outputs))
     if not found:
         return np.zeros((samples, n, 0)), np.zeros((n, 0))
     return np.stack(found, axis=2), np.stack(errors, axis=1)

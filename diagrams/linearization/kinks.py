@@ -17,18 +17,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, TypeAlias
 
 import casadi as ca
 import numpy as np
 
 from ...blocks.core import Block, Finding, Output, State
+from ...fmus.running import Fmu
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
 from .block_slopes import BlockSlopes, slopes_of
 from .findings import Kink, StepsOnly, ZeroSlope
 from .operating_points import operating_point
+from .plant_models import plant_paths
 from .signal_paths import SignalPaths
 
 NEAR = 1e-6
@@ -61,7 +64,19 @@ def find_kinks(flat: FlatDiagram, at: OperatingPoint) -> tuple[Finding, ...]:
         if log is None:
             log = read_log(flat, at)
         found += _BlockAtPoint.of(flat, at, log, path, slopes, wired).find()
-    return tuple(found)
+    return (*found, *_find_steps_of_plants(flat))
+
+
+def _find_steps_of_plants(flat: FlatDiagram) -> Iterator[StepsOnly]:
+    """Yield the ways through FMUs from or to a port of integers, which has no derivatives."""
+    for path in plant_paths(flat):
+        block = flat.table.blocks[path]
+        if not isinstance(block, Fmu):
+            continue
+        for port, source in product(block.output_variables, block.input_variables):
+            whole = block.output_variables[port].is_integer or block.input_variables[source].is_integer
+            if whole and (path, source) in flat.table.wires:
+                yield StepsOnly(path, port, source)
 
 
 def find_kinks_between(

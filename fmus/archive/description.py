@@ -50,6 +50,8 @@ class FmuDescription:
     """Array and index, from 0 on, of each scalar that was gathered."""
     texts: dict[str, int] = field(default_factory=dict)
     """Value reference of each variable that is a text, by name."""
+    complaints: tuple[str, ...] = ()
+    """Rules of the standard that the description breaks, as FMPy's validation words them."""
     can_save: bool = False
     """Whether the state of an instance can be saved and restored (canGetAndSetFMUState)."""
     can_serialize: bool = False
@@ -152,13 +154,8 @@ def read_description(file: str | os.PathLike[str]) -> FmuDescription:
 
 @lru_cache(maxsize=256)
 def _read(path: Path, mtime: int, length: int) -> FmuDescription:
-    import fmpy
-
     data, entries, text = _read_archive(path)
-    try:
-        model = fmpy.read_model_description(str(path))
-    except Exception as error:  # FMPy raises bare exceptions
-        raise FmuFileError(f"the modelDescription.xml of {str(path)!r} can't be read: {error}") from error
+    model, complaints = _parse(path)
     if not re.fullmatch(r"2\.0|3\.0(\.\d+)?", model.fmiVersion):
         raise FmuFileError(
             f"{str(path)!r} is an FMU of FMI {model.fmiVersion}; expected FMI 2.0 or 3.0. Export it again with one of "
@@ -168,15 +165,51 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
         raise FmuFileError(f"{str(path)!r} has no co-simulation interface; export it with one.")
     version, identifier = model.fmiVersion, model.coSimulation.modelIdentifier
     binary = _find_binary(path, entries, version, identifier)
-    root = ET.fromstring(text)
+    try:
+        found = _read_variables(path, entries, ET.fromstring(text), model)
+    except FmuFileError:
+        raise
+    except Exception as error:  # of a description that breaks its own rules
+        raise FmuFileError(
+            f"the modelDescription.xml of {str(path)!r} can't be read: {type(error).__name__}: {error}. "
+            f"{''.join(f'{complaint} ' for complaint in complaints[:3])}Export it again."
+        ) from error
+    return FmuDescription(
+        version, path, hashlib.sha256(data).hexdigest(), model.modelName, identifier, model.instantiationToken or "",
+        binary, complaints=complaints, **found,
+    )  # fmt: skip
+
+
+def _parse(path: Path) -> tuple[Any, tuple[str, ...]]:
+    """Return FMPy's reading of a description, and the complaints about one that breaks rules of the standard."""
+    import fmpy
+    from fmpy.model_description import ValidationError
+
+    try:
+        try:
+            return fmpy.read_model_description(str(path)), ()
+        except ValidationError as error:  # many FMUs that run break some rule
+            return fmpy.read_model_description(str(path), validate=False), tuple(map(str, error.problems))
+    except Exception as error:  # FMPy raises bare exceptions
+        raise FmuFileError(f"the modelDescription.xml of {str(path)!r} can't be read: {error}") from error
+
+
+def _read_variables(path: Path, entries: set[str], root: ET.Element, model: Any) -> dict[str, Any]:
+    """Return the variables, states and capabilities of an FMU, as arguments of its description."""
+    version = model.fmiVersion
     flags = _capabilities(root, version)
     if flags["model_exchange"] is not None:
-        flags["model_exchange_binary"] = _find_binary(path, entries, version, flags["model_exchange"])
+        try:
+            flags["model_exchange_binary"] = _find_binary(path, entries, version, flags["model_exchange"])
+        except FmuFileError:
+            flags["model_exchange"] = None
     bounds = _unsigned_bounds(root)
     scalars, other, texts = {}, {}, {}
     for v in model.modelVariables:
         if v.causality == "independent":
             continue
+        if v.name in scalars or v.name in other:
+            raise FmuFileError(f"{str(path)!r} has two variables {v.name!r}. Export it again.")
         if fmi3_type(v.type) in WIRE_TYPES:
             scalars[v.name] = read_variable(v, bounds)
         else:
@@ -185,10 +218,15 @@ def _read(path: Path, mtime: int, length: int) -> FmuDescription:
                 texts[v.name] = v.valueReference
     variables, elements = gather(scalars, frozenset(other))
     states, order = find_states(model, scalars, variables, elements)
-    return FmuDescription(
-        version, path, hashlib.sha256(data).hexdigest(), model.modelName, identifier, model.instantiationToken, binary,
-        variables, other, elements, texts, states=states, state_order=order, **flags,
-    )  # fmt: skip
+    return {
+        "variables": variables,
+        "other": other,
+        "elements": elements,
+        "texts": texts,
+        "states": states,
+        "state_order": order,
+        **flags,
+    }
 
 
 def _read_archive(path: Path) -> tuple[bytes, set[str], bytes]:

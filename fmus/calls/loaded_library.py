@@ -76,11 +76,19 @@ class LoadedFmu:
             )
 
     def _list_limits(self) -> list[str]:
-        """Return a message on the ports that are neither read nor set; none if wires carry all."""
-        ins, outs = (self.description.other_ports(causality) for causality in ("input", "output"))
+        """Return messages on ports that are neither read nor set, and on a description that breaks rules."""
+        label, about = self.block.label, self.description
+        ins, outs = (about.other_ports(causality) for causality in ("input", "output"))
         parts = [f"the outputs {', '.join(map(str, outs))} are not recorded"] if outs else []
         parts += [f"the inputs {', '.join(map(str, ins))} keep their start values"] if ins else []
-        return [f"{self.block.label}: no wire carries texts, binaries and clocks: {'; '.join(parts)}"] if parts else []
+        found = [f"{label}: no wire carries texts, binaries and clocks: {'; '.join(parts)}"] if parts else []
+        if about.complaints:
+            more = f", and {len(about.complaints) - 1} more" if len(about.complaints) > 1 else ""
+            found.append(
+                f"{label}: its description breaks the standard: {about.complaints[0].rstrip('.')}{more}. "
+                f"'loopwright validate {about.file}' has them all"
+            )
+        return found
 
     def _log(self, status: int, text: str) -> None:
         if status and len(self.messages) < 1000:

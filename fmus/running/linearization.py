@@ -23,6 +23,8 @@ EQUATIONS, STEP = 1e-5, 1e-4
 class FmuLinearization:
     """Linear model of an FMU about an operating point (x0, u0) at the time t.
 
+    Ports of integers, Booleans and enumerations have no derivatives: their rows and columns are zero.
+
     For the equations dx/dt = f + A (x − x0) + B (u − u0). For a step of length h with held inputs, the states after it
     are f + A (x − x0) + B (u − u0). In both cases y = y0 + C (x − x0) + D (u − u0), for a step after it. At an
     equilibrium f is zero, or x0 for a step.
@@ -74,6 +76,8 @@ class _OperatingPoint:
         self.inputs, self.outputs = (
             [v.name for v in chosen.values()] for chosen in (block.input_variables, block.output_variables)
         )
+        self.moved = [n for n in self.inputs if not about.find(n).is_integer]
+        self.sets_parameters = any(about.find(n).causality == "parameter" for n in self.inputs)
         if not np.isfinite(self.t):
             raise ParameterError(f"found {t!r}; expected a time in s.", block=block.label, port="t")
         ports = {self.port_of[name]: name for name in self.inputs}
@@ -119,6 +123,19 @@ class _OperatingPoint:
         shapes = ((self.port_of[n] if ports else n, self.about.find(n).shape) for n in names)
         return tuple(label for name, shape in shapes for label in elements(name, shape))
 
+    def widen(self, J: np.ndarray) -> np.ndarray:
+        """Return the matrix for all ports: rows and columns of integers are zero, as they have no derivatives."""
+        columns, rows = self.smooth([*self.states, *self.inputs]), self.smooth([*self.states, *self.outputs])
+        found = np.zeros((len(rows), len(columns)))
+        found[:, columns] = J
+        found[~rows] = 0.0
+        return found
+
+    def smooth(self, names: list[str]) -> np.ndarray:
+        """Return which elements of variables are real numbers."""
+        kinds = [np.full(v.size, not v.is_integer) for v in map(self.about.find, names)]
+        return np.concatenate(kinds) if kinds else np.zeros(0, dtype=bool)
+
     def model(self, J: np.ndarray, x: np.ndarray, u: np.ndarray, values: np.ndarray, **more: Any) -> FmuLinearization:
         """Return the linear model with this matrix [[A, B], [C, D]]."""
         n = x.size
@@ -150,10 +167,11 @@ def linear_model(
             "equations can't be linearized. Use step_difference(), or identify it from a run.",
             block=block.label,
         )
+    derived_too = not point.sets_parameters  # the standard has directional derivatives by inputs and states alone
     settable = all(about.find(name).initial == "exact" for name in about.states)
     ways = (
-        (True, True, about.model_exchange_has_derivatives and about.model_exchange is not None),
-        (False, True, about.has_derivatives and settable),
+        (True, True, derived_too and about.model_exchange_has_derivatives and about.model_exchange is not None),
+        (False, True, derived_too and about.has_derivatives and settable),
         (True, False, about.model_exchange is not None),
         (False, False, settable),
     )
@@ -225,20 +243,26 @@ def _linearize_by_directions(point: _OperatingPoint, instance: LoadedFmu) -> Fmu
     point.check(x)
     values = _values(point, instance)
     unknowns = [*(about.states[n] for n in point.states), *point.outputs]
+    smooth = [n for n in unknowns if not about.find(n).is_integer]
     found = []
-    for name in (*point.states, *point.inputs):
+    for name in (*point.states, *point.moved):
         with _mode_of(point, instance, name):
             size = about.find(name).size
-            found += [instance.directional_derivative(unknowns, [name], seed) for seed in np.eye(size).tolist()]
-    J = np.array(found).reshape(len(found), values.size).T
+            found += [instance.directional_derivative(smooth, [name], seed) for seed in np.eye(size).tolist()]
+    part = np.zeros((values.size, len(found)))
+    part[point.smooth(unknowns)] = np.array(found).reshape(len(found), -1).T if found else 0.0
+    J = point.widen(part)
     derivation = Derivation(DerivativeMethod.DIRECTIONAL, _interface_name(instance.model_exchange))
     return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=np.zeros(J.shape))
 
 
 @contextmanager
 def _mode_of(point: _OperatingPoint, instance: LoadedFmu, name: str) -> Iterator[None]:
-    """Enter Event Mode for a discrete input of model exchange, and leave it again (FMI 3.0, 2.2.11)."""
-    discrete = instance.model_exchange and point.about.find(name).variability == "discrete"
+    """Enter Event Mode for a discrete input or a parameter of model exchange, and leave it again.
+
+    Clauses are FMI 2.0, 3.2.3, and FMI 3.0, 2.2.11.
+    """
+    discrete = instance.model_exchange and point.about.find(name).variability in ("discrete", "tunable")
     if discrete:
         instance.call("entering Event Mode", instance.fmi.enter_event_mode)
     yield
@@ -254,7 +278,8 @@ def _linearize_by_differences(point: _OperatingPoint, instance: LoadedFmu) -> Fm
     x, u = instance.values(point.states), instance.values(point.inputs)
     point.check(x)
     values = _values(point, instance)
-    column = Column(point.about, [*point.states, *point.inputs], np.concatenate([x, u]), EQUATIONS)
+    at = np.concatenate([x, instance.values(point.moved)])
+    column = Column(point.about, [*point.states, *point.moved], at, EQUATIONS)
 
     def evaluate(name: str, moved: np.ndarray) -> np.ndarray:
         with _mode_of(point, instance, name):
@@ -269,7 +294,7 @@ def _linearize_by_differences(point: _OperatingPoint, instance: LoadedFmu) -> Fm
                 instance.set_values({name: column.part(name, column.at)})
         return found
 
-    J, uncertainty = differentiate(column, values, evaluate)
+    J, uncertainty = map(point.widen, differentiate(column, values, evaluate))
     derivation = Derivation(DerivativeMethod.DIFFERENCES, _interface_name(instance.model_exchange))
     return point.model(J, x, u, values, h=None, derivation=derivation, uncertainty=uncertainty)
 
@@ -327,13 +352,15 @@ def _linearize_step(point: _OperatingPoint, instance: LoadedFmu, h: float, relat
 
     try:
         values = step_from_point({}, {}, first=True)
-        column = Column(about, known, np.concatenate([x, u]), relative_step)
+        moved_only = [*point.states, *point.moved]
+        start = np.concatenate([np.ravel(at[name]) for name in moved_only]) if moved_only else np.zeros(0)
+        column = Column(about, moved_only, start, relative_step)
 
         def evaluate(name: str, moved: np.ndarray) -> np.ndarray:
             change = {name: column.part(name, moved)}
             return step_from_point(change, {}) if name in point.states else step_from_point({}, change)
 
-        J, uncertainty = differentiate(column, values, evaluate)
+        J, uncertainty = map(point.widen, differentiate(column, values, evaluate))
     finally:
         if saved is not None:
             instance.free_state(saved)
