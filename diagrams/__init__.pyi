@@ -1,5 +1,8 @@
 from .admittance import (
     AdmittanceLoop,
+    Contact,
+    ContactAdmittance,
+    ContactLimit,
     Passivity,
     StabilityLimit,
     StabilityMap,
@@ -61,6 +64,9 @@ __all__ = [
     "BlockReport",
     "Channel",
     "Comparison",
+    "Contact",
+    "ContactAdmittance",
+    "ContactLimit",
     "Diagram",
     "DiskMargin",
     "Drawing",

@@ -14,6 +14,7 @@ from .results import OperatingPoint
 from .simulation import SimulatedDiagram
 
 if TYPE_CHECKING:
+    from .admittance import Contact
     from .document import Report
     from .drawing import Drawing
     from .linearization import Linearization
@@ -223,6 +224,41 @@ class Diagram(SimulatedDiagram):
         from .linearization import linearize_batch
 
         return linearize_batch(self, points, variants, **options)
+
+    def contact(
+        self,
+        port: str = "plant.external_force",
+        *,
+        position: str = "plant.position",
+        velocity: str = "plant.velocity",
+        force: str | None = "force",
+        direction: Any = "perp",
+        at: Any = None,
+        **options: Any,
+    ) -> Contact:
+        """Return the contact of an environment with the plant: admittance, passivity and limits of coupled stability.
+
+        The plant is the block or FMU with the port; all the rest of the diagram is its controller.
+
+        Parameters
+        ----------
+        port, position, velocity : str
+            Port at which the environment pushes; position and velocity there, in its axes.
+        force : str or None
+            Wire of the measured force on the robot; None if the controller does not measure it.
+        direction : {"perp", "par"} or vector
+            Direction of the environment: across or along the diagram's path, or a vector.
+        at : OperatingPoint, Snapshot or float, optional
+            Point at rest, as in `linearize`; the start without it. ``options`` are those of the run there.
+
+        Raises
+        ------
+        UnknownNameError, ShapeError, OptionError, ParameterError
+            Ports that don't fit; a point that is not at rest; a plant without a model of its equations; several rates.
+        """
+        from .admittance import make_contact
+
+        return make_contact(self, port, (position, velocity, force), direction, at, options)
 
     def report(
         self,

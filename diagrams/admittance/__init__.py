@@ -1,6 +1,9 @@
 """Admittance that an environment feels, and coupled stability."""
 
 from .compliance_loop import SIDES, AdmittanceLoop, control_rate
+from .contact import Contact, make_contact
+from .contact_admittance import ContactAdmittance
+from .contact_limits import ContactLimit
 from .coupled import crossing_frequency, growth_rate, poles
 from .rendered import Passivity, passivity, rendered_admittance, rendered_response, rendered_system, target_admittance
 from .shown_plant import check_plant, is_discrete
@@ -16,6 +19,9 @@ from .stability_limits import (
 __all__ = [
     "SIDES",
     "AdmittanceLoop",
+    "Contact",
+    "ContactAdmittance",
+    "ContactLimit",
     "Passivity",
     "StabilityLimit",
     "StabilityMap",
@@ -24,6 +30,7 @@ __all__ = [
     "crossing_frequency",
     "growth_rate",
     "is_discrete",
+    "make_contact",
     "passivity",
     "poles",
     "rendered_admittance",

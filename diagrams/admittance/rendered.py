@@ -15,6 +15,7 @@ the sampled loop and the exact motion of the plant between the ticks. Y does not
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +38,7 @@ OFF_PATH = (
     " Off the path the force that is conjugate to the rate of η is q F∥ (E22): driven by F∥, the admittance is not "
     "passive in motions that change q, whatever Re Y says at one point."
 )
-_LOWEST, _HIGHEST = 1e-2, 1e5
+LOWEST, HIGHEST = 1e-2, 1e5
 """Ends of a scan, rad/s."""
 _ROUNDED = 1e-10
 """Real part relative to |Y| below which it is rounding."""
@@ -156,7 +157,7 @@ def rendered_response(loop: AdmittanceLoop, omega: Array) -> FrequencyResponseDa
 
 
 def passivity(
-    loop: AdmittanceLoop, *, low: float = _LOWEST, high: float | None = None, per_decade: int = 200
+    loop: AdmittanceLoop, *, low: float = LOWEST, high: float | None = None, per_decade: int = 200
 ) -> Passivity:
     """Return the frequencies at which the real part of the rendered admittance is negative.
 
@@ -174,14 +175,31 @@ def passivity(
     OptionError
         If an end of the scan is not positive, or not below the Nyquist frequency.
     """
+    sampled = loop.implementation == "sampled"
+    top = (math.pi / loop.sample_time * (1.0 - 1e-9) if sampled else HIGHEST) if high is None else high
+    intervals = find_negative(lambda w: rendered_admittance(loop, w), low, top, per_decade)
+    poles = np.linalg.eigvals(close_loop(loop))
+    stable = bool(np.all(np.abs(poles) <= 1.0 + 1e-9) if sampled else np.all(poles.real <= 1e-6))
+    return Passivity(
+        frequency=intervals[0][0] if intervals else math.inf,
+        intervals=intervals,
+        scanned=(low, top),
+        stable=stable,
+        caveat=(SAMPLED if sampled else CONTINUOUS) + (OFF_PATH if loop.side == "par" and loop.q != 1.0 else ""),
+        findings=loop.findings,
+    )
+
+
+def find_negative(
+    admittance: Callable[[np.ndarray], Array], low: float, high: float, per_decade: int
+) -> tuple[tuple[float, float], ...]:
+    """Return the intervals of frequencies in which the real part of an admittance is negative, on a scan in rad/s."""
     from scipy.optimize import brentq
 
-    sampled = loop.implementation == "sampled"
-    top = (math.pi / loop.sample_time * (1.0 - 1e-9) if sampled else _HIGHEST) if high is None else high
-    grid = np.geomspace(low, top, max(8, math.ceil(per_decade * math.log10(top / low)) + 1))
+    grid = np.geomspace(low, high, max(8, math.ceil(per_decade * math.log10(high / low)) + 1))
 
     def sine(w: np.ndarray | float) -> np.ndarray:
-        Y: np.ndarray = rendered_admittance(loop, w)
+        Y = np.asarray(admittance(np.asarray(w)))
         return np.asarray(Y.real / np.abs(Y) + _ROUNDED)
 
     positive = sine(grid) >= 0.0
@@ -191,17 +209,8 @@ def passivity(
 
     edges = ([] if positive[0] else [low]) + [find_edge(int(i)) for i in np.flatnonzero(positive[1:] != positive[:-1])]
     if len(edges) % 2:
-        edges.append(top)
-    poles = np.linalg.eigvals(close_loop(loop))
-    stable = bool(np.all(np.abs(poles) <= 1.0 + 1e-9) if sampled else np.all(poles.real <= 1e-6))
-    return Passivity(
-        frequency=edges[0] if edges else math.inf,
-        intervals=tuple(zip(edges[::2], edges[1::2], strict=True)),
-        scanned=(low, top),
-        stable=stable,
-        caveat=(SAMPLED if sampled else CONTINUOUS) + (OFF_PATH if loop.side == "par" and loop.q != 1.0 else ""),
-        findings=loop.findings,
-    )
+        edges.append(high)
+    return tuple(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _index(loop: AdmittanceLoop) -> int:

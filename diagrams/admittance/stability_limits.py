@@ -24,9 +24,9 @@ UNITS = {"stiffness": "N/m", "damping": "N.s/m", "mass": "kg", "tool_mass": "kg"
 """Unit of each property."""
 PER_DECADE = 40
 """Points of a scan in a decade, by default."""
-_SIDES = 0.01
+CONFIRMED_AT = 0.01
 """Relative distance from a limit at which it is confirmed: 0.99 and 1.01."""
-_GROWTH = 0.03
+GROWTH_AT = 0.03
 """Relative distance from a limit at which growth rates are given: 0.97 and 1.03."""
 _FLAT = 20.0
 """Ratio of distance from zero and depth beyond which an extremum does not reach zero."""
@@ -176,7 +176,7 @@ def stability_limit(
     def growth_at(x: float) -> float:
         return float(growth_rate(loop, **{over: x}, **environment))
 
-    changes = [_refine(growth_at, a, b) for a, b in _find_brackets(growth_at, grid, sigma)]
+    changes = [refine_change(growth_at, a, b) for a, b in find_brackets(growth_at, grid, sigma)]
     if sigma[0] > 0.0:
         changes.insert(0, 0.0)
     if not changes:
@@ -190,7 +190,7 @@ def stability_limit(
         return StabilityLimit(
             value=0.0, restabilizes=tuple(later), tolerance=0.0, confirmed_by=confirmed, **rates, **common
         )
-    step = min(_SIDES, 0.5 * (later[0] / value - 1.0)) if later else _SIDES
+    step = min(CONFIRMED_AT, 0.5 * (later[0] / value - 1.0)) if later else CONFIRMED_AT
     confirmed = _confirm(loop, over, value, step, environment)
     slope = (growth_at((1.0 + step) * value) - growth_at((1.0 - step) * value)) / (2.0 * step)  # of σ over ln value
     error = abs(growth_rate_by_control(loop, **{over: value}, **environment) / slope)
@@ -198,8 +198,8 @@ def stability_limit(
         value=value,
         frequency=crossing_frequency(loop, **{over: value}, **environment),
         restabilizes=tuple(later),
-        growth_below=growth_at((1.0 - _GROWTH) * value),
-        growth_above=growth_at((1.0 + _GROWTH) * value),
+        growth_below=growth_at((1.0 - GROWTH_AT) * value),
+        growth_above=growth_at((1.0 + GROWTH_AT) * value),
         tolerance=value * (10.0 * error + _ROUNDING),
         confirmed_by=confirmed,
         **common,
@@ -294,7 +294,7 @@ def _check(name: str, environment: dict[str, float]) -> None:
             raise OptionError(f"an environment has no {other!r}. {near(other, UNITS)}", port=other)
 
 
-def _find_brackets(growth_at: Growth, grid: np.ndarray, sigma: np.ndarray) -> Iterator[tuple[float, float]]:
+def find_brackets(growth_at: Growth, grid: np.ndarray, sigma: np.ndarray) -> Iterator[tuple[float, float]]:
     """Yield intervals in which the growth rate changes its sign: between points, and around extrema between them."""
     from scipy.optimize import minimize_scalar
 
@@ -319,7 +319,7 @@ def _find_brackets(growth_at: Growth, grid: np.ndarray, sigma: np.ndarray) -> It
                 yield top, float(grid[i + 2])
 
 
-def _refine(growth_at: Growth, low: float, high: float) -> float:
+def refine_change(growth_at: Growth, low: float, high: float) -> float:
     """Return the value at which the growth rate changes its sign, by Brent's method."""
     from scipy.optimize import brentq
 

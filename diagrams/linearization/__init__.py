@@ -16,7 +16,8 @@ from .findings import (
 from .kinks import find_kinks_between
 from .linear_model import Linearization, linearize, linearize_batch
 from .loops_over_a_period import ticks_to_renewal
-from .operating_points import PointLike, capture, operating_point, run_to
+from .operating_points import PointLike, capture, check_options, operating_point, run_to
+from .plant_equations import PlantEquations, linearize_plant, moves_between_ticks
 from .trim_search import point_from_states, trim
 
 __all__ = [
@@ -28,16 +29,20 @@ __all__ = [
     "Kink",
     "Linearization",
     "MeanSlope",
+    "PlantEquations",
     "PointLike",
     "Signal",
     "StepsOnly",
     "UnusualStart",
     "ZeroSlope",
     "capture",
+    "check_options",
     "find_kinks_between",
     "find_signal",
     "linearize",
     "linearize_batch",
+    "linearize_plant",
+    "moves_between_ticks",
     "operating_point",
     "point_from_states",
     "run_to",

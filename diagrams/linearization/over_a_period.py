@@ -315,10 +315,10 @@ def find_moving(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) 
         return ()
     by_d = local.differentiate(NONE, at.t, at.x, at.w)["dx", "d"]
     injected = zip(local.inputs, local.injected, strict=True)
-    return tuple(signal.name for signal, where in injected if np.any(by_d[:, where]) and _is_moving(flat, signal))
+    return tuple(signal.name for signal, where in injected if np.any(by_d[:, where]) and is_moving(flat, signal))
 
 
-def _is_moving(flat: FlatDiagram, signal: Signal) -> bool:
+def is_moving(flat: FlatDiagram, signal: Signal) -> bool:
     """Whether a signal follows continuous states between two ticks."""
     return bool(flat.output(signal.port).depends("y", "x")[:, flat.continuous].any())
 

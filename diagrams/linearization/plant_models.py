@@ -153,7 +153,7 @@ def model_equations(flat: FlatDiagram, at: OperatingPoint, way: str | None) -> l
     models = []
     for path in plant_paths(flat):
         z, w, wired = plant_entries(flat, path)
-        m = _linearize_equations(flat, at, path, at.z)
+        m = linearize_equations(flat, at, path, at.z)
         B, D, names = m.B[:, wired], m.D[:, wired], _prefix_names(path, m.states)
         models.append(PlantModel(path, m.A, B, m.C, D, m.x0, m.f, names, z, w, m.derivation, _largest_error(m)))
     return models
@@ -203,7 +203,7 @@ def _model_step(
     m: FmuLinearization | _HeldStep
     equations: FmuLinearization | None
     try:
-        equations = _linearize_equations(flat, at, path, z)
+        equations = linearize_equations(flat, at, path, z)
     except FmuError:
         if way == "equations":
             raise
@@ -301,7 +301,7 @@ def _outputs_before(
     if equations is not None:
         before = inputs_before(flat, at)
         mine = plant_entries(flat, path)[0]
-        m = equations if np.array_equal(before[mine], z[mine]) else _linearize_equations(flat, at, path, before)
+        m = equations if np.array_equal(before[mine], z[mine]) else linearize_equations(flat, at, path, before)
         return m.C, m.D
     C = np.linalg.lstsq(step.A.T, step.C.T, rcond=None)[0].T  # step.C is by the states before the step: step.C = C A
     D = step.D - C @ step.B
@@ -309,7 +309,8 @@ def _outputs_before(
     return C, D
 
 
-def _linearize_equations(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> FmuLinearization:
+def linearize_equations(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> FmuLinearization:
+    """Return the linear model of an FMU's equations under the inputs z."""
     point = at.plants[path]
     return fmu_at(flat, path).linear_model(t=point["t"], state=point["state"], inputs=_inputs(flat, at, path, z))
 

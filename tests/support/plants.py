@@ -82,3 +82,15 @@ def hidden(file, folder, *, saves=True):
                 data = text.encode()
             new.writestr(item, data)
     return path
+
+
+def undirected(file, folder):
+    """The FMU without its directional derivatives: its linear models are differences."""
+    path = folder / "undirected.fmu"
+    with zipfile.ZipFile(file) as old, zipfile.ZipFile(path, "w") as new:
+        for item in old.namelist():
+            data = old.read(item)
+            if item == "modelDescription.xml":
+                data = data.replace(b'providesDirectionalDerivatives="true"', b"")
+            new.writestr(item, data)
+    return path

@@ -15,7 +15,7 @@ from loopwright.diagrams.admittance import stability_limits as _stability_limits
 from loopwright.diagrams.admittance.compliance_loop import AdmittanceLoop
 from loopwright.diagrams.admittance.coupled import close_loop, growth_rate, growth_rate_by_control, poles
 from loopwright.diagrams.admittance.stability_limits import (
-    _find_brackets,
+    find_brackets,
     rule_of_thumb,
     stability_limit,
     stability_map,
@@ -328,7 +328,7 @@ def test_an_island_between_two_points_of_the_scan_is_found(sign):
         return sign * (1e-4 - (math.log(x) - 1.03) ** 2)
 
     grid = np.geomspace(0.5, 20.0, 9)  # 0.46 apart in ln x, the island is 0.02 wide
-    edges = [x for pair in _find_brackets(at, grid, np.array([at(x) for x in grid])) for x in pair]
+    edges = [x for pair in find_brackets(at, grid, np.array([at(x) for x in grid])) for x in pair]
     assert edges[0] < math.exp(1.02) < edges[1] == edges[2] < math.exp(1.04) < edges[3]
 
 

@@ -14,7 +14,7 @@ from loopwright.diagrams.admittance import shown_plant as _shown_plant
 from loopwright.diagrams.document.html import to_html
 from loopwright.diagrams.paper.report_case import Fig3Case
 from loopwright.fmus import Fmu, build, gantry, gantry_contact, gantry_elastic, gantry_stiction, scara
-from support.plants import hidden
+from support.plants import hidden, undirected
 
 START = (0.8, 0.5)  # of the path: there the tangent is the axis z, the normal the axis y
 IN_CONTACT = {"contact": 1.0, "wall_point": (0.0, 0.5), "wall_normal": (0.0, -1.0)}
@@ -162,6 +162,10 @@ def test_the_rigid_gantrys_limits_are_not_those_of_the_other_plants(side):
     assert stability_limit(AdmittanceLoop.of(diagram(), side)).value == pytest.approx(rigid, rel=1e-6)
     elastic, sticking = (true_limit(kind, side) for kind in ("elastic", "stiction"))
     assert rigid / elastic == pytest.approx({"par": 3.156, "perp": 1.782}[side], abs=2e-3)  # on the unsafe side
+    for plant, limit in ((gantry_elastic, elastic), (gantry_stiction, sticking)):
+        found = diagram(plant).contact(direction=side).stability_limit()
+        assert found.value == pytest.approx(limit, rel=1e-6)  # to the threshold of `true_limit`
+        assert found.confirmed_by.startswith("closed-loop eigenvalues of python-control's interconnection")
     if side == "par":
         assert sticking / rigid == pytest.approx(48.08, abs=0.01)  # on the safe side, and of no use
 
@@ -263,19 +267,6 @@ def test_differences_show_a_plant_within_their_stated_error(tmp_path, monkeypatc
     assert re.search(
         r"found a linear model \(differences .*\) that is uncertain by .*; expected at most", refusal(made)
     )
-
-
-def undirected(file, folder):
-    import zipfile
-
-    path = folder / "undirected.fmu"
-    with zipfile.ZipFile(file) as old, zipfile.ZipFile(path, "w") as new:
-        for item in old.namelist():
-            data = old.read(item)
-            if item == "modelDescription.xml":
-                data = data.replace(b'providesDirectionalDerivatives="true"', b"")
-            new.writestr(item, data)
-    return path
 
 
 def test_a_plant_without_a_linear_model_has_no_reduced_loop(tmp_path):

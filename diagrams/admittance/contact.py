@@ -1,0 +1,240 @@
+"""What an environment feels at the plant of a diagram: admittance, passivity and limits of coupled stability."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from ...blocks import AdmittanceFilter, ForceProjection, PathProjection
+from ...blocks.core import Array, Finding, OptionError, UnknownNameError
+from ...fmus.running import Derivation
+from ..linearization import check_options, operating_point
+from .compliance_loop import SIDES
+from .contact_admittance import ContactAdmittance, compute_admittance
+from .contact_limits import ContactLimit, CoupledLoop, check_properties, find_limit
+from .contact_loop import close_loop, join_environment
+from .contact_parts import ContactParts, Ports, take_apart
+from .rendered import CONTINUOUS, HIGHEST, LOWEST, OFF_PATH, SAMPLED, Passivity, find_negative
+from .stability_limits import PER_DECADE
+
+if TYPE_CHECKING:
+    from ..flat import WiredDiagram
+    from ..linearization import PointLike
+    from ..results import OperatingPoint
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """A point of a diagram's plant that an environment touches, linear at an operating point; `Diagram.contact`.
+
+    The environment is a spring k_e, a damper b_e and a mass m_e along ``direction``; a tool of the mass ``tool_mass``
+    lies beyond the force sensor. The plant runs in continuous time with them.
+
+    Attributes
+    ----------
+    diagram : Diagram
+        Diagram of the contact.
+    plant : str
+        Path of the plant.
+    direction : ndarray
+        Unit vector, in the axes of the force.
+    side : str
+        ``"par"`` or ``"perp"`` if the direction was given so, else "".
+    sample_time : float
+        Sample time of the controller in s; 0 if the diagram is continuous.
+    point : OperatingPoint
+        Operating point of the linear model.
+    derivation : Derivation
+        Method by which the plant was differentiated.
+    findings : tuple of Finding
+        Kinks, stairs and flat slopes that the linear model leaves out.
+    """
+
+    diagram: WiredDiagram
+    plant: str
+    direction: np.ndarray
+    side: str
+    point: OperatingPoint
+    parts: ContactParts = field(repr=False)
+    filter: AdmittanceFilter | None = field(default=None, repr=False)
+    scale: float = 1.0
+
+    @property
+    def sample_time(self) -> float:
+        """Sample time of the controller in s; 0 if the diagram is continuous."""
+        return self.parts.sample_time
+
+    @property
+    def derivation(self) -> Derivation:
+        """Method by which the plant was differentiated."""
+        return self.parts.derivation
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Kinks, stairs and flat slopes that the linear model leaves out."""
+        return self.parts.findings
+
+    def admittance(self, omega: Array) -> ContactAdmittance:
+        """Return the admittance that the environment feels beside that of the diagram's filter, m/(N s).
+
+        Parameters
+        ----------
+        omega : float or array
+            Frequencies in rad/s; those of a sampled loop lie below the Nyquist frequency π/T.
+
+        Raises
+        ------
+        OptionError
+            If a frequency is not positive, or not below the Nyquist frequency.
+        """
+        w = np.asarray(omega, dtype=float)
+        target = None
+        if self.filter is not None:
+            s, a = 1j * w, self.filter
+            target = self.scale * s / (a.mass * s * s + float(a.effective_damping) * s + a.stiffness)
+        return ContactAdmittance(w, compute_admittance(self.parts, self.direction, w), target, self.findings)
+
+    def passivity(self, *, low: float = LOWEST, high: float | None = None, per_decade: int = 200) -> Passivity:
+        """Return the frequencies at which the real part of the admittance is negative.
+
+        Parameters
+        ----------
+        low, high : float, optional
+            Ends of the scan, rad/s; by default 0.01 rad/s and the Nyquist frequency, or 1e5 rad/s in a continuous loop.
+        per_decade : int, optional
+            Points of the scan in a decade.
+
+        Raises
+        ------
+        OptionError
+            If an end of the scan is not positive, or not below the Nyquist frequency.
+        """
+        T = self.sample_time
+        top = (math.pi / T * (1.0 - 1e-9) if T else HIGHEST) if high is None else high
+        intervals = find_negative(lambda w: compute_admittance(self.parts, self.direction, w), low, top, per_decade)
+        poles = np.linalg.eigvals(close_loop(self.parts, join_environment(self.parts, self.direction)).A)
+        stable = bool(np.all(np.abs(poles) <= 1.0 + 1e-6) if T else np.all(poles.real <= 1e-4))
+        off_path = self.side == "par" and abs(self.scale - 1.0) > 1e-9
+        return Passivity(
+            frequency=intervals[0][0] if intervals else math.inf,
+            intervals=intervals,
+            scanned=(low, top),
+            stable=stable,
+            caveat=(SAMPLED if T else CONTINUOUS) + (OFF_PATH if off_path else ""),
+            findings=self.findings,
+        )
+
+    def loop(self, vary: str, **environment: float) -> CoupledLoop:
+        """Return the loop with an environment of which one property varies; see `stability_limit`."""
+        check_properties(environment, vary)
+        return CoupledLoop.of(self.parts, self.direction, vary, environment)
+
+    def stability_limit(
+        self,
+        vary: str = "stiffness",
+        *,
+        low: float | None = None,
+        high: float | None = None,
+        per_decade: int = PER_DECADE,
+        **environment: float,
+    ) -> ContactLimit:
+        """Return the first value of one property of the environment at which the coupled loop loses its stability.
+
+        Parameters
+        ----------
+        vary : {"stiffness", "damping", "mass", "tool_mass"}
+            Property, in N/m, N s/m or kg.
+        low, high : float, optional
+            Ends of the scan.
+        per_decade : int, optional
+            Points of the scan in a decade, at least 30.
+        **environment
+            Properties that are held: ``stiffness``, ``damping``, ``mass`` (0 without them), and ``tool_mass``, the
+            whole mass beyond the force sensor, which is the diagram's own without it.
+
+        Raises
+        ------
+        OptionError, ParameterError
+            If a property is unknown, negative or given twice, or the scan does not rise or is too coarse.
+        ConfirmationError
+            If python-control's interconnection of the same parts disagrees.
+        """
+        check_properties(environment, vary)
+        return find_limit(self.parts, self.direction, vary, environment, low=low, high=high, per_decade=per_decade)
+
+
+def make_contact(
+    diagram: WiredDiagram,
+    port: str,
+    names: tuple[str, str, str | None],
+    direction: str | Sequence[float] | np.ndarray,
+    at: PointLike,
+    options: Mapping[str, Any],
+) -> Contact:
+    """Return the contact of a diagram, with the names of position, velocity and force; see `Diagram.contact`."""
+    position, velocity, force = names
+    check_options(diagram, options, "contact")
+    point = operating_point(diagram, at, options)
+    step = {"step": options["step"]} if "step" in options else {}
+    diagram = diagram.replace(point.parameters) if point.parameters else diagram  # parameters that a trim has found
+    ports = Ports.find(diagram, diagram.flatten(point.base), port, position, velocity)
+    parts, unusual = take_apart(diagram, ports, force, point, step)
+    if unusual and at is None:  # such as a sensor's first sample
+        point = operating_point(diagram, float(point.base), options)
+        parts, _ = take_apart(diagram, ports, force, point, step)
+    unit, side, scale = _find_direction(diagram, point, ports, direction, parts.force.shape[1])
+    return Contact(diagram, ports.plant, unit, side, point, parts, _find_filter(diagram, side, len(unit)), scale)
+
+
+def _find_direction(
+    diagram: WiredDiagram, point: OperatingPoint, ports: Ports, direction: Any, many: int
+) -> tuple[np.ndarray, str, float]:
+    """Return the unit vector, its side, and the metres of motion per unit of the path's coordinate."""
+    where: dict[str, Any] = {"block": ports.plant, "port": "direction"}
+    if isinstance(direction, str):
+        if direction not in SIDES:
+            raise OptionError(f"found {direction!r}; expected 'par', 'perp' or a vector. Give one of them.", **where)
+        found = [(path, block) for path, block in diagram.blocks.items() if isinstance(block, PathProjection)]
+        if len(found) != 1 or many != 2:
+            raise UnknownNameError(
+                f"found {len(found)} projections onto a path and a force with {many} entries; expected one, and two "
+                f"entries, for {direction!r}. Give a vector in the axes of the force: direction=(1.0, 0.0).",
+                **where,
+            )
+        path, block = found[0]
+        frame = block.path.frame(float(np.ravel(point.values[f"{path}.theta"])[0]))
+        if direction == "perp":
+            return np.asarray(frame.normal, dtype=float), direction, 1.0
+        place = np.asarray(point.values[f"{ports.plant}.{ports.position}"], dtype=float)
+        q = 1.0 - float(frame.curvature) * float(frame.normal @ (place - frame.sigma))
+        return np.asarray(frame.tangent, dtype=float), direction, q
+    vector = np.atleast_1d(np.asarray(direction, dtype=float))
+    length = float(np.linalg.norm(vector))
+    if vector.shape != (many,) or not 0.0 < length < math.inf:
+        raise OptionError(
+            f"found {direction!r}; expected a vector of {many} finite entries that is not zero. Give one in the axes "
+            "of the force.",
+            **where,
+        )
+    return vector / length, "", 1.0
+
+
+def _find_filter(diagram: WiredDiagram, side: str, many: int) -> AdmittanceFilter | None:
+    """Return the admittance filter of the force's part in a direction, or the only one of a scalar force."""
+    filters = [path for path, block in diagram.blocks.items() if isinstance(block, AdmittanceFilter)]
+    wires = diagram.structure.wires
+    if side:
+        filters = [
+            path
+            for path in filters
+            if (wire := wires.get((path, "force"))) is not None
+            and isinstance(diagram.blocks[wire.block], ForceProjection)
+            and wire.port == f"f_{side}"
+        ]
+    elif many != 1:
+        return None
+    return cast(AdmittanceFilter, diagram.blocks[filters[0]]) if len(filters) == 1 else None

@@ -1,0 +1,95 @@
+"""The admittance that an environment feels at the plant of a diagram, and its passivity.
+
+Y(jω) = dᵀṗ/F along the direction d of the contact, in m/(N s). In a sampled loop F(t) = e^{jωt} acts in continuous
+time, the inputs of the plant are held, and Y is the fundamental of the velocity: the mean of dᵀṗ(t) e^{−jωt} over a
+sample. It does not contain the aliases of ω.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...blocks.core import Array, Finding, OptionError
+from .contact_loop import close_loop, join_environment
+from .contact_parts import ContactParts
+
+
+@dataclass(frozen=True, eq=False)
+class ContactAdmittance:
+    """Admittance at a contact over frequencies.
+
+    Attributes
+    ----------
+    omega : ndarray
+        Frequencies in rad/s.
+    rendered : ndarray
+        Admittance that the environment feels, m/(N s).
+    target : ndarray or None
+        Admittance of the diagram's `AdmittanceFilter` in this direction, with velocities in m/s; None where there is
+        none, or the direction is not that of one filter.
+    findings : tuple of Finding
+        Effects that the linear model leaves out.
+    """
+
+    omega: np.ndarray
+    rendered: np.ndarray
+    target: np.ndarray | None
+    findings: tuple[Finding, ...] = ()
+
+
+def compute_admittance(parts: ContactParts, direction: np.ndarray, omega: Array) -> np.ndarray:
+    """Return the admittance along a direction, m/(N s).
+
+    Raises
+    ------
+    OptionError
+        If a frequency is not positive, or not below the Nyquist frequency π/T of a sampled loop.
+    """
+    w, T = np.asarray(omega, dtype=float), parts.sample_time
+    top = math.pi / T if T else math.inf
+    if not np.all((w > 0.0) & (w < top)):
+        raise OptionError(
+            f"found frequencies from {np.min(w):g} to {np.max(w):g} rad/s; expected them positive"
+            f"{f', below the Nyquist frequency {top:.6g} rad/s' if T else ''}. Leave the others out.",
+            port="omega",
+        )
+    return _sampled(parts, direction, w) if T else _continuous(parts, direction, w)
+
+
+def _continuous(parts: ContactParts, direction: np.ndarray, w: np.ndarray) -> np.ndarray:
+    joined = join_environment(parts, direction)
+    loop = close_loop(parts, joined)
+    push = loop.at_tick.copy()
+    push[: len(joined.A)] += joined.G
+    x = np.linalg.solve(1j * w[..., None, None] * np.eye(len(loop.A)) - loop.A, push.astype(complex))
+    return np.asarray(((direction @ parts.velocity) @ x[..., : len(joined.A), :])[..., 0])
+
+
+def _sampled(parts: ContactParts, direction: np.ndarray, w: np.ndarray) -> np.ndarray:
+    from scipy.linalg import expm
+
+    T, joined = parts.sample_time, join_environment(parts, direction)
+    loop = close_loop(parts, joined)
+    n, many = joined.B.shape
+    every = n + many + 1
+    # x, the held u and F = e^{jωt} as one system, times e^{−jωt}, and its mean over a sample
+    turning = np.zeros((*w.shape, 2 * every, 2 * every), dtype=complex)
+    turning[..., :n, :every] = np.concatenate([joined.A, joined.B, joined.G], axis=-1)
+    turning[..., every - 1, every - 1] = 1j * w
+    turning[..., :every, :every] -= 1j * w[..., None, None] * np.eye(every)
+    turning[..., :every, every:] = np.eye(every) / T
+    turned = np.asarray(expm(turning * T))
+    z = np.exp(1j * w * T)[..., None, None]
+    push = z * turned[..., :n, every - 1 : every]
+    mean = turned[..., :every, every:]
+    drive = np.broadcast_to(loop.at_tick, (*w.shape, *loop.at_tick.shape)).astype(complex)
+    drive[..., :n, :] += push
+    states = np.linalg.solve(z * np.eye(len(loop.A)) - loop.A, drive)
+    by_state, by_force = loop.inputs
+    u = by_state @ states + by_force
+    now = np.concatenate([states[..., :n, :], u, np.ones((*w.shape, 1, 1))], axis=-2)
+    velocity = np.concatenate([direction @ parts.velocity, np.zeros(many + 1)])
+    return np.asarray((velocity @ (mean @ now))[..., 0])

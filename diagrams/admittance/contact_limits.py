@@ -1,0 +1,319 @@
+"""Limits of coupled stability of a diagram against an environment at its plant.
+
+The loop of `contact_loop` is scanned over one property of the environment, with extrema of the growth rate between the
+points; Brent's method refines each change of its sign.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import ConfirmationError, Finding, OptionError, near
+from ..frequency import Number, on_one_thread
+from .contact_loop import ClosedLoop, Modes, close_loop, controller_rows, join_environment, split_modes
+from .contact_parts import ContactParts
+from .stability_limits import (
+    CONFIRMED_AT,
+    GROWTH_AT,
+    PER_DECADE,
+    SCANNED,
+    UNITS,
+    find_brackets,
+    refine_change,
+)
+
+FEWEST_PER_DECADE = 30
+"""Fewest points of a scan in a decade: above k/M = (π/T)², stability changes several times in one."""
+_ROUNDING = 1e-12
+"""Relative rounding error of Brent's method."""
+_ESTIMATED = 10.0
+"""Factor by which a stated error of differences may be too small."""
+
+
+@dataclass(frozen=True)
+class ContactLimit:
+    """First value of one property of the environment at which a diagram loses its stability.
+
+    Attributes
+    ----------
+    vary : str
+        Property: ``"stiffness"``, ``"damping"``, ``"mass"`` or ``"tool_mass"``.
+    value : float
+        Limit; infinite if the loop is stable over the whole scan, 0 if it is unstable at its start.
+    unit : str
+        Unit of the limit.
+    frequency : float
+        Frequency in rad/s at which the loop oscillates there, 0 if it only grows; NaN without a limit.
+    direction : tuple of float
+        Unit vector, in the axes of the force, along which the unstable mode moves the contact most; empty without a
+        limit. It need not be the direction of the environment.
+    restabilizes : tuple of float
+        Values beyond the limit at which the loop becomes stable again, then unstable, in turn.
+    growth_below, growth_above : float
+        Growth rate σ in 1/s at 0.97 and at 1.03 of the limit: of the fastest mode that the environment can move.
+    scanned : tuple of float
+        Ends of the scan.
+    tolerance : float
+        Bound of the value's numerical error, in its unit: of the computation, and of the plant's linear model where
+        that is made of differences.
+    confirmed_by : str
+        Independent computation that agrees.
+    environment : dict
+        Properties that were held.
+    findings : tuple of Finding
+        Kinks and stairs of the diagram that the linear model leaves out.
+    """
+
+    vary: str
+    value: float
+    unit: str
+    frequency: float
+    direction: tuple[float, ...]
+    restabilizes: tuple[float, ...]
+    growth_below: float
+    growth_above: float
+    scanned: tuple[float, float]
+    tolerance: float
+    confirmed_by: str
+    environment: dict[str, float] = field(default_factory=dict)
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def number(self) -> Number:
+        """The limit as a number of a report."""
+        return Number(self.value, self.unit, self.tolerance, self.confirmed_by, findings=self.findings)
+
+
+@dataclass(frozen=True, eq=False)
+class CoupledLoop:
+    """A contact with the properties of its environment that are held: growth rates by the one that is varied."""
+
+    parts: ContactParts
+    direction: np.ndarray
+    vary: str
+    held: Mapping[str, float]
+    modes: Modes
+
+    @classmethod
+    def of(cls, parts: ContactParts, direction: np.ndarray, vary: str, held: Mapping[str, float]) -> CoupledLoop:
+        """Return the coupled loop, with the modes split off that the environment can't move."""
+        used = {vary} | {name for name, value in held.items() if value and name != "tool_mass"}
+        loop = close_loop(parts, join_environment(parts, direction, **held))
+        return cls(parts, direction, vary, held, split_modes(parts, direction, loop, used))
+
+    def close(self, value: Any) -> ClosedLoop:
+        """Return the loop at values of the property."""
+        return close_loop(self.parts, join_environment(self.parts, self.direction, **{**self.held, self.vary: value}))
+
+    def growth(self, value: Any) -> np.ndarray:
+        """Return σ in 1/s of the fastest mode that the environment can move; infinite without a solution."""
+        A = self.close(value).A
+        solvable = np.isfinite(A).all(axis=(-1, -2))
+        poles = np.linalg.eigvals(self.modes.reduce(np.where(solvable[..., None, None], A, 0.0)))
+        return np.where(solvable, np.max(to_rates(self.parts, poles).real, axis=-1), np.inf)
+
+    def growth_at(self, value: float) -> float:
+        """Return σ in 1/s at one value."""
+        return float(self.growth(np.float64(value)))
+
+    def fastest_mode(self, value: float) -> tuple[float, tuple[float, ...]]:
+        """Return the frequency of the mode that grows fastest, in rad/s, and the direction in which it moves."""
+        A = self.close(np.float64(value)).A
+        if not np.all(np.isfinite(A)):
+            return math.nan, ()
+        found, vectors = np.linalg.eig(self.modes.reduce(A))
+        rates = to_rates(self.parts, found)
+        i = int(np.argmax(rates.real))
+        return float(abs(rates[i].imag)), self._move(self.modes.right @ vectors[:, i])
+
+    def _move(self, state: np.ndarray) -> tuple[float, ...]:
+        """Return the unit vector of the largest motion of the contact in a mode."""
+        n = len(self.parts.plant.A)
+        moved = self.parts.position @ state[:n]
+        if not np.linalg.norm(moved):
+            moved = self.parts.velocity @ state[:n]
+        axis = np.linalg.svd(np.stack([moved.real, moved.imag], axis=-1))[0][:, 0]
+        towards = axis @ self.direction
+        axis = axis * (-1.0 if towards < 0.0 or (towards == 0.0 and axis[np.argmax(np.abs(axis))] < 0.0) else 1.0)
+        return tuple(float(v) for v in axis)
+
+    def find_fixed_growth(self) -> tuple[float, float, tuple[float, ...]] | None:
+        """Return σ, frequency and direction of an unstable mode that no such environment moves, or None.
+
+        A pure drift is no instability. Its poles, of which several at one place scatter by rounding, are marginal.
+        """
+        fixed, sampled = self.modes.fixed, bool(self.parts.sample_time)
+        near_rest = np.abs(fixed - (1.0 if sampled else 0.0)) < (1e-3 if sampled else 1.0)
+        scatter = 3.0 * 1e-16 ** (1.0 / max(1, int(np.count_nonzero(near_rest))))
+        excess = np.abs(fixed) - 1.0 if sampled else fixed.real
+        if not np.any(excess > scatter):
+            return None
+        pole = fixed[int(np.argmax(excess))]
+        rate = to_rates(self.parts, np.array([pole]))[0]
+        found, vectors = np.linalg.eig(self.close(np.float64(0.0)).A)
+        i = int(np.argmin(np.abs(found - pole)))
+        return float(rate.real), float(abs(rate.imag)), self._move(vectors[:, i])
+
+    def growth_by_control(self, value: float) -> float:
+        """Return σ in 1/s from python-control's discretization and feedback of plant and controller."""
+        import control
+
+        parts, K = self.parts, self.parts.controller
+        joined = join_environment(parts, self.direction, **{**self.held, self.vary: value})
+        rows, T = controller_rows(parts, joined), parts.sample_time
+        many = joined.B.shape[-1]
+        if T:
+            plant = control.sample_system(control.ss(joined.A, joined.B, rows.x, 0.0 * rows.now), T, method="zoh")
+            last = control.ss(np.zeros((many, many)), np.eye(many), rows.last, rows.now, T)
+            found = control.feedback(plant + last, control.ss(*K, T), sign=1)
+        elif np.linalg.det(np.eye(many) - K.D @ rows.now) <= 0.0:
+            return math.inf
+        else:
+            found = control.feedback(control.ss(joined.A, joined.B, rows.x, rows.now), control.ss(*K), sign=1)
+        poles = np.asarray(found.poles())
+        for fixed in self.modes.fixed:
+            poles = np.delete(poles, np.argmin(np.abs(poles - fixed)))
+        return float(np.max(to_rates(parts, poles).real))
+
+
+def to_rates(parts: ContactParts, poles: np.ndarray) -> np.ndarray:
+    """Return poles in 1/s: as they are, or s = ln z/T in a sampled loop."""
+    if not parts.sample_time:
+        return poles
+    return np.asarray(np.log(np.where(np.abs(poles) < 1e-300, 1e-300, poles).astype(complex)) / parts.sample_time)
+
+
+@on_one_thread
+def find_limit(
+    parts: ContactParts,
+    direction: np.ndarray,
+    vary: str,
+    held: Mapping[str, float],
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    per_decade: int = PER_DECADE,
+) -> ContactLimit:
+    """Return the first value of a property at which the coupled loop loses its stability; see `Contact`.
+
+    Raises
+    ------
+    OptionError
+        If the property is unknown, the scan does not rise or is too coarse.
+    ParameterError
+        If a property is NaN, infinite or negative.
+    ConfirmationError
+        If python-control's interconnection of the same parts is not stable below the limit and unstable above it.
+    """
+    first, last = _check_scan(vary, low, high, per_decade)
+    loop = CoupledLoop.of(parts, direction, vary, held)
+    grid = np.geomspace(first, last, max(8, math.ceil(per_decade * math.log10(last / first)) + 1))
+    common: dict[str, Any] = {"vary": vary, "unit": UNITS[vary], "scanned": (first, last), "environment": dict(held)}
+    common |= {"findings": parts.findings}
+    fixed = loop.find_fixed_growth()
+    if fixed is not None:
+        rate, frequency, moved = fixed
+        return ContactLimit(
+            value=0.0, frequency=frequency, direction=moved, restabilizes=(), growth_below=math.nan, growth_above=rate,
+            tolerance=0.0, confirmed_by=f"a mode that no such environment moves grows by {rate:.4g} 1/s", **common,
+        )  # fmt: skip
+    sigma = loop.growth(grid)
+    changes = [refine_change(loop.growth_at, a, b) for a, b in find_brackets(loop.growth_at, grid, sigma)]
+    if sigma[0] > 0.0:
+        frequency, moved = loop.fastest_mode(first)
+        return ContactLimit(
+            value=0.0, frequency=frequency, direction=moved, restabilizes=tuple(changes), growth_below=math.nan,
+            growth_above=float(sigma[0]), tolerance=0.0,
+            confirmed_by=f"unstable from the start of the scan, σ = {sigma[0]:.4g} 1/s", **common,
+        )  # fmt: skip
+    if not changes:
+        return ContactLimit(
+            value=math.inf, frequency=math.nan, direction=(), restabilizes=(), growth_below=math.nan,
+            growth_above=math.nan, tolerance=0.0, confirmed_by="no change of sign of the growth rate on the scan",
+            **common,
+        )  # fmt: skip
+    value, *later = changes
+    step = min(CONFIRMED_AT, 0.5 * (later[0] / value - 1.0)) if later else CONFIRMED_AT
+    confirmed = _confirm(loop, value, step)
+    slope = (loop.growth_at((1.0 + step) * value) - loop.growth_at((1.0 - step) * value)) / (2.0 * step)
+    error = 10.0 * abs(loop.growth_by_control(value) / slope) + abs(_model_error(loop, value) / slope) + _ROUNDING
+    frequency, moved = loop.fastest_mode(value)
+    return ContactLimit(
+        value=value,
+        frequency=frequency,
+        direction=moved,
+        restabilizes=tuple(later),
+        growth_below=loop.growth_at((1.0 - GROWTH_AT) * value),
+        growth_above=loop.growth_at((1.0 + GROWTH_AT) * value),
+        tolerance=value * error,
+        confirmed_by=confirmed,
+        **common,
+    )
+
+
+def check_properties(names: Iterable[str], vary: str) -> None:
+    """Refuse unknown properties, and one that is held and varied."""
+    for name in names:
+        if name not in UNITS:
+            raise OptionError(f"an environment has no {name!r}. {near(name, UNITS)}", port=str(name))
+        if name == vary:
+            raise OptionError(
+                "found it among the held properties, too; expected it only as the one that varies. Leave it out.",
+                port=name,
+            )
+
+
+def _check_scan(vary: str, low: float | None, high: float | None, per_decade: int) -> tuple[float, float]:
+    if vary not in UNITS:
+        raise OptionError(f"an environment has no {vary!r}. {near(str(vary), UNITS)}", port="vary")
+    first, last = SCANNED[vary]
+    first, last = first if low is None else low, last if high is None else high
+    if not 0.0 < first < last < math.inf:
+        raise OptionError(
+            f"found a scan from {first!r} to {last!r}; expected 0 < low < high. Give other ends.", port=vary
+        )
+    if not per_decade >= FEWEST_PER_DECADE:
+        raise OptionError(
+            f"found {per_decade!r} points in a decade; expected at least {FEWEST_PER_DECADE}. Give more.",
+            port="per_decade",
+        )
+    return first, last
+
+
+def _confirm(loop: CoupledLoop, value: float, step: float) -> str:
+    """Confirm a limit by the poles of python-control's interconnection below and above it; return the computation."""
+    below, above = (loop.growth_by_control(x * value) for x in (1.0 - step, 1.0 + step))
+    if not below < 0.0 < above:
+        raise ConfirmationError(
+            f"{loop.vary} {value:.6g} {UNITS[loop.vary]} is no limit: python-control's interconnection has the growth "
+            f"rates {below:.4g} and {above:.4g} 1/s at {1.0 - step:.4g} and {1.0 + step:.4g} of it; expected the first "
+            "negative, the second positive. Scan more finely with per_decade=…."
+        )
+    return f"closed-loop eigenvalues of python-control's interconnection at {1.0 - step:.4g} and {1.0 + step:.4g}"
+
+
+def _model_error(loop: CoupledLoop, value: float) -> float:
+    """Return a bound of the change of σ by the stated errors of the plant's linear model, entry by entry."""
+    parts, (E, contact) = loop.parts, loop.parts.errors
+    base, total = loop.growth_at(value), 0.0
+
+    def changed(name: str, matrix: np.ndarray) -> ContactParts:
+        if name in "ABCD":
+            return replace(parts, plant=parts.plant._replace(**{name: matrix}))
+        changes: dict[str, Any] = {name: matrix}
+        return replace(parts, **changes)
+
+    entries = {"A": E.A, "B": E.B, "C": E.C, "D": E.D}
+    entries |= {"force": contact.B, "position": contact.C, "velocity": contact.D}
+    for name, errors in entries.items():
+        matrix = getattr(parts.plant, name) if name in "ABCD" else getattr(parts, name)
+        for place in zip(*np.nonzero(errors), strict=True):
+            moved = matrix.copy()
+            moved[place] += _ESTIMATED * errors[place]
+            total += abs(replace(loop, parts=changed(name, moved)).growth_at(value) - base)
+    return total

@@ -1,0 +1,267 @@
+"""The loop of a diagram against an environment at its plant, as matrices.
+
+The plant is ẋ = A x + B u + B_F F, y = C x + D u + D_F F, with the position p = C_p x and the velocity ṗ = C_v x of the
+contact. The environment pushes along the unit vector d: F = d f with
+
+    f = F_ext − k_e dᵀp − b_e dᵀṗ − m_e dᵀp̈,      p̈ = C_v (A x + B u + B_F d f)
+
+which is solved for f: the mass moves along with the plant. The force sensor shows d f, and less by the inertia of a
+tool that is heavier by Δm than the diagram's own: −Δm p̈.
+
+Sampled, plant and environment run in continuous time under held inputs u, by the matrix exponential, and the
+controller computes once a tick. f and p̈ are measured under the last inputs; so are all outputs of an FMU. The outputs
+of a plant with equations are those under the new inputs, as in a run of the diagram. Continuous, f and u contain each
+other: that loop is solved as if nothing took time.
+
+Modes that the environment can't reach or doesn't feel stay as they are, whatever its properties, such as a drift in
+another direction. `split_modes` tells them by controllability and observability, not by the place of their poles.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ...blocks.core import Array
+from .compliance_loop import check_environment
+from .contact_parts import ContactParts
+
+SLOW, SLOW_RATE = 1e-3, 1.0
+"""Distance of |z| from 1, and rate in 1/s, within which a stable mode is looked at."""
+_RANK = 1e-9
+"""Part of a direction, relative to the directions found before, below which it is none of its own."""
+
+
+class Joined(NamedTuple):
+    """Plant and environment: ẋ = A x + B u + G F_ext, its outputs, and the force that the sensor feels.
+
+    ``y`` and ``felt`` hold the matrices by x, by u and by F_ext. All have the axes of a batch in front.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    G: np.ndarray
+    y: tuple[np.ndarray, np.ndarray, np.ndarray]
+    felt: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+class Rows(NamedTuple):
+    """What the controller gets at a tick, by x, by the last u, by the new u and by F_ext."""
+
+    x: np.ndarray
+    last: np.ndarray
+    now: np.ndarray
+    force: np.ndarray
+
+
+def join_environment(
+    parts: ContactParts,
+    direction: np.ndarray,
+    stiffness: Array = 0.0,
+    damping: Array = 0.0,
+    mass: Array = 0.0,
+    tool_mass: Array | None = None,
+) -> Joined:
+    """Return the plant with spring, damper and mass along a direction; properties may be arrays, which are broadcast.
+
+    Raises
+    ------
+    ParameterError
+        If a property is NaN, infinite or negative.
+    """
+    check_environment(stiffness=stiffness, damping=damping, mass=mass, tool_mass=tool_mass)
+    tool = parts.tool_mass if tool_mass is None else tool_mass
+    k, b, m, more = (
+        np.asarray(v, dtype=float)[..., None, None]
+        for v in np.broadcast_arrays(stiffness, damping, mass, np.asarray(tool, dtype=float) - parts.tool_mass)
+    )
+    plant, d = parts.plant, direction[:, None]
+    push = parts.force @ d
+    along = d.T @ parts.velocity
+    share = 1.0 / (1.0 + m * (along @ push))
+    f_x = -share * (k * (d.T @ parts.position) + b * along + m * (along @ plant.A))
+    f_u, f_F = -share * m * (along @ plant.B), share
+    shown = parts.force_shown @ d
+    A, B, G = plant.A + push @ f_x, plant.B + push @ f_u, push * f_F
+    y = (plant.C + shown @ f_x, plant.D + shown @ f_u, shown * f_F)
+    inertia = more * parts.velocity
+    return Joined(A, B, G, y, (d @ f_x - inertia @ A, d @ f_u - inertia @ B, d * f_F - inertia @ G))
+
+
+def controller_rows(parts: ContactParts, joined: Joined) -> Rows:
+    """Return the inputs of the controller."""
+    (yx, yu, yF), (fx, fu, fF) = joined.y, joined.felt
+    zero_y, zero_f = np.zeros_like(yu), np.zeros_like(fu)
+    if not parts.sample_time:
+        parts_of_u = ((zero_y, yu), (zero_f, fu))
+    else:
+        parts_of_u = ((yu, zero_y) if parts.is_stepped else (zero_y, yu), (fu, zero_f))
+    (y_last, y_now), (f_last, f_now) = parts_of_u
+
+    def stack(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.concatenate([a, b], axis=-2)
+
+    return Rows(stack(yx, fx), stack(y_last, f_last), stack(y_now, f_now), stack(yF, fF))
+
+
+def hold_inputs(joined: Joined, T: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the matrices over one sample with held inputs u."""
+    from scipy.linalg import expm
+
+    n, many = joined.B.shape[-2:]
+    whole = np.zeros((*joined.A.shape[:-2], n + many, n + many))
+    whole[..., :n, :n], whole[..., :n, n:] = joined.A, joined.B
+    whole = np.asarray(expm(whole * T))
+    return whole[..., :n, :n], whole[..., :n, n:]
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """The coupled loop: s⁺ (or ds/dt) = A s + g F at the ticks, with the plant's state first.
+
+    The states are those of the plant, the last inputs (of a sampled loop) and those of the controller. ``inputs`` are
+    the matrices of u by the states and by F at the tick. ``solvable`` is False where a continuous loop has no solution.
+    """
+
+    A: np.ndarray
+    at_tick: np.ndarray
+    inputs: tuple[np.ndarray, np.ndarray]
+    joined: Joined
+    solvable: np.ndarray
+
+
+def close_loop(parts: ContactParts, joined: Joined) -> ClosedLoop:
+    """Return the loop of joined plant and controller."""
+    K, rows, sampled = parts.controller, controller_rows(parts, joined), bool(parts.sample_time)
+    batch, (n, many), nk = joined.A.shape[:-2], parts.plant.B.shape, len(K.A)
+    E = np.eye(many) - K.D @ rows.now
+    solvable = np.linalg.det(E) > 0.0 if not sampled else np.ones(batch, dtype=bool)
+    E_inv = np.linalg.inv(np.where(solvable[..., None, None], E, np.eye(many)))
+    u_x, u_last, u_k, u_F = (E_inv @ v for v in (K.D @ rows.x, K.D @ rows.last, K.C, K.D @ rows.force))
+    u_k = np.broadcast_to(u_k, (*batch, many, nk))
+    u = np.concatenate([u_x, *([u_last] if sampled else []), u_k], axis=-1)
+    h = np.concatenate([rows.x, *([rows.last] if sampled else []), np.zeros((*batch, rows.x.shape[-2], nk))], axis=-1)
+    h, h_F = h + rows.now @ u, rows.force + rows.now @ u_F
+    Ad, Bd = hold_inputs(joined, parts.sample_time) if sampled else (joined.A, joined.B)
+    own_x = np.concatenate([Ad, np.zeros((*batch, n, u.shape[-1] - n))], axis=-1)
+    own_k = np.concatenate([np.zeros((*batch, nk, u.shape[-1] - nk)), np.broadcast_to(K.A, (*batch, nk, nk))], axis=-1)
+    A = np.concatenate([own_x + Bd @ u, *([u] if sampled else []), own_k + K.B @ h], axis=-2)
+    at_tick = np.concatenate([Bd @ u_F, *([u_F] if sampled else []), K.B @ h_F], axis=-2)
+    return ClosedLoop(np.where(solvable[..., None, None], A, np.nan), at_tick, (u, u_F), joined, solvable)
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """Coordinates that split the modes that an environment moves from the others.
+
+    Attributes
+    ----------
+    left, right : ndarray
+        ``left @ A @ right`` is the matrix of the modes that the environment can move.
+    fixed : ndarray
+        Poles of the others, s or z.
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+    fixed: np.ndarray
+
+    def reduce(self, A: np.ndarray) -> np.ndarray:
+        """Return the matrix of the modes that the environment can move."""
+        return np.asarray(self.left @ A @ self.right)
+
+
+def split_modes(parts: ContactParts, direction: np.ndarray, loop: ClosedLoop, used: set[str]) -> Modes:
+    """Return the modes that an environment can move, which is made of the properties ``used``.
+
+    An environment reaches modes through its force, over a sample and at a tick; it feels them by the position if it has
+    a spring, by the velocity if it has a damper, and by the acceleration if it has a mass. A tool's mass feels all
+    directions, and acts at the ticks.
+    """
+    from scipy.linalg import expm, matrix_balance
+
+    T, A = parts.sample_time, loop.A
+    n, nf = len(parts.plant.A), len(direction)
+    axes = np.eye(nf) if "tool_mass" in used else direction[:, None]
+    d = direction[:, None]
+    size, many = len(A), parts.plant.B.shape[1]
+    pushes, felt = [], []
+    for axis in axes.T[:, :, None]:
+        free = join_environment(parts, axis[:, 0])
+        at_tick = close_loop(parts, free._replace(G=0.0 * free.G)).at_tick
+        pushes.append(at_tick)
+    held = np.zeros((n + 1, n + 1))
+    held[:n, :n], held[:n, n:] = loop.joined.A, parts.force @ d
+    along = np.zeros((size, 1))
+    along[:n] = np.asarray(expm(held * T))[:n, n:] if T else held[:n, n:]
+    pushes.append(along)
+
+    def row(by_x: np.ndarray, by_u: np.ndarray) -> np.ndarray:
+        made = np.zeros((len(by_x), size))
+        made[:, :n] = by_x
+        if T:
+            made[:, n : n + many] = by_u
+        else:
+            made += by_u @ loop.inputs[0]
+        return made
+
+    none = np.zeros((1, many))
+    if "stiffness" in used:
+        felt.append(row(d.T @ parts.position, none))
+    if "damping" in used:
+        felt.append(row(d.T @ parts.velocity, none))
+    if "mass" in used or "tool_mass" in used:
+        rows = parts.velocity if "tool_mass" in used else d.T @ parts.velocity
+        felt.append(row(rows @ loop.joined.A, rows @ loop.joined.B))
+    shifted = A - np.eye(size) if T else A
+    balanced, scale = matrix_balance(shifted, permute=False, separate=True)
+    scale = scale[0]
+    V, fixed = _split_fixed(balanced, np.hstack(pushes) / scale[:, None], bool(T))
+    W, more = _split_fixed((V.T @ balanced @ V).T, (np.vstack(felt) * scale @ V).T, bool(T))
+    return Modes(W.T @ V.T / scale, scale[:, None] * (V @ W), np.concatenate([fixed, more]) + (1.0 if T else 0.0))
+
+
+def _split_fixed(A: np.ndarray, B: np.ndarray, sampled: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Return a basis of what is left without the slow and unstable modes that B doesn't reach, and their poles.
+
+    The basis spans a subspace that A, and A + B F for every F, leads into itself. Its modes are those of (A, B); A is
+    z − 1 in a sampled loop.
+    """
+    from scipy.linalg import schur
+
+    def is_slow(re: float, im: float) -> bool:
+        return abs(1.0 + complex(re, im)) > 1.0 - SLOW if sampled else re > -SLOW_RATE
+
+    _, right, count = schur(A, sort=is_slow)
+    _, left, again = schur(A.T, sort=is_slow)
+    if not count or again != count:
+        return np.eye(len(A)), np.zeros(0)
+    right, left = right[:, :count], left[:, :count]
+    dual = np.linalg.solve(left.T @ right, left.T)  # dual @ right is the unit matrix
+    inner = dual @ A @ right
+    rest = _not_reached(inner, dual @ B, np.linalg.norm(B, axis=0), float(np.linalg.norm(A, 2)))
+    if not rest.shape[1]:
+        return np.eye(len(A)), np.zeros(0)
+    whole, _ = np.linalg.qr(dual.T @ rest, mode="complete")
+    return whole[:, rest.shape[1] :], np.linalg.eigvals(rest.T @ inner @ rest)
+
+
+def _not_reached(A: np.ndarray, B: np.ndarray, lengths: np.ndarray, size: float) -> np.ndarray:
+    """Return an orthonormal basis beside the subspace that B reaches through A.
+
+    ``lengths`` are the sizes of the columns of B, ``size`` that of A, against which rounding is told.
+    """
+    n = len(A)
+    V, new, reference = np.zeros((n, 0)), B, lengths
+    while new.shape[1] and V.shape[1] < n:
+        rest = new / np.where(reference > 0.0, reference, 1.0)
+        for _ in range(2):  # twice, against rounding
+            rest = rest - V @ (V.T @ rest)
+        U, s, _ = np.linalg.svd(rest, full_matrices=False)
+        found = U[:, s > _RANK]
+        V = np.hstack([V, found])
+        new, reference = A @ found, np.full(found.shape[1], size)
+    whole, _ = np.linalg.qr(V, mode="complete")
+    return whole[:, V.shape[1] :]

@@ -1,0 +1,370 @@
+"""The parts of a diagram that an environment at its plant couples: the plant's equations, and all the rest.
+
+The plant is one block or FMU with a force port. Its equations are linearized in continuous time. All its outputs are
+opened; what then leads from them, and from the measured force, to the plant's inputs is the controller, sampled or
+continuous: the rest of the diagram, with its actuators, sensors and delays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ...blocks import ForceSensor
+from ...blocks.core import (
+    Finding,
+    FmuError,
+    OptionError,
+    ParameterError,
+    ShapeError,
+    UnknownNameError,
+    near,
+    same_unit,
+)
+from ...fmus.running import Derivation
+from ..linearization import (
+    BlockFinding,
+    Linearization,
+    PlantEquations,
+    Signal,
+    UnusualStart,
+    find_signal,
+    linearize,
+    linearize_plant,
+    moves_between_ticks,
+)
+from .compliance_loop import StateMatrices
+
+if TYPE_CHECKING:
+    from ..flat import FlatDiagram, WiredDiagram
+    from ..results import OperatingPoint
+
+AT_REST = 1e-9
+"""Largest change of a state in one second or over a sample, relative to 1 + its size, at a point that is at rest."""
+_ROUNDED = 1e-9
+"""Relative size of an entry that should be zero."""
+_DOUBTFUL = 10.0
+"""Factor by which a stated error of differences may be too small."""
+
+
+@dataclass(frozen=True, eq=False)
+class ContactParts:
+    """Plant and controller, linear at an operating point; n_f is the number of entries of the force.
+
+    Attributes
+    ----------
+    plant : StateMatrices
+        From the plant's wired inputs to its wired outputs, continuous.
+    force : ndarray, shape (n, n_f)
+        Input matrix of the force port.
+    force_shown : ndarray
+        Feedthrough from the force port to the wired outputs.
+    position, velocity : ndarray, shape (n_f, n)
+        Output matrices of position and velocity at the contact.
+    controller : StateMatrices
+        From the plant's outputs and the n_f entries of the measured force to the plant's wired inputs.
+    sample_time : float
+        Sample time T of the controller in s; 0 if everything is continuous.
+    is_stepped : bool
+        Whether the plant is an FMU, whose outputs at a tick are those under its last inputs.
+    tool_mass : float
+        Mass of the tool in kg that the diagram's force sensor feels.
+    derivation : Derivation
+        Method by which the plant was differentiated.
+    errors : tuple of StateMatrices
+        Errors of the entries of ``plant``, and of those of (A, force, position, velocity); zero if they are exact.
+    findings : tuple of Finding
+        Kinks, stairs and flat slopes that the model leaves out.
+    """
+
+    plant: StateMatrices
+    force: np.ndarray
+    force_shown: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    controller: StateMatrices
+    sample_time: float
+    is_stepped: bool
+    tool_mass: float
+    derivation: Derivation
+    errors: tuple[StateMatrices, StateMatrices]
+    findings: tuple[Finding, ...]
+
+
+@dataclass(frozen=True)
+class Ports:
+    """The plant of a contact and its ports, by name."""
+
+    plant: str
+    force: str
+    position: str
+    velocity: str
+
+    @classmethod
+    def find(cls, diagram: WiredDiagram, flat: FlatDiagram, force: str, position: str, velocity: str) -> Ports:
+        """Return the ports that names denote.
+
+        Raises
+        ------
+        UnknownNameError, OptionError
+            If a name denotes none, or position and velocity are not outputs of the block with the force port.
+        """
+        plant, _, port = str(force).rpartition(".")
+        if plant not in diagram.blocks:
+            candidates = [f"{path}.{name}" for path, block in diagram.blocks.items() for name in block.inputs]
+            raise UnknownNameError(
+                f"found no block with the input {force!r}. {near(str(force), candidates)}", block=diagram.name
+            )
+        if port not in diagram.blocks[plant].inputs:
+            raise UnknownNameError(
+                f"it has no input {port!r}. {near(port, diagram.blocks[plant].inputs)}", block=plant, port=port
+            )
+        found = []
+        for name, quantity in ((position, "position"), (velocity, "velocity")):
+            signal = find_signal(flat, name)
+            if signal.port[0] != plant or signal.entry:
+                raise OptionError(
+                    f"found {name!r}, of the block {signal.port[0]!r}; expected the {quantity} of the contact, an "
+                    f"output of {plant!r} that the force acts on. Name that output: {quantity}=….",
+                    block=plant,
+                    port=quantity,
+                )
+            found.append(signal.port[1])
+        return cls(plant, port, *found)
+
+
+class Source(NamedTuple):
+    """Output port, or a part of it, that an input of the plant is wired to."""
+
+    block: str
+    port: str
+    part: int | slice | None
+
+
+def take_apart(
+    diagram: WiredDiagram, ports: Ports, measured: str | None, point: OperatingPoint, options: Mapping[str, Any]
+) -> tuple[ContactParts, bool]:
+    """Return the linear parts of a diagram at a point, and whether that point is a start unlike every later tick.
+
+    Raises
+    ------
+    ParameterError
+        If the point is not at rest, the plant has no continuous linear model, or its ports are not those of a contact.
+    OptionError
+        If the diagram has several rates, or signals around a plant with equations change between the ticks.
+    """
+    path, block = ports.plant, diagram.blocks[ports.plant]
+    flat, all_wires = diagram.flatten(point.base), diagram.structure.wires
+    wires = {
+        port: Source(wire.block, wire.port, wire.index)
+        for port in block.inputs
+        if (wire := all_wires.get((path, port))) is not None
+    }
+    looped = next((port for port, wire in wires.items() if wire.block == path), None)
+    if looped is not None:
+        raise OptionError(
+            f"found it wired to an output of {path!r} itself; expected a block between them. Put a Gain(gain=1) there.",
+            block=path,
+            port=looped,
+        )
+    used = {wire.port for wire in all_wires.values() if wire.block == path}
+    seen = [name for name in block.outputs if name in used]
+    outputs = [f"{path}.{name}" for name in seen]
+    sources = list(dict.fromkeys(f"{wire.block}.{wire.port}" for wire in wires.values()))
+    signal = None if measured is None else find_signal(flat, measured)
+    inside = signal is not None and signal.port[0] == path  # the plant measures the force itself
+    injected = outputs if measured is None or inside else [*outputs, measured]
+    model = linearize(diagram, point, inputs=injected, outputs=sources, openings=outputs, **options)
+    _check_rates(diagram, point, path, model, outputs, sources)
+    m = _linearize_plant(diagram, point, path)
+    _check_rest(path, m, model)
+    pushed, position, velocity = (
+        m.inputs.entries([ports.force]),
+        *(m.outputs.entries([name]) for name in (ports.position, ports.velocity)),
+    )
+    felt = [] if signal is None else list(signal.entries)
+    if not len(position) == len(velocity) == len(pushed) or len(felt) not in (0, len(pushed)):
+        raise ShapeError(
+            f"found {len(pushed)} entries of the force, {len(position)} of the position, {len(velocity)} of the "
+            f"velocity and {len(felt)} of the measured force {measured!r}; expected equal numbers. Name other ports.",
+            block=path,
+            port=ports.force,
+        )
+    wired, rows = m.inputs.entries(wires), m.outputs.entries(seen)
+    K = _cut_controller(model, path, wires, flat, signal)
+    if signal is None:
+        K = StateMatrices(K.A, _widen(K.B, len(pushed)), K.C, _widen(K.D, len(pushed)))
+    elif inside:
+        own = [rows.index(m.outputs.slices[signal.port[1]].start + i) for i in felt]
+        K = StateMatrices(K.A, np.hstack([K.B, K.B[:, own]]), K.C, np.hstack([K.D, K.D[:, own]]))
+    plant = StateMatrices(m.A, m.B[:, wired], m.C[rows], m.D[np.ix_(rows, wired)])
+    n, U = len(m.A), m.error
+    E = StateMatrices(U[:n, :n], U[:n, n:], U[n:, :n], U[n:, n:])
+    _check_contact(path, ports, m, E, (pushed, position, velocity))
+    if signal is not None:
+        _check_unit(diagram, path, ports, signal)
+        driven = wires.get(ports.force)
+        direct = driven is not None and (driven.block, driven.port) == signal.port
+        _check_force_wire(path, ports, signal, K, [wired.index(i) for i in pushed if i in wired], direct=direct)
+    sensor = None if signal is None else diagram.blocks[signal.port[0]]
+    parts = ContactParts(
+        plant=plant,
+        force=m.B[:, pushed],
+        force_shown=m.D[np.ix_(rows, pushed)],
+        position=m.C[position],
+        velocity=m.C[velocity],
+        controller=K,
+        sample_time=model.dt,
+        is_stepped=block.stepped,
+        tool_mass=sensor.tool_mass if isinstance(sensor, ForceSensor) else 0.0,
+        derivation=m.derivation,
+        errors=(
+            StateMatrices(E.A, E.B[:, wired], E.C[rows], E.D[np.ix_(rows, wired)]),
+            StateMatrices(E.A, E.B[:, pushed], E.C[position], E.C[velocity]),
+        ),
+        findings=_collect_findings(model, path),
+    )
+    return parts, any(isinstance(f, UnusualStart) for f in model.findings)
+
+
+def _widen(M: np.ndarray, by: int) -> np.ndarray:
+    return np.hstack([M, np.zeros((len(M), by))])
+
+
+def _collect_findings(model: Linearization, path: str) -> tuple[Finding, ...]:
+    """Return the findings on the ways through the controller, and those about the plant itself."""
+    own = (f for f in model.findings if isinstance(f, BlockFinding) and f.block == path)
+    return tuple(dict.fromkeys((*model.carried, *own)))
+
+
+def _cut_controller(
+    model: Linearization, path: str, wires: Mapping[str, Source], flat: FlatDiagram, signal: Signal | None
+) -> StateMatrices:
+    """Return the matrices from the plant's outputs and the measured force to its inputs, without the plant's states."""
+    own = [name.startswith((f"{path}.", f"held({path}.")) for name in model.states]
+    keep = [i for i, mine in enumerate(own) if not mine]
+    rows, start, shapes = dict[tuple[str, str], np.ndarray](), 0, flat.checked.shapes
+    for block, port in dict.fromkeys((wire.block, wire.port) for wire in wires.values()):
+        many = int(np.prod(shapes[block, port]))
+        rows[block, port] = np.arange(start, start + many).reshape(shapes[block, port])
+        start += many
+    picked = [
+        i
+        for wire in wires.values()
+        for i in np.ravel(rows[wire.block, wire.port][... if wire.part is None else wire.part]).tolist()
+    ]
+    hidden = [i for i, mine in enumerate(own) if mine]
+    if np.any(model.A[np.ix_(keep, hidden)]) or np.any(model.C[np.ix_(picked, hidden)]):
+        raise OptionError(
+            "found a way from its states to its inputs beside its outputs; expected none. Report this diagram as an "
+            "error of loopwright.",
+            block=path,
+        )
+    D = model.D[picked].copy()
+    if signal is not None and signal.port in rows:  # it is measured ahead of what is injected there
+        taken = np.ravel(rows[signal.port])[list(signal.entries)].tolist()
+        for j, entry in enumerate(taken, D.shape[1] - len(taken)):
+            D[[i for i, one in enumerate(picked) if one == entry], j] += 1.0
+    return StateMatrices(model.A[np.ix_(keep, keep)], model.B[keep], model.C[np.ix_(picked, keep)], D)
+
+
+def _linearize_plant(diagram: WiredDiagram, at: OperatingPoint, path: str) -> PlantEquations:
+    try:
+        return linearize_plant(diagram, at, path)
+    except FmuError as error:
+        raise ParameterError(
+            f"found no model of its equations ({error.message.rstrip('.')}); expected one. An identified model does "
+            "not do: it holds the force over a sample, as no environment does. Take an FMU with model exchange or "
+            "directional derivatives.",
+            block=path,
+        ) from error
+
+
+def _check_rates(
+    diagram: WiredDiagram, at: OperatingPoint, path: str, model: Linearization, outputs: list[str], sources: list[str]
+) -> None:
+    if not model.dt:
+        return
+    if model.dt != float(at.base):
+        raise OptionError(
+            f"found a period of {model.dt:g} s with ticks each {float(at.base):g} s; expected one rate. Give all "
+            "sampled subsystems one sample time, and no shorter step.",
+            block=diagram.name,
+        )
+    moving = "" if diagram.blocks[path].stepped else moves_between_ticks(diagram, at, outputs, sources)
+    if moving:
+        raise OptionError(
+            f"found {moving!r}, which acts on continuous blocks between the ticks; expected a plant whose inputs are "
+            "held and whose outputs are sampled. Give it as an FMU, or sample the blocks around it.",
+            block=path,
+        )
+
+
+def _check_rest(path: str, m: PlantEquations, model: Linearization) -> None:
+    slow = np.max(np.abs(m.f) / (1.0 + np.abs(m.x0)), initial=0.0)
+    residual = float(max(slow, np.max(np.abs(model.affine), initial=0.0)))
+    if not residual <= AT_REST:
+        raise ParameterError(
+            f"found a point at which states change, by {residual:.3g} in a second or a sample; expected rest, to "
+            f"{AT_REST:g}. Give such a point: at=diagram.trim(…).",
+            block=path,
+        )
+
+
+def _check_contact(
+    path: str, ports: Ports, m: PlantEquations, E: StateMatrices, entries: tuple[list[int], list[int], list[int]]
+) -> None:
+    """Refuse a velocity that is not the rate of its position, and a force that moves it at once or not at all."""
+    pushed, position, velocity = entries
+    P, V = m.C[position], m.C[velocity]
+    rate, size = P @ m.A, np.abs(P) @ np.abs(m.A) + np.abs(V)
+    error = np.abs(P) @ E.A + E.C[position] @ np.abs(m.A) + E.C[velocity]
+    at_once = np.vstack([P @ m.B, m.D[position], m.D[velocity]])
+    unsure = np.vstack([np.abs(P) @ E.B, E.D[position], E.D[velocity]])
+    scale = np.abs(V) @ np.abs(m.B)
+    if np.any(np.abs(rate - V) > _ROUNDED * (size + np.max(np.abs(V))) + _DOUBTFUL * error) or np.any(
+        np.abs(at_once) > _ROUNDED * np.max(scale, initial=0.0) + _DOUBTFUL * unsure
+    ):
+        raise ParameterError(
+            f"found {ports.velocity!r}, which is not the rate of {ports.position!r}; expected position and velocity of "
+            "the point that the force acts on. Name other outputs: position=…, velocity=….",
+            block=path,
+            port=ports.velocity,
+        )
+    mobility = V @ m.B[:, pushed]
+    symmetric = 0.5 * (mobility + mobility.T)
+    if not np.all(np.linalg.eigvalsh(symmetric) > _ROUNDED * np.max(np.abs(symmetric), initial=0.0)):
+        raise ParameterError(
+            f"found a force whose accelerations are {mobility.tolist()} for each newton; expected it to push along "
+            f"itself in every direction. Name a position in the axes of the force.",
+            block=path,
+            port=ports.force,
+        )
+
+
+def _check_unit(diagram: WiredDiagram, path: str, ports: Ports, signal: Signal) -> None:
+    """Refuse a measured force in another unit than the force itself, where both are known."""
+    force, measured = diagram.blocks[path].inputs[ports.force].unit, diagram.checked.units.get(signal.port)
+    if isinstance(force, str) and isinstance(measured, str) and not same_unit(force, measured):
+        raise OptionError(
+            f"found {signal.name!r} in {measured}; expected the measured force in {force}, as of {path}.{ports.force}. "
+            "Name the wire that has it: force=….",
+            block=path,
+            port=ports.force,
+        )
+
+
+def _check_force_wire(
+    path: str, ports: Ports, signal: Signal, K: StateMatrices, rows: list[int], *, direct: bool
+) -> None:
+    """Refuse a measured force that drives the force port itself: the environment's force would act twice."""
+    if direct or (rows and np.any(K.D[rows, -len(signal.entries) :])):
+        raise OptionError(
+            f"found {signal.name!r}, which leads on to {path}.{ports.force}; expected the signal of the force sensor, "
+            "which acts on the controller alone. Name that wire: force=….",
+            block=path,
+            port=ports.force,
+        )

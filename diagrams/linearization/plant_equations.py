@@ -1,0 +1,117 @@
+"""The continuous linear model of one plant of a diagram, an FMU or a block with equations, at an operating point."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...blocks.core import Block, Layout, ParameterError
+from ...fmus.running import Derivation, DerivativeMethod
+from ..flat import FlatDiagram, WiredDiagram
+from ..results import OperatingPoint
+from ..wiring import join
+from .derivatives import LocalDerivatives, Signal, find_signal
+from .over_a_period import find_moving, is_moving
+from .plant_models import linearize_equations
+
+
+class PlantEquations(NamedTuple):
+    """Linear model of a plant's equations, dx/dt = f + A x + B u and y = C x + D u, about an operating point.
+
+    ``inputs`` and ``outputs`` lay out u and y by ports, ``states`` names the entries of x, and ``error`` bounds the
+    errors of the entries of [[A, B], [C, D]]; it is an estimate where they are differences.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    f: np.ndarray
+    x0: np.ndarray
+    states: tuple[str, ...]
+    inputs: Layout
+    outputs: Layout
+    derivation: Derivation
+    error: np.ndarray
+
+
+def linearize_plant(diagram: WiredDiagram, at: OperatingPoint, path: str) -> PlantEquations:
+    """Return the linear model of the equations of one block or FMU of a diagram.
+
+    Parameters
+    ----------
+    diagram : Diagram
+        Diagram with the plant.
+    at : OperatingPoint
+        Instant of the diagram.
+    path : str
+        Path of the plant.
+
+    Raises
+    ------
+    FmuError
+        If the FMU gives no model of its equations.
+    ParameterError
+        If the block has no equations in continuous time.
+    """
+    flat, block = diagram.flatten(at.base), diagram.blocks[path]
+    inputs, outputs = (_lay_out(block, kind) for kind in ("inputs", "outputs"))
+    if block.stepped:
+        m = linearize_equations(flat, at, path, at.z)
+        names = tuple(f"{path}.{name}" for name in m.states)
+        return PlantEquations(m.A, m.B, m.C, m.D, m.f, m.x0, names, inputs, outputs, m.derivation, m.uncertainty)
+    return _differentiate(diagram, flat, at, path, inputs, outputs)
+
+
+def _lay_out(block: Block, kind: str) -> Layout:
+    return Layout.of({port: spec.shape or () for port, spec in getattr(block, kind).items()})
+
+
+def _differentiate(
+    diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, path: str, inputs: Layout, outputs: Layout
+) -> PlantEquations:
+    """Return the model of a block, by algorithmic differentiation of its equations."""
+    import casadi as ca
+
+    block, trace = diagram.blocks[path], diagram.checked.traced[path]
+    where = flat.states.slices.get(path, slice(0, 0))
+    if trace.foreign is not None or trace.advance != "derivative" or where.stop == where.start:
+        raise ParameterError(
+            f"found {type(block).__name__}, whose equations have no derivatives in continuous time; expected a plant "
+            "with a linear model. Give an FMU, or a block with a derivative.",
+            block=path,
+        )
+    inputs, outputs = Layout.of(dict(trace.inputs)), Layout.of(dict(trace.outputs))
+    u0 = np.zeros(inputs.total)
+    for port in trace.inputs:
+        wire = diagram.structure.wires.get((path, port))
+        value = block.inputs[port].default if wire is None else at.values[join(wire.block, wire.port)]
+        value = np.asarray(0.0 if value is None else value, dtype=float)
+        u0[inputs.slices[port]] = np.ravel(value if wire is None or wire.index is None else value[wire.index])
+    x = ca.MX.sym("x", where.stop - where.start)
+    ports = [ca.MX.sym(name, int(np.prod(shape))) for name, shape in trace.inputs.items()]
+    results = trace.function(at.t, x, *ports, trace.pack(block, np.inf))
+    outs, rates = results[: len(trace.outputs)], results[len(trace.outputs)]
+    u, values = ca.vertcat(*ports), ca.vertcat(rates, *outs)
+    x0, n = at.x[where], where.stop - where.start
+    function = ca.Function("linear", [x, u], [ca.jacobian(values, ca.vertcat(x, u)), values])
+    J, y = (np.array(v.full()) for v in function(x0, u0))
+    return PlantEquations(
+        J[:n, :n], J[:n, n:], J[n:, :n], J[n:, n:], y[:n, 0], x0, tuple(flat.labels[where]), inputs, outputs,
+        Derivation(DerivativeMethod.TRACED), np.zeros(J.shape),
+    )  # fmt: skip
+
+
+def moves_between_ticks(diagram: WiredDiagram, at: OperatingPoint, outputs: list[str], inputs: list[str]) -> str:
+    """Return the name of a signal around a plant that changes between the ticks of a sampled diagram, or "".
+
+    These are outputs of the plant that other continuous blocks follow between the ticks, and inputs of the plant that
+    are not held.
+    """
+    flat = diagram.flatten(at.base)
+    signals = [find_signal(flat, name) for name in outputs]
+    local = LocalDerivatives(flat, signals, [], signals)
+    sources: list[Signal] = [find_signal(flat, name) for name in inputs]
+    names = [*find_moving(flat, local, at), *(s.name for s in sources if is_moving(flat, s))]
+    return names[0] if names else ""

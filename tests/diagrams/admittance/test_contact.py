@@ -1,0 +1,296 @@
+"""The contact of a diagram's own linear model, against the reduced loop by hand, closed forms and other plants."""
+
+import math
+import re
+from functools import cache
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import (
+    Block,
+    Constant,
+    Gain,
+    Input,
+    OptionError,
+    ParameterError,
+    Reference,
+    State,
+    TransferFunction,
+)
+from loopwright.blocks.core.errors import ShapeError, UnknownNameError
+from loopwright.diagrams import (
+    AdmittanceLoop,
+    Diagram,
+    experiments,
+    growth_rate,
+    passivity,
+    rendered_admittance,
+    stability_limit,
+    target_admittance,
+)
+from loopwright.diagrams.paper.report_case import NO_FRICTION
+from loopwright.fmus import gantry, gantry_elastic
+from support.contact import FORCE_TRACKING
+from support.plants import hidden, undirected
+
+SIDE = pytest.mark.parametrize("side", ["par", "perp"])
+IMPLEMENTATIONS = {"continuous": ("continuous", 0), "sampled_d0": ("sampled", 0), "sampled_d1": ("sampled", 1)}
+
+
+@cache
+def diagram(name="sampled_d0", plant=None):
+    options = {} if plant is None else {"plant": plant.build()}
+    made = experiments.compliance(delay=IMPLEMENTATIONS[name][1], **options).diagram
+    return made.continuous() if name == "continuous" else made
+
+
+@cache
+def contact(name="sampled_d0", side="perp", plant=None):
+    return diagram(name, plant).contact(direction=side)
+
+
+def by_hand(name="sampled_d0", side="perp", **changes):
+    implementation, delay = IMPLEMENTATIONS[name]
+    return AdmittanceLoop.of(diagram(), side, **changes).replace(implementation=implementation, delay=delay)
+
+
+def agree(found, expected, tolerance=1e-9):
+    assert found.value == pytest.approx(expected.value, rel=tolerance)
+    assert found.restabilizes == pytest.approx(expected.restabilizes, rel=tolerance)
+    if math.isfinite(expected.value):
+        assert found.frequency == pytest.approx(expected.frequency, rel=10 * tolerance)
+        assert abs(found.value - expected.value) <= found.tolerance + expected.tolerance
+
+
+# --- the rigid gantry, beside the reduction by hand ------------------------------------------------------------------
+
+
+@pytest.mark.drawn
+@SIDE
+@pytest.mark.parametrize("name", IMPLEMENTATIONS)
+@pytest.mark.parametrize("damping", [0.0, 10.0, 100.0])
+def test_stiffness_limits_of_the_rigid_gantry_are_those_by_hand(side, name, damping):
+    found = contact(name, side).stability_limit(damping=damping)
+    agree(found, stability_limit(by_hand(name, side), damping=damping))
+    assert found.environment == {"damping": damping}
+
+
+@SIDE
+def test_mass_limits_of_the_rigid_gantry_are_those_by_hand(side):
+    agree(contact(side=side).stability_limit("mass"), stability_limit(by_hand(side=side), "mass"))
+    # a tool acts in both directions: the lighter impedance, that along the path, breaks first
+    found = contact(side=side).stability_limit("tool_mass")
+    agree(found, stability_limit(by_hand(side="par"), "tool_mass"))
+    np.testing.assert_allclose(np.abs(found.direction), [0.0, 1.0], atol=1e-6)
+
+
+@SIDE
+@pytest.mark.parametrize("name", IMPLEMENTATIONS)
+def test_admittance_and_passivity_of_the_rigid_gantry_are_those_by_hand(side, name):
+    here, loop = contact(name, side), by_hand(name, side)
+    omega = np.geomspace(0.1, 3000.0, 41)
+    found = here.admittance(omega)
+    np.testing.assert_allclose(found.rendered, rendered_admittance(loop, omega), rtol=1e-10)
+    np.testing.assert_allclose(found.target, target_admittance(loop, omega), rtol=1e-14)
+    p, expected = here.passivity(), passivity(loop)
+    assert p.frequency == pytest.approx(expected.frequency, rel=1e-9)
+    np.testing.assert_allclose(p.intervals, expected.intervals, rtol=1e-9)
+    assert (p.stable, p.scanned, p.caveat) == (expected.stable, expected.scanned, expected.caveat)
+
+
+def placed(eta, xi, **changes):
+    """Fig. 3 at rest at a point of its path."""
+    path = diagram()["controller.feedback_linearization"].path
+    changes |= {"plant.start.position": path.to_plane(eta, xi)}
+    changes |= {name: Reference(value, unit="m", name=name) for name, value in (("eta_d", eta), ("xi_d", xi))}
+    return diagram().replace(changes)
+
+
+@pytest.mark.drawn
+@SIDE
+@pytest.mark.parametrize(("eta", "xi"), [(0.2, 0.0), (0.2, -0.02), (0.5, 0.02)])
+@pytest.mark.parametrize("friction", [True, False])
+@pytest.mark.parametrize("tool_mass", [0.0, 0.2])
+def test_limits_beside_the_path_are_those_by_hand(side, eta, xi, friction, tool_mass):
+    changes = {"sensors.force_sensor.tool_mass": tool_mass}
+    if not friction:
+        changes |= {f"plant.start.{name}": 0.0 for name in NO_FRICTION}
+        changes["controller.feedback_linearization.model"] = gantry.nominal.replace(**NO_FRICTION)
+    made = placed(eta, xi, **changes)
+    here, loop = made.contact(direction=side), AdmittanceLoop.of(made, side, eta=eta, xi=xi)
+    assert here.parts.tool_mass == tool_mass
+    for vary, held in (("stiffness", {"damping": 10.0}), ("mass", {})):
+        found, expected = here.stability_limit(vary, **held), stability_limit(loop, vary, **held)
+        agree(found, expected, 1e-8)
+    omega = np.geomspace(1.0, 3000.0, 11)
+    np.testing.assert_allclose(here.admittance(omega).rendered, rendered_admittance(loop, omega), rtol=1e-7)
+    np.testing.assert_allclose(here.admittance(omega).target, target_admittance(loop, omega), rtol=1e-9)
+
+
+def test_a_block_as_plant_has_the_limits_of_its_fmu():
+    block = gantry.nominal.replace(name="plant", start_position=(0.8, 0.5))
+    found = diagram().replace({"plant": block}).contact().stability_limit(damping=10.0)
+    agree(found, contact().stability_limit(damping=10.0))
+
+
+def test_differences_show_their_error(tmp_path):
+    made = experiments.compliance(plant=undirected(gantry_elastic.build(), tmp_path)).diagram
+    found = made.contact()
+    exact = contact(plant=gantry_elastic).stability_limit()
+    limit = found.stability_limit()
+    assert str(found.derivation).startswith("differences")
+    assert abs(limit.value - exact.value) <= limit.tolerance + exact.tolerance
+    assert 1e-9 * limit.value < limit.tolerance < 0.01 * limit.value
+
+
+def test_a_vector_is_a_direction():
+    found = diagram().contact(direction=(0.0, -3.0))
+    agree(found.stability_limit(damping=10.0), contact(side="par").stability_limit(damping=10.0))
+    assert found.admittance(1.0).target is None
+
+
+def test_a_tool_breaks_the_other_direction_whatever_touches_the_robot():
+    found = contact(side="perp").stability_limit(tool_mass=0.65)
+    limit = contact(side="par").stability_limit("tool_mass")
+    assert limit.value < 0.65
+    assert (found.value, found.restabilizes) == (0.0, ())
+    assert found.frequency == pytest.approx(limit.frequency, rel=1e-9)  # the Nyquist frequency
+    np.testing.assert_allclose(np.abs(found.direction), [0.0, 1.0], atol=1e-6)  # along the path, beside the contact
+    expected = growth_rate(by_hand(side="par"), tool_mass=0.65)
+    assert found.growth_above == pytest.approx(expected, rel=1e-9)
+    assert contact(side="par").stability_limit(tool_mass=0.65).value == 0.0
+
+
+@SIDE
+def test_force_tracking_drifts_in_the_other_direction_and_has_its_limit(side):
+    free = {name: FORCE_TRACKING[name].replace(name=f"admittance_{name}") for name in ("par", "perp")}
+    made = diagram().replace({f"controller.admittance_{name}": block for name, block in free.items()})
+    found = made.contact(direction=side)
+    agree(found.stability_limit(damping=10.0), stability_limit(AdmittanceLoop.of(made, side), damping=10.0))
+    slow = [p for p in found.loop("stiffness").modes.fixed if abs(p - 1.0) < 1e-7]
+    assert len(slow) >= 1  # the drift of the other direction, which no growth rate counts
+
+
+# --- another diagram: a cart whose drive lags behind the force that it shows -----------------------------------------
+
+M, TAU, SHARE, DRAG = 3.0, 0.02, 4.0, 8.0
+"""Mass in kg, lag in s, share of the measured force that the drive adds, drag in N s/m."""
+
+
+class Cart(Block):
+    motor = Input(unit="N")
+    push = Input(unit="N")
+    position = State(unit="m", start=0.0, output=True)
+    velocity = State(unit="m/s", start=0.0, output=True)
+
+    def derivative(self, t, x, u):
+        return x.velocity, (u.motor + u.push) / M
+
+
+def cart_diagram(cart=None):
+    cart = Cart(name="cart") if cart is None else cart
+    hand = Constant(value=0.0, unit="N", name="hand")
+    felt = Gain(gain=1.0, name="sensor")(hand).named("felt")
+    lag = TransferFunction(numerator=(1.0,), denominator=(TAU, 1.0), name="drive")
+    wanted = Gain(gain=SHARE, name="share")(felt) - Gain(gain=DRAG, name="drag")(cart.velocity)
+    return Diagram("cart", cart(motor=lag(wanted), push=hand))
+
+
+@cache
+def cart_contact():
+    ports = {"position": "cart.position", "velocity": "cart.velocity", "force": "felt"}
+    return cart_diagram().contact("cart.push", direction=[1.0], **ports)
+
+
+def test_a_cart_has_the_limits_of_routh():
+    # (τ s + 1)((M + m) s² + b s + k) + DRAG s + SHARE (m s² + b s + k) = 0
+    here = cart_contact()
+    assert here.sample_time == 0.0
+    limit = here.stability_limit()
+    k = DRAG / (TAU * SHARE)
+    assert limit.value == pytest.approx(k, rel=1e-10)
+    assert limit.frequency == pytest.approx(math.sqrt((k * TAU + DRAG) / (M * TAU)), rel=1e-9)
+    assert limit.direction == (1.0,)
+    # (M + m + SHARE m)(k τ + DRAG) = (M + m) τ k (1 + SHARE), above the limit: masses make it stable
+    k = 1.5 * k
+    stable_from = M * (TAU * k * SHARE - DRAG) / ((1 + SHARE) * (k * TAU + DRAG) - TAU * k * (1 + SHARE))
+    found = here.stability_limit("mass", stiffness=k)
+    assert found.value == 0.0
+    assert found.restabilizes == pytest.approx([stable_from], rel=1e-9)
+    assert found.frequency == pytest.approx(cubic_frequency(k, 1e-4), rel=1e-9)
+
+
+def cubic_frequency(k, m):
+    roots = np.roots([(M + m) * TAU, M + m + SHARE * m, k * TAU + DRAG, k * (1 + SHARE)])
+    return float(abs(roots[np.argmax(roots.real)].imag))
+
+
+def test_a_cart_on_a_damper_has_the_limit_of_routh():
+    b = 5.0
+    # (M + b τ)(b + k τ + DRAG + SHARE b) = M τ k (1 + SHARE)
+    k = (M + b * TAU) * (b * (1 + SHARE) + DRAG) / (M * TAU * (1 + SHARE) - (M + b * TAU) * TAU)
+    assert cart_contact().stability_limit(damping=b).value == pytest.approx(k, rel=1e-10)
+
+
+def test_without_damping_a_spring_breaks_the_loop_where_the_admittance_is_no_longer_passive():
+    here = cart_contact()
+    limit, w = here.stability_limit(), here.passivity().frequency
+    assert limit.frequency == pytest.approx(w, rel=1e-9)
+    assert limit.value == pytest.approx(w / abs(here.admittance(w).rendered), rel=1e-8)
+    s = 1j * w
+    Y = (1 + SHARE / (TAU * s + 1)) / (M * s + DRAG / (TAU * s + 1))
+    assert here.admittance(w).rendered == pytest.approx(Y, rel=1e-12)
+
+
+def test_a_force_that_is_not_measured_leaves_the_drag():
+    ports = {"position": "cart.position", "velocity": "cart.velocity", "force": None}
+    here = cart_diagram().contact("cart.push", direction=[1.0], **ports)
+    assert here.stability_limit().value == math.inf
+    s = 2.0j
+    assert here.admittance(2.0).rendered == pytest.approx(1 / (M * s + DRAG / (TAU * s + 1)), rel=1e-12)
+
+
+# --- refusals --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "words"),
+    [
+        ({"port": "plant.external"}, UnknownNameError, "has no input 'external'. Did you mean 'external_force'"),
+        ({"port": "robot.external_force"}, UnknownNameError, "found no block with the input 'robot.external_force'"),
+        ({"position": "eta"}, OptionError, "expected the position of the contact, an output of 'plant'"),
+        ({"position": "plant.velocity"}, ParameterError, "which is not the rate of 'velocity'"),
+        ({"force": "v_par"}, ShapeError, "1 of the measured force 'v_par'; expected equal numbers"),
+        ({"force": "position"}, OptionError, "found 'position' in m; expected the measured force in N"),
+        ({"direction": "across"}, OptionError, "found 'across'; expected 'par', 'perp' or a vector"),
+        ({"direction": (0.0, 0.0)}, OptionError, "expected a vector of 2 finite entries that is not zero"),
+        ({"force": "free_space.y"}, OptionError, "which leads on to plant.external_force"),
+        ({"at": 1.2}, ParameterError, "found a point at which states change"),
+        ({"when": 1.2}, UnknownNameError, "contact takes no 'when'"),
+    ],
+)
+def test_ports_that_make_no_contact_are_refused(arguments, error, words):
+    with pytest.raises(error, match=re.escape(words)):
+        diagram().contact(**arguments)
+
+
+def test_a_plant_without_a_model_of_its_equations_is_refused(tmp_path):
+    made = experiments.compliance(plant=hidden(gantry.build(), tmp_path)).diagram
+    with pytest.raises(ParameterError, match="An identified model does not do: it holds the force over a sample"):
+        made.contact()
+
+
+def test_properties_of_environments_are_checked():
+    with pytest.raises(OptionError, match="an environment has no 'spring'"):
+        contact().stability_limit("spring")
+    with pytest.raises(OptionError, match="an environment has no 'stifness'. Did you mean 'stiffness'"):
+        contact().stability_limit("mass", stifness=3.0)
+    with pytest.raises(OptionError, match="among the held properties"):
+        contact().stability_limit(stiffness=3.0)
+    with pytest.raises(ParameterError, match="expected finite numbers that are not negative"):
+        contact().stability_limit(damping=-1.0)
+    with pytest.raises(OptionError, match="expected at least 30"):
+        contact().stability_limit(per_decade=10)
+    with pytest.raises(OptionError, match="below the Nyquist frequency"):
+        contact().admittance(4000.0)
