@@ -3,7 +3,8 @@
 Every block whose equations are not linear is looked at, at the values of its states and inputs, one entry after the
 other. Three things are found:
 
-- *stairs*: an output that depends on an input with a slope that is zero everywhere, or by events only;
+- *stairs*: an output that depends on an input with a slope that is zero everywhere, or by events only. Of those that
+  don't come from rounding, such as comparisons, only those whose steps lie within the nominal range;
 - *kinks*: within 1e-6 of the point, relative to the nominal value, the exact slopes at both ends differ by more than
   the curvature between them explains, or the value jumps. A smooth function passes however steep it is;
 - *zero slopes*: the slope is zero at the point, while the value changes from one end of the nominal range to the other,
@@ -58,7 +59,6 @@ def find_kinks(flat: FlatDiagram, at: OperatingPoint) -> tuple[Finding, ...]:
     for path in sorted(flat.checked.traced):
         slopes = slopes_of(flat.checked.traced[path])
         wired = {f"u {port}" for port in slopes.inputs if (path, port) in flat.table.wires}
-        found += [StepsOnly(path, row[2:], column[2:]) for row, column in slopes.steps if column in wired]
         if slopes.is_simple or not slopes.columns.total or not slopes.rows.total:
             continue
         if log is None:
@@ -147,6 +147,7 @@ class _BlockAtPoint:
     def find(self) -> Iterator[Finding]:
         """Yield the kinks and zero slopes of the block."""
         steps = set(self.slopes.steps)
+        yield from (StepsOnly(self.path, r[2:], c[2:]) for r, c in self.slopes.steps if self._steps_count(r, c))
         kinks, zeros = dict[tuple[str, str], Kink](), dict[tuple[str, str], ZeroSlope]()
         f0, J0 = self._slopes(0, 0.0)
         for column in range(self.slopes.columns.total):
@@ -167,6 +168,15 @@ class _BlockAtPoint:
         outputs = self.slopes.rows.ports - self._unused
         told = {source for row, source in (*made, *steps) if row in outputs}  # a state is named if no output is
         yield from (f for (row, source), f in made.items() if row in outputs or _is_own(row, source, told))
+
+    def _steps_count(self, row: str, column: str) -> bool:
+        """Whether a row follows an input in stairs, or in steps of which some lie within its nominal range."""
+        if column not in self.wired or self.slopes.has_stairs:
+            return column in self.wired
+        rows, columns = self.slopes.rows.slices[row], self.slopes.columns.slices[column]
+        here = self._values(columns.start, 0.0)[rows]
+        ends = (self._values(i, s * self.span[i])[rows] for i in range(columns.start, columns.stop) for s in (-1, 1))
+        return any(not np.array_equal(end, here) for end in ends)
 
     @property
     def _unused(self) -> frozenset[str]:

@@ -158,6 +158,14 @@ def test_steps_and_events_are_told(case):
     assert lin.loop("v").findings == lin.findings
 
 
+def test_a_switch_that_nothing_reaches_over_the_nominal_range_is_not_told():
+    for far, number in ((0.9, 1), (1.1, 0)):  # the nominal range of u = 0 is ±1
+        relay = Relay(on_point=far, off_point=-far, on_value=1.0, name="block")
+        guard = on(lambda u, far=far: np.where(np.abs(u) > far, 1.0, 0.0))
+        for diagram in (around(relay), sampled(relay), around(guard)):
+            assert len(diagram.linearize().findings) == number
+
+
 def test_a_relay_at_its_point_jumps():
     (found,) = (
         sampled(Relay(on_point=0.0, off_point=0.0, on_value=2.0, off_value=-1.0, name="block")).linearize().findings
