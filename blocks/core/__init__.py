@@ -31,6 +31,7 @@ from .errors import (
     close_names,
     near,
 )
+from .files import replace_file, write_text
 from .findings import Finding
 from .frozen import FrozenMapping
 from .instants import FINEST, is_before, left_of, move_earlier, next_edge, period_of, read_time, right_of
@@ -114,9 +115,11 @@ __all__ = [
     "rate_of",
     "read_time",
     "recorder",
+    "replace_file",
     "right_of",
     "same_unit",
     "shape_of",
     "shorten",
     "source",
+    "write_text",
 ]

@@ -14,10 +14,10 @@ import sys
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Any
 
-from ...blocks.core import FmuError, FmuFileError, LoopwrightError, OptionError
+from ...blocks.core import FmuError, FmuFileError, LoopwrightError, OptionError, write_text
 from ...fmus.models import gantry
 from ..paper import DEFINITIONS, EXPERIMENTS, Experiment, key_numbers
 from ..results import Run
@@ -67,6 +67,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OptionError as error:
         _say(f"loopwright: error: {error}", sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        _say("loopwright: interrupted.", sys.stderr)
+        return 130
     except BrokenPipeError:  # the reader of a pipe, such as head, has had enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python complains when it ends
         return 1
@@ -172,12 +175,16 @@ def _run(arguments: argparse.Namespace) -> int:
                 sys.stderr,
             )
         else:
+            stay = _earlier_files_text(letter, folder)
             try:
                 table[letter], names = _write(experiment, run, problem, folder)
                 written.append(names)
             except OSError as error:
-                failed[letter] = f"its files can't be written: {error}"
+                failed[letter] = f"its files can't be written: {error}{stay}"
                 _say(f"loopwright: experiment {letter}: {failed[letter]}", sys.stderr)
+            except KeyboardInterrupt:
+                interrupted = True
+                _say(f"loopwright: interrupted; nothing of {letter} is written{stay}.", sys.stderr)
         if interrupted:
             break
     _print_table(table, failed)
@@ -201,25 +208,28 @@ def _simulate(experiment: Experiment) -> tuple[Run | None, str | None, bool]:
 def _write(
     experiment: Experiment, run: Run, problem: str | None, folder: Path
 ) -> tuple[dict[str, float | None], list[str]]:
-    """Write all files of a run; return its key numbers and the files' names. Older files of the experiment go."""
+    """Write all files of a run; return its key numbers and the files' names.
+
+    They take the place of older ones all together, at the end; if one can't be written, the older ones stay.
+    """
     from ..paper import plot_experiment, plot_path
     from ..results import save
 
     letter = experiment.letter
-    for file in _files(letter, folder):
-        file.unlink(missing_ok=True)
     numbers = key_numbers(experiment, run)
     content: dict[str, Any] = {n: v if v is None or math.isfinite(v) else None for n, v in numbers.items()}
     content["never"] = [n for n, v in numbers.items() if v is not None and not math.isfinite(v)]
     if problem is not None:
         content["error"] = problem
-    run.to_csv(folder / f"{letter}.csv", *SIGNALS)
-    names = [f"{letter}.csv", f"{letter}.json"]
-    (folder / names[1]).write_text(
-        json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
-    )
-    for name, plot in (("path", plot_path), ("signals", plot_experiment)):
-        names += [file.name for file in save(plot(experiment, run), folder / f"{letter}_{name}")]
+    names = [file.name for file in _files(letter, folder)]
+    with TemporaryDirectory(prefix=".writing-", dir=folder) as apart:
+        new = Path(apart)
+        run.to_csv(new / f"{letter}.csv", *SIGNALS)
+        write_text(new / f"{letter}.json", json.dumps(content, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+        for name, plot in (("path", plot_path), ("signals", plot_experiment)):
+            save(plot(experiment, run), new / f"{letter}_{name}")
+        for name in names:
+            (new / name).replace(folder / name)
     return numbers, names
 
 

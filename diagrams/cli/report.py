@@ -84,6 +84,9 @@ def report_command(arguments: argparse.Namespace) -> int:
         except OSError as error:
             say(f"loopwright: error: the report can't be written: {error}. Name another file.", sys.stderr)
             return 1
+        except KeyboardInterrupt:
+            say("loopwright: interrupted; the report is not written.", sys.stderr)
+            return 130
     say(f"Written: {'  '.join(map(str, files))}")
     return 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, replace_file, write_text
 from .html import to_html
 from .json import to_json
 from .model import Document
@@ -48,12 +48,13 @@ def write_report(
         return []
     file = Path(path).expanduser()
     page = to_html(report)
-    file.write_text(page, encoding="utf-8")
+    write_text(file, page)
     files = [file]
     if pdf:
         files.append(file.with_suffix(".pdf"))
-        write_pdf(page, files[-1])
+        with replace_file(files[-1]) as fresh:
+            write_pdf(page, fresh)
     if json:
         files.append(file.with_suffix(".json"))
-        files[-1].write_text(to_json(report), encoding="utf-8")
+        write_text(files[-1], to_json(report))
     return files

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 
-from ...blocks.core import OptionError, Sum, near
+from ...blocks.core import OptionError, Sum, near, write_text
 from ..wiring import CheckedDiagram, Structure, stepped_blocks
 from .layout import Net, arrange
 from .nets import Border, Nets, Place
@@ -51,7 +51,7 @@ class Drawing:
         file = Path(path)
         if file.suffix.lower() != ".svg":
             raise OptionError(f"found {str(path)!r}; expected a file for SVG; name it {file.stem}.svg.")
-        file.write_text(self.svg, encoding="utf-8")
+        write_text(file, self.svg)
         return file
 
 

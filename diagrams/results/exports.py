@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, replace_file
 from .stored import PathLike
 
 if TYPE_CHECKING:
@@ -33,7 +35,8 @@ def to_csv(run: RecordedSignals, path: PathLike | IO[str], names: Sequence[str])
     table = dict(columns(run, names))
     header = ",".join(["t", *table])
     rows = np.column_stack([run.t, *table.values()])
-    np.savetxt(path, rows, "%.17g", ",", header=header, comments="", encoding="utf-8")
+    with replace_file(path) if isinstance(path, str | os.PathLike) else nullcontext(path) as file:
+        np.savetxt(file, rows, "%.17g", ",", header=header, comments="", encoding="utf-8")
 
 
 def to_pandas(run: RecordedSignals, names: Sequence[str]) -> DataFrame:
@@ -68,7 +71,7 @@ def to_parquet(run: RecordedSignals, path: PathLike, names: Sequence[str]) -> No
     fields = [arrow.field(n, arrow.float64(), metadata={"unit": u} if u else None) for n, u in units.items()]
     schema = arrow.schema(fields, metadata={"diagram": run.diagram_name})
     n = _GROUP // (8 * len(fields)) + 1
-    with parquet.ParquetWriter(path, schema) as writer:
+    with replace_file(path) as file, parquet.ParquetWriter(file, schema) as writer:
         for k in range(0, max(len(run.t), 1), n):
             some = slice(k, k + n)
             arrays = [np.ascontiguousarray(run.t[some]), *(v for _, v in columns(run, names, some))]
@@ -96,7 +99,8 @@ def to_mat(run: RecordedSignals, path: PathLike, names: Sequence[str]) -> None:
         "units": np.array(units, dtype=object),
     }
     contents = {"t": np.array(run.t), "info": info, **values}
-    savemat(path, contents, appendmat=False, long_field_names=True, oned_as="column")
+    with replace_file(path) as file:
+        savemat(file, contents, appendmat=False, long_field_names=True, oned_as="column")
 
 
 def matlab_names(names: Sequence[str]) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import OptionError
+from ...blocks.core import OptionError, replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -125,10 +125,37 @@ def new_figure(height: float) -> Figure:
 def save(figure: Figure, stem: Path) -> tuple[Path, Path]:
     """Write a figure as PNG (150 dpi) and SVG, the same bytes for the same figure, and return the files."""
     files = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
-    with style():
-        figure.savefig(files[0], dpi=150, metadata={"Software": None})
-        figure.savefig(files[1], metadata={"Date": None, "Creator": None})
+    with style(), replace_file(files[0]) as png, replace_file(files[1]) as svg:
+        figure.savefig(png, dpi=150, metadata={"Software": None})
+        figure.savefig(svg, metadata={"Date": None, "Creator": None})
     return files
+
+
+def named_signals(run: RecordedSignals, names: Iterable[object]) -> list[str]:
+    """Return names of signals that are given one by one or in lists; without any, those of all named wires.
+
+    Raises
+    ------
+    OptionError
+        If no name is given and no wire has one, or for anything but names.
+    """
+    found: list[str] = []
+    for name in names:
+        several = name if isinstance(name, list | tuple | set | np.ndarray) else [name]
+        for one in several:
+            if not isinstance(one, str):
+                raise OptionError(
+                    f'found {one!r} to draw; expected the name of a signal, as in run.plot("eta"). Name the wire with '
+                    '.named("…"), or give the path of the port.'
+                )
+            found.append(str(one))
+    if found:
+        return found
+    wires = [name for name in run.names if name in run.wires]
+    if not wires:
+        some = ", ".join(map(repr, run.names[:6]))
+        raise OptionError(f"found no signal to draw, and no wire has a name; expected names, such as {some}.")
+    return wires
 
 
 def plot_signals(run: RecordedSignals, names: Sequence[str], axes: Sequence[Axes] | None = None) -> Figure:

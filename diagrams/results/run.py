@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -286,13 +286,14 @@ class Run:
         first = self.layout.total if self.columns is None else int(np.searchsorted(self.columns, self.layout.total))
         return Snapshot(float(self.t[k]), k, values, row[first:].copy(), dict(self.wires), self)
 
-    def plot(self, *names: str, axes: Sequence[Axes] | None = None) -> Figure:
+    def plot(self, *names: str | Iterable[str], axes: Sequence[Axes] | None = None) -> Figure:
         """Draw signals over time, one below the other, and return the figure.
 
         Parameters
         ----------
         *names : str
-            Signals to draw, or entries of them, ``"motor_force[1]"``; a vector's entries share an axis.
+            Signals or entries of them, ``"q[1]"``, also in a list; a vector's entries share an axis. Without any, all
+            named wires.
         axes : sequence of matplotlib axes, optional
             Axes to draw into, one per name.
 
@@ -301,9 +302,9 @@ class Run:
         UnknownNameError
             For a name that was not recorded.
         """
-        from .plots import plot_signals
+        from .plots import named_signals, plot_signals
 
-        return plot_signals(self, names, axes)
+        return plot_signals(self, named_signals(self, names), axes)
 
     # --- for other tools: all named wires (where none has a name, all ports) if no signal is given -------------------
 

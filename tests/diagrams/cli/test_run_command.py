@@ -98,8 +98,6 @@ def test_drawing_leaves_matplotlib_alone(done):
     assert figure._repr_png_().startswith(b"\x89PNG")  # a notebook shows it without pyplot
     with pytest.raises(OptionError, match="found 1 axes for 2 signals"):
         run.plot("eta", "xi", axes=figure.axes[:1])
-    with pytest.raises(OptionError, match="found no signal to draw"):
-        run.plot()
 
 
 def test_table_fits_eighty_columns(tmp_path, capsys, undrawn):
@@ -335,3 +333,58 @@ def test_version_and_help(capsys):
     assert all(f"  {name} " in text for name in DEFINITIONS)
     assert "cubic=False  (D only)" in text
     assert "velocity_limit=None  (B, C, D only)" in text
+
+
+# --- interrupts and full disks --------------------------------------------------------------------------------------
+
+
+def test_an_interrupt_while_figures_are_saved_leaves_the_earlier_files(tmp_path, capsys, monkeypatch, undrawn):
+    assert main(["run", "A", "--out", str(tmp_path)]) == 0
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+
+    def interrupt(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("loopwright.diagrams.results.save", interrupt)
+    capsys.readouterr()
+    assert main(["run", "A", "B", "--out", str(tmp_path)]) == 130
+    err = capsys.readouterr().err
+    assert "interrupted; nothing of A is written; the files of an earlier run stay in" in err
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_an_interrupt_while_plants_are_built_ends_without_a_traceback(tmp_path, capsys, monkeypatch):
+    def interrupt(**options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_cli.gantry, "build", interrupt)
+    assert main(["run", "A", "--out", str(tmp_path)]) == 130
+    assert capsys.readouterr().err == "loopwright: interrupted.\n"
+
+
+def test_an_interrupt_while_the_command_is_loaded_ends_without_a_traceback():
+    code = (
+        "import sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'loopwright.diagrams.cli': raise KeyboardInterrupt\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "from loopwright.diagrams.__main__ import main\n"
+        "raise SystemExit(main())\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (130, "loopwright: interrupted.\n")
+
+
+def test_files_that_cannot_be_written_leave_the_earlier_ones(tmp_path, capsys, monkeypatch, undrawn):
+    assert main(["run", "A", "--out", str(tmp_path)]) == 0
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+
+    def full(*arguments, **options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("loopwright.diagrams.results.save", full)
+    capsys.readouterr()
+    assert main(["run", "A", "--out", str(tmp_path)]) == 1
+    assert "its files can't be written: [Errno 28] No space left on device; the files of an" in capsys.readouterr().err
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before

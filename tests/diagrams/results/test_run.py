@@ -3,6 +3,7 @@
 import json
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -203,3 +204,33 @@ def test_a_run_of_a_later_format_says_which_loopwright_reads_it(waves, tmp_path)
         OptionError, match=r"of version 2 of the format .* reads version 1\. Open it with loopwright 9\.1"
     ):
         Run.open(tmp_path / "run")
+
+
+def test_plots_take_lists_all_named_wires_and_say_what_is_no_name():
+    run = Diagram("d", Gain(gain=2.0)(Constant(value=1.0)).named("y")).simulate(0.2, step=0.1, progress=False)
+    assert [ax.get_ylabel() for ax in run.plot().axes] == ["y"]
+    assert [ax.get_ylabel() for ax in run.plot(["y", "gain.y"]).axes] == ["y", "gain.y"]
+    assert len(run.plot("y", ("y", "y")).axes) == 3
+    with pytest.raises(OptionError, match=r"found <signal constant\.y> to draw; expected the name of a signal"):
+        run.plot(Constant(value=1.0).y)
+    with pytest.raises(UnknownNameError, match="no signal 'z'"):
+        run.plot(["z"])
+    bare = Diagram("d", Gain(gain=2.0)(Constant(value=1.0))).simulate(0.2, step=0.1, progress=False)
+    with pytest.raises(OptionError, match=r"no wire has a name; expected names, such as 'constant\.y', 'gain\.y'"):
+        bare.plot()
+
+
+def test_exports_leave_the_old_file_if_they_fail(tmp_path, monkeypatch):
+    run = Diagram("d", Gain(gain=2.0)(Constant(value=1.0)).named("y")).simulate(0.2, step=0.1, progress=False)
+    run.to_csv(tmp_path / "a.csv")
+    before = (tmp_path / "a.csv").read_bytes()
+
+    def cut(path, *arguments, **options):
+        Path(path).write_text("t,y\n0,")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savetxt", cut)
+    with pytest.raises(OSError, match="No space"):
+        run.to_csv(tmp_path / "a.csv")
+    assert (tmp_path / "a.csv").read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["a.csv"]

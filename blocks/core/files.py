@@ -1,0 +1,52 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+
+@contextmanager
+def replace_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield the name of a file to write; when the block ends, it takes the place of the file ``path``.
+
+    If the block fails, or is interrupted, nothing is left of the new file, and an old one stays as it was: a full disk
+    cuts no file. The name ends as ``path`` does. Whatever is no regular file, such as a pipe, is written directly.
+
+    Raises
+    ------
+    OSError
+        If the file can't be written.
+    """
+    given = Path(path).expanduser()
+    if given.exists() and not given.is_file():
+        yield given
+        return
+    target = Path(os.path.realpath(given))
+    fresh = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
+    try:
+        yield fresh
+        with open(fresh, "rb+") as file:
+            os.fsync(file.fileno())  # some systems tell of a full disk here only
+        if target.exists():
+            shutil.copymode(target, fresh)
+        fresh.replace(target)
+    finally:
+        with suppress(OSError):
+            fresh.unlink()
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text as UTF-8; the file appears whole or not at all.
+
+    Raises
+    ------
+    OSError
+        If the file can't be written.
+    """
+    with replace_file(path) as fresh:
+        fresh.write_text(text, encoding="utf-8")
