@@ -83,6 +83,7 @@ class Domains:
         self.rising = np.array([e.direction != "falling" for e in flat.events])
         self.falling = np.array([e.direction != "rising" for e in flat.events])
         self._hysteresis = np.array([e.hysteresis for e in flat.events])
+        self.has_hysteresis = self._hysteresis > 0.0
         self._gates = np.array([e.subsystem for e in flat.events], dtype=bool)
         self.domain = np.zeros(n, dtype=int)
         """1 above, −1 below, 0 on the border."""
@@ -93,6 +94,9 @@ class Domains:
         """Distance from the border within which the direction of leaving it may be one of rounding."""
         self._slack = np.zeros(n)
         """Distance beyond zero to which an indicator that has just crossed it counts as beyond: that of rounding."""
+        self._lows, self._highs = np.full((3, n), -math.inf), np.full((3, n), math.inf)
+        self._columns = np.arange(n)
+        self._set_bounds()
         self.limits = EventLimits(flat.events)
         self._many, self.search = many, EventSearch(self, many, self._spacing)
         self._own = [_continuous_states(flat, e) for e in flat.events]
@@ -102,10 +106,15 @@ class Domains:
 
     def bounds(self, domain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and the largest value of each indicator that leaves it in its domain."""
-        above, below = domain > 0, domain < 0
-        low = np.where(above, self._least - self._slack, np.where(below, -math.inf, self._low - self._rounding))
-        high = np.where(below, self._hysteresis + self._slack, np.where(above, math.inf, self._high + self._rounding))
-        return low, high
+        row = domain + 1
+        return self._lows[row, self._columns], self._highs[row, self._columns]
+
+    def _set_bounds(self) -> None:
+        """Write the table of bounds, one row for each domain: below, on the border, above."""
+        np.subtract(self._low, self._rounding, out=self._lows[1])
+        np.subtract(self._least, self._slack, out=self._lows[2])
+        np.add(self._hysteresis, self._slack, out=self._highs[0])
+        np.add(self._high, self._rounding, out=self._highs[1])
 
     def domains_of(self, z: np.ndarray, before: np.ndarray, opened: np.ndarray | None = None) -> np.ndarray:
         """Return the domains at the values z of the indicators, which come from the domains ``before``."""
@@ -132,6 +141,7 @@ class Domains:
         self.domain = self._first = np.where(z > 0.0, 1, np.where(on_border, 0, -1))
         self._low, self._high = -self._hysteresis, self._hysteresis.copy()
         self._slack[:] = 0.0
+        self._set_bounds()
 
     def reset(self, subsystem: str) -> None:
         """Go back to the domains of the start for the blocks in a subsystem whose states have done so."""
@@ -160,26 +170,31 @@ class Domains:
         self.domain = found.before
         self.take_fired(fired, found.now)
         self._slack = np.where(fired, np.minimum(_SCATTER * found.values, _CONTINUOUS * self._size), self._slack)
+        self._set_bounds()
         return found.t, fired
 
     def look_at(self, size: np.ndarray, scatter: np.ndarray) -> None:
         """Note the largest values of the indicators in a step that is searched, and how they scatter at its start."""
         self._size, self._rounding = size, _ROUNDING * size
         self._slack = np.maximum(self._slack, np.minimum(_SCATTER * scatter, _CONTINUOUS * size))
+        self._set_bounds()
 
-    def settle(self, z: np.ndarray) -> int:
-        """Note values of the indicators, one instant a row: one that was far from zero has crossed it.
+    def outside(self, z: np.ndarray, domain: np.ndarray) -> np.ndarray:
+        """Return which values of the indicators, one instant a row, are outside of the bounds of their domains.
 
-        Returns the number of rows until the first such instant, that one included; 0 if there is none.
+        One that has just crossed zero, and is far from it at an instant, has done so: no slack is left from there on.
         """
+        low, high = self.bounds(domain)
         if not self._slack.any():
-            return 0
+            return np.asarray((z > high) | (z < low))
+        out = (z > high) | (z < low)
         far = (np.abs(z) > self._slack) & (self._slack > 0.0)
-        rows = np.flatnonzero(far.any(axis=1))
-        if not rows.size:
-            return 0
-        self._slack = np.where(far[rows[0]], 0.0, self._slack)
-        return int(rows[0]) + 1
+        row = int(far.any(axis=1).argmax())
+        if far[row].any() and not out[: row + 1].any():
+            self._slack = np.where(far[row], 0.0, self._slack)
+            self._set_bounds()
+            out[row + 1 :] = self.outside(z[row + 1 :], domain) if row + 1 < len(z) else False
+        return np.asarray(out)
 
     # --- contact -----------------------------------------------------------------------------------------------------
 
@@ -222,6 +237,7 @@ class Domains:
                 self.domain[i] = 0
                 self._low[i] = min(after.z[i], -self._hysteresis[i])
                 self._high[i] = max(after.z[i], self._hysteresis[i])
+                self._set_bounds()
                 self.limits.note_contact(i, int(side))
 
     # --- never a hang ------------------------------------------------------------------------------------------------
@@ -243,12 +259,15 @@ class Domains:
     def save(self) -> Any:
         """Return what is needed to go on from here."""
         domains = self.domain.copy(), self._first.copy(), self._low.copy(), self._high.copy(), self._slack.copy()
-        return domains, self.search.fresh, self.limits.save()
+        noise = self._size.copy(), self._rounding.copy()
+        return domains, noise, self.search.fresh, self.limits.save()
 
     def restore(self, saved: Any) -> None:
         """Go back to what `save` returned."""
-        domains, self.search.fresh, limits = saved
+        domains, noise, self.search.fresh, limits = saved
+        self._size, self._rounding = (part.copy() for part in noise)
         self.domain, self._first, self._low, self._high, self._slack = (part.copy() for part in domains)
+        self._set_bounds()
         self.limits.restore(limits)
 
 

@@ -44,6 +44,8 @@ class Rule(Protocol):
 
     domain: np.ndarray
     """Domains of all indicators: 1 above zero, −1 below, 0 on the border."""
+    has_hysteresis: np.ndarray
+    """Which events have a hysteresis."""
 
     @property
     def g(self) -> Callable[[float, np.ndarray], np.ndarray]:
@@ -64,8 +66,8 @@ class Rule(Protocol):
     def look_at(self, size: np.ndarray, scatter: np.ndarray) -> None:
         """Note the largest values of the indicators in a step that is searched, and how they scatter at its start."""
 
-    def settle(self, z: np.ndarray) -> int:
-        """Note values, one instant a row; return the number of rows after which the bounds are others, or 0."""
+    def outside(self, z: np.ndarray, domain: np.ndarray) -> np.ndarray:
+        """Return which values, one instant a row, are outside of the bounds of their domains."""
 
 
 class EventSearch:
@@ -117,25 +119,22 @@ class EventSearch:
         z, opened = self._many(times, step.interpolate_many(times))
         bad = np.flatnonzero(np.any(~np.isfinite(z) & (opened > 0.5), axis=1))
         end = int(bad[0]) if bad.size else len(times)
-        size = np.max(np.abs(z[:end]), axis=0)
+        closed = None if np.all(opened > 0.5) else opened <= 0.5
+        size = np.abs(z[:end]).max(axis=0)
         rule.look_at(size, _scatter(times, z) if self.fresh and k == 1 else np.zeros_like(size))
         dips = self._find_dips(times[:end], z[:end])
         known = [(0, rule.domain)]  # the instants from which on the domains were others, and these
         while k < end:
             now = known[-1][1]
-            low, high = rule.bounds(now)
-            left = ((z[k:end] > high) | (z[k:end] < low)) & (opened[k:end] > 0.5)
-            rows = np.flatnonzero(left.any(axis=1))
-            stop = k + int(rows[0]) if rows.size else end
-            settled = rule.settle(z[k:stop])
-            stop = k + settled if settled else stop
-            for dip in (d for d in sorted(dips) if k <= d < stop):
+            out = rule.outside(z[k:end], now)
+            if closed is not None:
+                out &= ~closed[k:end]
+            rows = out.any(axis=1)
+            stop = k + int(rows.argmax()) if rows.any() else end
+            for dip in (d for d in dips if k <= d < stop):
                 ends = self._follow_dips(step, times, z, dip, dips[dip], known)
                 if ends:
                     return self._earliest(step, times, dip, ends, known)
-            if settled:
-                k = stop
-                continue
             if stop == end:
                 break
             b = float(times[stop])
@@ -184,18 +183,21 @@ class EventSearch:
             return {}
         size = np.abs(z)
         near = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:])
-        if not near.any():
-            return {}
-        h = np.diff(times)[:, None]
-        slope = np.diff(z, axis=0) / h
-        span = h[:-1] + h[1:]
-        with np.errstate(all="ignore"):
-            bend = np.diff(slope, axis=0) / span
-            tangent = slope[:-1] + bend * h[:-1]
-            lowest = z[1:-1] - tangent * tangent / (4.0 * bend)
-            far = ((lowest > 0.0) == (z[1:-1] > 0.0)) & (np.abs(lowest) > 0.3 * np.maximum(size[:-2], size[2:]))
-        near &= np.isfinite(bend) & (bend != 0.0) & ~far
-        return {int(k) + 2: np.flatnonzero(near[k]) for k in np.flatnonzero(near.any(axis=1))}
+        up = z > 0.0
+        near &= ((up[1:-1] == up[:-2]) & (up[1:-1] == up[2:])) | self._rule.has_hysteresis
+        dips = {}
+        for k in np.flatnonzero(near.any(axis=1)).tolist():
+            h0, h1 = float(times[k + 1] - times[k]), float(times[k + 2] - times[k + 1])
+            slope0, slope1 = (z[k + 1] - z[k]) / h0, (z[k + 2] - z[k + 1]) / h1
+            bend = (slope1 - slope0) / (h0 + h1)
+            tangent = slope0 + bend * h0
+            with np.errstate(all="ignore"):
+                lowest = z[k + 1] - tangent * tangent / (4.0 * bend)
+            far = ((lowest > 0.0) == (z[k + 1] > 0.0)) & (np.abs(lowest) > 0.3 * np.maximum(size[k], size[k + 2]))
+            which = np.flatnonzero(near[k] & np.isfinite(bend) & (bend != 0.0) & ~far)
+            if which.size:
+                dips[k + 2] = which
+        return dips
 
     def _follow_dips(
         self, step: Step, times: np.ndarray, z: np.ndarray, k: int, which: np.ndarray, known: list[Known]

@@ -53,7 +53,6 @@ class OneStepDense:
     """Dense output of one of SciPy's one-step methods, with less work per call and to the last bit its value."""
 
     def __init__(self, dense: Any, method: str):
-        self.many = lambda times: dense(times).T
         self._dense, self._powers = dense, method in ("RK23", "RK45", "Radau")
         if self._powers:
             self._scale = 1.0 if method == "Radau" else dense.h
@@ -70,6 +69,18 @@ class OneStepDense:
         found: np.ndarray = self._scale * np.dot(dense.Q, np.array(powers))
         found += dense.y_old
         return found
+
+    def many(self, times: np.ndarray) -> np.ndarray:
+        """Return the states at several times, one row each; to rounding those of single calls."""
+        dense = self._dense
+        if not self._powers:
+            return np.asarray(dense(times).T)
+        u = (times - dense.t_old) / dense.h
+        powers = np.empty((dense.order + 1, len(times)))
+        powers[0] = u
+        for k in range(dense.order):
+            np.multiply(powers[k], u, out=powers[k + 1])
+        return np.asarray(powers.T @ (self._scale * dense.Q.T) + dense.y_old)
 
 
 def from_nordsieck(dense: Any, t_old: float, x_old: np.ndarray) -> FromStart:

@@ -1,0 +1,121 @@
+"""What an event costs: python benchmarks/events.py.
+
+Everyday diagrams that switch often: a thermostat, a PWM by a comparator, a bouncing ball, a wheel that an anti-lock
+brake holds by a relay. Printed are the events of a run, the time for one event to be found in a step (the search), and
+the whole time of the run by its events: the search, the solver, the jump, the record. Times are the processor's, the
+smallest of three runs; nothing else should run beside it.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import scipy.integrate  # noqa: F401  its import is no part of a run
+
+from loopwright.blocks import (
+    Block,
+    Clock,
+    Compare,
+    Event,
+    Function,
+    Gain,
+    Input,
+    Integrator,
+    Relay,
+    State,
+    TransferFunction,
+)
+from loopwright.diagrams import Diagram
+from loopwright.diagrams.events import Domains
+
+
+class Ball(Block):
+    """A ball that loses no energy."""
+
+    h = State(start=1.0, output=True)
+    v = State(output=True)
+    impact = Event("falling")
+
+    def derivative(self, t, x, u):
+        return x.v, -9.81 + 0.0 * t
+
+    def indicators(self, t, x, u):
+        return x.h
+
+    def jump(self, t, x, u, fired):
+        return 0.0 * x.h, -x.v
+
+
+class Wheel(Block):
+    """A braked wheel: its slip at a constant speed of the car, with a friction that falls beyond its peak."""
+
+    brake = Input()
+    slip = State(start=0.0, output=True)
+    pressure = State(output=True)
+
+    def derivative(self, t, x, u):
+        friction = 2.0 * x.slip / (0.1 + 10.0 * x.slip**2)
+        return 5.0 * x.pressure - 8.0 * friction, 20.0 * (2.0 * u.brake - 1.0) * (1.0 + 0.0 * x.pressure)
+
+
+def thermostat() -> tuple[Diagram, float, float]:
+    """A first-order lag that a relay heats."""
+    room, relay = (
+        TransferFunction(numerator=1.0, denominator=[2.0, 1.0], name="room"),
+        Relay(on_point=1.0, off_point=0.9),
+    )
+    return Diagram("thermostat", room(Gain(gain=-1.5)(relay(room.y)) + 1.5)), 200.0, 0.1
+
+
+def pwm() -> tuple[Diagram, float, float]:
+    """A carrier of 50 Hz against a level, into a lag."""
+    carrier = Function(lambda t: np.sin(2 * np.pi * 50 * t), name="carrier")(Clock())
+    return (
+        Diagram("pwm", TransferFunction(numerator=1.0, denominator=[1.0, 1.0])(Compare(">")(carrier, 0.3))),
+        4.0,
+        1e-3,
+    )
+
+
+def ball() -> tuple[Diagram, float, float]:
+    """Free flights between impacts."""
+    return Diagram("ball", Ball()), 200.0, 0.1
+
+
+def brake() -> tuple[Diagram, float, float]:
+    """A relay that lets the pressure up and down about the slip of most friction."""
+    wheel = Wheel(name="wheel")
+    hold = Relay(on_point=-0.099, off_point=-0.101, name="hold")(Gain(gain=-1.0)(wheel.slip))
+    return Diagram("brake", wheel(hold), Integrator(name="work")(wheel.pressure)), 10.0, 1e-3
+
+
+def measure(diagram: Diagram, duration: float, step: float) -> tuple[int, float, float]:
+    """Return the events of a run, and the least time in s of its searches and of all of it."""
+    spent = [0.0]
+    locate = Domains.locate
+
+    def timed(self, step):
+        start = time.thread_time()
+        found = locate(self, step)
+        spent[0] += time.thread_time() - start
+        return found
+
+    Domains.locate = timed
+    try:
+        diagram.simulate(20 * step, step=step, progress=False)
+        search = total = np.inf
+        for _ in range(3):
+            spent[0], start = 0.0, time.thread_time()
+            run = diagram.simulate(duration, step=step, progress=False)
+            total, search = min(total, time.thread_time() - start), min(search, spent[0])
+    finally:
+        Domains.locate = locate
+    return len({event.t for event in run.events}), search, total
+
+
+if __name__ == "__main__":
+    print(f"{'diagram':12s} {'events':>7s} {'search, ms each':>16s} {'all, ms each':>13s}")
+    for make in (thermostat, pwm, ball, brake):
+        events, search, total = measure(*make())
+        print(f"{make.__name__:12s} {events:7d} {1e3 * search / events:16.3f} {1e3 * total / events:13.3f}")
