@@ -145,6 +145,8 @@ class Linearization:
             self.A, self.B, C, D, self.dt, name=name.replace(".", "_"), remove_useless_states=False, **names
         )
         system.findings = self.carried
+        taken = (finding for finding in self.findings if isinstance(finding, EntryTaken))
+        system.notes = tuple(map(str, dict.fromkeys((*self.carried, *taken))))
         return system
 
     @cached_property
@@ -194,7 +196,8 @@ class Linearization:
         Returns
         -------
         control.StateSpace
-            L, with the names of the wires as inputs and outputs.
+            L, with the names of the wires as inputs and outputs. Its ``findings`` limit it; its ``notes`` are their
+            texts, and which entry was taken where one was asked for.
 
         Raises
         ------

@@ -99,4 +99,6 @@ def test_a_model_says_which_entry_was_taken():
     assert (finding.name, finding.entry) == ("motor_force", (1,))
     assert str(finding) in model.notes
     assert "called motor_force[0] here" in str(finding)
+    assert str(finding) in three().linearize().loop("motor_force[1]").notes
+    assert three().linearize().loop("motor_force").notes == ()
     assert not [f for f in three().linearize(outputs="motor_force").findings if isinstance(f, EntryTaken)]

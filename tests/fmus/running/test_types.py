@@ -229,8 +229,10 @@ def test_variables_that_no_wire_carries_are_said(file3):
     assert "without ports for path (String), blob (Binary), tick (Clock)" in repr(plant)
     run = Diagram("d", plant(**rest(plant))).simulate(0.01, step=0.01, progress=False)
     assert run.messages == (
-        ("plant: no wire carries texts, binaries and clocks: the outputs blob (Binary) are not recorded; the inputs tick "
-        "(Clock) keep their start values"),
+        (
+            "plant: no wire carries texts, binaries and clocks: the outputs blob (Binary) are not recorded; the inputs tick "
+            "(Clock) keep their start values"
+        ),
     )
 
 
