@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -225,6 +225,21 @@ class Block(Value, Wireable):
         if len(names) < 2 or any(port.default is None for port in self.inputs.values()):
             return iter(self._signal())  # one signal, or none: the error says what to do
         return iter([Signal(self, name) for name in names])
+
+    def check_place(self, old: Block, wired: Collection[str], read: Collection[str]) -> None:
+        """Check that the block fits the wires of another one; `Diagram.replace` calls it.
+
+        The diagram's own checks follow in any case. A block overrides it to say more about several ports together.
+
+        Parameters
+        ----------
+        old : Block
+            Block that it replaces.
+        wired : collection of str
+            Inputs of that block that are wired.
+        read : collection of str
+            Outputs of that block that are wired to others, named or results of the diagram.
+        """
 
     def __repr__(self) -> str:
         text = super().__repr__()

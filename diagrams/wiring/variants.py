@@ -37,6 +37,7 @@ def _change(table: Structure, path: str, value: object, diagram: str) -> None:
     owner = table.blocks.get(_find_owner(table, head)) if head else None
     if isinstance(value, Block) and not (owner is not None and last in type(owner).parameter_specs):
         full = find_path(path, table.blocks, "block", diagram)
+        value.check_place(table.blocks[full], *_used_ports(table, full))
         table.blocks[full] = value.replace(name=full.rpartition(".")[2])
     elif last in _OF_A_SUBSYSTEM and (subsystem := _find_subsystem(table, head, last, diagram)) is not None:
         table.subsystems[subsystem] = _change_subsystem(table.subsystems[subsystem], last, value)
@@ -49,6 +50,12 @@ def _change(table: Structure, path: str, value: object, diagram: str) -> None:
     else:
         full, keys = split_path(table, path, diagram)
         table.blocks[full] = change_parameter(table.blocks[full], keys, value)
+
+
+def _used_ports(table: Structure, path: str) -> tuple[set[str], set[str]]:
+    """Return the inputs of a block that are wired, and its outputs that are wired to something or named."""
+    wires = (*table.wires.values(), *table.names.values(), *table.controls.values(), *table.results.values())
+    return {port for block, port in table.wires if block == path}, {w.port for w in wires if w.block == path}
 
 
 def _find_subsystem(table: Structure, path: str, key: str, diagram: str) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from ..archive import FmuDescription, FmuVariable, read_description
 from ..calls import FmuInstance
 from .linearization import STEP, FmuLinearization, linear_model, step_difference
 from .ports import FmuPorts, choose_ports
+from .replacement import check_replacement
 from .start_values import check_start, check_value
 
 
@@ -91,6 +92,16 @@ class Fmu(Block):
     def _choose_ports(self, description: FmuDescription) -> FmuPorts:
         chosen = None if self.ports is None else tuple(self.ports)
         return choose_ports(description, tuple(self.rename.items()), chosen, self.label)
+
+    def check_place(self, old: Block, wired: Collection[str], read: Collection[str]) -> None:
+        """Check that it fits the wires of the block that it replaces.
+
+        Raises
+        ------
+        WiringError
+            Or one of its kinds; the text says port by port what is missing, extra, or of another shape, unit or type.
+        """
+        check_replacement(self, old, wired, read)
 
     def start_value(self, description: FmuDescription, name: str, value: Any) -> Any:
         """Return a start value in the variable's shape, after checking it.
