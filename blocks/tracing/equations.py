@@ -14,6 +14,7 @@ from casadi import ArrayInterface
 
 from ..core import Block, DefinitionError, LoopwrightError, Port, Shape, ShapeError, State, TraceError
 from .symbols import flat_column, size
+from .traced_functions import NotTracedError
 
 _ARGUMENTS = {
     "output": ("t", "x", "u"),
@@ -85,15 +86,18 @@ def trace_error(error: Exception, block: Block, equation: str) -> TraceError:
             code = linecache.getline(file, step.tb_lineno).strip()
             line = f" in line {step.tb_lineno} of {file}" + (f", {code!r}" if code else "")
         step = step.tb_next
+    instead = block.untraced_twin
+    if isinstance(error, NotTracedError):  # says what to write
+        other = f", or take {instead}, which is not traced" if instead else ""
+        return TraceError(f"its {equation} can't be traced{line}: {error}{other}.")
     text = f"its {equation} can't be traced{line}: {type(error).__name__}: {error}."
     if isinstance(error, NameError | ZeroDivisionError | AttributeError | KeyError | ImportError):
         mistake = TraceError(f"{text} Correct the equation there.")
         mistake.is_mistake = True
         return mistake
-    arguments, instead = block.traced_of, block.untraced_twin
     return TraceError(
-        f"{text} Use NumPy functions of {arguments}: np.where for branches, np.stack for vectors, np.sqrt and not "
-        f"math.sqrt{f', or {instead}, which is not traced' if instead else ''}."
+        f"{text} Use NumPy functions of {block.traced_of}: np.where for branches, np.stack for vectors, np.sqrt and "
+        f"not math.sqrt{f', or {instead}, which is not traced' if instead else ''}."
     )
 
 

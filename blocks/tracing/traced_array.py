@@ -4,7 +4,11 @@
 
 - ``np.mod``, ``%``, ``np.floor_divide``, ``//`` and ``np.divmod`` by the remainder of C, which is exact: 1.0 modulo 0.1
   is 0.09999999999999995, since the floating-point number 0.1 is a little more than a tenth;
-- truth values: ``(u > 0) + (u > 1)`` is a logical or, thus 0 or 1; ``&``, ``|``, ``^`` and ``~`` work on them.
+- truth values: ``(u > 0) + (u > 1)`` is a logical or, thus 0 or 1; ``&``, ``|``, ``^`` and ``~`` work on them;
+- the functions of `traced_functions`, such as ``np.sort`` and ``np.polyval``, methods such as ``clip``, and ``None`` as
+  an index.
+
+An operation that can't be traced raises a `NotTracedError`, which says what to write.
 """
 
 from __future__ import annotations
@@ -17,9 +21,24 @@ import casadi as ca
 import numpy as np
 from casadi import ArrayInterface
 
+from .traced_functions import (
+    ARRAY,
+    FUNCTIONS,
+    INDEX,
+    LOGIC,
+    NUMBER,
+    ROUND,
+    TRUTH,
+    NotTracedError,
+    advise,
+    argmax,
+    argmin,
+)
+
 _Array: Any = ArrayInterface  # its stubs leave out what is used here
+_KNOWN = (ArrayInterface, np.ndarray, np.generic, int, float)
 _COMPARISONS = ("__lt__", "__le__", "__gt__", "__ge__", "__eq__", "__ne__", "all", "any")
-_MOVES = ("__getitem__", "reshape", "transpose", "squeeze", "flatten", "ravel")
+_MOVES = ("reshape", "transpose", "squeeze", "flatten", "ravel")
 _ARITHMETIC = (
     *(f"__{r}{name}__" for name in ("sub", "mul", "truediv", "pow", "matmul") for r in ("", "r")),
     *("__neg__", "__pos__", "__abs__", "sum", "mean", "prod", "max", "min", "ptp", "var", "std"),
@@ -98,6 +117,36 @@ def _invert(a: Any) -> Any:
     return _own(_Array._wrap(ca.logic_not(a._v), a._ndim), True) if _are_truth(a) else NotImplemented
 
 
+def _truth_of(operation: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    return lambda a: _own(_Array._wrap(operation(a._v), a._ndim), True)
+
+
+def _accumulate(choose: Any, a: Any, axis: int = 0) -> Any:
+    """Return the smallest or largest entry so far along a vector."""
+    if a.ndim != 1:
+        return NotImplemented
+    made = [a[0]]
+    for i in range(1, a.shape[0]):
+        made.append(choose(made[-1], a[i]))
+    return np.stack(made)
+
+
+def _without_new_axes(a: Any, index: tuple[Any, ...]) -> Any:
+    """Return an array indexed with ``None`` among the parts, each of which is an axis of length one."""
+    rest = tuple(part for part in index if part is not None)
+    plain = a[rest] if rest else a
+    sizes, shape = list(plain.shape), list[int]()
+    for part in index:
+        if part is None:
+            shape.append(1)
+        elif part is Ellipsis:
+            shape += sizes
+            sizes = []
+        elif not isinstance(part, int | np.integer):
+            shape.append(sizes.pop(0))
+    return plain.reshape(tuple(shape + sizes))
+
+
 _mod, _floordiv = _binary(_remainder), _binary(_floor_divide)
 _or, _and, _xor = _of_truth(ca.logic_or), _of_truth(ca.logic_and), _of_truth(lambda a, b: a != b)
 _UFUNCS: dict[np.ufunc, Callable[..., Any]] = {
@@ -109,9 +158,27 @@ _UFUNCS: dict[np.ufunc, Callable[..., Any]] = {
     np.bitwise_and: _and,
     np.bitwise_xor: _xor,
     np.invert: _invert,
+    np.isnan: _truth_of(lambda v: ca.logic_not(v <= np.inf)),  # CasADi takes v != v for false
+    np.isfinite: _truth_of(lambda v: ca.fabs(v) < np.inf),
+    np.isinf: _truth_of(lambda v: ca.fabs(v) == np.inf),
 }
 _TRUTH: set[np.ufunc] = {np.less, np.less_equal, np.greater, np.greater_equal, np.equal, np.not_equal}
 _TRUTH |= {np.logical_and, np.logical_or, np.logical_not, np.logical_xor, np.signbit}
+
+
+def _number(a: Any, convert: Callable[[], Any], text: str) -> Any:
+    """Return what a conversion of a constant gives; raise an error with the text for a symbol."""
+    try:
+        return convert()
+    except (RuntimeError, TypeError, NotImplementedError):
+        raise NotTracedError(text) from None
+
+
+def _logic(operation: Callable[[Any, Any], Any], a: Any, b: Any) -> Any:
+    made = operation(a, b)
+    if made is NotImplemented:
+        raise NotTracedError(LOGIC)
+    return made
 
 
 class TracedArray(_Array):  # type: ignore[misc]
@@ -129,14 +196,85 @@ class TracedArray(_Array):  # type: ignore[misc]
             made = _UFUNCS[ufunc](*inputs)
             if made is not NotImplemented:
                 return made
-        return _own(super().__array_ufunc__(ufunc, method, *inputs, **options), ufunc in _TRUTH)
+        if method == "accumulate" and ufunc in (np.minimum, np.maximum):
+            return _accumulate(ufunc, *inputs, **options)
+        made = super().__array_ufunc__(ufunc, method, *inputs, **options)
+        if made is NotImplemented and all(
+            isinstance(i, _Array | np.ndarray | np.generic | int | float) for i in inputs
+        ):
+            raise NotTracedError(advise(ufunc.__name__ + (f".{method}" if method != "__call__" else "")))
+        return _own(made, ufunc in _TRUTH)
 
     def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:
+        if function in FUNCTIONS:
+            made = FUNCTIONS[function](*args, **kwargs)
+            if made is not NotImplemented:
+                return made
         truth = False
         if function in _JOINS and args:
             joined = args[1:] if function is np.where else args[0] if isinstance(args[0], tuple | list) else args[:1]
             truth = _are_truth(*joined)
-        return _own(super().__array_function__(function, types, args, kwargs), truth)
+        made = super().__array_function__(function, types, args, kwargs)
+        if made is NotImplemented:
+            raise NotTracedError(advise(function.__name__))
+        return _own(made, truth)
+
+    def __getitem__(self, index: Any) -> Any:
+        parts = index if isinstance(index, tuple) else (index,)
+        if any(isinstance(part, _Array) for part in parts):
+            raise NotTracedError(INDEX)
+        if any(part is None for part in parts):
+            return _own(_without_new_axes(self, parts), self.is_truth)
+        return _own(super().__getitem__(index), self.is_truth)
+
+    def __bool__(self) -> bool:
+        return bool(_number(self, super().__bool__, TRUTH))
+
+    def __float__(self) -> float:
+        return float(_number(self, super().__float__, NUMBER))
+
+    def __int__(self) -> int:
+        return int(_number(self, super().__float__, NUMBER))
+
+    def __round__(self, digits: int | None = None) -> Any:
+        raise NotTracedError(ROUND)
+
+    def __array__(self, *args: Any, **options: Any) -> Any:
+        return _number(self, lambda: super(TracedArray, self).__array__(*args, **options), ARRAY)
+
+    def clip(self, low: Any = None, high: Any = None) -> Any:
+        """Return the entries limited to a range."""
+        return np.clip(self, low, high)
+
+    def dot(self, other: Any) -> Any:
+        """Return the product with a vector or matrix."""
+        return np.dot(self, other)
+
+    def cumsum(self) -> Any:
+        """Return the sums so far."""
+        return np.cumsum(self)
+
+    def argmax(self) -> Any:
+        """Return the place of the first largest entry."""
+        return argmax(self)
+
+    def argmin(self) -> Any:
+        """Return the place of the first smallest entry."""
+        return argmin(self)
+
+    def copy(self) -> Any:
+        """Return the array itself, which never changes."""
+        return self
+
+    def astype(self, kind: Any) -> Any:
+        """Return the array as one of numbers; whole numbers are none while it is traced."""
+        if np.dtype(kind) == np.dtype(float):
+            return _own(_Array._wrap(self._v, self._ndim), False)
+        raise NotTracedError(f"entries are floating-point numbers; expected astype(float), not {kind}. Write np.floor")
+
+    def tolist(self) -> Any:
+        """Return the entries, in lists for each axis."""
+        return self if self.ndim == 0 else [self[i].tolist() for i in range(self.shape[0])]
 
     def __add__(self, other: Any) -> Any:
         return _or(self, other) if _are_truth(self, other) else _own(super().__add__(other), False)
@@ -163,20 +301,20 @@ class TracedArray(_Array):  # type: ignore[misc]
         return _floordiv(other, self), _mod(other, self)
 
     def __or__(self, other: Any) -> Any:
-        return _or(self, other)
+        return _logic(_or, self, other)
 
     def __and__(self, other: Any) -> Any:
-        return _and(self, other)
+        return _logic(_and, self, other)
 
     def __xor__(self, other: Any) -> Any:
-        return _xor(self, other)
+        return _logic(_xor, self, other)
 
     __ror__, __rand__, __rxor__ = __or__, __and__, __xor__
 
     def __invert__(self) -> Any:
         made = _invert(self)
         if made is NotImplemented:
-            raise TypeError("bad operand type for unary ~: expected truth values, such as u > 0")
+            raise NotTracedError("expected truth values behind ~. Write ~(u > 0)")
         return made
 
 

@@ -248,7 +248,7 @@ def test_python_inside(here, capsys):
     assert main(["build", "mine.py:Branches"]) == 1
     err = capsys.readouterr().err
     assert f"in line {line_of('if x.y[0] > 5.0:')} of {here / 'mine.py'}" in err
-    assert "Can only determine truth value of a numeric MX" in err
+    assert "a symbol has no truth value while it is traced" in err
     assert err.rstrip().endswith("Or put its Python code inside: --python.")
     assert names(here) == SOURCES
     assert main(["build", "mine.py:Branches", "--python", "--name", "b"]) == 0
