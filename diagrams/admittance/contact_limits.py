@@ -31,6 +31,8 @@ FEWEST_PER_DECADE = 30
 """Fewest points of a scan in a decade: above k/M = (π/T)², stability changes several times in one."""
 _ROUNDING = 1e-12
 """Relative rounding error of Brent's method."""
+_ROUNDED = 1e-9
+"""Entry of a unit vector below which it is rounding."""
 _ESTIMATED = 10.0
 """Factor by which a stated error of differences may be too small."""
 
@@ -140,7 +142,7 @@ class CoupledLoop:
         axis = np.linalg.svd(np.stack([moved.real, moved.imag], axis=-1))[0][:, 0]
         towards = axis @ self.direction
         axis = axis * (-1.0 if towards < 0.0 or (towards == 0.0 and axis[np.argmax(np.abs(axis))] < 0.0) else 1.0)
-        return tuple(float(v) for v in axis)
+        return tuple(float(v) if abs(v) > _ROUNDED else 0.0 for v in axis)
 
     def find_fixed_growth(self) -> tuple[float, float, tuple[float, ...]] | None:
         """Return σ, frequency and direction of an unstable mode that no such environment moves, or None.

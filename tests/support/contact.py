@@ -125,3 +125,42 @@ def measured_growth(signal, sample_time, at, span=1.0, window=1.0):
     weight = np.hanning(length + 2)[1:-1]
     energies = [np.sum(weight * signal[k : k + length] ** 2) for k in (first, first + shift)]
     return 0.5 * np.log(energies[1] / energies[0]) / span
+
+
+class Pushed:
+    """The inputs of a plant with another external force."""
+
+    def __init__(self, u, external_force):
+        self.motor_force, self.external_force = u.motor_force, external_force
+
+
+def moor(plant):
+    """A plant of the library on spring, damper and mass in one direction, by its own equations."""
+
+    class MooredPlant(plant):
+        direction: Array = parameter(default=(1.0, 0.0), shape=(2,), unit="1")
+        anchor: Array = parameter(default=(0.0, 0.0), shape=(2,), unit="m")
+        spring: float = parameter(default=0.0, unit="N/m", minimum=0.0)
+        damper: float = parameter(default=0.0, unit="N.s/m", minimum=0.0)
+        load: float = parameter(default=0.0, unit="kg", minimum=0.0)
+        contact_force = Output(shape=(2,), unit="N")
+
+        def contact(self, t, x, u):
+            """The force of the environment: the acceleration is affine in it, which is solved."""
+            d = self.direction
+            f = -self.spring * (d @ (x.position - self.anchor)) - self.damper * (d @ x.velocity)
+            a0, a1 = (
+                d @ plant.derivative(self, t, x, Pushed(u, u.external_force + d * k))[1] for k in (0.0, 1.0)
+            )  # the states are position, velocity, …
+            return d * ((f - self.load * a0) / (1.0 + self.load * (a1 - a0)))
+
+        def derivative(self, t, x, u):
+            return plant.derivative(self, t, x, Pushed(u, u.external_force + self.contact(t, x, u)))
+
+        def output(self, t, x, u):
+            force = self.contact(t, x, u)
+            found = plant.output(self, t, x, Pushed(u, u.external_force + force))
+            found = found if isinstance(found, tuple) else (found,)
+            return *found, np.where(t > 0.0, force, 0.0 * force)  # nothing has acted yet at the start
+
+    return MooredPlant
