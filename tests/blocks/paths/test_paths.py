@@ -435,7 +435,7 @@ def brute_force(path, y, samples=1_000_000):
     return theta[i], distance[i], theta[1] * np.max(np.hypot(*path.sigma(theta[::1000], 1)))
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @EVERY
 def test_projection_is_the_global_minimum(path):
     rng = np.random.default_rng(3)

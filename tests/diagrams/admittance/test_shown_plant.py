@@ -170,7 +170,7 @@ def test_the_rigid_gantrys_limits_are_not_those_of_the_other_plants(side):
         assert sticking / rigid == pytest.approx(48.08, abs=0.01)  # on the safe side, and of no use
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("kind", ["rigid", "elastic", "stiction"])
 def test_the_matrices_of_these_tests_are_those_of_the_plants(kind):
     plant = {"rigid": gantry, "elastic": gantry_elastic, "stiction": gantry_stiction}[kind]
@@ -247,6 +247,7 @@ def test_friction_is_compared_at_the_velocity_of_the_loop():
     assert "found the friction slope" in refusal(made, model=gantry.nominal)  # the plant is then the model
 
 
+@pytest.mark.slow
 def test_a_soft_spring_in_the_plant_is_a_stiffness():
     assert "plant.position: found the stiffness 5 N/m along and 5 N/m across the path" in refusal(own(Sprung()))
 

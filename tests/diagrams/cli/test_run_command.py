@@ -199,7 +199,7 @@ def test_a_run_that_fails_before_its_first_sample_leaves_an_older_ones_files(tmp
     assert not out
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("ticks", [0, 1])
 def test_figures_of_next_to_nothing(done, tmp_path, ticks):
     from dataclasses import replace

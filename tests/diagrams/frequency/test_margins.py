@@ -380,22 +380,22 @@ def check(loop):
     return True
 
 
-@random_cases(8, 200, open_loops(sampled=False), reaching=0.1)
+@random_cases(6, 200, open_loops(sampled=False), reaching=0.1)
 def test_margins_of_random_continuous_loops_are_confirmed(loop):
     return check(loop)
 
 
-@random_cases(8, 200, open_loops(sampled=True), reaching=0.1)
+@random_cases(6, 200, open_loops(sampled=True), reaching=0.1)
 def test_margins_of_random_sampled_loops_are_confirmed(loop):
     return check(loop)
 
 
-@random_cases(8, 60, stabilized_loops(sampled=False), reaching=0.5)
+@random_cases(6, 60, stabilized_loops(sampled=False), reaching=0.5)
 def test_margins_of_random_continuous_state_feedbacks_are_confirmed(loop):
     return check(loop)
 
 
-@random_cases(8, 60, stabilized_loops(sampled=True), reaching=0.5)
+@random_cases(6, 60, stabilized_loops(sampled=True), reaching=0.5)
 def test_margins_of_random_sampled_state_feedbacks_are_confirmed(loop):
     return check(loop)
 

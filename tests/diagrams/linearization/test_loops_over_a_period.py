@@ -119,6 +119,7 @@ def test_a_loop_that_does_not_close_to_the_diagram_is_refused():
         confirm_loop(cut, 0.31 * one, ("u",), "d")
 
 
+@pytest.mark.slow
 def test_an_injection_at_a_box_with_an_offset_measures_the_loop():
     diagram = offset(0.03)
     found = diagram.frequency_response("u", [2.0, 10.0], amplitude=0.01)

@@ -96,7 +96,7 @@ def test_fig3_answers_an_injection_as_its_linear_model_does(options, wire):
     assert found.moved <= 1e-8
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["multisine", "chirp"])
 def test_fig3_answers_other_test_signals_alike(kind):
     diagram = fig3_loop(xi=0.03)
@@ -208,6 +208,7 @@ def cubic(step_at=1e9, back_at=2e9):
     return Diagram("cubic", x(Function(lambda x, u: -(x**3) + u, name="rate")(x.y, law)))
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("step_at", [0.1, 20.0])
 def test_a_step_of_a_source_makes_the_uncertainty_infinite(step_at):
     found = cubic(step_at).frequency_response("u", [2.0], amplitude=1e-3)
@@ -227,6 +228,7 @@ def test_a_source_that_steps_and_comes_back_is_in_the_uncertainty():
     assert np.max(found.uncertainty) > 0.1
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     ("options", "omega"),
     [
@@ -244,6 +246,7 @@ def test_the_uncertainty_bounds_the_error_of_the_solver(options, omega):
     assert found.uncertainty[0] < 1e-3
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("amplitude", [0.03, 0.3, 1.0])
 def test_the_uncertainty_bounds_what_the_amplitude_adds(amplitude):
     """−5 x − 5 x³: by the describing function the slope is 5 + 15/4 a² at the amplitude a of x."""

@@ -103,6 +103,7 @@ def test_a_port_of_another_shape(uncompiled):
         path_following(plant=build(Volume()))
 
 
+@pytest.mark.slow
 def test_ports_of_other_names_are_renamed(runs):
     class Robot(gantry.Gantry):
         """The gantry with one output of another name."""

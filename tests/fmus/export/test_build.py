@@ -75,6 +75,7 @@ def test_key_depends_on_everything(msd):
     assert key() == key()
 
 
+@pytest.mark.slow
 def test_builds_at_once_in_threads(tmp_path, monkeypatch):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
     built, spec = [], mass_spring_damper()
