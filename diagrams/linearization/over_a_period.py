@@ -15,10 +15,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ...blocks.core import Block, Finding, left_of
+from ...blocks.core import Finding, left_of
 from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
+from ..simulation import announcers
 from .derivatives import LocalDerivatives, Numbers, Signal
 from .findings import EventWithinPeriod, MemoryActs, UnusualStart
 from .plant_models import PlantModel, fmu_at, inputs_before, join_matrices, model_steps, states_of
@@ -297,14 +298,9 @@ def differentiate_flow(
 
 def _split_at_discontinuities(flat: FlatDiagram, t: float, end: float) -> Iterator[tuple[float, float]]:
     """Yield the parts of an interval between the discontinuities of the sources."""
-    sources = [
-        flat.table.blocks[path]
-        for path in flat.checked.traced
-        if not flat.table.is_sampled(flat.table.subsystem_of[path])
-        and type(flat.table.blocks[path]).next_instant is not Block.next_instant
-    ]
+    sources = announcers(flat)
     while t < end:
-        edge = min([end, *(source.next_instant(t) for source in sources)])
+        edge = min([end, *(source.next_instant(t) for _, source in sources)])
         yield t, edge
         t = edge
 

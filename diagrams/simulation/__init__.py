@@ -1,5 +1,6 @@
 """The loop over ticks, and between them."""
 
+from .announced import announcers
 from .interrupted import Interrupted
 from .run_options import RunKeywords, RunOptions
 from .simulated_diagram import SimulatedDiagram
@@ -16,6 +17,7 @@ __all__ = [
     "Simulation",
     "SimulationView",
     "Workspace",
+    "announcers",
     "apply_point",
     "copy_states",
     "simulate",

@@ -10,6 +10,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping
 from typing import Protocol
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -47,8 +48,17 @@ class Times:
         return self.times[i] if i < len(self.times) else math.inf
 
 
+_KNOWN: WeakKeyDictionary[FlatDiagram, list[tuple[str, Announcer]]] = WeakKeyDictionary()
+
+
 def announcers(flat: FlatDiagram) -> list[tuple[str, Announcer]]:
     """Return the blocks in continuous time that are not smooth at known instants, by path, with those instants."""
+    if flat not in _KNOWN:
+        _KNOWN[flat] = _find_announcers(flat)
+    return _KNOWN[flat]
+
+
+def _find_announcers(flat: FlatDiagram) -> list[tuple[str, Announcer]]:
     found: list[tuple[str, Announcer]] = []
     for path in sorted(flat.checked.traced):
         block = flat.table.blocks[path]

@@ -14,11 +14,13 @@ from loopwright.blocks import (
     Lookup1D,
     Lookup2D,
     Output,
+    Product,
     PythonFunction,
     Ramp,
+    UnitDelay,
     parameter,
 )
-from loopwright.diagrams import Diagram, check_block
+from loopwright.diagrams import Diagram, check_block, subsystem
 
 WIDTH = 1e-3
 
@@ -107,3 +109,19 @@ def test_foreign_code_on_a_clock_is_looked_at_along_it():
     function = PythonFunction(lambda u: 1.0 if 3.2 < u < 3.25 else 0.0, results={"y": ()})
     with pytest.raises(DefinitionError, match=r"jump at t = 3\.2"):
         check_block(function, {"u": Clock()}, duration=10.0)
+
+
+@pytest.mark.parametrize("case", ["equation", "on a clock", "table"])
+def test_a_linear_model_along_the_motion_passes_through_the_pulse(case):
+    """Over 10 s the integral grows by the pulse's area, and its square by the area of it along the motion."""
+
+    @subsystem(sample_time=10.0)
+    def sampled(u):
+        return UnitDelay(initial_value=0.0)(u)
+
+    source, area = CASES[case]
+    x = Integrator(name="x")(source())
+    model = Diagram("d", sampled(Integrator(name="z")(Product()(x, x)))).linearize()
+    grown = dict(zip(model.states, model.affine, strict=True))
+    assert grown["x.y"] == pytest.approx(area, rel=1e-8)
+    assert grown["z.y"] == pytest.approx(6.8, rel=1e-3)  # (10 s − 3.2 s), but for the width of the pulse
