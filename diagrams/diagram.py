@@ -226,16 +226,9 @@ class Diagram(SimulatedDiagram):
         return linearize_batch(self, points, variants, **options)
 
     def contact(
-        self,
-        port: str = "plant.external_force",
-        *,
-        position: str = "plant.position",
-        velocity: str = "plant.velocity",
-        force: str | None = "force",
-        direction: Any = "perp",
-        at: Any = None,
-        **options: Any,
-    ) -> Contact:
+        self, port: str = "plant.external_force", *, position: str = "plant.position", velocity: str = "plant.velocity",
+        force: str | None = "force", direction: Any = "perp", at: Any = None, **options: Any,
+    ) -> Contact:  # fmt: skip
         """Return the contact of an environment with the plant: admittance, passivity and limits of coupled stability.
 
         The plant is the block or FMU with the port; all the rest of the diagram is its controller.
