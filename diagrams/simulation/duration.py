@@ -7,28 +7,41 @@ from fractions import Fraction
 from typing import Any
 
 from ...blocks.core import OptionError
-from ..flat import WiredDiagram
+from ..flat import FlatDiagram, WiredDiagram
+from ..wiring import stepped_blocks
 
 FIXED_STEP = ("euler", "heun", "rk4")
 
 
-def ticks_in(duration: Any, base: Fraction, name: str) -> int:
-    """Return the number of ticks in a duration; rounding of a few ulps, as in 0.1 + 0.2, is forgiven."""
+def ticks_in(duration: Any, base: Fraction, name: str) -> tuple[int, Fraction]:
+    """Return the number of ticks in a duration, and the seconds that are left after them.
+
+    Rounding of a few ulps, as in 0.1 + 0.2, is forgiven: nothing is left then.
+    """
     try:
         span = float(duration)
     except (TypeError, ValueError):
         span = math.nan
     if not 0 < span < math.inf or isinstance(duration, str | bool):
         raise OptionError(f"found a duration of {duration!r}; expected seconds, positive.", block=name, port="duration")
-    n = round(Fraction(span) / base)
-    if n < 1 or abs(Fraction(span) - n * base) > Fraction(span) * Fraction(1, 10**12):
-        raise OptionError(
-            f"found a duration of {duration!r} s, no multiple of the {float(base):g} s between ticks; take "
-            f"{float(max(n, 1) * base)!r} s.",
-            block=name,
-            port="duration",
-        )
-    return n
+    exact = Fraction(span)
+    n = round(exact / base)
+    if n and abs(exact - n * base) <= exact * Fraction(1, 10**12):
+        return n, Fraction(0)
+    n = exact // base
+    return n, exact - n * base
+
+
+def refuse_rest(flat: FlatDiagram, n: int, duration: Any, name: str) -> None:
+    """Refuse an end between two ticks where an FMU takes steps of one length only."""
+    for path, plant in stepped_blocks(flat.table).items():
+        if not getattr(plant, "variable_step", False) or getattr(plant, "fixed_internal_step", None) is not None:
+            raise OptionError(
+                f"found a duration of {duration!r} s, no multiple of the {float(flat.base):g} s between ticks, and "
+                f"{path} takes steps of one length only; take {float(max(n, 1) * flat.base)!r} s.",
+                block=name,
+                port="duration",
+            )
 
 
 def default_step(diagram: WiredDiagram, step: Any, duration: float | None, solver: str, start: Any = None) -> Any:

@@ -19,7 +19,7 @@ from .plants import Plant, bind, load_plants
 from .run_options import RunOptions
 from .start_at_point import start_at, take_over
 from .stops import StopConditions
-from .ticks import Progress, Row, run_hybrid, run_ticks, take_tick
+from .ticks import Progress, Row, end_between_ticks, run_hybrid, run_ticks, take_tick
 from .view import Position, SimulationView
 from .workspace import Workspace
 
@@ -127,6 +127,22 @@ class Engine:
             )  # fmt: skip
             if ended is not None:
                 position.stopped = self._stops.met_at(ended)
+        except SimulationError as error:
+            culprit = self.blame(error)
+            raise culprit from culprit.__cause__
+
+    def end_between_ticks(self, end: float, row: Row, progress: Progress) -> None:
+        """Go on from a tick to the end of the run, before the next tick, and record it; see `go`."""
+        position = self.position
+        try:
+            now = position.t
+            ended = end_between_ticks(self.workspace, self.continuous, self.plants, now, end, row)
+            position.end = end
+            if ended is not None:
+                position.stopped = self._stops.met_at(ended)
+            elif self._can_stop:
+                self._is_over()
+            progress(position.t)
         except SimulationError as error:
             culprit = self.blame(error)
             raise culprit from culprit.__cause__

@@ -21,7 +21,8 @@ class SimulatedDiagram(WiredDiagram):
         Parameters
         ----------
         duration : float
-            Simulated time in s, a multiple of the step between ticks.
+            Simulated time in s. One that is no multiple of the step between ticks ends with a sample between two of
+            them; such a run has no ``final_state``.
         progress : bool, optional
             Show a progress bar; by default on a terminal, and in a notebook where ipywidgets is installed.
         **options

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block, SimulationError
+from ...blocks.core import Block, OptionError, SimulationError
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import (
     Occurrence,
@@ -26,7 +26,7 @@ from ..results import (
     check_fits,
     not_open_error,
 )
-from .duration import default_step, ticks_in
+from .duration import default_step, refuse_rest, ticks_in
 from .engine import Engine
 from .interrupted import Interrupted
 from .progress import progress_bar
@@ -86,10 +86,12 @@ class Simulation:
         every_tick = base is not None or self.flat.plants_at_every_tick
         self._last: int | None = None
         if duration is not None:
-            self._last = ticks_in(duration, self.flat.base, diagram.name)
-            first = 0 if start is None else start.tick
-            self._last += first
-            self._recording.check_memory(self._last - first, every_tick=every_tick)
+            count, rest = ticks_in(duration, self.flat.base, diagram.name)
+            if rest:
+                refuse_rest(self.flat, count, duration, diagram.name)
+                count += 1  # one more sample
+            self._last = count + (0 if start is None else start.tick)
+            self._recording.check_memory(count, every_tick=every_tick)
         self._engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=self._on_event)
         self._elapsed, self._begun = 0.0, False
         self._open: bool | None = None  # until it begins; False once it has ended
@@ -166,18 +168,31 @@ class Simulation:
     # --- going on ----------------------------------------------------------------------------------------------------
 
     def advance(self, duration: float, *, progress: Any = None) -> None:
-        """Go on for a duration in s, a multiple of the step between ticks.
+        """Go on for a duration in s; one that is no multiple of the step between ticks ends the run.
 
         Raises
         ------
         SimulationError
             See `Diagram.simulate`; ``error.run`` holds what was recorded until then.
         OptionError
-            A duration that is not positive, or no multiple of the step; a run that has not begun, or has ended.
+            A duration that is not positive, or no multiple of the step where an FMU takes steps of one length
+            only; a run that has not begun, or has ended.
         """
         if not self._open:
             raise not_open_error(self._open, self.diagram.name)
-        last = self._engine.position.tick + ticks_in(duration, self.flat.base, self.diagram.name)
+        position = self._engine.position
+        count, rest = ticks_in(duration, self.flat.base, self.diagram.name)
+        if rest:
+            refuse_rest(self.flat, count, duration, self.diagram.name)
+        if position.end is not None:
+            raise OptionError(
+                f"the run has ended at t = {position.end:g} s, between two ticks, and can't go on from "
+                f"there. Let it go on in multiples of {float(self.flat.base):g} s, and end between them only at last.",
+                block=self.diagram.name,
+                port="duration",
+            )
+        last = position.tick + count
+        end = float(position.tick * self.flat.base + count * self.flat.base + rest) if rest else None
         started = time.perf_counter()
 
         def tell(t: float) -> None:
@@ -187,7 +202,10 @@ class Simulation:
 
         try:
             if self.stopped is None:
-                self._engine.go(last, self._recorder.row, tell)
+                if count:
+                    self._engine.go(last, self._recorder.row, tell)
+                if end is not None and self.stopped is None:
+                    self._engine.end_between_ticks(end, self._recorder.row, tell)
         except SimulationError as error:
             self._elapsed += time.perf_counter() - started
             raise self._with_run(error) from error.__cause__
@@ -295,7 +313,8 @@ class Simulation:
     @property
     def can_save(self) -> bool:
         """Whether the complete state can be saved: every FMU can turn its state into bytes."""
-        return self._begun and bool(self._open or not self._engine.plants) and can_save(self._engine)
+        between = self._engine.position.end is not None
+        return self._begun and not between and bool(self._open or not self._engine.plants) and can_save(self._engine)
 
     def save(self) -> RunState:
         """Return the complete state at this tick, that of the FMUs included.
@@ -307,6 +326,11 @@ class Simulation:
         OptionError
             If the run has not begun, or has ended and its FMUs are freed.
         """
+        if self._engine.position.end is not None:
+            raise OptionError(
+                f"the run has ended at t = {self.t:g} s, between two ticks, and is not saved there. Save it at a tick.",
+                block=self.diagram.name,
+            )
         if not self._begun or (self._engine.plants and not self._open):
             raise not_open_error(self._open, self.diagram.name)
         return save_state(self._engine)

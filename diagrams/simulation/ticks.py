@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import SimulationError
-from ..flat import TickPattern
+from ..flat import NONE, TickPattern
 from .continuous import Continuous
 from .plants import Plant
 from .view import Position
@@ -133,6 +133,43 @@ def run_hybrid(
         if count % 16 == 0:
             progress(position.t)
     progress(position.t)
+    return None
+
+
+def end_between_ticks(
+    workspace: Workspace,
+    continuous: Continuous | None,
+    plants: Mapping[str, Plant],
+    now: float,
+    end: float,
+    row: Row,
+) -> float | None:
+    """Go on from the time of a tick to the end of a run before the next one, where nothing sampled acts.
+
+    Returns
+    -------
+    float or None
+        Time in s at which a stop condition has ended the run before.
+    """
+    if continuous is not None:
+
+        def sample(t: float) -> bool:
+            row(t, workspace.log)
+            return continuous.is_stopped()
+
+        ended = continuous.advance(now, end, (), sample)
+        if ended is not None:
+            return ended
+    for plant in plants.values():
+        plant.step(now, end - now)
+    if continuous is not None:
+        take_tick(workspace, continuous, plants, end, NONE)
+    else:  # everything is held but for what has been stepped
+        workspace.here.t[0] = end
+        flat = workspace.flat
+        for name, where in flat.plant_outputs.slices.items():
+            workspace.log[flat.log.slices[name]] = workspace.here.w[where]
+    row(end, workspace.log)
     return None
 
 

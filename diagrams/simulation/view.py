@@ -22,6 +22,8 @@ class Position:
     tick: int = 0
     stopped: Stopped | None = None
     """The stop condition that has ended the run, which may be between two ticks."""
+    end: float | None = None
+    """Time in s between two ticks at which the run has ended, because its duration has."""
     fired: list[Occurrence] = field(default_factory=list)
     """The events of the latest instant at which any fired."""
 
@@ -32,7 +34,9 @@ class Position:
     @property
     def t(self) -> float:
         """Time that the run has reached in s."""
-        return self.time_of(self.tick) if self.stopped is None else self.stopped.t
+        if self.stopped is not None:
+            return self.stopped.t
+        return self.time_of(self.tick) if self.end is None else self.end
 
     def note_event(self, event: Occurrence) -> None:
         """Keep an event that has fired, with those of the same instant."""
@@ -42,7 +46,7 @@ class Position:
 
     def restore(self, tick: int, stopped: Stopped | None) -> None:
         """Go to a saved position; nothing has fired there."""
-        self.tick, self.stopped = tick, stopped
+        self.tick, self.stopped, self.end = tick, stopped, None
         self.fired.clear()
 
 

@@ -302,9 +302,7 @@ def test_options_of_the_run_and_of_the_experiment_are_kept_apart():
         experiment.simulate(progres=False)
 
 
-@pytest.mark.parametrize(
-    ("duration", "words"), [(0, "positive"), (-1, "positive"), (0.0005, "no multiple of the 0.001 s")]
-)
+@pytest.mark.parametrize(("duration", "words"), [(0, "positive"), (-1, "positive")])
 def test_a_wrong_duration(duration, words):
     with pytest.raises(OptionError, match=words):
         experiments.path_following().diagram.simulate(duration, progress=False)

@@ -112,13 +112,6 @@ def test_what_is_no_duration_is_refused(duration):
         Diagram("d", Sine(frequency=1.0)()).simulate(duration, step=0.1, progress=False)
 
 
-def test_a_duration_between_ticks_is_refused():
-    with pytest.raises(
-        OptionError, match=r"found a duration of 0\.25 s, no multiple of the 0\.1 s between ticks; take"
-    ):
-        Diagram("d", Sine(frequency=1.0)()).simulate(0.25, step=0.1, progress=False)
-
-
 def test_a_run_that_can_not_fit_is_refused_before_it_takes_memory():
     with pytest.raises(OptionError, match=r"numbers each need .* GiB, and this machine has .*Is the duration in s\?"):
         Diagram("d", Sine(frequency=1.0)()).simulate(1e12, step=1e-3, progress=False)
