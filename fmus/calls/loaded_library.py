@@ -122,12 +122,39 @@ class LoadedFmu:
             Further start values, by the FMU's names; they override the block's.
         """
         self._began = start_time
+        given = {**self.block.start, **(values or {})}
         try:
             self.fmi.set_up(start_time, stop_time, None)
-            self.set_values({**self.block.start, **(values or {})})
+            self.set_values(given)
             self.fmi.enter_initialization_mode(start_time, stop_time, None)
+            lost = self._find_lost(given)
+            if lost:  # some tools' FMUs drop parameters that are set before this mode
+                self.set_values(lost)
+                lost = self._find_lost(lost)
         except Exception as error:
             raise self._initialization_error(error) from error
+        for name, value in lost.items():
+            found = self.values([name])
+            raise FmuRuntimeError(
+                f"its start value was set to {np.ravel(value).tolist()}, but is {found.tolist()}: the FMU does not "
+                "keep it. Leave it out, or set the parameters that it depends on.",
+                block=self.block.label,
+                port=f"start.{name}",
+                t=self._began,
+            )
+
+    def _find_lost(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Return those of the given parameters and inputs that the FMU has not kept."""
+        lost = {}
+        for name, value in given.items():
+            if name in self.description.texts:
+                continue
+            variable = self.description.find(name)
+            if variable.causality in ("parameter", "input"):
+                found, kept = self.read_variables([variable]), np.ravel(value).astype(float)
+                if not np.allclose(found, kept, rtol=1e-6 if variable.type == "Float32" else 1e-12, atol=0.0):
+                    lost[name] = value
+        return lost
 
     def _initialization_error(self, error: Exception) -> FmuRuntimeError:
         self._note(error)

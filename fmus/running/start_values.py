@@ -12,13 +12,12 @@ from ..archive import FmuDescription, FmuVariable
 
 
 def check_start(description: FmuDescription, start: Mapping[str, Any], label: str) -> dict[str, Any]:
-    """Return start values in their variables' shapes; values of a gathered array's scalars are merged into the array.
+    """Return start values in their variables' shapes; those of a gathered array's scalars are put into the array's.
 
     Raises
     ------
     UnknownNameError, ParameterError
-        For an unknown variable, one that can't be set, another shape or type, a value out of its range, and an array
-        that is given twice.
+        For an unknown variable, one that can't be set, another shape or type, and a value out of its range.
     """
     found: dict[str, Any] = {}
     parts: dict[str, dict[str, Any]] = {}
@@ -30,17 +29,12 @@ def check_start(description: FmuDescription, start: Mapping[str, Any], label: st
         else:
             parts.setdefault(array, {})[name] = checked
     for array, values in parts.items():
-        if array in found:
-            raise ParameterError(
-                f"found values for {array} and for {', '.join(values)}; give each element once.",
-                block=label,
-                port=f"start.{array}",
-            )
         whole, total = description.variables[array], sum(1 for a, _ in description.elements.values() if a == array)
-        if whole.start is None and len(values) < total:
+        base = found.get(array, whole.start)
+        if base is None and len(values) < total:
             found.update(values)
             continue
-        merged = np.zeros(whole.shape) if whole.start is None else np.array(whole.start)
+        merged = np.zeros(whole.shape) if base is None else np.array(base)
         for name, value in values.items():
             merged[description.elements[name][1]] = value
         found[array] = merged

@@ -177,11 +177,14 @@ def description2():
     )
 
 
-def typed_fmu(folder, fmi, text=None, *, complete=False):
-    """Build the FMU of a version into a folder, and return its path."""
+def typed_fmu(folder, fmi, text=None, *, complete=False, change=None):
+    """Build the FMU of a version into a folder, and return its path; a change replaces one text of the source."""
     library = folder / f"typed{fmi}{complete}.so"
+    if change is not None:
+        library = folder / f"typed{fmi}_{len(list(folder.iterdir()))}.so"
+        assert change[0] in source(fmi, complete)
     if not library.exists():
-        compile_shared({"typed.c": source(fmi, complete)}, library)
+        compile_shared({"typed.c": source(fmi, complete).replace(*(change or ("\0", "")))}, library)
     path = folder / f"typed{fmi}_{len(list(folder.iterdir()))}.fmu"
     platform = native_platform() if fmi == 3 else {"x86_64-linux": "linux64"}.get(native_platform(), native_platform())
     with zipfile.ZipFile(path, "w") as archive:

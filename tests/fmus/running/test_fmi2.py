@@ -249,6 +249,21 @@ def test_after_a_fatal_status_nothing_is_called(ending, monkeypatch):
     assert calls == []
 
 
+def test_ports_that_are_split_or_are_parameters_have_their_columns(file):
+    whole, split = Fmu(file), Fmu(file, rename={"motor_force[2]": "hoist"})
+    point = {"state": {"velocity": (0.004, -0.3)}}
+    one, two = whole.linear_model(**point), split.linear_model(**point, inputs={"hoist": 0.0})
+    assert two.inputs == ("motor_force[1]", "hoist", "external_force[1]", "external_force[2]")
+    assert np.array_equal(one.B, two.B)
+    more = Fmu(file, ports=["motor_force", "coulomb_scale", "velocity"])
+    model = more.linear_model(**point, inputs={"coulomb_scale": 1.0})
+    assert model.inputs == ("coulomb_scale", "motor_force[1]", "motor_force[2]")
+    mass = np.array([7.61, 4.41]) + np.array([29.26, 16.79])
+    friction = -np.array([65.42, 37.69]) * np.tanh(np.array([0.004, -0.3]) / 0.01) / mass
+    assert np.abs(model.B[2:, 0] - friction).max() < 1e-6 * np.abs(friction).max()
+    assert model.how.startswith("differences")
+
+
 # --- names and files --------------------------------------------------------------------------------------------------
 
 
@@ -256,6 +271,8 @@ def test_scalars_of_an_array_are_read_set_and_renamed(file):
     plant = Fmu(file, name="plant", start={"position[2]": 0.25, "velocity": (0.1, 0.2)})
     assert plant.start["position"].tolist() == [0.8, 0.25]
     assert repr(plant["position[2]"]) == "<signal plant.position[1]>"
+    again = plant.replace(start={**plant.start, "position[2]": 0.3})
+    assert again.start["position"].tolist() == [0.8, 0.3]
     split = Fmu(file, name="plant", rename={"position[1]": "y_axis"})
     assert [*split.outputs] == ["y_axis", "position[2]", "velocity", "acceleration"]
     rest = {"motor_force": (0.0, 40.0), "external_force": (0.0, 0.0)}

@@ -152,6 +152,24 @@ def test_start_values_of_every_type_arrive(file, fmi):
     assert run["plant.length"].tolist() == [len("a longer text")] * 2
 
 
+FORGETS = ("fmi2EnterInitializationMode() { return 0; }",
+           "fmi2EnterInitializationMode(void *p) { ((instance *)p)->vReal[30] = 2.5; return 0; }")  # fmt: skip
+IGNORES = ("if (!c->running) follow(c);", "c->vReal[30] = 2.5; if (!c->running) follow(c);")
+
+
+def test_parameters_that_initialization_drops_are_set_in_it(folder):
+    plant = Fmu(typed_fmu(folder, 2, change=FORGETS), name="plant", start={"gain": 7.0}, ports=["inner"])
+    assert Diagram("d", plant()).simulate(0.01, step=0.01, progress=False)["plant.inner"].tolist() == [7.0, 7.0]
+
+
+def test_a_start_value_that_the_fmu_does_not_keep_is_an_error(folder):
+    plant = Fmu(typed_fmu(folder, 2, change=IGNORES), name="plant", start={"gain": 7.0}, ports=["inner"])
+    with pytest.raises(
+        FmuRuntimeError, match=r"^plant\.start\.gain.*: its start value was set to \[7\.0\], but is \[2\.5\]"
+    ):
+        Diagram("d", plant()).simulate(0.01, step=0.01, progress=False)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "text"),
     [
