@@ -125,7 +125,7 @@ def from_the_start(model, push, ticks, **environment):
     return np.array(found)
 
 
-@pytest.mark.drawn(6)
+@pytest.mark.drawn(3)
 @SIDE
 @pytest.mark.parametrize("name", VARIANTS)
 def test_the_reduced_model_moves_as_the_running_co_simulation(side, name):

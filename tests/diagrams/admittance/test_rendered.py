@@ -133,7 +133,7 @@ LOOPS = {
 }
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("name", LOOPS)
 @pytest.mark.parametrize("hertz", [1.0, 10.0, 60.0])
 def test_the_fundamental_is_that_of_the_running_co_simulation(name, hertz):

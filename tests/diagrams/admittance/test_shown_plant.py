@@ -357,6 +357,7 @@ def test_poles_and_gains_of_the_chain_of_integrators_are_not_told_of_another_loo
     assert not [p for p, n in paths.items() if np.isnan(n.value)]
 
 
+@pytest.mark.slow
 def test_friction_is_taken_out_of_a_plant_only_where_that_is_shown():
     assert Fig3Case(experiments.compliance(plant=gantry_elastic.build()).diagram).plant_model is None
     case = Fig3Case(diagram(gantry_elastic))

@@ -244,6 +244,7 @@ def test_integrator_and_tolerance(here, uncompiled):
     assert float(variables["tolerance"].start) == 1e-6
 
 
+@pytest.mark.slow
 def test_python_inside(here, capsys):
     assert main(["build", "mine.py:Branches"]) == 1
     err = capsys.readouterr().err
@@ -684,7 +685,7 @@ def test_paths_that_leave_the_folder(altered, capsys):
     assert found == ["the archive holds '../../escape.txt', which points out of its folder."]
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lag.fmu", "lag2.fmu"])
 def test_a_start_value_that_it_refuses(altered, name, capsys):
     """What fails is told with the FMU's own words."""

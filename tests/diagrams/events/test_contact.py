@@ -194,7 +194,7 @@ def test_a_mass_that_sticks_is_let_go_to_either_side():
     assert run["m.v"][-1] == pytest.approx(-(2.0**2 - 1.5**2) / 2, abs=1e-6)
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("solver", ["auto", "DOP853", "BDF", "rk4"])
 def test_contact_that_is_held_is_left_when_a_force_lifts(solver):
     """The force is 12 t, from the weight at t₁ = g/12 on ḧ = 12 (t − t₁)."""

@@ -95,6 +95,7 @@ def smallest_by_scipy(system, frequencies):
     return -1 / found.fun
 
 
+@pytest.mark.slow
 def test_the_spinning_body_has_small_margins_although_each_channel_alone_has_large_ones():
     found = mimo_disk_margin(SATELLITE)
     # L(0) = -I + J/10 with J² = -I: S - 1/2 = -10 J - 1/2 has μ² = 100 + 1/4; the peak is beside it, at 0.05 rad/s

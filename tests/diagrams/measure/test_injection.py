@@ -133,6 +133,7 @@ def test_a_drift_is_no_part_of_a_phasor():
     np.testing.assert_allclose(rest, 0.2 / 5.0, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_velocity_at_the_ticks_is_not_its_fundamental():
     """A mass under held forces: the sampled velocity's phasor differs from the fundamental's by the hold's ripple."""
 
@@ -151,6 +152,7 @@ def test_the_velocity_at_the_ticks_is_not_its_fundamental():
     assert abs(found.y[0, 0, 0] / u / fundamental - 1) > 0.05
 
 
+@pytest.mark.slow
 def test_several_rates_are_measured_over_their_common_period():
     """S and T as in the linear model; a wire that is renewed within the period is no loop for a held signal."""
 
@@ -219,6 +221,7 @@ def test_a_step_of_a_source_makes_the_uncertainty_infinite(step_at):
     assert not found.settled[0]
 
 
+@pytest.mark.slow
 def test_a_source_that_steps_and_comes_back_is_in_the_uncertainty():
     """The first and the second measurement go over the frequencies in opposite orders."""
     quiet = cubic().frequency_response("u", [2.0, 4.0], amplitude=1e-3)

@@ -90,6 +90,7 @@ def test_an_fmu_that_moves_is_no_equilibrium():
     assert any("not an equilibrium" in t and "motor.current" in t for t in moving_report().sections[0].text)
 
 
+@pytest.mark.slow
 def test_a_turning_angle_on_which_nothing_depends_is_told_apart():
     motor = Fmu(dc_motor.build(), name="motor")
     diagram = Diagram("turning", motor(voltage=Constant(value=12.0), load_torque=0.0))
@@ -171,6 +172,7 @@ def test_a_variant_that_is_called_as_its_key_is_named_once():
     assert "continuous continuous" not in page
 
 
+@pytest.mark.slow
 def test_identification_that_was_asked_for_does_not_say_that_an_fmu_gives_no_derivatives():
     with pytest.raises(FmuError, match=r"identified from its responses only at rest.*still moves") as e:
         pi_loop().linearize(0.01, plants="identified")

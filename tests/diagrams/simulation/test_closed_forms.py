@@ -356,6 +356,7 @@ def test_an_integrator_that_resets_itself_fires_at_the_roots_of_its_closed_form(
 # --- delay -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_delay_that_is_no_multiple_of_the_sample_time_in_a_sampled_loop():
     """The held control signal reaches the plant a delay of 2.35 samples late: a matrix exponential for each piece."""
     A, B = np.array([[0.0, 1.0], [-2.0, -0.8]]), np.array([0.0, 2.0])

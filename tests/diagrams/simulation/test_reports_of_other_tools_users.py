@@ -455,6 +455,7 @@ def test_a_step_that_fails_is_named_and_what_was_recorded_is_kept():
     assert caught.value.run["y"].tolist() == [0.0, 0.1, 0.2, 0.3, 0.4]
 
 
+@pytest.mark.slow
 def test_the_result_of_a_loose_tolerance_is_as_good_as_that_tolerance_with_sampled_parts_too():
     """Default tolerances that differ from function to function give answers that disagree."""
 

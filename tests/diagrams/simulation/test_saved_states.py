@@ -76,7 +76,7 @@ def assert_same_bits(diagram, cut, rest, **options):
     return straight
 
 
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     "solver", ["auto", "RK45", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "euler", "heun", "rk4"]
 )
@@ -145,6 +145,7 @@ def test_a_simulation_goes_back_and_repeats_itself():
     assert np.array_equal(second.data, first.data[first.t >= 1.0])
 
 
+@pytest.mark.slow
 def test_a_saved_state_is_not_changed_by_what_happens_later():
     with thermostat().simulation() as simulation:
         simulation.advance(1.0)
@@ -204,6 +205,7 @@ def test_an_fmu_with_events_goes_on_to_the_last_bit():
     assert_same_bits(Diagram("d", Gain(gain=1.0)(ball.height)), 1.0, 1.5, step=0.01)
 
 
+@pytest.mark.slow
 def test_a_gantry_that_touches_its_wall_goes_on_to_the_last_bit_in_contact():
     plant = Fmu(gantry_contact.build(), name="plant", start={"position": (0.5, 0.63), "velocity": (0.0, 0.4)})
     still = Constant(value=(0.0, 0.0))

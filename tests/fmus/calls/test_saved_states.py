@@ -225,6 +225,7 @@ def test_states_are_freed_once_by_hand_by_their_end_or_with_the_instance(file, m
     assert len(calls) == 6
 
 
+@pytest.mark.slow
 def test_many_states_cost_no_memory_when_they_are_dropped(file):
     import resource
 

@@ -28,6 +28,7 @@ def path(fmi, request):
     return build_fmu(request.param(), fmi=fmi)
 
 
+@pytest.mark.drawn(8)
 @pytest.mark.parametrize("integrator", [1, 2, 3])
 @pytest.mark.parametrize("h", [1.0, 0.01])
 def test_an_inelastic_impact_rests_in_contact_and_says_so(path, instance, integrator, h):
@@ -46,6 +47,7 @@ def test_an_inelastic_impact_rests_in_contact_and_says_so(path, instance, integr
     assert item["height"] >= 0.0
 
 
+@pytest.mark.drawn(12)
 @pytest.mark.parametrize("integrator", [1, 2, 3])
 @pytest.mark.parametrize("speed", [-2.0, -0.01, 0.5])
 def test_a_start_on_the_floor_is_an_impact_if_it_moves_down(path, instance, integrator, speed):

@@ -48,6 +48,7 @@ def library(path, folder):
 # ---- the description ----
 
 
+@pytest.mark.drawn(8)
 @form
 @pytest.mark.parametrize("make", MODELS)
 def test_valid(uncompiled, make, options):

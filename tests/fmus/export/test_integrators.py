@@ -70,7 +70,7 @@ def test_the_error_follows_the_tolerance(instance, integrator):
     assert 0.8 < np.polyfit(np.log(tolerances), np.log(errors), 1)[0] < 1.3, errors
 
 
-@pytest.mark.drawn(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(("tolerance", "end"), [(1e-6, 900.0), (1e-6, 2000.0), (1e-8, 2000.0), (1e-10, 2000.0)])
 def test_a_stiff_model_against_radau(instance, tolerance, end):
     """Van der Pol, mu = 1000: in 2000 s two periods and a half, through six layers of width 1/mu."""
