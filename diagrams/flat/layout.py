@@ -180,13 +180,18 @@ class FlatLayout:
         It does where the base was asked for, finer than the clocks need, and where one of them takes steps of one
         length only.
         """
-        plants = stepped_blocks(self.table).values()
         numbers = [n for clock in self.distinct for n in (clock.every, clock.offset)]
-        if not plants or math.gcd(*numbers) != 1:
-            return bool(plants)
-        return not all(
-            getattr(plant, "variable_step", False) and getattr(plant, "fixed_internal_step", None) is None
-            for plant in plants
+        if math.gcd(*numbers) != 1:
+            return bool(stepped_blocks(self.table))
+        return bool(self.even_plants)
+
+    @cached_property
+    def even_plants(self) -> tuple[str, ...]:
+        """Paths of what is stepped from outside in steps of one length only."""
+        return tuple(
+            path
+            for path, plant in stepped_blocks(self.table).items()
+            if not getattr(plant, "variable_step", False) or getattr(plant, "fixed_internal_step", None) is not None
         )
 
     def acting(self, k: int) -> frozenset[TickPattern]:

@@ -65,6 +65,20 @@ class Stepped(Protocol):
         """Load the plant for a run; see `loopwright.blocks.Block`."""
 
 
+def note_fine_steps(flat: FlatDiagram) -> tuple[str, ...]:
+    """Return a message where plants step more finely than any subsystem acts, since one of them can't do otherwise."""
+    shortest = min((clock.every for clock in flat.distinct), default=1)
+    if not flat.even_plants or shortest == 1:
+        return ()
+    text = (
+        f"{', '.join(flat.even_plants)}: takes steps of one length only, so what is stepped from outside goes by the "
+        f"common base of all sample times, {float(flat.base):.6g} s, {shortest} times finer than the fastest "
+        "subsystem. Take sample times of which the shortest divides the others, or an FMU with "
+        "canHandleVariableCommunicationStepSize."
+    )
+    return (text,)
+
+
 def load_plants(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) -> Iterator[tuple[str, Plant]]:
     """Yield the plants by path, each as soon as it is loaded; ``stack`` unloads them.
 

@@ -29,6 +29,7 @@ from ..results import (
 from .duration import default_step, refuse_rest, ticks_in
 from .engine import Engine
 from .interrupted import Interrupted
+from .plants import note_fine_steps
 from .progress import progress_bar
 from .run_options import RunOptions
 from .save import can_save, restore_state, save_state
@@ -84,6 +85,7 @@ class Simulation:
         self._stack = ExitStack()
         self._start_state = saved
         every_tick = base is not None or self.flat.plants_at_every_tick
+        self._notes = note_fine_steps(self.flat) if base is None else ()
         self._last: int | None = None
         if duration is not None:
             count, rest = ticks_in(duration, self.flat.base, diagram.name)
@@ -308,7 +310,8 @@ class Simulation:
 
     @property
     def _messages(self) -> tuple[str, ...]:
-        return (*self._engine.workspace.messages, *(m for p in self._engine.plants.values() for m in p.messages))
+        plants = self._engine.plants.values()
+        return (*self._notes, *self._engine.workspace.messages, *(m for p in plants for m in p.messages))
 
     @property
     def can_save(self) -> bool:

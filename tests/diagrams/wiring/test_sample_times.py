@@ -123,8 +123,11 @@ def test_an_fmu_that_takes_steps_of_one_length_steps_at_the_base(cache, monkeypa
     monkeypatch.setattr(Fmu, "variable_step", property(lambda self: False))
     steps = counted(plant, monkeypatch)
     a, b = sampled(1e-3, lambda u: Gain(gain=1.0)(u), name="a"), sampled(0.7e-3, name="b")
-    Diagram("d", plant(force=a(plant.position)), b(plant.position)).simulate(7e-3, progress=False)
+    run = Diagram("d", plant(force=a(plant.position)), b(plant.position)).simulate(7e-3, progress=False)
     assert len(steps) == 70
+    (message,) = run.messages
+    assert message.startswith("plant: takes steps of one length only")
+    assert "0.0001 s, 7 times finer than the fastest subsystem" in message
 
 
 def test_a_linear_model_over_uneven_ticks_is_that_of_the_run(cache):
