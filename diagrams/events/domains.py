@@ -35,6 +35,7 @@ _ROUNDING = 1e-13  # of an indicator near the border, relative to its values in 
 _SCATTER = (
     8.0  # rounding errors of an indicator that has just crossed zero, relative to those seen, or its values there
 )
+_CLOSE = 1e-11  # of an indicator that may cross zero within ulps of the time, relative to its values in the last step
 _CONTINUOUS = 1e-9  # they are at most this part of its values in the step: else it jumps there
 
 Indicators = Callable[[float, np.ndarray], np.ndarray]
@@ -95,7 +96,7 @@ class Domains:
         self._slack = np.zeros(n)
         """Distance beyond zero to which an indicator that has just crossed it counts as beyond: that of rounding."""
         self._lows, self._highs = np.full((3, n), -math.inf), np.full((3, n), math.inf)
-        self._columns = np.arange(n)
+        self._columns, self._z = np.arange(n), np.zeros(n)
         self._set_bounds()
         self.limits = EventLimits(flat.events)
         self._many, self.search = many, EventSearch(self, many, self._spacing)
@@ -150,9 +151,26 @@ class Domains:
 
     def update(self, t: float, x: np.ndarray) -> np.ndarray:
         """Take over the domains at one instant, and return which events their changes fire."""
-        now = self.domains_of(self.g(t, x), self.domain)
+        self._z = np.array(self.g(t, x))
+        now = self.domains_of(self._z, self.domain)
         fired = self.fires(self.domain, now)
         self.take_fired(fired, now)
+        return fired
+
+    def is_close(self) -> bool:
+        """Return whether an indicator was so close to zero at the last `update` that it may cross it at once."""
+        return bool(np.any((np.abs(self._z) <= _CLOSE * self._size) & (self._size > 0.0)))
+
+    def update_ahead(self, t: float, x: np.ndarray) -> np.ndarray:
+        """Take over the domains of the events that fire at an instant just after the last `update`; return them."""
+        z = np.array(self.g(t, x))
+        now = self.domains_of(z, self.domain)
+        fired = self.fires(self.domain, now)
+        if fired.any():
+            self.take_fired(fired, np.where(fired, now, self.domain))
+            far = _SCATTER * np.maximum(np.abs(z), np.abs(self._z))
+            self._slack = np.where(fired, np.minimum(far, _CONTINUOUS * self._size), self._slack)
+            self._set_bounds()
         return fired
 
     def take_fired(self, fired: np.ndarray, now: np.ndarray) -> None:

@@ -14,6 +14,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from ...blocks.core import SimulationError
 from ..solvers import Step
 
 _SAMPLES = 4
@@ -263,6 +264,21 @@ class EventSearch:
                 t, ahead = min(b, t + ahead), 2 * ahead
         below = max(a, t - max(4 * math.ulp(t), self._finest))
         return t, max(abs(value(t) - level), abs(value(below) - level))
+
+
+def evaluate_many(
+    g: Callable[[float, np.ndarray], np.ndarray], opened: np.ndarray, times: np.ndarray, states: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return indicators at several times, one row each, NaN beyond a failure, and what ``g`` writes into ``opened``."""
+    n = len(opened)
+    z, open_then = np.full((len(times), n), math.nan), np.ones((len(times), n))
+    try:
+        for k, t in enumerate(times.tolist()):
+            z[k] = g(t, states[k])
+            open_then[k] = opened
+    except SimulationError:  # a loop without a solution: whoever needs that instant evaluates it again
+        z[k:], open_then[k:] = math.nan, 1.0
+    return z, open_then
 
 
 def _scatter(times: np.ndarray, z: np.ndarray) -> np.ndarray:

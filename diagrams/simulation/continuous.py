@@ -9,16 +9,18 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import NonFiniteError, OptionError, SimulationError, is_before, left_of
-from ..events import Domains
+from ..events import Domains, evaluate_many
 from ..results import Occurrence
 from ..solvers import Problem, Step, make_solver
 from .announced import Times, announcers
 from .diagnosis import forget_trials, opaque_failure, state_values
 from .left_of_start import domains_from_left
-from .solver_setup import absolute_tolerances, next_instant, remembers, time_scale_of
+from .solver_setup import absolute_tolerances, longest_step, next_instant, time_scale_of
 from .transport_delays import delays_of, keep_step
 from .workspace import Workspace
 
+_ULPS = 4
+"""An event within so many ulps of a tick belongs to the tick."""
 NOTHING: frozenset[Any] = frozenset()
 TIGHT, ONE_STEP = 1e-9, ("auto", "RK23", "RK45", "DOP853", "Radau")
 """Below this relative tolerance these methods, to which a stop costs little, land on every sample."""
@@ -66,13 +68,8 @@ class Continuous:
         self._flow, self._jacobian = workspace.flow(), None
         problem = Problem(self.where.size, self._rate, self._slope, flat.continuous_labels)
         self.time_scale = time_scale_of(flat)
-        longest = max_step
-        if longest is None and remembers(flat):
-            longest = float(flat.base)  # memory is renewed at accepted steps, and must not grow stale
-        if longest is None and self.time_scale < math.inf:
-            longest = 5.0 * self.time_scale  # else a step may fit whole periods of a source
-        if self.delays is not None:
-            longest = min(longest or math.inf, self.delays.shortest)
+        shortest = math.inf if self.delays is None else self.delays.shortest
+        longest = longest_step(flat, max_step, self.time_scale, shortest)
         self.solver = make_solver(
             solver,
             problem,
@@ -133,16 +130,7 @@ class Continuous:
         return g
 
     def _g_many(self, times: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the indicators at several times, one row each, NaN beyond a failure, and which are open there."""
-        n = len(self.flat.events)
-        z, opened = np.full((len(times), n), math.nan), np.ones((len(times), n))
-        try:
-            for k, t in enumerate(times.tolist()):
-                z[k] = self._indicators(self._time(t), states[k])
-                opened[k] = self._opened
-        except SimulationError:  # a loop without a solution: whoever needs that instant evaluates it again
-            z[k:], opened[k:] = math.nan, 1.0
-        return z, opened
+        return evaluate_many(lambda t, x: self._indicators(self._time(t), x), self._opened, times, states)
 
     def _not_finite(self, t: float, x: np.ndarray, g: np.ndarray) -> SimulationError:
         """Return the error of an indicator that is not finite: that of the block which made the first such value."""
@@ -211,30 +199,56 @@ class Continuous:
         if self.delays is not None:
             self.delays.note_edge(float(self.workspace.here.t[0]))
 
-    def settle(self, t: float) -> bool:
-        """Fire what has changed its domain at an instant; return whether anything did."""
+    def settle(self, t: float, *, ahead: bool = False) -> bool:
+        """Fire what has changed its domain at an instant; return whether anything did.
+
+        Parameters
+        ----------
+        ahead : bool
+            Whether the instant is a tick, to which events belong that are a few ulps later.
+        """
         if self.domains is None:
             return False
         fired = self.domains.update(t, self.workspace.here.x[self.where])
         if not fired.any():
-            return False
+            return ahead and self._fire_ahead(t)
         self._fire(t, fired)
         return True
 
-    def _fire(self, t: float, fired: np.ndarray) -> None:
+    def _fire_ahead(self, t: float) -> bool:
+        """Fire at a tick what changes its domain within a few ulps of time; jumps see it on the far side."""
+        here, domains = self.workspace.here, self.domains
+        if domains is None or not t > 0.0 or not domains.is_close():
+            return False
+        x = here.x[self.where]
+        later = t + _ULPS * math.ulp(t)
+        x = x + (later - t) * self._rate(t, x)
+        fired = domains.update_ahead(later, x)
+        if not fired.any():
+            return False
+        here.t[0], here.x[self.where] = later, x
+        self._synchronize()
+        self._fire(t, fired, later)
+        here.t[0] = t
+        self._synchronize()
+        return True
+
+    def _fire(self, t: float, fired: np.ndarray, at: float | None = None) -> None:
+        """Let events fire at the instant t; their jumps are evaluated there, or a few ulps later, ``at``."""
         assert self.domains is not None
+        at = t if at is None else at
         workspace, domains = self.workspace, self.domains
         for _ in range(domains.most):
             before = workspace.here.x.copy()
-            motion = domains.motion(t, before[self.where], fired)
+            motion = domains.motion(at, before[self.where], fired)
             self._jump(fired)
             for i in np.flatnonzero(fired):
                 self._tell(t, self.flat.events[int(i)], before)
                 self._reset_domains(self.flat.events[int(i)])
             domains.count(t, fired)
             self._synchronize()
-            domains.land(motion, t, workspace.here.x[self.where], fired)
-            fired = domains.update(t, workspace.here.x[self.where])
+            domains.land(motion, at, workspace.here.x[self.where], fired)
+            fired = domains.update(at, workspace.here.x[self.where])
             if not fired.any():
                 if self.delays is not None:
                     self.delays.note_edge(t)
@@ -290,6 +304,8 @@ class Continuous:
                 if self.domains is not None:
                     found = self.domains.locate(step)
                     solved = workspace.trial.x[self._loops]
+                    if found is not None and step.t == end and end - found[0] <= _ULPS * math.ulp(end):
+                        found = end, found[1]
                 t = step.t if found is None else found[0]
                 while pending < t or (pending == t < edge and found is None):
                     self._put(pending, step.interpolate(pending))

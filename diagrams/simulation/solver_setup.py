@@ -36,6 +36,18 @@ def absolute_tolerances(flat: FlatDiagram, atol: float) -> Any:
     return atol if np.all(scale == 1.0) or np.ndim(atol) else atol * scale
 
 
+def longest_step(flat: FlatDiagram, max_step: float | None, time_scale: float, shortest_delay: float) -> float | None:
+    """Return the longest step of a solver in s: that asked for, or what memories, sources and delays allow."""
+    longest = max_step
+    if longest is None and remembers(flat):
+        longest = float(flat.base)  # memory is renewed at accepted steps, and must not grow stale
+    if longest is None and time_scale < math.inf:
+        longest = 5.0 * time_scale  # else a step may fit whole periods of a source
+    if shortest_delay < math.inf:
+        longest = min(longest or math.inf, shortest_delay)
+    return longest
+
+
 def next_instant(path: str, block: Announcer, t: float) -> float:
     """Return the next instant of a block; one that does not come after t would keep the run where it is."""
     try:

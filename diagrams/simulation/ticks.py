@@ -195,7 +195,7 @@ def take_tick(
         return
     continuous.enter(now)
     if acting:
-        continuous.settle(now)  # subsystems see the instant after its own events
+        continuous.settle(now, ahead=True)  # subsystems see the instant after its own events
     workspace.tick(acting)
     continuous.enter(now)
     if (acting or plants) and continuous.delays is not None:
