@@ -20,6 +20,7 @@ from ...blocks.core import FmuFileError, Layout
 from ..platform import native_platform
 from .gathering import Elements, gather
 from .states import find_states
+from .units import FmuUnits
 from .variables import WIRE_TYPES, FmuVariable, OtherVariable, fmi3_type, read_variable
 
 _FOLDERS2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"}
@@ -52,6 +53,8 @@ class FmuDescription:
     """Value reference of each variable that is a text, by name."""
     complaints: tuple[str, ...] = ()
     """Rules of the standard that the description breaks, as FMPy's validation words them."""
+    unit_complaints: tuple[str, ...] = ()
+    """Texts on units whose names mean something else here, so that their variables' units are others or none."""
     can_save: bool = False
     """Whether the state of an instance can be saved and restored (canGetAndSetFMUState)."""
     can_serialize: bool = False
@@ -203,7 +206,7 @@ def _read_variables(path: Path, entries: set[str], root: ET.Element, model: Any)
             flags["model_exchange_binary"] = _find_binary(path, entries, version, flags["model_exchange"])
         except FmuFileError:
             flags["model_exchange"] = None
-    bounds = _unsigned_bounds(root)
+    bounds, units = _unsigned_bounds(root), FmuUnits({u.name: u for u in model.unitDefinitions})
     scalars, other, texts = {}, {}, {}
     for v in model.modelVariables:
         if v.causality == "independent":
@@ -211,7 +214,7 @@ def _read_variables(path: Path, entries: set[str], root: ET.Element, model: Any)
         if v.name in scalars or v.name in other:
             raise FmuFileError(f"{str(path)!r} has two variables {v.name!r}. Export it again.")
         if fmi3_type(v.type) in WIRE_TYPES:
-            scalars[v.name] = read_variable(v, bounds)
+            scalars[v.name] = read_variable(v, bounds, units)
         else:
             other[v.name] = OtherVariable(v.name, v.type, v.causality or "local")
             if v.type == "String" and not v.shape:
@@ -225,6 +228,7 @@ def _read_variables(path: Path, entries: set[str], root: ET.Element, model: Any)
         "texts": texts,
         "states": states,
         "state_order": order,
+        "unit_complaints": tuple(units.complaints),
         **flags,
     }
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import UnitError, parse_unit
+from .units import FmuUnits
 
 _FMI2_TYPES = {"Real": "Float64", "Integer": "Int32"}
 _INTEGERS = {
@@ -131,7 +131,7 @@ def inexact(values: np.ndarray) -> bool:
     return bool(np.any((values > _EXACT) | (values < -_EXACT)))
 
 
-def read_variable(v: Any, bounds: Mapping[int, Mapping[str, str]]) -> FmuVariable:
+def read_variable(v: Any, bounds: Mapping[int, Mapping[str, str]], units: FmuUnits) -> FmuVariable:
     """Return a variable that FMPy has read; ``bounds`` holds attributes that it drops, by value reference."""
     declared = v.declaredType
     given = bounds.get(v.valueReference, {})
@@ -148,7 +148,7 @@ def read_variable(v: Any, bounds: Mapping[int, Mapping[str, str]]) -> FmuVariabl
         (v.valueReference,),
         v.causality or "local",
         shape,
-        _unit(attribute("unit")),
+        units[attribute("unit")],
         None if v.start is None else _start(v.start, shape),
         v.description or (declared.description if declared is not None else None) or "",
         _number(attribute("min")),
@@ -176,14 +176,3 @@ def _start(text: Any, shape: tuple[int, ...]) -> np.ndarray:
     values = np.array([words[x] if x in words else float(x) for x in found])
     full = np.broadcast_to(values, (int(np.prod(shape, dtype=int)),)) if values.size == 1 else values
     return np.array(full).reshape(shape)
-
-
-def _unit(text: str | None) -> str | None:
-    """Return a unit that this library can read, else None."""
-    if text is None:
-        return None
-    try:
-        parse_unit(text)
-    except UnitError:
-        return None
-    return text

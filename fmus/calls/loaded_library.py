@@ -88,7 +88,7 @@ class LoadedFmu:
                 f"{label}: its description breaks the standard: {about.complaints[0].rstrip('.')}{more}. "
                 f"'loopwright validate {about.file}' has them all"
             )
-        return found
+        return found + [f"{label}: {text}" for text in about.unit_complaints]
 
     def _log(self, status: int, text: str) -> None:
         if status and len(self.messages) < 1000:

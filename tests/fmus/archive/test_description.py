@@ -1,15 +1,29 @@
 """Reading of FMU files: types that are not read are said, and files that can't be read are errors of ours."""
 
+import random
+import re
 import struct
 import zipfile
 
 import pytest
+from fmpy.model_description import BaseUnit
+from fmpy.model_description import Unit as UnitDefinition
 
-from loopwright.blocks import Constant, FmuFileError, ParameterError, UnknownNameError
+from loopwright.blocks import (
+    Constant,
+    FmuFileError,
+    LoopwrightError,
+    ParameterError,
+    UnknownNameError,
+    parse_unit,
+)
 from loopwright.diagrams import Diagram
 from loopwright.diagrams.cli import main
 from loopwright.fmus import Fmu
+from loopwright.fmus.archive.units import FmuUnits
 from loopwright.fmus.models import mass_spring_damper
+from loopwright.fmus.platform import native_platform
+from support.typed_fmus import description2, description3
 
 COUNT = b'<Binary name="count" valueReference="9001" causality="output" variability="discrete"/>'
 MODE = (
@@ -80,6 +94,74 @@ def test_an_fmu_whose_outputs_are_all_of_other_types_is_refused(file, tmp_path):
         FmuFileError, match=r"^plant: found only outputs that no wire carries: count \(Binary\); expected"
     ):
         Fmu(none, name="plant")
+
+
+# --- units --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "base", "expected", "complaints"),
+    [
+        ("N", 'kg="1" m="1" s="-2"', "N", 0),
+        ("rad/s", 's="-1"', "rad/s", 0),  # the radian is left out by some tools
+        ("deg", 'rad="1" factor="0.0174533"', "deg", 0),
+        ("degC", 'K="1" offset="273.15"', "degC", 0),
+        ("newton", 'kg="1" m="1" s="-2"', "kg.m.s-2", 0),
+        ("count", "", "1", 0),
+        ("m", 's="1" factor="60"', None, 1),  # minutes
+        ("h", 'kg="1" m="2" s="-1"', "kg.m2.s-1", 1),  # Planck's
+        ("inch", 'm="1" factor="0.0254"', None, 0),
+    ],
+)
+def test_a_unit_is_read_as_the_fmu_defines_it(name, base, expected, complaints):
+    unit = BaseUnit(**{k: float(v) if "." in v or k in ("factor", "offset") else int(v)
+                       for k, v in re.findall(r'(\w+)="([^"]+)"', base)})  # fmt: skip
+    units = FmuUnits({name: UnitDefinition(name=name, baseUnit=unit)})
+    assert units[name] == expected
+    assert expected is None or parse_unit(expected)
+    assert len(units.complaints) == complaints
+    assert units[None] is None
+
+
+# --- mutations ----------------------------------------------------------------------------------------------------------
+
+
+def mutate(text, rng):
+    """Change a description at one to three places: attributes, elements, characters."""
+    words = ["", "-1", "0", "9" * 20, "nan", "inf", "abc", "true", "1 2 3", "[1]", "x[0]", "&lt;", "2.5"]
+    for _ in range(rng.randint(1, 3)):
+        at = rng.choice(list(re.finditer(r'(\w+)="([^"]*)"', text)))
+        element = rng.choice(list(re.finditer(r"<(\w+)[^<>]*/>", text)))
+        kind, i = rng.randrange(5), rng.randrange(len(text))
+        text = [
+            text[: at.start()] + text[at.end() :],
+            text[: at.start(2)] + rng.choice(words) + text[at.end(2) :],
+            text[: element.start()] + text[element.end() :],
+            text[: element.end()] + element[0] + text[element.end() :],
+            text[:i] + rng.choice('<>"&x0 ') + text[i + 1 :],
+        ][kind]
+    return text
+
+
+@pytest.mark.parametrize("count", [200, pytest.param(5000, marks=pytest.mark.slow)])
+def test_mutated_descriptions_are_read_or_refused_by_errors_of_ours(tmp_path, count):
+    rng, found = random.Random(7), {True: 0, False: 0}
+    for k in range(count):
+        text = mutate(rng.choice([description2(), description3()]), rng)
+        path = tmp_path / f"{k}.fmu"
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("modelDescription.xml", text)
+            for folder in dict.fromkeys(("linux64", "x86_64-linux", native_platform())):
+                archive.writestr(f"binaries/{folder}/typed{k}.so", b"")
+        try:
+            plant = Fmu(path, name="plant")
+            assert repr(plant)
+            assert len(plant.inputs) + len(plant.outputs) >= 0
+            found[True] += 1
+        except LoopwrightError:
+            found[False] += 1
+        path.unlink()
+    assert min(found.values()) > count // 10
 
 
 # --- versions -----------------------------------------------------------------------------------------------------------
