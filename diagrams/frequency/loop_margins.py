@@ -44,7 +44,7 @@ def margins(loop: LinearSystem, *, delay: int = 0, skew: float = 0.0) -> Margins
     loop : control.StateSpace
         L with S = 1/(1 + L): continuous (dt = 0) or sampled (dt = T). It may have poles at s = 0 or z = 1, and
         unstable ones. A transfer function is realized first, in powers of z − 1 where it is sampled: the margins
-        are those of its coefficients as they were given, which far below 1/T say less than a state space does.
+        are those of its coefficients as they were given, whose rounding the tolerances count.
     delay : int
         Whole samples of delay in series with a sampled loop.
     skew : float

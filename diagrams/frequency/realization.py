@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import ParameterError
-from .state_space import read_matrices
+from .state_space import read_coefficients, read_matrices
+from .transfer_functions import Coefficients
 
 if TYPE_CHECKING:
     from .state_space import LinearSystem
@@ -33,7 +34,8 @@ class Realization:
 
     The shift z − 1 keeps a loop accurate far below the sampling frequency, where several poles at z = 1 would cancel
     all digits. Frequencies and points of the contour are given as s in both cases: p = exp(s T) − 1. ``hidden`` are
-    the poles, in the plane of p, that the reduction has removed.
+    the poles, in the plane of p, that the reduction has removed; ``coefficients`` those of the transfer function in z
+    that was realized.
     """
 
     A: np.ndarray
@@ -42,6 +44,7 @@ class Realization:
     D: np.ndarray
     dt: float
     hidden: np.ndarray
+    coefficients: Coefficients | None = None
 
     @classmethod
     def of(cls, loop: LinearSystem, *, delay: int = 0) -> Realization:
@@ -96,7 +99,7 @@ class Realization:
             A, B, C, D = _delay_inputs(A, B, C, D)
         made = cls(*_balance(A, B, C), D, float(dt), np.zeros(0)).reduce()
         # scaled once more, with input and output: rounding in A alone may have set the first scales
-        return cls(*_scale(made.A, made.B, made.C), D, made.dt, made.hidden)
+        return cls(*_scale(made.A, made.B, made.C), D, made.dt, made.hidden, read_coefficients(loop))
 
     @property
     def order(self) -> int:
@@ -139,11 +142,15 @@ class Realization:
         return (self.D + self.C @ x)[:, 0, 0], -slope * rate * (self.C @ twice)[:, 0, 0]
 
     def error(self, omega: float) -> float:
-        """Return an estimate of the relative rounding error of L at ω: the difference to the adjoint solution."""
+        """Return an estimate of the relative rounding error of L at ω.
+
+        It is the difference to the adjoint solution, and what the rounding of a transfer function's coefficients makes.
+        """
         s = np.array([1j * omega])
         direct = self.matrix(s)[0]
         adjoint = self.D + (_transpose(self).C @ _transpose(self)._states(s))[0].T
-        return 1e-13 + 10 * float(np.max(np.abs(direct - adjoint)) / (np.max(np.abs(direct)) + 1e-300))
+        given = 0.0 if self.coefficients is None else self.coefficients.error(complex(np.exp(s[0] * self.dt)))
+        return given + 1e-13 + 10 * float(np.max(np.abs(direct - adjoint)) / (np.max(np.abs(direct)) + 1e-300))
 
     def closed_matrix(self, factor: complex | np.ndarray = 1.0) -> np.ndarray:
         """Return the closed-loop matrix A − B F (I + D F)⁻¹ C; F, a number or a matrix, multiplies the loop."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 import numpy as np
 
 from ...blocks.core import Finding
-from .transfer_functions import realize
+from .transfer_functions import Coefficients, realize
 
 if TYPE_CHECKING:
     from control import StateSpace, TransferFunction
@@ -72,3 +72,12 @@ def findings_of(system: LinearSystem) -> tuple[Finding, ...]:
     """Return the findings that a system carries: of a loop of a diagram those on it, else none."""
     found: tuple[Finding, ...] = getattr(system, "findings", ())
     return found
+
+
+def read_coefficients(system: LinearSystem) -> Coefficients | None:
+    """Return the coefficients of a sampled transfer function with one channel; None of any other system."""
+    import control
+
+    if not isinstance(system, control.TransferFunction) or not system.dt or (system.ninputs, system.noutputs) != (1, 1):
+        return None
+    return Coefficients(*(tuple(float(c) for c in row[0][0]) for row in (system.num, system.den)))

@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+SHORT = 32
+"""Binary digits up to which a coefficient is taken as exact."""
+
 
 class CompanionForm(NamedTuple):
     """State space p x = A x + B u, y = C x + D u, with p = s, or p = z − 1 of a sampled system."""
@@ -45,6 +48,24 @@ def realize(numerator: Sequence[float], denominator: Sequence[float], *, sampled
     if n:
         B[n - 1, 0] = float(sigma)
     return CompanionForm(A, B, np.array(C).reshape(1, n), np.array([[float(through)]]))
+
+
+class Coefficients(NamedTuple):
+    """Coefficients of a transfer function in z, the highest power first, each rounded to a floating-point number."""
+
+    numerator: tuple[float, ...]
+    denominator: tuple[float, ...]
+
+    def error(self, z: complex) -> float:
+        """Return the relative error at a point that the rounding of the coefficients makes.
+
+        Those of few digits, such as 1, −3, 3, −1, are taken as exact.
+        """
+        found = 0.0
+        for row in self:
+            inexact = sum(abs(c) for c in row if not (np.frexp(c)[0] * 2.0**SHORT).is_integer())
+            found += 0.5 * float(np.finfo(float).eps) * inexact / (abs(complex(np.polyval(row, z))) + 1e-300)
+        return found
 
 
 def _exact(coefficients: Sequence[float]) -> list[Fraction]:

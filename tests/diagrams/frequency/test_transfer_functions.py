@@ -38,6 +38,15 @@ def test_three_integrators_sampled_fast_have_the_margins_of_their_state_space(T,
     for name in ("phase_margin_deg", "gain_margin_low", "mt", "bandwidth", "delay_margin_s"):
         one, other = found.numbers()[name].value, exact.numbers()[name].value
         assert one == pytest.approx(other, rel=max(1e-11, digits)), name
+    for name in ("phase_margin_deg", "gain_margin_low"):
+        number, other = found.numbers()[name], exact.numbers()[name]
+        assert abs(number.value - other.value) <= number.tolerance + other.tolerance, name
+
+
+def test_the_tolerance_counts_the_rounding_of_coefficients_where_it_shows():
+    slow, fast = (margins(held_triple(T)).phase_margin_deg for T in (1e-2, 1e-6))
+    assert slow.tolerance < 1e-9
+    assert 1e-7 < fast.tolerance < 1e-2
 
 
 def exact_value(numerator, denominator, z):
