@@ -84,11 +84,15 @@ def _times_of(flat: FlatDiagram, path: str) -> Iterator[tuple[float, bool]]:
         yield from switching_times(traced, flat.p[flat.parameters.slices[path]], lines).items()
 
 
-def _line_at(flat: FlatDiagram, path: str, port: str) -> Line | None:
-    """Return the signal at an input if it is a straight line in time: of a clock, with gains, sums and constants."""
+def _line_at(flat: FlatDiagram, path: str, port: str, behind: frozenset[str] = frozenset()) -> Line | None:
+    """Return the signal at an input if it is a straight line in time: of a clock, with gains, sums and constants.
+
+    ``behind`` holds the blocks that lead here: one that comes again is in an algebraic loop.
+    """
     wire = flat.table.wires.get((path, port))
-    if wire is None:
+    if wire is None or wire.block in behind:
         return None
+    behind |= {wire.block}
     source = flat.table.blocks[wire.block]
     shape = flat.checked.shapes.get((wire.block, wire.port))
     if shape is None or flat.table.is_sampled(flat.table.subsystem_of[wire.block]):
@@ -100,11 +104,11 @@ def _line_at(flat: FlatDiagram, path: str, port: str) -> Line | None:
         value = np.ravel(np.asarray(source.value, dtype=float))
         line = value, np.zeros(value.size)
     elif isinstance(source, Gain) and np.ndim(source.gain) < 2:
-        inner = _line_at(flat, wire.block, "u")
+        inner = _line_at(flat, wire.block, "u", behind)
         if inner is not None:
             line = np.ravel(source.gain * inner[0]), np.ravel(source.gain * inner[1])
     elif isinstance(source, Sum):
-        inners = [_line_at(flat, wire.block, name) for name in source.inputs]
+        inners = [_line_at(flat, wire.block, name, behind) for name in source.inputs]
         signs = [1.0 if sign == "+" else -1.0 for sign in source.signs]
         known = [(s * i[0], s * i[1]) for s, i in zip(signs, inners, strict=True) if i is not None]
         if len(known) == len(inners):
