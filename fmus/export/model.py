@@ -183,6 +183,16 @@ class EventSpec:
         return f"{self.name}.indicator"
 
 
+def check_file_name(name: str) -> None:
+    """Refuse a model name that no file can have on Windows: that of a device, such as con or lpt1."""
+    if re.fullmatch(r"con|prn|aux|nul|(com|lpt)\d", name, re.IGNORECASE):
+        raise DefinitionError(
+            f"the model name {name!r} is that of a device on Windows, where no file {name}.fmu can be. Choose another, "
+            f"such as {name}_.",
+            block=name,
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class ModelSpec:
     """Model to export: x' = derivative(t, x, u, p), y = output(t, x, u, p); at events x = jump(t, x, u, p, fired).
@@ -242,6 +252,7 @@ class ModelSpec:
             raise DefinitionError(
                 f"the model name {self.name!r} is no C identifier. Use letters, digits and _.", block=self.name
             )
+        check_file_name(self.name)
         for field in ("internal_step", "stop_time", "step_size"):
             value = getattr(self, field)
             if not (math.isfinite(value) and value > 0):

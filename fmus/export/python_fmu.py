@@ -28,6 +28,7 @@ import numpy as np
 from ...blocks.core import Block, DefinitionError, FmuError, Port
 from ...blocks.tracing import bundle, traced_parameters
 from .html_page import block_text
+from .model import check_file_name
 from .package import _zip, write_atomically
 from .xml_fmi3 import _unit, package_version
 
@@ -90,6 +91,7 @@ def build_python(
     name = name or type(block).__name__.lower()
     if not (name.isidentifier() and name.isascii()):
         raise DefinitionError(f"found {name!r} as the model's name; expected letters, digits and _, such as my_model.")
+    check_file_name(name)
     source, kind = _source(block, name), _kind(block, name)
     values = _values(block, name, kind)
     about: dict[str, Any] = {

@@ -130,8 +130,13 @@ static bool lw_update_outputs(lw_instance *self) {
     return lw_update(self, &self->s.have_outputs, lw_output, LW_Y, LW_N_Y);
 }
 
+/* lw_derivative may be declared always_inline, which no call through a pointer can be. */
+static int lw_derivative_called(const double **arg, double **res, long long int *iw, double *w, int mem) {
+    return lw_derivative(arg, res, iw, w, mem);
+}
+
 static bool lw_update_derivatives(lw_instance *self) {
-    return lw_update(self, &self->s.have_derivatives, lw_derivative, LW_DX, LW_N_X);
+    return lw_update(self, &self->s.have_derivatives, lw_derivative_called, LW_DX, LW_N_X);
 }
 
 #if LW_N_Z

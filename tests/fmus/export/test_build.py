@@ -90,6 +90,13 @@ def test_builds_at_once_in_threads(tmp_path, monkeypatch):
     assert [p.name for p in built[0].parent.iterdir()] == ["mass_spring_damper.fmu"]
 
 
+@pytest.mark.parametrize(("platform", "said"), [("x86_64-windows", "takes minutes"), ("x86_64-linux", "takes longer")])
+def test_how_long_the_first_build_takes_is_said_before_it(uncompiled, platform, said):
+    lines = []
+    build_fmu(mass_spring_damper(), platform=platform, notify=lines.append)
+    assert lines == [f"compiling mass_spring_damper for {platform} (the first build on a machine {said})"]
+
+
 # ---- bad models, and compilers that fail ----
 
 
@@ -108,6 +115,9 @@ def test_builds_at_once_in_threads(tmp_path, monkeypatch):
         (lambda: Variable("u", "input", start=[1, 2]), ParameterError, ["shape ()"]),
         (lambda: Variable("u", "input", start=3.0, maximum=2.0), ParameterError, ["within [-inf, 2.0]"]),
         (lambda: mass_spring_damper(name="a-b"), DefinitionError, ["'a-b' is no C identifier"]),
+        (lambda: mass_spring_damper(name="con"), DefinitionError, ["'con' is that of a device on Windows", "con_"]),
+        (lambda: mass_spring_damper(name="Aux"), DefinitionError, ["no file Aux.fmu can be"]),
+        (lambda: mass_spring_damper(name="LPT1"), DefinitionError, ["'LPT1' is that of a device"]),
         (lambda: mass_spring_damper(internal_step=0.0), ParameterError, ["internal_step", "positive"]),
         (lambda: mass_spring_damper(inputs=()), DefinitionError, ["derivative", "found u of", "column of 0"]),
         (lambda: mass_spring_damper(inputs=(Variable("force", "input"),)), DefinitionError, ["force without a unit"]),

@@ -26,6 +26,7 @@ from support.exported import (
     pendulums,
     stiff,
     thermostat,
+    van_der_pol,
 )
 from support.instances import run
 
@@ -293,6 +294,20 @@ def test_compiles_from_its_sources_without_warnings(uncompiled, fmi, tmp_path):
     flags = ["-std=c11", "-O1", "-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror", "-fPIC", "-shared"]
     command = [gcc, *flags, f"-I{_build.fmi_headers()[0]}", "-o", tmp_path / "a.so", tmp_path / "sources" / "model.c"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+SLOW_LEVELS = [pytest.param(level, marks=pytest.mark.slow) for level in ("-O0", "-O2", "-O3", "-Os")]
+
+
+@pytest.mark.parametrize("level", ["-O1", *SLOW_LEVELS])
+def test_equations_that_are_inlined_compile_at_every_level(uncompiled, level, tmp_path):
+    if (gcc := shutil.which("gcc")) is None:
+        pytest.skip("no gcc on this machine")
+    with zipfile.ZipFile(build_fmu(van_der_pol())) as archive:
+        archive.extractall(tmp_path)
+    command = [gcc, "-std=c11", level, f"-I{_build.fmi_headers()[0]}", "-c", "-o", tmp_path / "a.o"]
+    done = subprocess.run([*command, tmp_path / "sources" / "model.c"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
 
