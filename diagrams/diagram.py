@@ -242,7 +242,7 @@ class Diagram(SimulatedDiagram):
         direction : {"perp", "par"} or vector
             Direction of the environment: across or along the diagram's path, or a vector.
         at : OperatingPoint, Snapshot or float, optional
-            Point at rest, as in `linearize`; the start without it. ``options`` are those of the run there.
+            Point at rest, as in `linearize`; the start without it. ``options`` are those of the run, and ``stairs``.
 
         Raises
         ------

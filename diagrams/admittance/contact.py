@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -177,17 +177,25 @@ def make_contact(
 ) -> Contact:
     """Return the contact of a diagram, with the names of position, velocity and force; see `Diagram.contact`."""
     position, velocity, force = names
+    taken = {name: options[name] for name in ("stairs", "step") if name in options}
+    options = {name: value for name, value in options.items() if name != "stairs"}
     check_options(diagram, options, "contact")
     point = operating_point(diagram, at, options)
-    step = {"step": options["step"]} if "step" in options else {}
     diagram = diagram.replace(point.parameters) if point.parameters else diagram  # parameters that a trim has found
     ports = Ports.find(diagram, diagram.flatten(point.base), port, position, velocity)
-    parts, unusual = take_apart(diagram, ports, force, point, step)
-    if unusual and at is None:  # such as a sensor's first sample
-        point = operating_point(diagram, float(point.base), options)
-        parts, _ = take_apart(diagram, ports, force, point, step)
+    parts, unusual = take_apart(diagram, ports, force, point, taken)
+    if unusual:  # such as a sensor's first sample: at rest, the next tick has the same states
+        point = _move_on(point)
+        parts, _ = take_apart(diagram, ports, force, point, taken)
     unit, side, scale = _find_direction(diagram, point, ports, direction, parts.force.shape[1])
     return Contact(diagram, ports.plant, unit, side, point, parts, _find_filter(diagram, side, len(unit)), scale)
+
+
+def _move_on(point: OperatingPoint) -> OperatingPoint:
+    """Return the operating point of the next tick of a diagram that rests."""
+    h = float(point.base)
+    plants = {path: {**plant, "t": plant["t"] + h} for path, plant in point.plants.items()}
+    return replace(point, t=point.t + h, tick=point.tick + 1, plants=plants)
 
 
 def _find_direction(

@@ -157,7 +157,8 @@ def take_apart(
         If the diagram has several rates, or signals around a plant with equations change between the ticks.
     """
     path, block = ports.plant, diagram.blocks[ports.plant]
-    flat, all_wires = diagram.flatten(point.base), diagram.structure.wires
+    flat = diagram.flatten(point.base)
+    all_wires = flat.table.wires  # with the delays of subsystems
     wires = {
         port: Source(wire.block, wire.port, wire.index)
         for port in block.inputs
@@ -209,7 +210,7 @@ def take_apart(
         driven = wires.get(ports.force)
         direct = driven is not None and (driven.block, driven.port) == signal.port
         _check_force_wire(path, ports, signal, K, [wired.index(i) for i in pushed if i in wired], direct=direct)
-    sensor = None if signal is None else diagram.blocks[signal.port[0]]
+    sensor = None if signal is None else _find_sensor(flat, signal.port[0])
     parts = ContactParts(
         plant=plant,
         force=m.B[:, pushed],
@@ -219,7 +220,7 @@ def take_apart(
         controller=K,
         sample_time=model.dt,
         is_stepped=block.stepped,
-        tool_mass=sensor.tool_mass if isinstance(sensor, ForceSensor) else 0.0,
+        tool_mass=0.0 if sensor is None else sensor.tool_mass,
         derivation=m.derivation,
         errors=(
             StateMatrices(E.A, E.B[:, wired], E.C[rows], E.D[np.ix_(rows, wired)]),
@@ -228,6 +229,19 @@ def take_apart(
         findings=_collect_findings(model, path),
     )
     return parts, any(isinstance(f, UnusualStart) for f in model.findings)
+
+
+def _find_sensor(flat: FlatDiagram, path: str) -> ForceSensor | None:
+    """Return the force sensor that a measured force comes from, at once or through blocks with one wire, as delays."""
+    for _ in flat.table.blocks:
+        block = flat.table.blocks[path]
+        if isinstance(block, ForceSensor):
+            return block
+        sources = [wire.block for port in block.inputs if (wire := flat.table.wires.get((path, port))) is not None]
+        if len(sources) != 1:
+            return None
+        path = sources[0]
+    return None
 
 
 def _widen(M: np.ndarray, by: int) -> np.ndarray:

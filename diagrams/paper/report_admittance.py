@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from ...blocks.core import ConfirmationError
 from ..admittance import (
     SIDES,
     AdmittanceLoop,
-    StabilityLimit,
     growth_rate,
     passivity,
     rendered_admittance,
@@ -23,11 +23,10 @@ from ..frequency import Number, with_findings
 from ..report import Implementation
 from .reduced_loops import ReducedLoops, each_implementation
 from .report_case import Fig3Case
+from .report_contact import DAMPINGS, SPRING, again, contact_sections, find_contacts
 from .report_figures import RULE, TARGET, WITH_FRICTION, draw_admittances, draw_stability
 
 TEXTS = Texts(__package__, "admittance")
-DAMPINGS = (0.0, 10.0, 100.0)
-SPRING = 10.0  # N/m, that holds a mass where the admittance has no stiffness
 TITLE = "Admittance and coupled stability"
 
 
@@ -40,11 +39,18 @@ def admittance(case: Fig3Case) -> Section:
     """Return the section about the admittances.
 
     Where the diagram has friction, ``ke_limit`` is that of the design without it, and ``ke_limit_friction`` that of
-    ``stiffness_limits(AdmittanceLoop.of(diagram))``. Where the plant is not shown to be the reduced model, the section
-    says why in place of numbers.
+    ``stiffness_limits(AdmittanceLoop.of(diagram))``. Where the plant is not shown to be the reduced model, the numbers
+    are those of `Diagram.contact`; where it has none, the section says why.
     """
     if not isinstance(case.reduced, ReducedLoops):
-        return Section("admittance", TITLE, not_shown(case))
+        contacts = find_contacts(case)
+        if contacts is None:
+            return Section("admittance", TITLE, not_shown(case))
+        try:
+            parts = contact_sections(contacts)
+        except ConfirmationError as error:  # a limit that is refuted is none; the rest of the report holds
+            return Section("admittance", TITLE, (*not_shown(case), str(error)))
+        return Section("admittance", TITLE, (*TEXTS.paragraphs("contacts"), str(case.reduced)), sections=parts)
     parts = tuple(_side(case.reduced, side) for side in SIDES)
     return Section("admittance", TITLE, TEXTS.paragraphs("limits"), sections=parts)
 
@@ -107,18 +113,9 @@ def _limits(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Itera
                 shown = {"ke_limit": found.number, "rule_of_thumb": rule, "ke_frequency": frequency}
                 place = f"{name}.be_{b:g}"
                 numbers |= {f"{kind.key_of(of)}.{place}": n for of, n in shown.items() if n is not None}
-                rows.append((name, f"{b:g} N s/m", *shown.values(), _again(found)))
+                rows.append((name, f"{b:g} N s/m", *shown.values(), again(found)))
         columns = ("variant", "b_e", "largest k_e", "rule of thumb", "oscillates at", "stable again")
         yield Table(f"Largest stiffness of the environment, {kind.title}", columns, tuple(rows))
-
-
-def _again(found: StabilityLimit) -> str:
-    if not found.restabilizes:
-        return "no"
-    text, values = [], list(found.restabilizes)
-    for low, high in zip(values[::2], [*values[1::2], None], strict=False):
-        text.append(f"from {low:.6g}" + (f" to {high:.6g}" if high is not None else "") + f" {found.unit}")
-    return ", ".join(text)
 
 
 def _masses(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Iterator[Table]:
@@ -132,7 +129,7 @@ def _masses(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Itera
                 found = stability_limit(variant, over, **moored)
                 path = f"{key}{suffix}.{name}"
                 numbers[path] = found.number
-                shown += [numbers[path], _again(found)]
+                shown += [numbers[path], again(found)]
             rows.append((name + suffix, *shown))
     columns = ("variant", "largest m_e", "stable again", "largest tool mass", "stable again")
     how = f"on a spring of {SPRING:g} N/m" if moored else "without spring and damper"

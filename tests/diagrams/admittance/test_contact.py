@@ -22,6 +22,8 @@ from loopwright.blocks.core.errors import ShapeError, UnknownNameError
 from loopwright.diagrams import (
     AdmittanceLoop,
     Diagram,
+    MeanSlope,
+    StepsOnly,
     experiments,
     growth_rate,
     passivity,
@@ -128,6 +130,13 @@ def test_limits_beside_the_path_are_those_by_hand(side, eta, xi, friction, tool_
     np.testing.assert_allclose(here.admittance(omega).target, target_admittance(loop, omega), rtol=1e-9)
 
 
+def test_the_delay_of_a_subsystem_counts():
+    made = diagram().replace({"controller.delay": 1, "sensors.force_sensor.tool_mass": 0.1})
+    loop = by_hand(tool_mass=0.1).replace(delay=1)
+    for held in ({"damping": 10.0}, {"tool_mass": 0.2}):
+        agree(made.contact().stability_limit(**held), stability_limit(loop, **held))
+
+
 def test_a_block_as_plant_has_the_limits_of_its_fmu():
     block = gantry.nominal.replace(name="plant", start_position=(0.8, 0.5))
     found = diagram().replace({"plant": block}).contact().stability_limit(damping=10.0)
@@ -142,6 +151,23 @@ def test_differences_show_their_error(tmp_path):
     assert str(found.derivation).startswith("differences")
     assert abs(limit.value - exact.value) <= limit.tolerance + exact.tolerance
     assert 1e-9 * limit.value < limit.tolerance < 0.01 * limit.value
+
+
+def test_the_first_sample_of_a_force_sensor_is_no_model_of_it():
+    made = diagram().replace({"sensors.force_sensor.tool_mass": 0.2})  # at t = 0 it takes the acceleration as zero
+    expected = stability_limit(AdmittanceLoop.of(made, "perp"), "mass")
+    for at in (None, 0.0, made.operating_point(0.0), made.trim(), 5e-3):
+        agree(made.contact(at=at).stability_limit("mass"), expected)
+
+
+def test_stairs_are_taken_as_asked():
+    made = experiments.compliance(encoder=1e-6).diagram
+    blind, mean = made.contact(at=0.01), made.contact(at=0.01, stairs="gain")
+    assert any(isinstance(finding, StepsOnly) for finding in blind.findings)
+    assert any(isinstance(finding, MeanSlope) for finding in mean.stability_limit(damping=10.0).findings)
+    # velocities from differences come half a sample late, which costs some of the limit
+    ratio = mean.stability_limit(damping=10.0).value / contact().stability_limit(damping=10.0).value
+    assert 0.5 < ratio < 1.0
 
 
 def test_a_vector_is_a_direction():

@@ -330,18 +330,35 @@ PARTS = ("poles", "admittance", "time_domain")
 
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", [gantry_elastic, gantry_stiction])
-def test_a_report_of_another_plant_has_no_limits_and_says_why(plant):
+def test_a_report_of_another_plant_has_the_limits_of_its_contact_and_says_why(plant):
     found = report(plant, *PARTS)
-    assert not [path for path in found.numbers() if path.startswith(("admittance", "time_domain"))]
+    numbers = found.numbers()
+    assert not [path for path in numbers if path.startswith("time_domain")]
     assert [s.key for s in found.sections] == ["poles", "admittance"]
     words = section(found, "admittance")
+    assert words.text[0].startswith("The admittance Y(jω)")
+    assert words.text[-1] == refusal(diagram(plant))
+    assert "none was tried in time domain" in to_html(found)
+    kind = plant.__name__.rpartition("_")[2]
+    for side in SIDES:
+        limit = numbers[f"admittance.{side}.ke_limit.sampled_d0.be_0"]
+        assert limit.value == pytest.approx(true_limit(kind, side), rel=1e-6)
+        late = diagram(plant).replace({"controller.delay": 1}).contact(direction=side).stability_limit(damping=10.0)
+        assert numbers[f"admittance.{side}.ke_limit.sampled_d1.be_10"].value == pytest.approx(late.value, rel=1e-9)
+        assert late.value < numbers[f"admittance.{side}.ke_limit.sampled_d0.be_10"].value
+
+
+@pytest.mark.parametrize("made", [{"encoder": 1e-6}, {"plant": None}])
+def test_a_report_without_a_contact_to_tell_says_why(made):
+    if "plant" in made:
+        made = {"plant": Fmu(gantry_contact.build(), start=IN_CONTACT)}
+    found = analyse(experiments.compliance(**made).diagram, only=("admittance",))
+    words = section(found, "admittance")
+    assert words.text[0].startswith(
+        "This report has no admittances and no limits of coupled stability, neither computed nor tried"
+    )
     assert not words.tables
     assert not words.sections
-    assert words.text[0].startswith(
-        "This report has no admittances and no limits of coupled stability, neither computed nor"
-    )
-    assert words.text[1] == refusal(diagram(plant))
-    assert "no limits of coupled stability" in to_html(found)
 
 
 def test_a_report_of_the_time_runs_alone_says_why_there_are_none():
