@@ -103,7 +103,7 @@ def _limits(variants: Mapping[Implementation, Contact], numbers: dict[str, Numbe
 def _masses(variants: Mapping[Implementation, Contact], has_spring: bool, numbers: dict[str, Number]) -> Table:
     rows = []
     # without any stiffness the robot drifts, and there is no limit to lose
-    moored = {} if has_spring else {"stiffness": SPRING}
+    moored: dict[str, Any] = {} if has_spring else {"stiffness": SPRING}
     for name, contact in variants.items():
         for vary, key in (("mass", "me_limit"), ("tool_mass", "tool_mass_limit")):
             found = contact.stability_limit(vary, **moored)
