@@ -60,21 +60,22 @@ def announcers(flat: FlatDiagram) -> list[tuple[str, Announcer]]:
 
 def _find_announcers(flat: FlatDiagram) -> list[tuple[str, Announcer]]:
     found: list[tuple[str, Announcer]] = []
+    known: Lines = {}
     for path in sorted(flat.checked.traced):
         block = flat.table.blocks[path]
         if flat.table.is_sampled(flat.table.subsystem_of[path]):
             continue
         if type(block).next_instant is not Block.next_instant:
             found.append((path, block))
-        elif not block.opaque and (times := dict(_times_of(flat, path))):
+        elif not block.opaque and (times := dict(_times_of(flat, path, known))):
             found.append((path, Times(times)))
     return found
 
 
-def _times_of(flat: FlatDiagram, path: str) -> Iterator[tuple[float, bool]]:
+def _times_of(flat: FlatDiagram, path: str, known: Lines) -> Iterator[tuple[float, bool]]:
     """Yield the times at which a block without instants of its own is not smooth; see `Times`."""
     block, traced = flat.table.blocks[path], flat.checked.traced[path]
-    lines = {name: line for name in traced.inputs if (line := _line_at(flat, path, name)) is not None}
+    lines = {name: line for name in traced.inputs if (line := _line_at(flat, path, name, known)) is not None}
     moving = {name: line for name, line in lines.items() if np.any(line[1])}
     for name, values in block.input_breaks().items():
         if name in moving:
@@ -84,38 +85,45 @@ def _times_of(flat: FlatDiagram, path: str) -> Iterator[tuple[float, bool]]:
         yield from switching_times(traced, flat.p[flat.parameters.slices[path]], lines).items()
 
 
-def _line_at(flat: FlatDiagram, path: str, port: str, behind: frozenset[str] = frozenset()) -> Line | None:
-    """Return the signal at an input if it is a straight line in time: of a clock, with gains, sums and constants.
+Lines = dict[str, Line | None]
+"""By path, whether the output of a block is a straight line in time; None where it is not, or is not known yet."""
 
-    ``behind`` holds the blocks that lead here: one that comes again is in an algebraic loop.
-    """
+
+def _line_at(flat: FlatDiagram, path: str, port: str, known: Lines) -> Line | None:
+    """Return the signal at an input if it is a straight line in time: of a clock, with gains, sums and constants."""
     wire = flat.table.wires.get((path, port))
-    if wire is None or wire.block in behind:
+    if wire is None or flat.table.is_sampled(flat.table.subsystem_of[wire.block]):
         return None
-    behind |= {wire.block}
-    source = flat.table.blocks[wire.block]
-    shape = flat.checked.shapes.get((wire.block, wire.port))
-    if shape is None or flat.table.is_sampled(flat.table.subsystem_of[wire.block]):
-        return None
-    line: Line | None = None
-    if isinstance(source, Clock):
-        line = np.zeros(1), np.ones(1)
-    elif isinstance(source, Constant):
-        value = np.ravel(np.asarray(source.value, dtype=float))
-        line = value, np.zeros(value.size)
-    elif isinstance(source, Gain) and np.ndim(source.gain) < 2:
-        inner = _line_at(flat, wire.block, "u", behind)
-        if inner is not None:
-            line = np.ravel(source.gain * inner[0]), np.ravel(source.gain * inner[1])
-    elif isinstance(source, Sum):
-        inners = [_line_at(flat, wire.block, name, behind) for name in source.inputs]
-        signs = [1.0 if sign == "+" else -1.0 for sign in source.signs]
-        known = [(s * i[0], s * i[1]) for s, i in zip(signs, inners, strict=True) if i is not None]
-        if len(known) == len(inners):
-            line = sum(k[0] for k in known) + np.zeros(size(shape)), sum(k[1] for k in known) + np.zeros(size(shape))
-    if line is None or line[0].size != size(shape):
+    if wire.block not in known:
+        known[wire.block] = None  # until it is known: a block that comes again is in an algebraic loop
+        known[wire.block] = _line_of(flat, wire.block, known)
+    line, shape = known[wire.block], flat.checked.shapes.get((wire.block, wire.port))
+    if line is None or shape is None or line[0].size != size(shape):
         return None
     if wire.index is None:
         return line
     index = np.ravel(np.arange(size(shape)).reshape(shape)[wire.index])
     return line[0][index], line[1][index]
+
+
+def _line_of(flat: FlatDiagram, path: str, known: Lines) -> Line | None:
+    """Return the output of a clock, a constant, a gain or a sum if it is a straight line in time."""
+    block = flat.table.blocks[path]
+    if isinstance(block, Clock):
+        return np.zeros(1), np.ones(1)
+    if isinstance(block, Constant):
+        value = np.ravel(np.asarray(block.value, dtype=float))
+        return value, np.zeros(value.size)
+    if isinstance(block, Gain) and np.ndim(block.gain) < 2:
+        inner = _line_at(flat, path, "u", known)
+        return None if inner is None else (np.ravel(block.gain * inner[0]), np.ravel(block.gain * inner[1]))
+    if isinstance(block, Sum):
+        start, slope = np.zeros(1), np.zeros(1)
+        for sign, name in zip(block.signs, block.inputs, strict=True):
+            inner = _line_at(flat, path, name, known)
+            if inner is None:
+                return None
+            factor = 1.0 if sign == "+" else -1.0
+            start, slope = start + factor * inner[0], slope + factor * inner[1]
+        return start, slope
+    return None

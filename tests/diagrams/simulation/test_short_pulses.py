@@ -17,6 +17,7 @@ from loopwright.blocks import (
     Product,
     PythonFunction,
     Ramp,
+    Sum,
     UnitDelay,
     parameter,
 )
@@ -79,6 +80,17 @@ def test_a_table_of_two_arguments_lands_on_its_rows():
 def test_a_table_of_a_signal_that_is_not_the_time_is_left_alone():
     run = Diagram("d", Integrator()(triangle()(Ramp(slope=0.0)))).simulate(1.0, step=0.5, progress=False)
     assert run["integrator.y"][-1] == 0.0
+
+
+def test_a_long_chain_of_sums_and_a_loop_of_them_are_followed_once():
+    signal = Clock().y
+    for i in range(60):  # 2 to the power of 60 ways lead back
+        signal = (signal + signal).named(f"s{i}")
+    run = Diagram("d", Integrator()(OnClock()(2.0**-60 * signal))).simulate(10.0, step=0.5, progress=False)
+    assert run["integrator.y"][-1] == pytest.approx(1.0, rel=2e-6)
+    e = Sum(signs="++", name="e")
+    looped = Diagram("d", Integrator()(OnClock()(e(Clock(), Gain(gain=0.5)(e.y)))), loops="solve")
+    assert np.isfinite(looped.simulate(1.0, step=0.5, progress=False)["integrator.y"]).all()
 
 
 # --- check_block --------------------------------------------------------------------------------------------------------
