@@ -13,6 +13,8 @@ from .features import Features, scan
 from .realization import Realization
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from .state_space import LinearSystem
 
 
@@ -154,11 +156,11 @@ def _make_contour(r: Realization, features: Features, delay: float) -> list[np.n
     return path + ([1j * line] if len(line) else [])
 
 
-def _follow_loop(r: Realization, s: np.ndarray, delay: float) -> np.ndarray:
+def _follow_loop(r: Realization, s: np.ndarray, delay: float) -> NDArray[np.complex128]:
     """Return 1 + L e^(−s delay) along points, bisected until it turns by less than 0.5 rad from one to the next."""
     for _ in range(30):
         L, _ = r.values(s)
-        f = 1 + L * np.exp(-s * delay)
+        f: NDArray[np.complex128] = 1 + L * np.exp(-s * delay)
         if np.any(f == 0):
             raise ConfirmationError(
                 "found 1 + L = 0 on the contour; expected no closed-loop pole on the limit of stability. Look at "
