@@ -55,7 +55,8 @@ class Fmi2Calls(FmiCalls):
         def message(
             environment: Any, name: Any, status: int, category: Any, text: bytes | None, *arguments: Any
         ) -> None:
-            log(status, format_message(text or b"", arguments))
+            if status:  # the others are not kept
+                log(status, format_message(text or b"", arguments))
 
         self._logger = Logger(message)  # kept as long as the library may call it
         callbacks = fmi2CallbackFunctions()

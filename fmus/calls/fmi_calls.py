@@ -6,6 +6,7 @@ import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -41,7 +42,8 @@ class StepCall:
     """Time at which a step has ended, in s; −∞ if the FMU does not say it, as in FMI 2.0."""
 
 
-def allow_missing(kind: Any, prefix: str, required: Sequence[str]) -> Any:
+@cache
+def allow_missing(kind: Any, prefix: str, required: tuple[str, ...]) -> Any:
     """Return a class of FMPy's that loads a library without some functions too; their calls return an error.
 
     Tools leave out functions of capabilities that their FMUs don't have, though the standard asks for all of them.
@@ -52,7 +54,7 @@ def allow_missing(kind: Any, prefix: str, required: Sequence[str]) -> Any:
         Class of FMPy's.
     prefix : str
         Prefix of the functions' names.
-    required : sequence of str
+    required : tuple of str
         Ends of the names of functions without which an FMU can't run.
     """
     needed = {f"{prefix}{name}" for name in required}

@@ -28,7 +28,7 @@ _DIRECTIVE = re.compile(
     r"%(?:(?P<percent>%)|(?P<flags>[-+ #0]*)(?P<width>\*|\d+)?(?:\.(?P<precision>\*|\d+)?)?"
     r"(?P<length>hh|h|ll|l|z|j|t)?(?P<kind>[diouxXcsfFeEgGaAp]))"
 )
-_LONGEST = 2000
+_LONGEST, _WIDEST = 2000, 200
 
 
 def format_message(text: bytes, arguments: Sequence[Any]) -> str:
@@ -54,10 +54,9 @@ def _convert(match: re.Match[str], words: Iterator[int], numbers: Iterator[float
     if match["percent"]:
         return "%"
     try:
-        width = next(words) if match["width"] == "*" else match["width"] or ""
-        precision = next(words) if match["precision"] == "*" else match["precision"]
+        width, precision = (_read_size(match[name], words) for name in ("width", "precision"))
         flags, kind = match["flags"], match["kind"]
-        dot = "" if precision is None else f".{precision}"
+        dot = f".{precision}" if precision else ""
         if kind in "fFeEgG":
             return f"%{flags}{width}{dot}{kind}" % next(numbers)
         if kind in "aA":
@@ -76,6 +75,14 @@ def _convert(match: re.Match[str], words: Iterator[int], numbers: Iterator[float
         return f"%{flags}{width}{dot}{'d' if kind in 'diu' else kind}" % word
     except (StopIteration, ValueError, TypeError, OverflowError):
         return match[0]
+
+
+def _read_size(text: str | None, words: Iterator[int]) -> str:
+    """Return a width or a precision, which the format or an argument gives; a wild one is cut."""
+    if not text:
+        return text or ""
+    number = next(words) & 0xFFFFFFFF if text == "*" else int(text)
+    return str(min(number, _WIDEST))
 
 
 def _read_text(address: int) -> str:

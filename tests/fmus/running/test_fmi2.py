@@ -326,6 +326,7 @@ def test_fmi_1_is_refused_by_its_version(msd, tmp_path):
         (b"%-6s|%5.2f|%c|%u", [ctypes.c_char_p(b"ab"), ctypes.c_double(2.0), ctypes.c_int(65), ctypes.c_uint(7)],
          "ab    | 2.00|A|7"),
         (b"%s%n", [ctypes.c_void_p(8)], "?%n"),
+        (b"%999999999d|%*d|%.3s", [ctypes.c_int(1), ctypes.c_int(4), ctypes.c_int(2), ctypes.c_char_p(b"abcdef")], "1".rjust(200) + "|   2|abc"),
     ],
 )  # fmt: skip
 def test_printf_formats_of_messages_are_filled_in(text, arguments, expected):
