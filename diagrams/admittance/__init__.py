@@ -3,7 +3,7 @@
 from .compliance_loop import SIDES, AdmittanceLoop, control_rate
 from .contact import Contact, make_contact
 from .contact_admittance import ContactAdmittance
-from .contact_limits import ContactLimit
+from .contact_limits import ContactLimit, ContactMap
 from .coupled import crossing_frequency, growth_rate, poles
 from .rendered import Passivity, passivity, rendered_admittance, rendered_response, rendered_system, target_admittance
 from .shown_plant import check_plant, is_discrete
@@ -22,6 +22,7 @@ __all__ = [
     "Contact",
     "ContactAdmittance",
     "ContactLimit",
+    "ContactMap",
     "Passivity",
     "StabilityLimit",
     "StabilityMap",

@@ -15,7 +15,7 @@ from ...fmus.running import Derivation
 from ..linearization import check_options, operating_point
 from .compliance_loop import SIDES
 from .contact_admittance import ContactAdmittance, compute_admittance
-from .contact_limits import ContactLimit, CoupledLoop, check_properties, find_limit
+from .contact_limits import ContactLimit, ContactMap, CoupledLoop, check_properties, find_limit, map_growth
 from .contact_loop import close_loop, join_environment
 from .contact_parts import ContactParts, Ports, take_apart
 from .rendered import CONTINUOUS, HIGHEST, LOWEST, OFF_PATH, SAMPLED, Passivity, find_negative
@@ -165,6 +165,31 @@ class Contact:
         """
         check_properties(environment, vary)
         return find_limit(self.parts, self.direction, vary, environment, low=low, high=high, per_decade=per_decade)
+
+    def stability_map(
+        self, x_values: Array, y_values: Array, *, x: str = "stiffness", y: str = "damping", **environment: float
+    ) -> ContactMap:
+        """Return the growth rate over two properties of the environment, and the limit of x at each value of y.
+
+        Parameters
+        ----------
+        x_values, y_values : array
+            Values of the two properties; those of x positive and rising.
+        x, y : str, optional
+            Properties.
+        **environment
+            Other properties, as `stability_limit` takes them.
+
+        Raises
+        ------
+        OptionError, ParameterError
+            If a property is unknown, negative or given twice, or values are not a row.
+        ConfirmationError
+            If python-control's interconnection of the same parts disagrees with a limit.
+        """
+        check_properties([*environment, y], x)
+        check_properties([*environment, x], y)
+        return map_growth(self.parts, self.direction, (x, x_values), (y, y_values), environment)
 
 
 def make_contact(

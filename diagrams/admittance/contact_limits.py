@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, OptionError, near
+from ...blocks.core import Array, ConfirmationError, Finding, OptionError, near
 from ..frequency import Number, on_one_thread
 from .contact_loop import ClosedLoop, Modes, close_loop, controller_rows, join_environment, split_modes
 from .contact_parts import ContactParts
@@ -89,6 +89,31 @@ class ContactLimit:
     def number(self) -> Number:
         """The limit as a number of a report."""
         return Number(self.value, self.unit, self.tolerance, self.confirmed_by, findings=self.findings)
+
+
+@dataclass(frozen=True, eq=False)
+class ContactMap:
+    """Growth rates over two properties of the environment.
+
+    Attributes
+    ----------
+    x, y : str
+        Properties.
+    x_values, y_values : ndarray
+        Values of the properties.
+    growth : ndarray, shape (len(y_values), len(x_values))
+        σ in 1/s, negative where the loop is stable; of the modes that the environment can move, and of those that grow
+        whatever it is.
+    limits : tuple of ContactLimit
+        Limit of x at each value of y.
+    """
+
+    x: str
+    y: str
+    x_values: np.ndarray
+    y_values: np.ndarray
+    growth: np.ndarray
+    limits: tuple[ContactLimit, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,6 +281,41 @@ def find_limit(
         confirmed_by=confirmed,
         **common,
     )
+
+
+@on_one_thread
+def map_growth(
+    parts: ContactParts,
+    direction: np.ndarray,
+    x: tuple[str, Array],
+    y: tuple[str, Array],
+    held: Mapping[str, float],
+) -> ContactMap:
+    """Return the growth rates over two properties, each given by its name and its values; see `Contact`.
+
+    Raises
+    ------
+    OptionError
+        If a property is given twice, or values are not a row; those of x are positive and rise.
+    """
+    across, up = np.asarray(x[1], dtype=float), np.asarray(y[1], dtype=float)
+    if x[0] == y[0] or across.ndim != 1 or up.ndim != 1:
+        raise OptionError(
+            f"found {x[0]!r} and {y[0]!r} with values of {across.ndim} and {up.ndim} axes; expected two different "
+            "properties, each with a row of values. Give x=…, y=….",
+            port=x[0],
+        )
+    if len(across) < 2 or not (across[0] > 0.0 and np.all(np.diff(across) > 0.0)):
+        raise OptionError(f"found the values {across.tolist()}; expected positive ones that rise.", port=x[0])
+    rows, limits = [], []
+    for value in up.tolist():
+        environment = {**held, y[0]: value}
+        loop = CoupledLoop.of(parts, direction, x[0], environment)
+        fixed = loop.find_fixed_growth()
+        rows.append(np.maximum(loop.growth(across), -np.inf if fixed is None else fixed[0]))
+        ends = {"low": float(across[0]), "high": float(across[-1])}
+        limits.append(find_limit(parts, direction, x[0], environment, **ends))
+    return ContactMap(x[0], y[0], across, up, np.array(rows).reshape(len(up), len(across)), tuple(limits))
 
 
 def check_properties(names: Iterable[str], vary: str) -> None:

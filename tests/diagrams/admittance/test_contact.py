@@ -29,6 +29,7 @@ from loopwright.diagrams import (
     passivity,
     rendered_admittance,
     stability_limit,
+    stability_map,
     target_admittance,
 )
 from loopwright.diagrams.paper.report_case import NO_FRICTION
@@ -305,6 +306,23 @@ def test_a_plant_without_a_model_of_its_equations_is_refused(tmp_path):
     made = experiments.compliance(plant=hidden(gantry.build(), tmp_path)).diagram
     with pytest.raises(ParameterError, match="An identified model does not do: it holds the force over a sample"):
         made.contact()
+
+
+def test_a_map_has_the_growth_rates_and_limits_by_hand():
+    stiffness, damping = np.geomspace(1e3, 1e5, 9), np.array([0.0, 10.0, 50.0])
+    found, expected = contact().stability_map(stiffness, damping), stability_map(by_hand(), stiffness, damping)
+    fast = expected.growth > -2.6  # there the modes of the other direction, which both have, are slower
+    assert np.count_nonzero(fast) > 5
+    np.testing.assert_allclose(found.growth[fast], expected.growth[fast], atol=1e-8)
+    assert np.all((found.growth > 0.0) == (expected.growth > 0.0))
+    for limit, other in zip(found.limits, expected.limits, strict=True):
+        agree(limit, other)
+    broken = contact().stability_map(stiffness, [0.0], tool_mass=0.65)
+    assert np.all(broken.growth > 0.0)  # of the other direction
+    with pytest.raises(OptionError, match="expected positive ones that rise"):
+        contact().stability_map([2.0, 1.0], damping)
+    with pytest.raises(OptionError, match="among the held properties"):
+        contact().stability_map(stiffness, damping, x="damping")
 
 
 def test_properties_of_environments_are_checked():
