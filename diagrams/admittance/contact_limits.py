@@ -313,8 +313,8 @@ def map_growth(
         loop = CoupledLoop.of(parts, direction, x[0], environment)
         fixed = loop.find_fixed_growth()
         rows.append(np.maximum(loop.growth(across), -np.inf if fixed is None else fixed[0]))
-        ends = {"low": float(across[0]), "high": float(across[-1])}
-        limits.append(find_limit(parts, direction, x[0], environment, **ends))
+        low, high = float(across[0]), float(across[-1])
+        limits.append(find_limit(parts, direction, x[0], environment, low=low, high=high))
     return ContactMap(x[0], y[0], across, up, np.array(rows).reshape(len(up), len(across)), tuple(limits))
 
 
