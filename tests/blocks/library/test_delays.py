@@ -1,6 +1,5 @@
 """Delays: of whole samples against shifted inputs, Padé's against python-control's and against itself."""
 
-import time
 from fractions import Fraction
 
 import control
@@ -25,10 +24,8 @@ def test_a_delay_gives_the_input_of_so_many_ticks_ago(steps, shape):
     np.testing.assert_array_equal(got, np.concatenate([np.full((steps, *shape), 4.0), u[:-steps]]))
 
 
-def test_a_delay_of_many_steps_is_traced_in_little_time():
-    began = time.perf_counter()
+def test_a_delay_of_many_steps_is_a_few_operations_a_step():
     made = trace(Delay(steps=5000, initial_value=0.0), {"u": ()}, sampled=True)
-    assert time.perf_counter() - began < 2.0  # measured: 0.02 s
     assert made.function.n_instructions() < 3 * 5000
     assert made.depends["y"] == {"x"}
 

@@ -1,7 +1,5 @@
 """A product with a large matrix is one operation: it is built quickly, and gives what NumPy and SciPy give."""
 
-import time
-
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -12,8 +10,8 @@ from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.linearization import StepsOnly
 
 N = 500
-BUDGET = 0.3
-"""CPU time in s."""
+FEW = 50
+"""Operations of a block with one large matrix; entry by entry there were 250,000 (benchmarks/matrices.py has times)."""
 
 
 def matrix(seed=0, n=N):
@@ -60,33 +58,27 @@ def held(A):
     return Diagram("held", Gain(gain=1.0)(controller(Constant(value=1.0)).named("y")))
 
 
+def count_operations(diagram):
+    """Count the operations of all blocks but sources."""
+    return sum(t.function.n_instructions() for t in diagram.checked.traced.values() if t.inputs)
+
+
 @pytest.mark.parametrize(
     "block",
     [lambda seed: Gain(gain=matrix(seed)), lambda seed: Closed(), lambda seed: Own(A=matrix(seed))],
     ids=["gain", "closed over", "parameter"],
 )
-def test_a_product_with_500_by_500_entries_is_built_in_a_fraction_of_a_second(block):
-    """It took 7 to 12 s."""
-    u, costs = np.linspace(-1, 1, N), []
-    for seed in (3, 4):
-        begin = time.process_time()
-        diagram = Diagram("product", block(seed)(Constant(value=u)).named("y"))
-        costs.append(time.process_time() - begin)
-    assert min(costs) < BUDGET
-    made = block(4)
+def test_a_product_with_500_by_500_entries_is_a_few_operations(block):
+    u, made = np.linspace(-1, 1, N), block(4)
+    diagram = Diagram("product", made(Constant(value=u)).named("y"))
+    assert count_operations(diagram) < FEW
     A = CLOSED_OVER if isinstance(made, Closed) else matrix(4)
     run = diagram.simulate(0.01, step=0.01)
     assert run["y"][-1] == pytest.approx(A @ u + isinstance(made, Own), rel=1e-12, abs=1e-12)
 
 
-def test_a_state_space_of_500_states_is_built_in_a_fraction_of_a_second():
-    """It took 36 s."""
-    costs = []
-    for seed in (5, 6):
-        begin = time.process_time()
-        Diagram("large", state_space(matrix(seed))(Constant(value=1.0)).named("y"))
-        costs.append(time.process_time() - begin)
-    assert min(costs) < BUDGET
+def test_a_state_space_of_500_states_is_a_few_operations():
+    assert count_operations(Diagram("large", state_space(matrix(5))(Constant(value=1.0)).named("y"))) < FEW
 
 
 def test_a_large_state_space_runs_as_the_matrix_exponential_and_is_linearized_to_its_matrix():
@@ -114,9 +106,8 @@ def test_exact_zeros_of_a_large_matrix_are_structure(share):
     A = matrix(8)
     A[np.random.default_rng(1).random(A.shape) < share] = 0.0
     u = np.linspace(-1, 1, N)
-    begin = time.process_time()
     diagram = Diagram("sparse", Gain(gain=A, name="gain")(Constant(value=u)).named("y"))
-    assert time.process_time() - begin < 2 * BUDGET
+    assert count_operations(diagram) < FEW
     assert diagram.simulate(0.01, step=0.01)["y"][-1] == pytest.approx(A @ u, rel=1e-12, abs=1e-12)
     changed = diagram.replace({"gain.gain": 2.0 * matrix(9)})  # zeros that are no more
     assert changed.simulate(0.01, step=0.01)["y"][-1] == pytest.approx(2.0 * matrix(9) @ u, rel=1e-12, abs=1e-12)
