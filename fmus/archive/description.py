@@ -61,6 +61,8 @@ class FmuDescription:
     """Whether a saved state can be turned into bytes, for another process (canSerializeFMUState)."""
     has_derivatives: bool = False
     """Whether the FMU computes directional derivatives in co-simulation (providesDirectionalDerivatives)."""
+    only_once: bool = False
+    """Whether a process can have one instance only (canBeInstantiatedOnlyOncePerProcess)."""
     variable_step: bool = False
     """Whether communication steps may differ in length (canHandleVariableCommunicationStepSize)."""
     fixed_internal_step: float | None = None
@@ -299,6 +301,7 @@ def _capabilities(root: ET.Element, version: str) -> dict[str, Any]:
         "can_save": _flag(steps, f"canGetAndSet{state}"),
         "can_serialize": _flag(steps, f"canGetAndSet{state}") and _flag(steps, f"canSerialize{state}"),
         "has_derivatives": _flag(steps, derivative),
+        "only_once": _flag(steps, "canBeInstantiatedOnlyOncePerProcess"),
         "variable_step": _flag(steps, "canHandleVariableCommunicationStepSize"),
         "fixed_internal_step": None if fixed is None else float(fixed),
         "model_exchange": None if exchange is None else exchange.get("modelIdentifier"),

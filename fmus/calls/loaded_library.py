@@ -10,6 +10,7 @@ from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from .fmu_block import FmuBlock
 _CALLS: dict[str, type[FmiCalls]] = {"2": Fmi2Calls, "3": Fmi3Calls}
 """Functions by the major version of FMI."""
 R = TypeVar("R")
+_OPEN: WeakSet[LoadedFmu] = WeakSet()
+"""Open instances of FMUs of which a process can have one only."""
 
 
 class LoadedFmu:
@@ -37,6 +40,7 @@ class LoadedFmu:
         self._open = self._running = False
         self._began = 0.0
         description, folder = self.description, Path.cwd()
+        self._refuse_second()
         try:
             files = unpack(description)
         except FmuError as error:
@@ -64,6 +68,19 @@ class LoadedFmu:
         finally:
             os.chdir(folder)  # FMPy stays in the binary's folder if loading fails
         self._open = True
+        if description.only_once:
+            _OPEN.add(self)
+
+    def _refuse_second(self) -> None:
+        """Refuse a second instance in this process where the FMU can have one only."""
+        for other in _OPEN:
+            if self.description.only_once and other.description.digest == self.description.digest:
+                raise FmuError(
+                    f"its FMU {str(self.description.file)!r} can have one instance in a process "
+                    f"(canBeInstantiatedOnlyOncePerProcess), and {other.block.label} is one. End that run first, or "
+                    "run them in separate processes.",
+                    block=self.block.label,
+                )
 
     def _check_version(self) -> None:
         """Refuse a library of another version of FMI than the description says (FMI 2.0, 2.1.4; FMI 3.0, 2.3.1)."""
@@ -313,6 +330,7 @@ class LoadedFmu:
         if not self._open:
             return
         self._open = False
+        _OPEN.discard(self)
         if self.fatal:  # nothing may be called any more, not even to free it (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)
             return
         with suppress(Exception):

@@ -304,6 +304,18 @@ def test_a_wrong_guid_is_quoted(msd, tmp_path):
         Diagram("d", Fmu(other, name="plant")(force=0.0)).simulate(0.1, step=0.1, progress=False)
 
 
+def test_an_fmu_of_which_a_process_can_have_one_instance_is_refused_a_second(msd, tmp_path):
+    flag = 'canBeInstantiatedOnlyOncePerProcess="true" canGetAndSetFMUstate'
+    one = Fmu(edited(msd, tmp_path, lambda text: text.replace("canGetAndSetFMUstate", flag)), name="one")
+    with one.instantiate([], None):
+        with pytest.raises(FmuError, match=r"^two: its FMU .*canBeInstantiatedOnlyOncePerProcess\), and one is one"):
+            one.replace(name="two").instantiate([], None).__enter__()
+        with Fmu(msd).instantiate([], None):  # another one
+            pass
+    with one.replace(name="two").instantiate([], None):
+        pass
+
+
 def test_fmi_1_is_refused_by_its_version(msd, tmp_path):
     text = '<?xml version="1.0"?><fmiModelDescription fmiVersion="1.0" modelName="m" modelIdentifier="m" guid="g" '
     text += 'numberOfContinuousStates="0" numberOfEventIndicators="0"><ModelVariables/></fmiModelDescription>'
