@@ -180,7 +180,7 @@ def test_a_periodic_loop_is_refused_with_both_ways_on(model):
         model.loop("voltage")
 
 
-@random_cases(6, 60, open_loops(sampled=True), reaching=0.1)
+@random_cases(4, 60, open_loops(sampled=True), reaching=0.1)
 def test_a_loop_with_one_renewal_has_the_margins_of_any_sampled_loop(loop):
     plain = margins(loop)
     found = periodic_margins(loop)

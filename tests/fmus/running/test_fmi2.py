@@ -52,6 +52,7 @@ def forces(n):
 # --- the numbers ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("plant", [gantry, gantry_contact], ids=["gantry", "contact"])
 def test_both_versions_of_a_model_give_the_same_numbers(plant, cache):
     start = {"position": (0.8, 0.6399), "velocity": (0.2, 0.05)}
