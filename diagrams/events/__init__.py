@@ -2,5 +2,6 @@
 
 from .domains import Domains
 from .search import evaluate_many
+from .sliding import Sliding
 
-__all__ = ["Domains", "evaluate_many"]
+__all__ = ["Domains", "Sliding", "evaluate_many"]

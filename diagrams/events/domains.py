@@ -123,6 +123,22 @@ class Domains:
         now = np.where(z > high, 1, np.where(z < low, -1, before))
         return np.where((self._open if opened is None else opened) > 0.5, now, before)  # a closed subsystem holds them
 
+    def domains_at(self, z: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """Return the domains at an instant: if events fire there, no slack hides another indicator's change.
+
+        Two events may look at one quantity, as the two of a relay do: what one of them has crossed, the other has, too.
+        """
+        now = self.domains_of(z, before)
+        fired = self.fires(before, now)
+        if not fired.any() or not self._slack.any():
+            return now
+        kept, self._slack = self._slack, np.zeros_like(self._slack)
+        self._set_bounds()
+        strict = self.domains_of(z, before)
+        self._slack = kept
+        self._set_bounds()
+        return np.where(fired | self.fires(before, strict), now, strict)
+
     def fires(self, before: np.ndarray, now: np.ndarray) -> np.ndarray:
         """Return which events a change of domains fires."""
         changed = now != before
@@ -152,7 +168,7 @@ class Domains:
     def update(self, t: float, x: np.ndarray) -> np.ndarray:
         """Take over the domains at one instant, and return which events their changes fire."""
         self._z = np.array(self.g(t, x))
-        now = self.domains_of(self._z, self.domain)
+        now = self.domains_at(self._z, self.domain)
         fired = self.fires(self.domain, now)
         self.take_fired(fired, now)
         return fired
@@ -260,10 +276,16 @@ class Domains:
 
     # --- never a hang ------------------------------------------------------------------------------------------------
 
-    def count(self, t: float, fired: np.ndarray) -> None:
+    def count(self, t: float, x: np.ndarray, fired: np.ndarray) -> None:
         """Note that events fired; raise if they pile up: chattering, Zeno behaviour, or a rest in contact."""
         self.search.fresh = True
-        self.limits.count(t, fired)
+
+        def change() -> tuple[float, np.ndarray]:
+            h = self._spacing
+            z, _ = self._many(np.array([t, t]), np.array([x, x + h * self._rates(t, x)]))
+            return h, np.abs(z[1] - z[0])
+
+        self.limits.count(t, fired, change)
 
     def too_many(self, t: float, fired: np.ndarray) -> SimulationError:
         """Return the error of events that fire each other at one instant for ever."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,8 @@ from ..flat import FlatEvent
 
 _CHATTER, _SPAN = 500, 1e-8  # so many events within so many seconds (relative to 1 + |t|)
 _ZENO, _SHRUNK = 8, 1e-6  # intervals that shrink from one to the next, down to this part of the largest one
+_RESOLVED = 1e3  # ulps of the time, above which intervals are no matter of rounding
+_SLIDES = 10  # events in a row, by which a fixed step knows a sliding mode
 _RESTS = 20  # events in a row that lead back into contact; colliding bodies pass an impact on a few times
 
 
@@ -51,8 +53,13 @@ class EventLimits:
 
     # --- counts ------------------------------------------------------------------------------------------------------
 
-    def count(self, t: float, fired: np.ndarray) -> None:
+    def count(self, t: float, fired: np.ndarray, change: Callable[[], tuple[float, np.ndarray]]) -> None:
         """Note that events fired.
+
+        Parameters
+        ----------
+        change : callable
+            Returns a time in s, and by how much the indicators change in it.
 
         Raises
         ------
@@ -69,7 +76,7 @@ class EventLimits:
             self._look_for_zeno(int(i))
         self._recent.append((t, tuple(np.flatnonzero(fired).tolist())))
         if len(self._recent) == _CHATTER and t - self._recent[0][0] < _SPAN * (1.0 + abs(t)):
-            raise self._chatters(t)
+            raise self._chatters(t, *change())
 
     def _rests(self, t: float, i: int) -> SimulationError:
         event = self.events[i]
@@ -82,14 +89,26 @@ class EventLimits:
             t=t,
         )
 
-    def _chatters(self, t: float) -> SimulationError:
-        counts = np.bincount([i for _, together in self._recent for i in together])
-        event = self.events[int(np.argmax(counts))]
+    def slides(self, span: float) -> FlatEvent | None:
+        """Return the event of which a few have just fired within so many seconds; None where that is not so."""
+        latest = list(self._recent)[-_SLIDES:]
+        if len(latest) < _SLIDES or latest[-1][0] - latest[0][0] > span or self._stuck.any():
+            return None
+        return self._most_of(latest)
+
+    def _most_of(self, latest: Iterable[tuple[float, tuple[int, ...]]]) -> FlatEvent:
+        return self.events[int(np.argmax(np.bincount([i for _, together in latest for i in together])))]
+
+    def _chatters(self, t: float, h: float, change: np.ndarray) -> SimulationError:
+        event = self._most_of(self._recent)
+        size = float(change[list(self.events).index(event)])
+        told = f"of {size:.1g} it would switch about every {2.0 * h:.2g} s" if 0.0 < size < np.inf else "it would go on"
         return SimulationError(
             f"the event {event.name!r} chatters: {_CHATTER} times events fired within "
             f"{t - self._recent[0][0]:.2g} s, so the run would not go on. "
-            "What it switches drives the indicator back across zero at once. Declare "
-            "a hysteresis, Event(hysteresis=…), or take a block that has one, such as Relay.",
+            "What it switches drives the indicator back across zero at once (a sliding mode). Declare a hysteresis; "
+            f"with one {told}. In a block of your own that is Event(hysteresis=…), in a Relay its off_point below its "
+            "on_point, which takes the place of a Compare, too. Or take a fixed step: solver='rk4'.",
             block=event.path,
             t=t,
         )
@@ -99,7 +118,7 @@ class EventLimits:
         if len(times) <= _ZENO or times[-1] - times[-2] > _SHRUNK * self._largest[i]:
             return
         intervals = np.diff(np.array(times))
-        if not np.all(intervals > 0.0):
+        if not np.all(intervals > _RESOLVED * np.spacing(times[-1])):
             return
         r = float((intervals[-1] / intervals[0]) ** (1.0 / (len(intervals) - 1)))
         if r < 0.9999 and np.all(intervals[1:] < 1.5 * intervals[:-1]):  # by one ratio, but for what the solver adds

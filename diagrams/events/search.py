@@ -58,6 +58,9 @@ class Rule(Protocol):
     def domains_of(self, z: np.ndarray, before: np.ndarray, opened: np.ndarray | None = None) -> np.ndarray:
         """Return the domains at values of the indicators, from those before."""
 
+    def domains_at(self, z: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """Return the domains at an instant at which events may fire."""
+
     def fires(self, before: np.ndarray, now: np.ndarray) -> np.ndarray:
         """Return which events a change of domains fires."""
 
@@ -170,7 +173,7 @@ class EventSearch:
             found = min(found, t)
         at = min(int(np.searchsorted(times, found, side="right")) - 1, last - 1)
         before = _domains_at(known, at)
-        now = self._rule.domains_of(self._rule.g(found, step.interpolate(found)), before)
+        now = self._rule.domains_at(self._rule.g(found, step.interpolate(found)), before)
         return Found(found, before, now, values)
 
     # --- excursions --------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import NonFiniteError, OptionError, SimulationError, is_before, left_of
-from ..events import Domains, evaluate_many
+from ..events import Domains, Sliding, evaluate_many
 from ..results import Occurrence
 from ..solvers import Problem, Step, make_solver
 from .announced import Times, announcers
@@ -79,6 +79,7 @@ class Continuous:
             max_step=longest,
         )
         self.fixed = self.solver.fixed
+        self.sliding = Sliding(float(flat.base) if self.fixed else None)
         self.lands = rtol < TIGHT and self.solver.name in ONE_STEP
         """Whether the solver lands on every sample: the dense output is of lower order than the step."""
         if self.fixed and self.delays is not None and float(flat.base) > self.delays.shortest * (1 + 1e-12):
@@ -213,6 +214,7 @@ class Continuous:
         if not fired.any():
             return ahead and self._fire_ahead(t)
         self._fire(t, fired)
+        self.sliding.switched = True
         return True
 
     def _fire_ahead(self, t: float) -> bool:
@@ -245,8 +247,8 @@ class Continuous:
             for i in np.flatnonzero(fired):
                 self._tell(t, self.flat.events[int(i)], before)
                 self._reset_domains(self.flat.events[int(i)])
-            domains.count(t, fired)
             self._synchronize()
+            domains.count(t, workspace.here.x[self.where], fired)
             domains.land(motion, at, workspace.here.x[self.where], fired)
             fired = domains.update(at, workspace.here.x[self.where])
             if not fired.any():
@@ -288,6 +290,7 @@ class Continuous:
             Time at which a stop condition has ended the run.
         """
         workspace = self.workspace
+        self.sliding.begin_step()
         times = iter(grid)
         pending = next(times, math.inf)
         while t < end:
@@ -301,7 +304,7 @@ class Continuous:
             found = None
             while found is None and t < edge:
                 step = self._step()
-                if self.domains is not None:
+                if self.domains is not None and not self.sliding.active:
                     found = self.domains.locate(step)
                     solved = workspace.trial.x[self._loops]
                     if found is not None and step.t == end and end - found[0] <= _ULPS * math.ulp(end):
@@ -322,6 +325,7 @@ class Continuous:
             happened = found is not None
             if found is not None:
                 self._fire(t, found[1])
+                workspace.messages += self.sliding.look(self.domains, t)
             if t == edge and self.delays is not None:
                 self.delays.note_reached(t, from_source=not is_before(t, self._sources_edge))
             if t == edge < end:  # a discontinuity of a source, or one that comes out of a delay
@@ -383,6 +387,7 @@ class Continuous:
             "domains": None if self.domains is None else self.domains.save(),
             "delays": None if self.delays is None else self.delays.save(),
             "solver": self.solver.save(),
+            "sliding": self.sliding.save(),
         }
 
     def restore(self, saved: Mapping[str, Any]) -> None:
@@ -392,3 +397,4 @@ class Continuous:
         if self.delays is not None and saved["delays"] is not None:
             self.delays.restore(saved["delays"])
         self.solver.restore(saved["solver"])
+        self.sliding.restore(saved["sliding"])
