@@ -16,7 +16,8 @@ from fmpy.validation import validate_fmu
 from lxml import etree
 
 from loopwright.blocks import Block, DefinitionError, FmuError, Input, Output, State, parameter
-from loopwright.fmus import bouncing_ball, build_python
+from loopwright.blocks.core import Layout
+from loopwright.fmus import Fmu, bouncing_ball, build_python
 from loopwright.fmus.checks.summary import summarize
 from loopwright.fmus.checks.validation import validate
 
@@ -187,6 +188,23 @@ def test_numbers_are_those_of_the_closed_form(built):
     result = fmpy.simulate_fmu(str(built), stop_time=2.0, output_interval=0.125, output=NAMES)
     for row in result:  # error of the method: (4e-3)⁵ / 120 a step, 2000 steps
         assert list(row)[1:] == pytest.approx(closed_form(row[0]), abs=2e-11)
+
+
+def test_it_runs_as_a_block_with_its_scalars_as_arrays(built):
+    plant = Fmu(built, name="plant")
+    assert (plant.outputs["s"].shape, plant.outputs["z"].shape) == ((2,), (1, 2))
+    y = np.zeros(sum(int(np.prod(p.shape)) for p in plant.outputs.values()))
+    with plant.instantiate([], None) as one:
+        one.bind(np.zeros(0), y)
+        one.begin()
+        for k in range(50):
+            one.step(k * 0.02, 0.02)
+    places = Layout.of({name: p.shape for name, p in plant.outputs.items()}).slices
+    s1, s2, q, w, z1, z2 = closed_form(1.0)
+    want = {"s": [s1, s2], "q": [q], "w": [w], "z": [z1, z2]}
+    for name in want.keys() & places.keys():
+        assert y[places[name]] == pytest.approx(want[name], abs=1e-10)
+    assert {"s", "z"} <= places.keys()
 
 
 def test_parameters_start_values_and_inputs(built):
