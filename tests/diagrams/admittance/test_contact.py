@@ -8,20 +8,13 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import (
-    Block,
-    Constant,
-    Gain,
-    Input,
     OptionError,
     ParameterError,
     Reference,
-    State,
-    TransferFunction,
 )
 from loopwright.blocks.core.errors import ShapeError, UnknownNameError
 from loopwright.diagrams import (
     AdmittanceLoop,
-    Diagram,
     MeanSlope,
     StepsOnly,
     experiments,
@@ -197,85 +190,6 @@ def test_force_tracking_drifts_in_the_other_direction_and_has_its_limit(side):
     agree(found.stability_limit(damping=10.0), stability_limit(AdmittanceLoop.of(made, side), damping=10.0))
     slow = [p for p in found.loop("stiffness").modes.fixed if abs(p - 1.0) < 1e-7]
     assert len(slow) >= 1  # the drift of the other direction, which no growth rate counts
-
-
-# --- another diagram: a cart whose drive lags behind the force that it shows -----------------------------------------
-
-M, TAU, SHARE, DRAG = 3.0, 0.02, 4.0, 8.0
-"""Mass in kg, lag in s, share of the measured force that the drive adds, drag in N s/m."""
-
-
-class Cart(Block):
-    motor = Input(unit="N")
-    push = Input(unit="N")
-    position = State(unit="m", start=0.0, output=True)
-    velocity = State(unit="m/s", start=0.0, output=True)
-
-    def derivative(self, t, x, u):
-        return x.velocity, (u.motor + u.push) / M
-
-
-def cart_diagram(cart=None):
-    cart = Cart(name="cart") if cart is None else cart
-    hand = Constant(value=0.0, unit="N", name="hand")
-    felt = Gain(gain=1.0, name="sensor")(hand).named("felt")
-    lag = TransferFunction(numerator=(1.0,), denominator=(TAU, 1.0), name="drive")
-    wanted = Gain(gain=SHARE, name="share")(felt) - Gain(gain=DRAG, name="drag")(cart.velocity)
-    return Diagram("cart", cart(motor=lag(wanted), push=hand))
-
-
-@cache
-def cart_contact():
-    ports = {"position": "cart.position", "velocity": "cart.velocity", "force": "felt"}
-    return cart_diagram().contact("cart.push", direction=[1.0], **ports)
-
-
-def test_a_cart_has_the_limits_of_routh():
-    # (τ s + 1)((M + m) s² + b s + k) + DRAG s + SHARE (m s² + b s + k) = 0
-    here = cart_contact()
-    assert here.sample_time == 0.0
-    limit = here.stability_limit()
-    k = DRAG / (TAU * SHARE)
-    assert limit.value == pytest.approx(k, rel=1e-10)
-    assert limit.frequency == pytest.approx(math.sqrt((k * TAU + DRAG) / (M * TAU)), rel=1e-9)
-    assert limit.direction == (1.0,)
-    # (M + m + SHARE m)(k τ + DRAG) = (M + m) τ k (1 + SHARE), above the limit: masses make it stable
-    k = 1.5 * k
-    stable_from = M * (TAU * k * SHARE - DRAG) / ((1 + SHARE) * (k * TAU + DRAG) - TAU * k * (1 + SHARE))
-    found = here.stability_limit("mass", stiffness=k)
-    assert found.value == 0.0
-    assert found.restabilizes == pytest.approx([stable_from], rel=1e-9)
-    assert found.frequency == pytest.approx(cubic_frequency(k, 1e-4), rel=1e-9)
-
-
-def cubic_frequency(k, m):
-    roots = np.roots([(M + m) * TAU, M + m + SHARE * m, k * TAU + DRAG, k * (1 + SHARE)])
-    return float(abs(roots[np.argmax(roots.real)].imag))
-
-
-def test_a_cart_on_a_damper_has_the_limit_of_routh():
-    b = 5.0
-    # (M + b τ)(b + k τ + DRAG + SHARE b) = M τ k (1 + SHARE)
-    k = (M + b * TAU) * (b * (1 + SHARE) + DRAG) / (M * TAU * (1 + SHARE) - (M + b * TAU) * TAU)
-    assert cart_contact().stability_limit(damping=b).value == pytest.approx(k, rel=1e-10)
-
-
-def test_without_damping_a_spring_breaks_the_loop_where_the_admittance_is_no_longer_passive():
-    here = cart_contact()
-    limit, w = here.stability_limit(), here.passivity().frequency
-    assert limit.frequency == pytest.approx(w, rel=1e-9)
-    assert limit.value == pytest.approx(w / abs(here.admittance(w).rendered), rel=1e-8)
-    s = 1j * w
-    Y = (1 + SHARE / (TAU * s + 1)) / (M * s + DRAG / (TAU * s + 1))
-    assert here.admittance(w).rendered == pytest.approx(Y, rel=1e-12)
-
-
-def test_a_force_that_is_not_measured_leaves_the_drag():
-    ports = {"position": "cart.position", "velocity": "cart.velocity", "force": None}
-    here = cart_diagram().contact("cart.push", direction=[1.0], **ports)
-    assert here.stability_limit().value == math.inf
-    s = 2.0j
-    assert here.admittance(2.0).rendered == pytest.approx(1 / (M * s + DRAG / (TAU * s + 1)), rel=1e-12)
 
 
 # --- refusals --------------------------------------------------------------------------------------------------------

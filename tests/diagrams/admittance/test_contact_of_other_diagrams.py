@@ -1,0 +1,158 @@
+"""Contacts of diagrams that aren't Fig. 3, against Routh's criterion and matrices of our own."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import brentq
+
+from loopwright.blocks import Block, Constant, ForceSensor, Gain, Input, Output, State, TransferFunction
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.fmus import Fmu, scara
+
+# --- another diagram: a cart whose drive lags behind the force that it shows -----------------------------------------
+
+M, TAU, SHARE, DRAG = 3.0, 0.02, 4.0, 8.0
+"""Mass in kg, lag in s, share of the measured force that the drive adds, drag in N s/m."""
+
+
+class Cart(Block):
+    motor = Input(unit="N")
+    push = Input(unit="N")
+    position = State(unit="m", start=0.0, output=True)
+    velocity = State(unit="m/s", start=0.0, output=True)
+
+    def derivative(self, t, x, u):
+        return x.velocity, (u.motor + u.push) / M
+
+
+def cart_diagram(cart=None):
+    cart = Cart(name="cart") if cart is None else cart
+    hand = Constant(value=0.0, unit="N", name="hand")
+    felt = Gain(gain=1.0, name="sensor")(hand).named("felt")
+    lag = TransferFunction(numerator=(1.0,), denominator=(TAU, 1.0), name="drive")
+    wanted = Gain(gain=SHARE, name="share")(felt) - Gain(gain=DRAG, name="drag")(cart.velocity)
+    return Diagram("cart", cart(motor=lag(wanted), push=hand))
+
+
+@cache
+def cart_contact():
+    ports = {"position": "cart.position", "velocity": "cart.velocity", "force": "felt"}
+    return cart_diagram().contact("cart.push", direction=[1.0], **ports)
+
+
+def test_a_cart_has_the_limits_of_routh():
+    # (τ s + 1)((M + m) s² + b s + k) + DRAG s + SHARE (m s² + b s + k) = 0
+    here = cart_contact()
+    assert here.sample_time == 0.0
+    limit = here.stability_limit()
+    k = DRAG / (TAU * SHARE)
+    assert limit.value == pytest.approx(k, rel=1e-10)
+    assert limit.frequency == pytest.approx(math.sqrt((k * TAU + DRAG) / (M * TAU)), rel=1e-9)
+    assert limit.direction == (1.0,)
+    # (M + m + SHARE m)(k τ + DRAG) = (M + m) τ k (1 + SHARE), above the limit: masses make it stable
+    k = 1.5 * k
+    stable_from = M * (TAU * k * SHARE - DRAG) / ((1 + SHARE) * (k * TAU + DRAG) - TAU * k * (1 + SHARE))
+    found = here.stability_limit("mass", stiffness=k)
+    assert found.value == 0.0
+    assert found.restabilizes == pytest.approx([stable_from], rel=1e-9)
+    assert found.frequency == pytest.approx(cubic_frequency(k, 1e-4), rel=1e-9)
+
+
+def cubic_frequency(k, m):
+    roots = np.roots([(M + m) * TAU, M + m + SHARE * m, k * TAU + DRAG, k * (1 + SHARE)])
+    return float(abs(roots[np.argmax(roots.real)].imag))
+
+
+def test_a_cart_on_a_damper_has_the_limit_of_routh():
+    b = 5.0
+    # (M + b τ)(b + k τ + DRAG + SHARE b) = M τ k (1 + SHARE)
+    k = (M + b * TAU) * (b * (1 + SHARE) + DRAG) / (M * TAU * (1 + SHARE) - (M + b * TAU) * TAU)
+    assert cart_contact().stability_limit(damping=b).value == pytest.approx(k, rel=1e-10)
+
+
+def test_without_damping_a_spring_breaks_the_loop_where_the_admittance_is_no_longer_passive():
+    here = cart_contact()
+    limit, w = here.stability_limit(), here.passivity().frequency
+    assert limit.frequency == pytest.approx(w, rel=1e-9)
+    assert limit.value == pytest.approx(w / abs(here.admittance(w).rendered), rel=1e-8)
+    s = 1j * w
+    Y = (1 + SHARE / (TAU * s + 1)) / (M * s + DRAG / (TAU * s + 1))
+    assert here.admittance(w).rendered == pytest.approx(Y, rel=1e-12)
+
+
+def test_a_force_that_is_not_measured_leaves_the_drag():
+    ports = {"position": "cart.position", "velocity": "cart.velocity", "force": None}
+    here = cart_diagram().contact("cart.push", direction=[1.0], **ports)
+    assert here.stability_limit().value == math.inf
+    s = 2.0j
+    assert here.admittance(2.0).rendered == pytest.approx(1 / (M * s + DRAG / (TAU * s + 1)), rel=1e-12)
+
+
+# --- an arm: joints that are not the axes of the force ---------------------------------------------------------------
+
+ANGLES, STIFF, DAMPED, AMPLIFIED = np.array([0.07072564, 1.0852782]), 400.0, 30.0, 2.0
+ARM = scara.nominal
+JACOBIAN = np.array(ARM.dh(ANGLES))
+
+
+class JointController(Block):
+    angle = Input(shape=(2,), unit="rad")
+    rate = Input(shape=(2,), unit="rad/s")
+    force = Input(shape=(2,), unit="N")
+    torque = Output(shape=(2,), unit="N.m")
+
+    def output(self, t, x, u):
+        return AMPLIFIED * (JACOBIAN.T @ u.force) - STIFF * (u.angle - ANGLES) - DAMPED * u.rate
+
+
+def arm_diagram(sample_time=1e-3):
+    arm = Fmu(scara.build(), name="arm")
+    push = Constant(value=(0.0, 0.0), unit="N", name="push")
+
+    @subsystem(sample_time=sample_time)
+    def joints(angle, rate, acceleration, push):
+        felt = ForceSensor(name="sensor", tool_mass=0.1)(push, acceleration).named("felt")
+        return JointController(name="law")(angle, rate, felt)
+
+    torque = joints(arm.joint_angle, arm.joint_velocity, arm.acceleration, push)
+    return Diagram("arm", arm(motor_torque=torque, external_force=push))
+
+
+def arm_growth(k, b, m, direction, T=1e-3, tool=0.1):
+    """ln|z|/T of the arm's slowest pole: M q̈ = τ − D q̇ + Jᵀ F, F = −d (k dᵀp + b dᵀṗ + m dᵀp̈), p = J δq."""
+    d, J = direction[:, None], JACOBIAN
+    along = J.T @ d @ d.T @ J
+    friction = np.diag(ARM.viscous_friction + ARM.coulomb_friction / ARM.friction_width)
+    M, C, K = np.array(ARM.inertia(ANGLES)) + m * along, friction + b * along, k * along
+    A = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]])
+    B = np.vstack([np.zeros((2, 2)), np.linalg.inv(M)])
+    held = expm(T * np.block([[A, B], [np.zeros((2, 6))]]))
+    # measured: −d (k dᵀp + b dᵀṗ + m dᵀp̈) − tool p̈, with p̈ = J q̈ under the last torque
+    pick = np.vstack([np.zeros((2, 2)), np.eye(2)]).T
+    on_a = m * d @ d.T @ J + tool * J
+    by_x = -d @ d.T @ J @ np.hstack([k * np.eye(2), b * np.eye(2)]) - on_a @ pick @ A
+    by_u = -on_a @ pick @ B
+    law = np.hstack([-STIFF * np.eye(2), -DAMPED * np.eye(2)]) + AMPLIFIED * J.T @ by_x
+    u = np.hstack([law, AMPLIFIED * J.T @ by_u])
+    closed = np.vstack([np.hstack([held[:4, :4], np.zeros((4, 2))]) + held[:4, 4:] @ u, u])
+    return np.log(np.abs(np.linalg.eigvals(closed)).max()) / T
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0), (0.6, 0.8)])
+@pytest.mark.parametrize(("vary", "held"), [("stiffness", {"damping": 5.0}), ("mass", {"stiffness": 50.0})])
+def test_an_arm_has_the_limits_of_its_own_matrices(direction, vary, held):
+    ports = {"position": "arm.position", "velocity": "arm.velocity", "force": "felt"}
+    found = arm_diagram().contact("arm.external_force", direction=direction, **ports).stability_limit(vary, **held)
+    names = {"stiffness": 0.0, "damping": 0.0, "mass": 0.0, **held}
+
+    def growth(value):
+        k, b, m = (names | {vary: value}).values()
+        return arm_growth(k, b, m, np.array(direction))
+
+    assert growth(0.99 * found.value) < 0.0 < growth(1.01 * found.value)
+    expected = brentq(growth, 0.9 * found.value, 1.1 * found.value, xtol=1e-300, rtol=1e-14)
+    assert found.value == pytest.approx(expected, rel=1e-9)
+    assert found.growth_below == pytest.approx(growth(0.97 * found.value), rel=1e-6)
