@@ -29,7 +29,7 @@ from ..linearization import (
     BlockFinding,
     Linearization,
     PlantEquations,
-    Signal,
+    Tap,
     UnusualStart,
     find_signal,
     linearize,
@@ -255,7 +255,7 @@ def _collect_findings(model: Linearization, path: str) -> tuple[Finding, ...]:
 
 
 def _cut_controller(
-    model: Linearization, path: str, wires: Mapping[str, Source], flat: FlatDiagram, signal: Signal | None
+    model: Linearization, path: str, wires: Mapping[str, Source], flat: FlatDiagram, signal: Tap | None
 ) -> StateMatrices:
     """Return the matrices from the plant's outputs and the measured force to its inputs, without the plant's states."""
     own = [name.startswith((f"{path}.", f"held({path}.")) for name in model.states]
@@ -359,7 +359,7 @@ def _check_contact(
         )
 
 
-def _check_unit(diagram: WiredDiagram, path: str, ports: Ports, signal: Signal) -> None:
+def _check_unit(diagram: WiredDiagram, path: str, ports: Ports, signal: Tap) -> None:
     """Refuse a measured force in another unit than the force itself, where both are known."""
     force, measured = diagram.blocks[path].inputs[ports.force].unit, diagram.checked.units.get(signal.port)
     if isinstance(force, str) and isinstance(measured, str) and not same_unit(force, measured):
@@ -371,9 +371,7 @@ def _check_unit(diagram: WiredDiagram, path: str, ports: Ports, signal: Signal) 
         )
 
 
-def _check_force_wire(
-    path: str, ports: Ports, signal: Signal, K: StateMatrices, rows: list[int], *, direct: bool
-) -> None:
+def _check_force_wire(path: str, ports: Ports, signal: Tap, K: StateMatrices, rows: list[int], *, direct: bool) -> None:
     """Refuse a measured force that drives the force port itself: the environment's force would act twice."""
     if direct or (rows and np.any(K.D[rows, -len(signal.entries) :])):
         raise OptionError(

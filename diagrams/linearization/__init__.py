@@ -1,6 +1,6 @@
 """Linear models, operating points and trim."""
 
-from .derivatives import Signal, find_signal
+from .derivatives import Tap, find_signal
 from .findings import (
     BlockFinding,
     CutFromTracking,
@@ -31,8 +31,8 @@ __all__ = [
     "MeanSlope",
     "PlantEquations",
     "PointLike",
-    "Signal",
     "StepsOnly",
+    "Tap",
     "UnusualStart",
     "ZeroSlope",
     "capture",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ...blocks.core import OptionError, WiringError
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
-from .derivatives import LocalDerivatives, Signal
+from .derivatives import LocalDerivatives, Tap
 from .mean_stairs import NO_STAIRS, Stairs
 from .over_a_period import find_moving
 
@@ -46,7 +46,7 @@ def refuse_transport_delays(flat: FlatDiagram) -> None:
             )
 
 
-def check_opening(flat: FlatDiagram, signal: Signal) -> None:
+def check_opening(flat: FlatDiagram, signal: Tap) -> None:
     """Refuse to cut a port without consumers."""
     if signal.port in {(w.block, w.port) for w in flat.table.wires.values()}:
         return

@@ -38,8 +38,8 @@ Numbers: TypeAlias = dict[str | tuple[str, str], np.ndarray]
 
 
 @dataclass(frozen=True)
-class Signal:
-    """An output port of a diagram, or entries of it.
+class Tap:
+    """A tap: an output port of a diagram, or entries of it.
 
     Attributes
     ----------
@@ -62,7 +62,7 @@ class Signal:
     entry: tuple[int, ...] = ()
 
 
-def find_signal(flat: FlatDiagram, name: str) -> Signal:
+def find_signal(flat: FlatDiagram, name: str) -> Tap:
     """Return the port, or entries of one, that a name of a wire or port denotes.
 
     Raises
@@ -90,7 +90,7 @@ def find_signal(flat: FlatDiagram, name: str) -> Signal:
         index_of_entry = index_of(entry, part.shape, full)
         part, labels = part[index_of_entry], labels[index_of_entry]
     flat_labels = tuple(str(e) for e in np.ravel(labels))
-    return Signal(name, (wire.block, wire.port), tuple(np.ravel(part).tolist()), flat_labels, entry)
+    return Tap(name, (wire.block, wire.port), tuple(np.ravel(part).tolist()), flat_labels, entry)
 
 
 class LocalDerivatives:
@@ -100,11 +100,11 @@ class LocalDerivatives:
     ----------
     flat : FlatDiagram
         Diagram to differentiate.
-    inputs : sequence of Signal
+    inputs : sequence of Tap
         Ports at which signals d are injected: d is added to the signal of all consumers.
-    outputs : sequence of Signal
+    outputs : sequence of Tap
         Ports whose signals are measured, ahead of the injection.
-    openings : sequence of Signal
+    openings : sequence of Tap
         Ports behind which the wire is cut. Consumers get the port's value in the closed diagram, as a constant, plus
         the injected signal. The motion therefore stays that of the closed diagram.
     evaluators : mapping, optional
@@ -116,9 +116,9 @@ class LocalDerivatives:
     def __init__(
         self,
         flat: FlatDiagram,
-        inputs: Sequence[Signal],
-        outputs: Sequence[Signal],
-        openings: Sequence[Signal],
+        inputs: Sequence[Tap],
+        outputs: Sequence[Tap],
+        openings: Sequence[Tap],
         evaluators: Evaluators | None = None,
         stairs: Stairs = NO_STAIRS,
     ):

@@ -20,7 +20,7 @@ import numpy as np
 from ...blocks.core import ConfirmationError, OptionError, PeriodicLoopError
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
-from .derivatives import LocalDerivatives, Signal
+from .derivatives import LocalDerivatives, Tap
 from .over_a_period import Chain, Model, find_needed, own_states, period_of, ticks_of_period
 
 SAME_ROWS = 1e-12
@@ -164,7 +164,7 @@ def model_loop(
     return model, [f"{labels[e]}@{j}" if len(groups[e]) > 1 else labels[e] for e, j, _ in chosen]
 
 
-def _make_error(signal: Signal, count: int, period: float) -> PeriodicLoopError:
+def _make_error(signal: Tap, count: int, period: float) -> PeriodicLoopError:
     return PeriodicLoopError(
         f"{signal.name!r} is renewed {count} times in the model's period of {period:g} s; expected once: its loop is "
         f"periodic and has no L at one rate. Take loop({signal.name!r}, slow='open') for the loop at its own rate, "
@@ -175,7 +175,7 @@ def _make_error(signal: Signal, count: int, period: float) -> PeriodicLoopError:
     )
 
 
-def _find_renewals(flat: FlatDiagram, signals: Sequence[Signal], ticks: Sequence[int]) -> list[list[int]]:
+def _find_renewals(flat: FlatDiagram, signals: Sequence[Tap], ticks: Sequence[int]) -> list[list[int]]:
     """Return the groups of places in ``ticks`` between the renewals of the wires; empty if no one clock renews them."""
     clock = _find_one_clock(flat, [signal.port for signal in signals])
     if clock is None or not clock.acts(ticks[0]):

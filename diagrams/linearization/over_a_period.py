@@ -20,7 +20,7 @@ from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
 from ..simulation import announcers
-from .derivatives import LocalDerivatives, Numbers, Signal
+from .derivatives import LocalDerivatives, Numbers, Tap
 from .findings import EventWithinPeriod, MemoryActs, UnusualStart
 from .plant_models import PlantModel, fmu_at, inputs_before, join_matrices, model_steps, states_of
 
@@ -314,7 +314,7 @@ def find_moving(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) 
     return tuple(signal.name for signal, where in injected if np.any(by_d[:, where]) and is_moving(flat, signal))
 
 
-def is_moving(flat: FlatDiagram, signal: Signal) -> bool:
+def is_moving(flat: FlatDiagram, signal: Tap) -> bool:
     """Whether a signal follows continuous states between two ticks."""
     return bool(flat.output(signal.port).depends("y", "x")[:, flat.continuous].any())
 

@@ -11,7 +11,7 @@ from ...fmus.running import Derivation, DerivativeMethod
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
-from .derivatives import LocalDerivatives, Signal, find_signal
+from .derivatives import LocalDerivatives, Tap, find_signal
 from .over_a_period import find_moving, is_moving
 from .plant_models import linearize_equations
 
@@ -112,6 +112,6 @@ def moves_between_ticks(diagram: WiredDiagram, at: OperatingPoint, outputs: list
     flat = diagram.flatten(at.base)
     signals = [find_signal(flat, name) for name in outputs]
     local = LocalDerivatives(flat, signals, [], signals)
-    sources: list[Signal] = [find_signal(flat, name) for name in inputs]
+    sources: list[Tap] = [find_signal(flat, name) for name in inputs]
     names = [*find_moving(flat, local, at), *(s.name for s in sources if is_moving(flat, s))]
     return names[0] if names else ""

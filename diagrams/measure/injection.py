@@ -11,7 +11,7 @@ import numpy as np
 
 from ...blocks.core import Array, Block, Output, Sum, WiringError, parameter
 from ..flat import FlatDiagram, WiredDiagram
-from ..linearization import Signal
+from ..linearization import Tap
 from ..results import OperatingPoint
 from ..simulation import RunOptions, Simulation, copy_states
 from ..wiring import SubsystemSettings, Wire
@@ -77,7 +77,7 @@ class InjectedDiagram:
 
 
 def inject_signal(
-    diagram: WiredDiagram, signal: Signal, lines: int, held: tuple[Fraction, Fraction] | None
+    diagram: WiredDiagram, signal: Tap, lines: int, held: tuple[Fraction, Fraction] | None
 ) -> InjectedDiagram:
     """Return a diagram in which every consumer of a port gets the port's signal plus a test signal.
 
@@ -85,7 +85,7 @@ def inject_signal(
     ----------
     diagram : WiredDiagram
         Diagram without the test signal.
-    signal : Signal
+    signal : Tap
         Port.
     lines : int
         Number of lines of the test signal.
@@ -148,9 +148,9 @@ class InjectionRun:
         Diagram without the test signal.
     made : InjectedDiagram
         Diagram with the test signal.
-    signal : Signal
+    signal : Tap
         Port to which the test signal is added.
-    outputs : iterable of Signal
+    outputs : iterable of Tap
         Other signals to measure.
     point : OperatingPoint or None
         Beginning of the run; the start of the diagram without it.
@@ -159,7 +159,7 @@ class InjectionRun:
     """
 
     def __init__(
-        self, diagram: WiredDiagram, made: InjectedDiagram, signal: Signal, outputs: Iterable[Signal],
+        self, diagram: WiredDiagram, made: InjectedDiagram, signal: Tap, outputs: Iterable[Tap],
         point: OperatingPoint | None, options: Mapping[str, Any],
     ):  # fmt: skip
         self.made, self.signal, self.outputs = made, signal, list(outputs)
@@ -244,7 +244,7 @@ class InjectionRun:
         return v, u, np.hstack([np.zeros((count + 1, 0)), *y])
 
 
-def _translate_point(point: OperatingPoint, old: FlatDiagram, made: InjectedDiagram, signal: Signal) -> OperatingPoint:
+def _translate_point(point: OperatingPoint, old: FlatDiagram, made: InjectedDiagram, signal: Tap) -> OperatingPoint:
     """Return an operating point of the diagram as one of the diagram with the test signal."""
     new = made.diagram.flatten(point.base)
     x = new.x0.copy()

@@ -16,7 +16,7 @@ from ...fmus.running import Fmu
 from ..admittance import check_plant, control_rate, is_discrete
 from ..document import Texts
 from ..flat import WiredDiagram
-from ..report import Basis, Case, Excitation, Implementation, Variant, point_of
+from ..report import Basis, Case, Implementation, InjectionPlan, Variant, point_of
 from ..results import OperatingPoint
 from .reduced_loops import FRICTION, NO_FRICTION, ReducedLoops
 
@@ -183,7 +183,7 @@ class Fig3Case(Case):
         """Return the virtual inputs."""
         return {side: f"controller.{name}" for side, name in SIDES.items()}
 
-    def excitation(self, variant: Variant, wire: str) -> Excitation:
+    def excitation(self, variant: Variant, wire: str) -> InjectionPlan:
         """Return the test signal, for a variant whose references are held, so that it stays where it is."""
         changes: dict[str, Any] = {
             path: Constant(value=0.0, unit=block.unit, name=path)
@@ -193,7 +193,7 @@ class Fig3Case(Case):
         for name in REFERENCES:
             if f"{name}.y" in variant.point.values:
                 changes[name] = Reference(float(np.ravel(variant.point.values[f"{name}.y"])[0]), unit="m", name=name)
-        return Excitation(variant.with_parameters(changes), FREQUENCIES, AMPLITUDE)
+        return InjectionPlan(variant.with_parameters(changes), FREQUENCIES, AMPLITUDE)
 
     @cached_property
     def _elsewhere(self) -> WeakKeyDictionary[Variant, dict[tuple[float, float], Variant | None]]:

@@ -13,7 +13,7 @@ from .analysis import (
     UNSTABLE,
     analyse,
 )
-from .case import Basis, Case, Excitation
+from .case import Basis, Case, InjectionPlan
 from .disks import disk_numbers, disk_range
 from .drawings import with_drawing
 from .parts import MakesSections, ReportKind, ReportPart
@@ -42,8 +42,8 @@ __all__ = [
     "UNSTABLE",
     "Basis",
     "Case",
-    "Excitation",
     "Implementation",
+    "InjectionPlan",
     "MakesSections",
     "ReportKind",
     "ReportPart",

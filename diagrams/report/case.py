@@ -45,7 +45,7 @@ class Basis(NamedTuple):
     is_design: bool = True
 
 
-class Excitation(NamedTuple):
+class InjectionPlan(NamedTuple):
     """A test signal: the variant that it is added to, frequencies in rad/s, and the amplitude."""
 
     variant: Variant
@@ -112,7 +112,7 @@ class Case:
         """Return the wires at which loops are looked at, by their keys in the report."""
         return wires_on_loops(self.diagram, self.wires)
 
-    def excitation(self, variant: Variant, wire: str) -> Excitation:
+    def excitation(self, variant: Variant, wire: str) -> InjectionPlan:
         """Return the test signal of the injection check: small, and spread around the poles of the diagram."""
         dt = variant.model.dt
         w = np.abs(in_s(variant.model.poles, dt))
@@ -121,7 +121,7 @@ class Case:
         source = variant.diagram.names.get(wire)
         path = wire if source is None else f"{source.block}.{source.port}"
         value = np.ravel(variant.point.values.get(path, 0.0))
-        return Excitation(
+        return InjectionPlan(
             variant,
             np.geomspace(centre / 10, min(centre * 3, 0.5 * np.pi / dt), 5),
             AMPLITUDE * (1.0 + float(np.max(np.abs(value), initial=0.0))),
