@@ -74,6 +74,9 @@ class Fmu(Block):
             raise ParameterError(
                 f"found {self.ports!r}; expected a list of names of variables.", block=who, port="ports"
             )
+        for old, new in self.rename.items():
+            if not isinstance(old, str) or not isinstance(new, str):
+                raise ParameterError(f"found {old!r}: {new!r}; expected two names.", block=who, port="rename")
         try:
             description = read_description(self.file)
         except FmuError as error:

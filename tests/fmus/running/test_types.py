@@ -1,5 +1,7 @@
 """Variables of all types on wires and as start values, and the choice of ports."""
 
+import pickle
+
 import fmpy
 import numpy as np
 import pytest
@@ -239,6 +241,15 @@ def test_a_tunable_parameter_changes_in_a_run_and_a_local_variable_is_read(file)
 def test_wrong_ports_are_refused(file3, ports, error, text):
     with pytest.raises(error, match=rf"^plant\.ports: {text}"):
         Fmu(file3, name="plant", ports=ports)
+
+
+def test_a_block_with_chosen_ports_is_a_value(file3):
+    plant = Fmu(file3, name="plant", ports=["u_Int8", "y_Int8"], rename={"u_Int8": "u"}, start={"path": "x"})
+    assert pickle.loads(pickle.dumps(plant)) == plant == plant.replace()
+    assert plant != plant.replace(ports=None)
+    assert [*plant.inputs] == ["u"]
+    with pytest.raises(ParameterError, match=r"^plant\.rename: found 'u_Int8': 3; expected two names"):
+        plant.replace(rename={"u_Int8": 3})
 
 
 def test_variables_that_no_wire_carries_are_said(file3):
