@@ -1,4 +1,4 @@
-"""What an environment feels at the plant of a diagram: admittance, passivity and limits of coupled stability."""
+"""Contact of an environment with the plant of a diagram: admittance, passivity and limits of coupled stability."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class Joined(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """What the controller gets at a tick, by x, by the last u, by the new u and by F_ext."""
+    """Inputs of the controller at a tick, by x, by the last u, by the new u and by F_ext."""
 
     x: np.ndarray
     last: np.ndarray
