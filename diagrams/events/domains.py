@@ -25,7 +25,7 @@ import numpy as np
 
 from ...blocks.core import SimulationError
 from ..flat import FlatDiagram, FlatEvent
-from ..solvers import Step
+from ..solvers import AcceptedStep
 from .limits import EventLimits
 from .search import EventSearch, Many
 
@@ -194,7 +194,7 @@ class Domains:
         self.limits.note_left_border(fired, self.domain, now)
         self.take(now)
 
-    def locate(self, step: Step) -> tuple[float, np.ndarray] | None:
+    def locate(self, step: AcceptedStep) -> tuple[float, np.ndarray] | None:
         """Return the first instant in a step at which events fire, and which; None if none does."""
         found = self.search.first_event(step)
         if found is None:

@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ...blocks.core import SimulationError
-from ..solvers import Step
+from ..solvers import AcceptedStep
 
 _SAMPLES = 4
 _HALVINGS = 40
@@ -93,7 +93,7 @@ class EventSearch:
         self.fresh = True
         """Whether an event has fired since the last step without one: others may follow closely."""
 
-    def first_event(self, step: Step) -> Found | None:
+    def first_event(self, step: AcceptedStep) -> Found | None:
         """Return the first instant in (t_old, t] at which events fire; if none does, None: domains are those at t."""
         instants = self._instants(step.t_old, step.t)
         first, width = 1, _FEW
@@ -117,7 +117,7 @@ class EventSearch:
         found = np.concatenate(([a], close, inner, [b - _CLOSE * h, b]))
         return found[np.concatenate(([True], found[1:] > found[:-1]))]
 
-    def _first_among(self, step: Step, times: np.ndarray, k: int) -> Found | None:
+    def _first_among(self, step: AcceptedStep, times: np.ndarray, k: int) -> Found | None:
         """Look at instants from number ``k`` on; the domains known are those of the one before."""
         rule = self._rule
         z, opened = self._many(times, step.interpolate_many(times))
@@ -159,7 +159,7 @@ class EventSearch:
 
     def _earliest(
         self,
-        step: Step,
+        step: AcceptedStep,
         times: np.ndarray,
         last: int,
         ends: list[tuple[int, float, float]],
@@ -204,7 +204,7 @@ class EventSearch:
         return dips
 
     def _follow_dips(
-        self, step: Step, times: np.ndarray, z: np.ndarray, k: int, which: np.ndarray, known: list[Known]
+        self, step: AcceptedStep, times: np.ndarray, z: np.ndarray, k: int, which: np.ndarray, known: list[Known]
     ) -> list[tuple[int, float, float]]:
         """Return those that were in the other domain between instants k − 2 and k, and between which times to look."""
         first, last = float(times[k - 2]), float(times[k])
@@ -219,7 +219,7 @@ class EventSearch:
                 found.append((int(i), first, t))
         return found
 
-    def _find_closest(self, i: int, side: int, low: float, high: float, step: Step) -> float:
+    def _find_closest(self, i: int, side: int, low: float, high: float, step: AcceptedStep) -> float:
         """Return the instant at which an indicator is closest to the other domain."""
         from scipy.optimize import minimize_scalar
 
@@ -231,7 +231,7 @@ class EventSearch:
 
     # --- location ----------------------------------------------------------------------------------------------------
 
-    def _find_root(self, i: int, a: float, b: float, step: Step, before: np.ndarray) -> tuple[float, float]:
+    def _find_root(self, i: int, a: float, b: float, step: AcceptedStep, before: np.ndarray) -> tuple[float, float]:
         """Return the time at which indicator ``i`` has just left its domain, between a and b, where it has.
 
         Also the larger one of its distances from there on both sides.

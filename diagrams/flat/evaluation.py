@@ -15,7 +15,7 @@ import numpy as np
 
 from ...blocks.core import Layout, SimulationError
 from ...blocks.tracing import GUARDS, NEXT, size
-from ..wiring import Step, Wire, join
+from ..wiring import OrderStep, Wire, join
 from .block_functions import BlockFunctions, call_block
 from .layout import FlatLayout, TickPattern
 from .logic import choose, is_true, logic_and, logic_not, logic_or, to_number
@@ -39,7 +39,7 @@ def evaluate(
     *,
     fired: Any = None,
     opened: bool = False,
-    order: Iterable[Step] | None = None,
+    order: Iterable[OrderStep] | None = None,
     before: Callable[[str, dict[str, Any]], None] | None = None,
     visit: Callable[[Instant, str, dict[str, Any], dict[str, Any]], None] | None = None,
     taps: Mapping[tuple[str, str], Callable[[Any], Any]] | None = None,
@@ -61,7 +61,7 @@ def evaluate(
         Which of the diagram's events fire; without it none does.
     opened : bool
         Evaluate every subsystem as if it acted.
-    order : iterable of Step, optional
+    order : iterable of OrderStep, optional
         Another order than that of a tick.
     before, visit : callable, optional
         ``before(path, inputs)`` is called ahead of each block, ``visit(instant, path, inputs, made)`` after it, with
@@ -132,7 +132,7 @@ class Instant:
 
     def run(
         self,
-        order: Iterable[Step],
+        order: Iterable[OrderStep],
         before: Callable[[str, dict[str, Any]], None] | None,
         visit: Callable[[Instant, str, dict[str, Any], dict[str, Any]], None] | None,
     ) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from ...blocks.core import NonFiniteError, OptionError, SimulationError, is_before, left_of
 from ..events import Domains, Sliding, evaluate_many
 from ..results import Occurrence
-from ..solvers import Problem, Step, make_solver
+from ..solvers import AcceptedStep, Problem, make_solver
 from .announced import Times, announcers
 from .diagnosis import forget_trials, opaque_failure, state_values
 from .left_of_start import domains_from_left
@@ -347,7 +347,7 @@ class Continuous:
             found = self._explain(error)
             raise found from found.__cause__
 
-    def _step(self) -> Step:
+    def _step(self) -> AcceptedStep:
         try:
             return self.solver.step()
         except SimulationError as error:

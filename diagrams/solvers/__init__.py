@@ -1,11 +1,11 @@
 """Solvers of fixed and variable step behind one interface."""
 
-from .base import Problem, Step, solver_name
+from .base import AcceptedStep, Problem, solver_name
 from .choose import make_solver
 
 __all__ = [
+    "AcceptedStep",
     "Problem",
-    "Step",
     "make_solver",
     "solver_name",
 ]

@@ -77,7 +77,7 @@ class Statistics:
     messages: list[str] = field(default_factory=list)
 
 
-class Step:
+class AcceptedStep:
     """One accepted step, from ``t_old`` to ``t``, where the state is ``x``."""
 
     __slots__ = ("_dense", "_prepare", "t", "t_old", "x")
@@ -120,7 +120,7 @@ class Solver(ABC):
         """Start at (t, x), up to ``stop``: after each discontinuity, and at the start."""
 
     @abstractmethod
-    def step(self) -> Step:
+    def step(self) -> AcceptedStep:
         """Take one step that the error control accepts, at most to ``stop``."""
 
     def save(self) -> dict[str, Any]:
@@ -198,7 +198,7 @@ class VariableStep(Solver):
         if not sliver:
             self._start(t, x)
 
-    def step(self) -> Step:
+    def step(self) -> AcceptedStep:
         """Take one step that the error control accepts, at most to ``stop``."""
         if self._sliver is None:
             step = self._advance()
@@ -210,9 +210,9 @@ class VariableStep(Solver):
         f = self.rate(t, x)
         self.check_finite(t, f, "rate")
         self.statistics.steps += 1
-        return Step(t, self.stop, _heun(self.rate, t, x, f, self.stop), lambda: lambda time: x + (time - t) * f)
+        return AcceptedStep(t, self.stop, _heun(self.rate, t, x, f, self.stop), lambda: lambda time: x + (time - t) * f)
 
-    def _check_progress(self, step: Step) -> None:
+    def _check_progress(self, step: AcceptedStep) -> None:
         """Raise if the last steps were so small that the run would never end, as at a jump that is no event."""
         h, self._mark = (step.t - self._mark) / _STRETCH, step.t
         if self.stop - step.t > _HOPELESS * h:
@@ -224,7 +224,7 @@ class VariableStep(Solver):
         """Start the method at (t, x), up to ``self.stop``."""
 
     @abstractmethod
-    def _advance(self) -> Step:
+    def _advance(self) -> AcceptedStep:
         """Take one step of the method."""
 
 
@@ -247,7 +247,7 @@ class FixedStep(Solver):
         self._x, self.stop, self._done = np.array(x, dtype=float), float(stop), 0
         self._count = max(1, math.ceil((self.stop - self._t) / self.max_step * (1 - 1e-9)))
 
-    def step(self) -> Step:
+    def step(self) -> AcceptedStep:
         """Take one step."""
         t, x = self._t, self._x
         self._done += 1
@@ -263,7 +263,7 @@ class FixedStep(Solver):
             f = x_new = x
         self._t, self._x = t_new, x_new
         self.statistics.steps += 1
-        return Step(t, t_new, x_new.copy(), lambda: lambda time: self._formula(self.rate, t, x, f, time))
+        return AcceptedStep(t, t_new, x_new.copy(), lambda: lambda time: self._formula(self.rate, t, x, f, time))
 
 
 def euler(rate: Callable[..., np.ndarray], t: float, x: np.ndarray, f: np.ndarray, t_new: float) -> np.ndarray:

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import NonFiniteError, OptionError
-from .base import Dense, Problem, Statistics, Step, VariableStep
+from .base import AcceptedStep, Dense, Problem, Statistics, VariableStep
 from .dense_output import from_derivatives
 
 _ADAMS, _BDF, _ONE_STEP = 1, 2, 2
@@ -200,14 +200,14 @@ class Cvode(VariableStep):
         self._check(self._library.CVodeReInit(self._memory, t, self._x))
         self._check(self._library.CVodeSetStopTime(self._memory, self.stop))
 
-    def _advance(self) -> Step:
+    def _advance(self) -> AcceptedStep:
         t, x_old = self._t, self._x_old
         self._check(self._library.CVode(self._memory, self.stop, self._x, byref(self._t_new), _ONE_STEP))
         self._t, self._x_old = self._t_new.value, self._calls.vector(self._x).copy()
         self.check_finite(self._t, self._x_old, "state")
         self.statistics.steps += 1
         self.statistics.rejected = self._fails + self._count_failed_tests()
-        return Step(t, self._t, self._x_old.copy(), lambda: self._prepare_dense(t, x_old))
+        return AcceptedStep(t, self._t, self._x_old.copy(), lambda: self._prepare_dense(t, x_old))
 
     def _count_failed_tests(self) -> int:
         count = c_long()

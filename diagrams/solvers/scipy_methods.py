@@ -24,7 +24,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...blocks.core import SimulationError
-from .base import Dense, Problem, Step, VariableStep
+from .base import AcceptedStep, Dense, Problem, VariableStep
 from .dense_output import OneStepDense, from_differences, from_nordsieck
 
 _ATTEMPT = {"RK23": 3, "RK45": 6, "DOP853": 12}  # evaluations of the rates per attempted step
@@ -130,7 +130,7 @@ class SciPySolver(VariableStep):
                 self._inner = self._method(self.rate, t, x, self.stop, first_step=first, **self._options)
         self._started = True
 
-    def _advance(self) -> Step:
+    def _advance(self) -> AcceptedStep:
         inner = self._inner
         before = self.statistics.rate_evaluations
         planned = 0.0 if self.name == "LSODA" else inner.h_abs
@@ -143,7 +143,7 @@ class SciPySolver(VariableStep):
         if self.name not in _MULTISTEP:  # a step that was cut at the stop says little about the next
             self.planned = max(planned, inner.h_abs) if inner.t == self.stop else inner.h_abs
         self.statistics.steps += 1
-        return Step(float(t_old), float(inner.t), inner.y.copy(), lambda: self._prepare_dense(t_old, x_old))
+        return AcceptedStep(float(t_old), float(inner.t), inner.y.copy(), lambda: self._prepare_dense(t_old, x_old))
 
     def _attempt_step(self) -> tuple[float, np.ndarray]:
         """Take a step, a shorter one where it ends at rates that are not finite; return the time and state before."""
@@ -232,7 +232,7 @@ class AutoSolver(VariableStep):
     def _start(self, t: float, x: np.ndarray) -> None:
         self._active.restart(t, x, self.stop)
 
-    def _advance(self) -> Step:
+    def _advance(self) -> AcceptedStep:
         try:
             step = self._active.step()
         except SimulationError:
@@ -263,7 +263,7 @@ class AutoSolver(VariableStep):
         if t < self.stop:
             to.restart(t, x, self.stop)
 
-    def _is_stiff(self, step: Step) -> bool:
+    def _is_stiff(self, step: AcceptedStep) -> bool:
         inner, border = self._explicit._inner, _STABLE[self._explicit.name]
         h, stages, last = step.t - step.t_old, inner.K, inner.n_stages - 1
         if inner.y_old is None or inner.y is None:
@@ -291,7 +291,7 @@ class AutoSolver(VariableStep):
             return -math.inf
         return float(np.linalg.eigvals(jacobian).real.min()) if np.isfinite(jacobian).all() else 0.0
 
-    def _has_eased(self, step: Step) -> bool:
+    def _has_eased(self, step: AcceptedStep) -> bool:
         scale = self.atol + self.rtol * np.abs(step.x)
         with np.errstate(all="ignore"):
             norm = (np.abs(self._implicit._inner.J) @ scale / scale).max()  # in the units of the error control

@@ -3,7 +3,7 @@
 from .check import Checked
 from .checked_diagram import CheckedDiagram
 from .cycles import find_cyclic_parts
-from .entry_order import Step
+from .entry_order import OrderStep
 from .order import Order, evaluation_order
 from .structure import Collector, Structure, SubsystemSettings, Wire, join, stepped_blocks
 from .subsystems import Subsystem, exact_time, subsystem
@@ -14,7 +14,7 @@ __all__ = [
     "CheckedDiagram",
     "Collector",
     "Order",
-    "Step",
+    "OrderStep",
     "Structure",
     "Subsystem",
     "SubsystemSettings",

@@ -18,7 +18,7 @@ from ...blocks.tracing import GUARDS, NEXT, Traced, size
 from .structure import Structure, Wire
 
 Port = tuple[str, str]
-Step = tuple[str, tuple[str, ...]]
+OrderStep = tuple[str, tuple[str, ...]]
 """A block's path, and its equations that are evaluated together: outputs by name, next state, guards."""
 Entry = tuple[str, str, int]
 """A block's path, the name of an equation, and an entry of it; next state and guards have one entry."""
@@ -56,7 +56,7 @@ class EntryOrder:
             whole = start and table.blocks[path].starts_from_inputs
             self._add(path, name, waits[path, name], whole=whole)
 
-    def sort(self, torn: Iterable[Port] = ()) -> tuple[list[Step], dict[Port, set[Port]]]:
+    def sort(self, torn: Iterable[Port] = ()) -> tuple[list[OrderStep], dict[Port, set[Port]]]:
         """Return the steps that can be evaluated, in order, and for each port that is still stuck those it waits for.
 
         Parameters
@@ -80,7 +80,7 @@ class EntryOrder:
         part = [*ready]
         heapq.heapify(whole)
         heapq.heapify(part)
-        steps: list[Step] = []
+        steps: list[OrderStep] = []
         while whole or part:
             path = heapq.heappop(whole) if whole else heapq.heappop(part)
             now = ready.pop(path, [])

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 from ...blocks.core import AlgebraicLoopError
 from ...blocks.tracing import GUARDS, NEXT, Traced
-from .entry_order import EntryOrder, Port, Step
+from .entry_order import EntryOrder, OrderStep, Port
 from .structure import Structure
 
 
@@ -46,7 +46,7 @@ class Order:
 
     Attributes
     ----------
-    steps : list of Step
+    steps : list of OrderStep
         Equations to evaluate, block by block.
     torn : tuple of Port
         Output ports whose values are taken as known.
@@ -54,7 +54,7 @@ class Order:
         Every algebraic loop, printed port by port.
     """
 
-    steps: list[Step]
+    steps: list[OrderStep]
     torn: tuple[Port, ...] = ()
     loops: tuple[str, ...] = ()
 
@@ -119,7 +119,7 @@ def _tear(traced: Mapping[str, Traced], within: Mapping[Port, set[Port]]) -> Ite
                     known.append(port)
 
 
-def _sort(traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]]) -> tuple[list[Step], set[Port]]:
+def _sort(traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]]) -> tuple[list[OrderStep], set[Port]]:
     """Return the steps that can be evaluated, in order, and the ports that are stuck in or behind loops."""
     missing = {port: len(sources) for port, sources in waits.items()}
     consumers: dict[Port, list[Port]] = defaultdict(list)
@@ -133,7 +133,7 @@ def _sort(traced: Mapping[str, Traced], waits: Mapping[Port, set[Port]]) -> tupl
     part = [path for path in names if ready[path]]
     heapq.heapify(whole)
     heapq.heapify(part)
-    order: list[Step] = []
+    order: list[OrderStep] = []
     while whole or part:
         path = heapq.heappop(whole) if whole else heapq.heappop(part)
         now = tuple(n for n in names[path] if n in ready[path])
