@@ -72,6 +72,7 @@ def as_in_a_table(value):
     return "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.6g}"
 
 
+@pytest.mark.slow
 def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_path):
     text, scope = (ROOT / "docs" / "frequency.md").read_text(encoding="utf-8"), {}
     with chdir(tmp_path):
@@ -91,6 +92,7 @@ def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_pat
     assert f"here {scope['sign'].frequency:.3f} rad/s" in text
 
 
+@pytest.mark.slow
 def test_the_page_on_export_runs(tmp_path):
     text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
     model, *more = blocks_of_code(text)
@@ -126,6 +128,7 @@ def test_the_page_on_export_tells_the_flags_as_they_are(fmi, model, tmp_path, un
         assert told == attributes, interface
 
 
+@pytest.mark.slow
 def test_the_code_of_a_notebook_runs(monkeypatch):
     monkeypatch.chdir(ROOT / "notebooks")
     notebook, scope = nbformat.read(ROOT / "notebooks" / f"{QUICK}.ipynb", as_version=4), {}

@@ -37,6 +37,7 @@ def tight(*calls, duration, **options):
     return simulate(*calls, duration=duration, rtol=1e-11, atol=1e-12, **options)
 
 
+@pytest.mark.slow
 def test_an_integrator_that_resets_itself_is_a_sawtooth():
     tooth = ResettableIntegrator(name="tooth")
     full = Compare(relation=">", name="full")(tooth.y, Constant(value=0.7))
@@ -56,6 +57,7 @@ def test_at_ticks_it_resets_itself_by_its_value_before():
     assert run["box.tooth.y"].tolist() == [0.0, 0.25, 0.5, 0.0, 0.25, 0.5, 0.0, 0.25, 0.5]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("T", [None, 0.01], ids=["continuous", "sampled"])
 def test_a_limited_integrator_leaves_its_limit_at_once(T):
     @subsystem(sample_time=T)

@@ -112,6 +112,7 @@ def test_the_area_under_a_quantized_sine_is_that_of_its_steps():
     assert run["area.y"][-1] == pytest.approx(steps, abs=1e-11)
 
 
+@pytest.mark.slow
 def test_play_in_a_diagram_carries_what_follows():
     wave, area = Wave(), Area()
     run = Diagram("d", area(Backlash(width=0.6, with_rate=True)(wave.y, wave.rate))).simulate(3.0, **TIGHT)
@@ -215,6 +216,7 @@ def test_a_requirement_stops_the_run_where_it_breaks_and_keeps_what_was_recorded
     assert error.value.run.t[-1] > 7.9
 
 
+@pytest.mark.slow
 def test_a_recorded_violation_lets_the_run_go_on():
     room = Lag(time_constant=10.0, name="room")
     cool = Requirement("cool", upper=5.5, on_violation="record", name="cool")

@@ -162,6 +162,7 @@ def rates_by_hand(m, d, k, e, reference, drive, held, acceleration_limit=np.inf)
     return np.array([e[1], a - r2])
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(4)
 @EVERY
 @EACH
@@ -189,6 +190,7 @@ def test_in_continuous_time_the_acceleration_is_cut_and_zero_at_the_speed_limit(
     assert stopped == 100 * has_speed
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize("name", ["velocity", "both"])
 def test_in_continuous_time_it_runs_into_the_speed_limit_and_out_of_it_at_events(name):

@@ -394,6 +394,7 @@ def test_contact_curvature_is_smooth_where_its_series_takes_over():
             assert value == pytest.approx(float(exact), rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize("name", ["closed spline", "open spline", "bean", "three points, closed"])
 def test_up_to_its_reach_a_point_is_the_nearest_and_beyond_it_is_not(name):

@@ -72,6 +72,7 @@ def test_stiffness_limits_of_the_rigid_gantry_are_those_by_hand(side, name, damp
     assert found.environment == {"damping": damping}
 
 
+@pytest.mark.slow
 @SIDE
 def test_mass_limits_of_the_rigid_gantry_are_those_by_hand(side):
     agree(contact(side=side).stability_limit("mass"), stability_limit(by_hand(side=side), "mass"))
@@ -103,7 +104,7 @@ def placed(eta, xi, **changes):
     return diagram().replace(changes)
 
 
-@pytest.mark.drawn
+@pytest.mark.drawn(1)
 @SIDE
 @pytest.mark.parametrize(("eta", "xi"), [(0.2, 0.0), (0.2, -0.02), (0.5, 0.02)])
 @pytest.mark.parametrize("friction", [True, False])
@@ -137,6 +138,7 @@ def test_a_block_as_plant_has_the_limits_of_its_fmu():
     agree(found, contact().stability_limit(damping=10.0))
 
 
+@pytest.mark.slow
 def test_differences_show_their_error(tmp_path):
     made = experiments.compliance(plant=undirected(gantry_elastic.build(), tmp_path)).diagram
     found = made.contact()
@@ -147,6 +149,7 @@ def test_differences_show_their_error(tmp_path):
     assert 1e-9 * limit.value < limit.tolerance < 0.01 * limit.value
 
 
+@pytest.mark.slow
 def test_the_first_sample_of_a_force_sensor_is_no_model_of_it():
     made = diagram().replace({"sensors.force_sensor.tool_mass": 0.2})  # at t = 0 it takes the acceleration as zero
     expected = stability_limit(AdmittanceLoop.of(made, "perp"), "mass")
@@ -182,6 +185,7 @@ def test_a_tool_breaks_the_other_direction_whatever_touches_the_robot():
     assert contact(side="par").stability_limit(tool_mass=0.65).value == 0.0
 
 
+@pytest.mark.slow
 @SIDE
 def test_force_tracking_drifts_in_the_other_direction_and_has_its_limit(side):
     free = {name: FORCE_TRACKING[name].replace(name=f"admittance_{name}") for name in ("par", "perp")}
@@ -216,6 +220,7 @@ def test_ports_that_make_no_contact_are_refused(arguments, error, words):
         diagram().contact(**arguments)
 
 
+@pytest.mark.slow
 def test_a_plant_without_a_model_of_its_equations_is_refused(tmp_path):
     made = experiments.compliance(plant=hidden(gantry.build(), tmp_path)).diagram
     with pytest.raises(ParameterError, match="An identified model does not do: it holds the force over a sample"):

@@ -141,6 +141,7 @@ def arm_growth(k, b, m, direction, T=1e-3, tool=0.1):
     return np.log(np.abs(np.linalg.eigvals(closed)).max()) / T
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (0.6, 0.8)])
 @pytest.mark.parametrize(("vary", "held"), [("stiffness", {"damping": 5.0}), ("mass", {"stiffness": 50.0})])
 def test_an_arm_has_the_limits_of_its_own_matrices(direction, vary, held):

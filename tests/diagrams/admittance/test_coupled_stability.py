@@ -125,6 +125,7 @@ def from_the_start(model, push, ticks, **environment):
     return np.array(found)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(3)
 @SIDE
 @pytest.mark.parametrize("name", VARIANTS)
@@ -487,6 +488,7 @@ def test_the_co_simulation_grows_as_predicted_on_both_sides_of_a_mass_limit(name
     assert late < math.exp(0.8 * limit.growth_below * 4.0) * early < early
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damping", [0.0, pytest.param(20.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("plant", [SMOOTH, pytest.param(ROUGH, marks=pytest.mark.slow)], ids=["smooth", "rough"])
 def test_force_tracking_against_the_wall_of_the_contact_plant(plant, damping):

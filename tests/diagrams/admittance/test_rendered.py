@@ -133,6 +133,7 @@ LOOPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize("name", LOOPS)
 @pytest.mark.parametrize("hertz", [1.0, 10.0, 60.0])

@@ -196,6 +196,7 @@ def test_an_elastic_plant_has_no_reduced_loop(side):
     assert refusal(diagram(gantry_elastic), side=side, plant=gantry_elastic.nominal) == ELASTIC
 
 
+@pytest.mark.slow
 def test_bristles_and_amplifiers_are_hidden_states():
     assert "plant: found 6 states (position, velocity, bristle); expected 4" in refusal(diagram(gantry_stiction))
     assert "plant: found 6 states (position, velocity, amplified); expected 4" in refusal(own(Amplified()))
@@ -348,6 +349,7 @@ def test_a_report_of_another_plant_has_the_limits_of_its_contact_and_says_why(pl
         assert late.value < numbers[f"admittance.{side}.ke_limit.sampled_d0.be_10"].value
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [{"encoder": 1e-6}, {"plant": None}])
 def test_a_report_without_a_contact_to_tell_says_why(made):
     if "plant" in made:

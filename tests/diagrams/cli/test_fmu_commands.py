@@ -196,6 +196,7 @@ def test_nothing_of_the_file_stays_loaded(here, capsys, uncompiled):
     assert (here / "lag.fmu").read_bytes() == first
 
 
+@pytest.mark.slow
 def test_a_plant_as_fmi_2(here, capsys):
     assert main(["build", "mass_spring_damper", "--fmi", "2", "--name", "msd", "--out", "new/folder"]) == 0
     out, err = capsys.readouterr()
@@ -525,6 +526,7 @@ def library(folder, name, source, *more):
     return out.read_bytes()
 
 
+@pytest.mark.slow
 @LINUX
 def test_a_missing_shared_library_is_named(altered, tmp_path, capsys):
     library(tmp_path, "libabsent", "int absent(void) { return 1; }")
@@ -544,6 +546,7 @@ def test_a_missing_shared_library_is_named(altered, tmp_path, capsys):
     assert "Next: Install the libraries that it lacks here: loopwright inspect names them." in out
 
 
+@pytest.mark.slow
 @LINUX
 def test_what_crashes_or_hangs_does_so_elsewhere(altered, tmp_path, capsys, monkeypatch):
     crash = "__attribute__((constructor)) static void f(void) { __builtin_trap(); }"
@@ -698,6 +701,7 @@ def test_a_start_value_that_it_refuses(altered, name, capsys):
     assert all("loading and instantiating it failed" in text for text in found)
 
 
+@pytest.mark.slow
 def test_terminal_without_greek(lag):
     environment = {**os.environ, "PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
     command = [sys.executable, "-m", "loopwright.diagrams", "inspect", str(lag / "lag.fmu")]

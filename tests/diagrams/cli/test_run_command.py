@@ -70,6 +70,7 @@ def test_key_numbers_are_strict_json(done):
     assert content["real_time_factor"] > 0
 
 
+@pytest.mark.slow
 def test_figures_are_pictures_and_reproducible(done, tmp_path):
     folder, experiment, run = done
     assert files(folder) == sorted(f"A{ending}" for ending in ALL)
@@ -100,6 +101,7 @@ def test_drawing_leaves_matplotlib_alone(done):
         run.plot("eta", "xi", axes=figure.axes[:1])
 
 
+@pytest.mark.slow
 def test_table_fits_eighty_columns(tmp_path, capsys, undrawn):
     assert main(["run", "D", "B", "--out", str(tmp_path), "--option", "cubic=true", "--option", "delay=1"]) == 0
     out, err = capsys.readouterr()
@@ -274,6 +276,7 @@ def test_wrong_usage(arguments, text, tmp_path, capsys, monkeypatch):
     assert files(tmp_path) == []  # nothing was begun
 
 
+@pytest.mark.slow
 def test_a_plant_that_is_no_fmu(tmp_path, capsys):
     text = tmp_path / "plant.fmu"
     text.write_text("not a zip archive")

@@ -84,6 +84,7 @@ def test_the_page_of_the_library_has_a_line_for_each_block_as_it_is():
     assert sorted(row[0] for row in rows) == sorted(cls.__name__ for cls in public_blocks())
 
 
+@pytest.mark.slow
 def test_the_code_of_the_page_of_the_library_runs():
     (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -107,7 +107,7 @@ def anything(seed, count):
     return nodes, [Net(f"{a} {b}", (a, b), ends, chance.choice([0.0, 40.0])) for (a, b), ends in sinks.items()]
 
 
-@pytest.mark.drawn(8)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("seed", range(60))
 def test_wires_reach_their_ends_and_lie_on_nothing_else(seed):
     nodes, nets = anything(seed, 3 + seed % 12 if seed < 50 else 40)
@@ -242,6 +242,7 @@ def test_the_same_diagram_is_drawn_the_same_in_every_process():
     assert len(drawn) == 1
 
 
+@pytest.mark.slow
 def test_drawing_needs_no_matplotlib_and_shows_in_notebooks():
     script = (
         "import sys; from loopwright.diagrams import experiments; d = experiments.compliance().diagram; "

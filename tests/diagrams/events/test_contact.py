@@ -158,6 +158,7 @@ class Swing(Block):
         return x.phi, x.rate, 0.0 * x.clock, (1.0 - x.mode) if self.switches else x.mode
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("switches", [False, True])
 @pytest.mark.parametrize("solver", ["auto", "BDF", "rk4"])
 def test_a_jump_that_leaves_the_motion_of_its_indicator_alone_is_no_impact(solver, switches):

@@ -58,6 +58,7 @@ def test_the_dense_output_leaves_the_start_of_a_step_along_the_rates(name):
     assert steps > 100
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize("solver", ["LSODA", "BDF", "CVODE_BDF", "CVODE_Adams", "auto"])
 def test_rounding_of_an_indicator_itself_fires_nothing(solver):

@@ -25,6 +25,7 @@ RELAYS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["euler", "rk4"])
 @pytest.mark.drawn(2)
 @pytest.mark.parametrize("name", RELAYS)
@@ -49,6 +50,7 @@ def test_a_fixed_step_goes_on_and_says_so(solver, name):
     assert errors[1] < 0.4 * errors[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["auto", "BDF"])
 @pytest.mark.drawn(2)
 @pytest.mark.parametrize("name", RELAYS)

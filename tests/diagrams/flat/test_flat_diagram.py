@@ -63,6 +63,7 @@ def test_compiled_c_is_bit_identical_to_the_interpreted_function_over_all_of_c(g
     assert np.all(library[:, -1] == 1)
 
 
+@pytest.mark.slow
 def test_a_path_with_tables_compiles_to_the_same_bits(tmp_path):
     experiment = experiments.path_following(path=SPLINE)
     run = experiment.diagram.simulate(2.0, progress=False)

@@ -128,6 +128,7 @@ def test_the_margin_at_both_ends_of_one_channel_is_smaller_than_at_one():
 complex_entries = st.tuples(st.floats(-3, 3), st.floats(-3, 3)).map(lambda v: complex(*v))
 
 
+@pytest.mark.slow
 @random_cases(10, 40, st.lists(complex_entries, min_size=4, max_size=4), reaching=0.5)
 def test_the_closed_form_for_two_channels_is_what_scaling_by_scipy_finds(entries):
     M = np.array(entries).reshape(2, 2)

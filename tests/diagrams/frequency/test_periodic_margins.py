@@ -124,6 +124,7 @@ def test_gain_phase_and_delay_margins_are_the_limits_of_the_period_gone_through_
     assert all(number.confirmed_by for number in found.numbers().values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wire", ["voltage", "reference"])
 def test_the_disk_margin_is_the_smallest_disk_that_destabilizes_the_period_gone_through_by_hand(model, wire):
     found = periodic_margins(model.loop(wire, lifted=True))
@@ -180,6 +181,7 @@ def test_a_periodic_loop_is_refused_with_both_ways_on(model):
         model.loop("voltage")
 
 
+@pytest.mark.slow
 @random_cases(4, 60, open_loops(sampled=True), reaching=0.1)
 def test_a_loop_with_one_renewal_has_the_margins_of_any_sampled_loop(loop):
     plain = margins(loop)

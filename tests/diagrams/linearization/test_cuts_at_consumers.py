@@ -82,6 +82,7 @@ def test_a_cut_behind_the_plant_leaves_the_tracking_alone():
     assert to.phase_margin_deg.value == pytest.approx(by_hand(), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_report_says_it_at_the_number():
     numbers = level().report(only=("inner",)).numbers()
     margin = numbers["inner.opening.continuous.phase_margin_deg"]

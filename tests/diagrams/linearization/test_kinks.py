@@ -252,6 +252,7 @@ def test_a_switched_path_is_told_only_on_the_loop_through_the_switch():
     assert lin.loop("w").findings == ()
 
 
+@pytest.mark.slow
 def test_a_report_marks_the_numbers_and_its_json_has_the_facts(tmp_path):
     report = servo().report(tmp_path / "servo.html", json=True, point=2 * T, only=("poles", "inner", "limits"))
     numbers = report.numbers()

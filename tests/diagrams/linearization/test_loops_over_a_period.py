@@ -53,6 +53,7 @@ def lifted_limit(L):
     return scipy.optimize.brentq(beyond, 1.5, 100.0)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn
 @pytest.mark.parametrize("wire", ["u", "y", "after_hold"])
 @pytest.mark.parametrize("phase", [0.03, 0.07, 0.09])
@@ -93,6 +94,7 @@ def test_a_wire_that_is_renewed_several_times_in_the_period_is_refused(wire):
         cascade().linearize().loop(wire)
 
 
+@pytest.mark.slow
 def test_the_lifted_loop_has_the_gain_limit_and_the_poles_of_the_diagram():
     model = cascade().linearize()
     L = model.loop("voltage", lifted=True)

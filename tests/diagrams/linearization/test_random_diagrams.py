@@ -254,6 +254,7 @@ RATES = st.lists(st.integers(1, 4), min_size=2, max_size=3).flatmap(
 )
 
 
+@pytest.mark.slow
 @random_cases(3, 30, seeds, RATES, fresh=True)
 def test_several_rates_and_offsets(seed, clocks):
     loop = Loop(seed, clocks)
@@ -264,6 +265,7 @@ def test_several_rates_and_offsets(seed, clocks):
     close(poles, want[: len(poles)], 1e-9)
 
 
+@pytest.mark.slow
 @random_cases(3, 30, seeds, fresh=True)
 def test_the_poles_do_not_depend_on_the_tick_at_which_the_period_begins(seed):
     diagram = Loop(seed, [(2, 1), (3, 0)]).diagram()

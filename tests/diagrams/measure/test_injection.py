@@ -79,6 +79,7 @@ def test_a_sampled_loop_has_its_closed_form(kind):
     np.testing.assert_allclose(found.omega, [2.0, 20.0, 90.0], rtol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     "options", [{}, {"xi": 0.03}, {"friction": False}, {"xi": 0.03, "friction": False}, {"delay": 1}], ids=str
@@ -178,6 +179,7 @@ def test_several_rates_are_measured_over_their_common_period():
             found.L  # noqa: B018
 
 
+@pytest.mark.slow
 def test_the_estimate_knows_when_the_amplitude_is_too_large():
     """−u³ beside −u: the third harmonic shows as distortion, the smaller amplitude is nearer to the linear model."""
 
@@ -231,6 +233,7 @@ def test_a_source_that_steps_and_comes_back_is_in_the_uncertainty():
     assert np.max(found.uncertainty) > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     ("options", "omega"),
@@ -249,6 +252,7 @@ def test_the_uncertainty_bounds_the_error_of_the_solver(options, omega):
     assert found.uncertainty[0] < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize("amplitude", [0.03, 0.3, 1.0])
 def test_the_uncertainty_bounds_what_the_amplitude_adds(amplitude):

@@ -154,6 +154,7 @@ def test_an_option_changes_the_run_by_far_more_than_the_comparison_lets_pass(run
     assert np.abs(run["position"] - plain["position"]).max() > 10 * POSITION
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("letter", ["A", *(pytest.param(letter, marks=pytest.mark.slow) for letter in "BCD")])
 def test_an_encoder_acts_as_in_the_independent_solution(runs, solutions, letter):
     # A quantum that rounds differently, from position errors of rounding size, changes the measured velocity by
@@ -180,7 +181,7 @@ def test_narrow_friction_acts_as_in_the_independent_solution(runs, solutions, le
     assert_agrees(run, solutions(letter, **NARROW), width=0.001)
 
 
-@pytest.mark.drawn(4)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("letter", ["A", "B", "C", "D"])
 @pytest.mark.parametrize(
     "options", [*(o for o, _ in OPTIONS.values()), ENCODER, NARROW], ids=[*OPTIONS, "encoder", "narrow"]

@@ -120,6 +120,7 @@ def test_ports_of_other_names_are_renamed(runs):
     np.testing.assert_array_equal(run["position"][0], (0.5, 0.6))
 
 
+@pytest.mark.slow
 def test_a_start_value_follows_the_new_name(runs):
     class Placed(Block):
         """The gantry, its position called p."""
@@ -142,6 +143,7 @@ def test_a_start_value_follows_the_new_name(runs):
     np.testing.assert_allclose(run["position"], want["position"], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_position_that_can_not_be_set(carriage, runs):
     with pytest.raises(OptionError) as caught:
         path_following(plant=carriage)

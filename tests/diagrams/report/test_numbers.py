@@ -322,6 +322,7 @@ def held_integrator(gain, sample_time=0.1):
     return Diagram("held_integrator", plant(controller(plant.y)))
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize("gain", [1.0, 10.0])
 def test_an_integrator_under_a_sampled_gain_has_its_margins(gain):

@@ -109,6 +109,7 @@ def test_fig_3_without_its_parts_gets_the_report_of_any_diagram():
     assert [s.key for s in analyse(small, only=("inner",)).sections] == ["inner"]
 
 
+@pytest.mark.slow
 def test_fig_3_that_is_wired_by_hand_brings_the_papers_parts_as_a_diagram_of_fig_3():
     made = experiments.compliance().diagram
     by_hand = Diagram._of("by hand", made.structure)

@@ -46,6 +46,7 @@ def texts(section):
         yield from texts(part)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0, 1])
 def test_tolerances_hold_the_exact_loop_where_an_fmu_was_differenced(delay):
     whole = expm(np.block([[A, B[:, None]], [np.zeros((1, 3))]]) * T)

@@ -286,6 +286,7 @@ class PI:
         return integral + T * self.ki * e + (1 - np.exp(-T * self.ki / self.kp)) * (u - v)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize("anti_windup", ["back_calculation", "clamping"])
 def test_a_cascade_of_pi_controllers_in_two_rates_is_its_recursion_by_hand(anti_windup):

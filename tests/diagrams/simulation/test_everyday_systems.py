@@ -171,6 +171,7 @@ def test_a_buck_converter_is_its_matrix_exponentials():
 # --- friction --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_block_on_a_belt_sticks_and_slips_with_the_period_of_the_closed_form():
     """A spring holds a block on a moving belt; static friction F_s, sliding friction F_k."""
     mass, spring, belt, static, sliding = 1.0, 100.0, 0.1, 8.0, 5.0

@@ -205,6 +205,7 @@ def test_a_sampled_box_in_an_enabled_one_acts_while_that_is_true_at_its_tick():
     assert run["n"].tolist() == np.where(acting, np.cumsum(acting) - 1, np.cumsum(acting) - 1).tolist()
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("frequency", [5.0, 49.0, 50.0, 100.0])
 @pytest.mark.parametrize("options", [{}, {"solver": "rk4", "step": 0.1}])
 @pytest.mark.parametrize("duration", [1.0, pytest.param(10.0, marks=pytest.mark.slow)])
@@ -215,13 +216,14 @@ def test_events_of_a_fast_source_are_found_however_long_the_steps_are(frequency,
     assert run["i.y"][-1] == pytest.approx(duration / 2, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_an_indicator_that_crosses_for_a_small_part_of_a_step_is_followed():
     count = Counter(name="count")(Compare(">")(Sine(frequency=50.0), 0.99))
     run = Diagram("d", count, Integrator()(Constant(value=1.0))).simulate(2.0, progress=False)
     assert run["count.y"][-1] == 100.0
 
 
-@pytest.mark.drawn(3)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("solver", ["auto", "LSODA", "BDF", "CVODE_BDF", "CVODE_Adams"])
 def test_no_solver_lets_a_ball_through_the_floor(solver):
     with pytest.raises(SimulationError, match="shows Zeno behaviour"):

@@ -228,6 +228,7 @@ def test_a_name_that_is_mistyped_is_an_error_with_what_it_may_mean():
         diagram.simulate(0.1, solver="DOP835", progress=False)
 
 
+@pytest.mark.slow
 def test_errors_of_users_do_not_vanish_with_pythons_assertions():
     code = """
         from loopwright.blocks import Gain, Sum, UnwiredInputError

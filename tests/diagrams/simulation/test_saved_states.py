@@ -76,6 +76,7 @@ def assert_same_bits(diagram, cut, rest, **options):
     return straight
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     "solver", ["auto", "RK45", "DOP853", "Radau", "BDF", "LSODA", "CVODE_BDF", "euler", "heun", "rk4"]
@@ -157,6 +158,7 @@ def test_a_saved_state_is_not_changed_by_what_happens_later():
         assert pickle.dumps(state) == before
 
 
+@pytest.mark.slow
 def test_it_goes_on_in_another_process(tmp_path):
     diagram = thermostat()
     straight = diagram.simulate(4.0, progress=False)
@@ -198,6 +200,7 @@ def test_an_ideal_controller_beside_an_fmu_goes_on_to_the_last_bit():
     assert_same_bits(diagram, 0.4, 0.3, step=1e-3)
 
 
+@pytest.mark.slow
 def test_an_fmu_with_events_goes_on_to_the_last_bit():
     ball = Fmu(bouncing_ball.build(), name="ball")
     straight = assert_same_bits(Diagram("d", Integrator(name="i")(ball.height)), 1.0, 1.5, step=0.01)
@@ -218,6 +221,7 @@ def test_a_gantry_that_touches_its_wall_goes_on_to_the_last_bit_in_contact():
     assert_same_bits(diagram, cut, 0.1, step=1e-3)
 
 
+@pytest.mark.slow
 def test_an_fmu_branches_into_two_futures():
     def diagram(force):
         plant = Fmu(gantry_contact.build(), name="plant")

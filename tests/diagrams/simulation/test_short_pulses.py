@@ -123,6 +123,7 @@ def test_foreign_code_on_a_clock_is_looked_at_along_it():
         check_block(function, {"u": Clock()}, duration=10.0)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("case", ["equation", "on a clock", "table"])
 def test_a_linear_model_along_the_motion_passes_through_the_pulse(case):
     """Over 10 s the integral grows by the pulse's area, and its square by the area of it along the motion."""

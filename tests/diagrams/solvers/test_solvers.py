@@ -170,6 +170,7 @@ def test_the_default_stays_explicit_where_the_problem_is_not_stiff(rtol):
     assert solver.statistics.solver == ("auto (RK45)" if rtol > 1e-8 else "auto (DOP853)")
 
 
+@pytest.mark.slow
 def test_the_default_does_not_take_a_fast_oscillation_for_stiff():
     a = np.array([[0.0, 300.0], [-300.0, -0.01]])
     solver = make_solver("auto", problem(lambda t, x: a @ x, lambda t, x: a, 2))
@@ -268,6 +269,7 @@ def test_rounding_does_not_carry_a_stage_beyond_the_stop(name):
         run(solver, [1.0], [stop], t)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("name", SOLVERS)
 def test_a_jump_between_restarts_is_met_with_a_step_that_shrinks(name):
     # at rest, steps grow without bound; then the input jumps

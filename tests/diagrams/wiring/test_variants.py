@@ -172,6 +172,7 @@ def test_sampled_refuses_wrong_times_and_methods():
         drive().sampled(0.1, method="simpson")
 
 
+@pytest.mark.slow
 def test_a_loop_that_a_computational_delay_breaks_is_solved_in_continuous_time():
     e = Sum(signs="+-", name="e")
 
@@ -190,6 +191,7 @@ def test_a_loop_that_a_computational_delay_breaks_is_solved_in_continuous_time()
         divergent.simulate(0.3, progress=False)
 
 
+@pytest.mark.slow
 def test_the_papers_controller_in_continuous_time_beside_the_fmu_is_near_the_sampled_one():
     """The ideal controller, its projection solved at every evaluation; the plant steps once a millisecond."""
     diagram = experiments.path_following().diagram

@@ -101,6 +101,7 @@ def without(file, folder, *flags):
 # --- exact ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(1)
 def test_a_run_that_is_cut_and_restored_goes_on_bit_by_bit(loop):
     with loop.open() as one:
         straight = one.go(0, N)
@@ -131,6 +132,7 @@ def test_a_state_restored_from_bytes_into_a_fresh_instance_goes_on_bit_by_bit(lo
         assert np.array_equal(three.go(CUT, N), straight[CUT:])
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(2)
 def test_another_process_goes_on_from_the_bytes(loop):
     with loop.open() as one:

@@ -24,6 +24,7 @@ from support.exported import mass_spring_damper
 from support.instances import run
 
 
+@pytest.mark.slow
 def test_same_input_same_bytes(msd, tmp_path, monkeypatch):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("ZIG_LOCAL_CACHE_DIR", str(tmp_path / "local"))  # the model is compiled anew
@@ -184,6 +185,7 @@ def test_no_compiler(monkeypatch, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_a_compiler_of_ones_own(monkeypatch, instance, msd):
     if (gcc := shutil.which("gcc")) is None:
         pytest.skip("no gcc on this machine")

@@ -51,6 +51,7 @@ def assert_ended(pids):
     pytest.fail(f"{[pid for pid in ids if running(pid)]} still run")
 
 
+@pytest.mark.slow
 @LINUX
 def test_a_compiler_that_does_not_end_is_stopped_with_its_children(tmp_path, spinning, monkeypatch):
     compiler, pids = spinning

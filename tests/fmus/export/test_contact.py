@@ -59,6 +59,7 @@ def test_a_start_on_the_floor_is_an_impact_if_it_moves_down(path, instance, inte
     assert item["velocity"] == pytest.approx(up - G * h, abs=1e-9)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("speed", [0.0, -0.5])
 def test_a_start_on_the_floor_without_a_way_out_is_a_rest(path, instance, speed):
     item = instance(path).initialize(height=0.0, velocity=speed, e=0.0)

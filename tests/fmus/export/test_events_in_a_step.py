@@ -195,6 +195,7 @@ def touch():
     )
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("integrator", [2, 3])
 @pytest.mark.parametrize(("height", "expected"), [(1e-2, 1), (1e-8, 1), (1e-12, 1), (-1e-12, 0)])
 def test_a_short_excursion_is_not_missed(instance, integrator, height, expected):

@@ -266,6 +266,7 @@ def test_binaries_are_where_the_standard_wants_them(uncompiled, fmi):
     assert [name.split("/")[1] for name in found] == [two.get(native_platform(), native_platform())]
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @version
 def test_fmpy_compiles_it_from_its_sources(fmi, tmp_path, instance):
@@ -285,6 +286,7 @@ def test_fmpy_compiles_it_from_its_sources(fmi, tmp_path, instance):
     assert run(instance(again).initialize(), 0.0, 100) == run(instance(path).initialize(), 0.0, 100)
 
 
+@pytest.mark.slow
 @version
 def test_compiles_from_its_sources_without_warnings(uncompiled, fmi, tmp_path):
     if (gcc := shutil.which("gcc")) is None:

@@ -207,6 +207,7 @@ def passes():
     return counter(lambda t, x, u, p, fired: [t, x[1] + 1.0], z=lambda t, x, u, p: [u[0] - 1.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_events_by_a_moving_input(instance, integrator):
     """The input passes 1 upwards and comes back within one internal step; x remembers when."""

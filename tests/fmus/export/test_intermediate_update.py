@@ -238,6 +238,7 @@ def event_by_input(instance, integrator, **options):
     return Importer(instance, build_fmu(spec), act, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_an_input_set_in_between_fires_events_at_once(instance, integrator):
     importer = event_by_input(instance, integrator)

@@ -49,6 +49,7 @@ def build(fmi):
 # ---- the calls ----
 
 
+@pytest.mark.slow
 def test_the_right_hand_side_is_the_models(build, exchange):
     spec = pendulums()
     me = exchange(build(spec), start_time=0.5).start(torque=TORQUE)
@@ -115,6 +116,7 @@ def test_directional_derivatives_are_the_jacobian_of_the_rates(build, exchange):
     np.testing.assert_allclose(J, expected, rtol=1e-12, atol=0)
 
 
+@pytest.mark.slow
 def test_derivatives_of_indicators(build, exchange):
     me = exchange(build(thermostat())).start()
     assert me.item.directional("too_warm.indicator", "temperature", [2.0]) == [2.0]
@@ -200,6 +202,7 @@ def test_functions_of_the_other_interface_are_refused(build, instance):
         assert "fmi2SetTime: this is a Co-Simulation instance" in slave.log[-1][2]
 
 
+@pytest.mark.slow
 def test_a_tunable_parameter_is_set_in_event_mode(build, exchange):
     me = exchange(build(echoing_ball())).start()
     fails(me.item, lambda: me.item.__setitem__("restitution", 0.5), "restitution", "set it in Event Mode")

@@ -78,6 +78,7 @@ def test_model_exchange_in_pathsim(fmi):
     np.testing.assert_allclose(y, np.stack([s, v, 5.0 - v - 100.0 * s], axis=1), rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize("fmi", FMI)
 def test_vectors_in_pathsim_as_scalars(fmi):
@@ -86,6 +87,7 @@ def test_vectors_in_pathsim_as_scalars(fmi):
     np.testing.assert_allclose(y, gantry_motion(t + DT, force), rtol=0, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fmi", FMI)
 @pytest.mark.parametrize(("kind", "ahead"), [("CoSimulationFMU", DT), ("ModelExchangeFMU", 0.0)])
 def test_events_in_pathsim(fmi, kind, ahead):

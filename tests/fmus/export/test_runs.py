@@ -84,6 +84,7 @@ def test_arrays_and_time_against_dop853(pendulum, instance):
     assert item["clock"] == 7.0
 
 
+@pytest.mark.slow
 def test_the_same_bits_in_both_versions_with_arrays_and_without(instance):
     pair = [instance(build_fmu(mass_spring_damper(), fmi=fmi)).initialize() for fmi in (2, 3)]
     assert run(pair[0], 0.0, 300) == run(pair[1], 0.0, 300)
@@ -335,6 +336,7 @@ def test_a_run_cut_between_steps_continues_bit_identically(echoing, instance, in
         ]
 
 
+@pytest.mark.slow
 def test_a_stiff_model_in_steps_a_thousand_times_its_time_constant(fmi, instance):
     item = instance(build_fmu(stiff(), fmi=fmi)).initialize()
     for k in range(100):

@@ -59,7 +59,7 @@ def pushes(n, T, amplitude):
     return motor, np.stack([np.cos(29.0 * t), np.sin(23.0 * t)], axis=1) * 0.1 * np.mean(amplitude)
 
 
-@pytest.mark.drawn(7)
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("fmi", [3, 2])
 @pytest.mark.parametrize("name", PLANTS)
 def test_every_plant_passes_fmpys_validation_and_says_what_its_variables_are(uncompiled, build, name, fmi):
@@ -72,6 +72,7 @@ def test_every_plant_passes_fmpys_validation_and_says_what_its_variables_are(unc
             assert variable.unit or variable.type not in ("Float64", "Real"), variable.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gantry_elastic", "gantry_stiction", "gantry_contact"])
 def test_the_gantries_have_the_ports_of_the_experiments(build, name):
     plant = Fmu(build(name))
@@ -278,6 +279,7 @@ def test_the_scara_obeys_lagranges_equation():
                 assert float(left - (torque[i] + work - rub)) == pytest.approx(0.0, abs=1e-11)
 
 
+@pytest.mark.slow
 def test_the_scaras_fmu_agrees_with_scipy(build):
     T, n = 1e-3, 500
     torque, force = pushes(n, T, np.array([30.0, 15.0]))
@@ -344,6 +346,7 @@ def test_the_mass_on_a_spring_is_a_damped_oscillation(build):
     )
 
 
+@pytest.mark.slow
 def test_the_dc_motor_follows_its_matrix_exponential(build):
     T, n = 1e-3, 100
     voltage, load = 12.0 * np.sign(np.sin(np.arange(n) / 7.0)), 0.05 * np.cos(np.arange(n) / 5.0)

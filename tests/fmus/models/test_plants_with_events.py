@@ -157,6 +157,7 @@ def touching(t_end, x0, u, wall):
     return np.array(rows), np.array(contacts), kinds
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("wall", "pattern", "kinds"),
     [

@@ -113,6 +113,7 @@ def test_the_stop_time_and_the_start_time_are_told(file):
 # --- states and derivatives -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("plant", [gantry_contact, bouncing_ball], ids=["contact", "ball"])
 def test_a_run_that_is_cut_goes_on_bit_by_bit_here_and_in_a_fresh_instance(plant, cache):
     block = Fmu(plant.build(fmi=2), name="plant")

@@ -333,6 +333,7 @@ def test_a_stiff_step_by_an_adaptive_solver_is_within_its_own_uncertainty(cache)
     assert np.abs(model.A - fine.A).max() < 1e-4 * np.abs(fine.A).max()
 
 
+@pytest.mark.slow
 def test_a_start_on_a_bound_is_moved_to_one_side(cache):
     t, x, u, p = (ca.SX.sym(c, n) for c, n in (("t", 1), ("x", 1), ("u", 1), ("p", 0)))
     spec = ModelSpec(
