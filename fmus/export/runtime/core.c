@@ -54,6 +54,16 @@ static bool lw_in_mode(lw_instance *self, const char *function, lw_mode expected
                    ", or reset the FMU.", function, lw_mode_names[self->s.mode], lw_mode_names[expected]);
 }
 
+/* Was the call given room for its result? */
+static bool lw_has_room(lw_instance *self, const char *function, const void *room) {
+    return room || lw_fail(self, "%s: the pointer to the result is NULL. Give one.", function);
+}
+
+/* May values be read: once initialization has begun, also in Terminated (FMI 3.0, 2.3.8; FMI 2.0, 3.2.3)? */
+static bool lw_is_readable(lw_instance *self) {
+    return self->s.mode == LW_INITIALIZING || self->s.mode == LW_TERMINATED;
+}
+
 /* Is it in one of Step Mode, Event Mode, Continuous-Time Mode? */
 static bool lw_is_initialized(lw_instance *self, const char *function) {
     if (self->s.mode > LW_INITIALIZING && self->s.mode < LW_TERMINATED) return true;
@@ -372,8 +382,15 @@ static void lw_destroy(lw_instance *self) {
 
 /* ---- saved states ---- */
 
-/* Serialized: the token, then the state as it is in memory (same machine type). */
-#define LW_SERIALIZED (sizeof LW_TOKEN + sizeof(lw_state))
+/* Serialized: the token, then the state as it is in memory (same machine type), then its checksum. */
+#define LW_SERIALIZED (sizeof LW_TOKEN + sizeof(lw_state) + sizeof(uint64_t))
+
+/* FNV-1a, 64 bits. */
+static uint64_t lw_checksum(const void *bytes, size_t size) {
+    uint64_t sum = 14695981039346656037u;
+    for (size_t i = 0; i < size; i++) sum = (sum ^ ((const unsigned char *)bytes)[i]) * 1099511628211u;
+    return sum;
+}
 
 static bool lw_between_steps(lw_instance *self, const char *function) {
     if (self->s.mode != LW_INTERMEDIATE) return true;
@@ -390,7 +407,8 @@ static bool lw_copy_state(lw_instance *self, const char *function, const void *f
 }
 
 static bool lw_get_state(lw_instance *self, const char *function, void **state) {
-    return lw_between_steps(self, function) && lw_copy_state(self, function, &self->s, state);
+    return lw_has_room(self, function, state) && lw_between_steps(self, function)
+           && lw_copy_state(self, function, &self->s, state);
 }
 
 /* Does a state from outside belong to this FMU, and to this interface type? */
@@ -407,19 +425,30 @@ static bool lw_accept_state(lw_instance *self, const char *function, const lw_st
 }
 
 static bool lw_serialize_state(lw_instance *self, const char *function, const lw_state *state, void *bytes, size_t size) {
-    if (!state || size < LW_SERIALIZED)
+    if (!state || !bytes || size < LW_SERIALIZED)
         return lw_fail(self, "%s: %s. Ask for the size of the serialized state first.", function,
-                       state ? "too few bytes" : "the state is NULL");
+                       !state ? "the state is NULL" : bytes ? "too few bytes" : "there are no bytes to write to");
+    const uint64_t sum = lw_checksum(state, sizeof *state);
     memcpy(bytes, LW_TOKEN, sizeof LW_TOKEN);
     memcpy((char *)bytes + sizeof LW_TOKEN, state, sizeof *state);
+    memcpy((char *)bytes + sizeof LW_TOKEN + sizeof *state, &sum, sizeof sum);
     return true;
 }
 
 static bool lw_deserialize_state(lw_instance *self, const char *function, const void *bytes, size_t size, void **state) {
-    if (size != LW_SERIALIZED || memcmp(bytes, LW_TOKEN, sizeof LW_TOKEN))
+    void *fresh = NULL; /* *state may be anything: only an output here */
+    uint64_t sum;
+    if (!lw_has_room(self, function, state)) return false;
+    if (!bytes || size != LW_SERIALIZED || memcmp(bytes, LW_TOKEN, sizeof LW_TOKEN))
         return lw_fail(self, "%s: these %zu bytes are no state of this FMU (%zu bytes that begin with its "
                        "token). Give what it has serialized itself.", function, size, LW_SERIALIZED);
-    return lw_copy_state(self, function, (const char *)bytes + sizeof LW_TOKEN, state);
+    memcpy(&sum, (const char *)bytes + size - sizeof sum, sizeof sum);
+    if (sum != lw_checksum((const char *)bytes + sizeof LW_TOKEN, sizeof(lw_state)))
+        return lw_fail(self, "%s: the checksum of these bytes is wrong: they have changed since they were serialized. Give the "
+                       "bytes as they were.", function);
+    if (!lw_copy_state(self, function, (const char *)bytes + sizeof LW_TOKEN, &fresh)) return false;
+    *state = fresh;
+    return true;
 }
 
 /* ---- initialization ---- */

@@ -31,16 +31,17 @@ static unsigned lw_category_of(const char *name) {
 
 fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean loggingOn, size_t nCategories, const fmi2String categories[]) {
     LW_SELF;
+    if (!categories) nCategories = 0;
     unsigned chosen = nCategories ? 0 : LW_LOG_WARNING | LW_LOG_ERROR;
     bool all_known = true;
     self->categories = loggingOn ? LW_LOG_WARNING | LW_LOG_ERROR : 0;
     for (size_t i = 0; i < nCategories; i++) {
-        unsigned category = lw_category_of(categories[i]);
+        unsigned category = categories[i] ? lw_category_of(categories[i]) : 0;
         chosen |= category;
         if (category) continue;
         all_known = false;
         lw_warn(self, "fmi2SetDebugLogging: there is no log category %s, only logStatusWarning, logStatusError and logAll.",
-                categories[i]);
+                categories[i] ? categories[i] : "NULL");
     }
     self->categories = loggingOn ? chosen : 0;
     return all_known ? fmi2OK : fmi2Warning;
@@ -194,10 +195,10 @@ fmi2Status fmi2DoStep(fmi2Component c, fmi2Real currentCommunicationPoint, fmi2R
 /* ---- Model Exchange (FMI 2.0, 3.2.1 and 3.2.2) ---- */
 
 /* Is the call allowed, and is the number of values right? */
-static bool lw_check_vector(lw_instance *self, const char *function, bool initializing, size_t found, size_t expected) {
+static bool lw_check_vector(lw_instance *self, const char *function, bool reading, size_t found, size_t expected) {
     if (!self->s.model_exchange)
         return lw_fail(self, "%s: this is a Co-Simulation instance. Instantiate it as fmi2ModelExchange.", function);
-    if (!(initializing && self->s.mode == LW_INITIALIZING) && !lw_is_initialized(self, function)) return false;
+    if (!(reading && lw_is_readable(self)) && !lw_is_initialized(self, function)) return false;
     if (found == expected) return true;
     return lw_fail(self, "%s: found room for %zu values, expected %zu.", function, found, expected);
 }
@@ -225,7 +226,7 @@ fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *eventInfo) {
     bool again = false, moved = false;
     bool ok = lw_check_vector(self, "fmi2NewDiscreteStates", false, 0, 0)
               && lw_update_discrete_states(self, "fmi2NewDiscreteStates", &again, &moved);
-    *eventInfo = (fmi2EventInfo){.newDiscreteStatesNeeded = again, .valuesOfContinuousStatesChanged = moved};
+    if (eventInfo) *eventInfo = (fmi2EventInfo){.newDiscreteStatesNeeded = again, .valuesOfContinuousStatesChanged = moved};
     return LW_OK(ok);
 }
 
@@ -239,7 +240,8 @@ fmi2Status fmi2CompletedIntegratorStep(fmi2Component c, fmi2Boolean noSetFMUStat
         fmi2Boolean *enterEventMode, fmi2Boolean *terminateSimulation) {
     LW_SELF;
     (void)noSetFMUStatePriorToCurrentPoint; /* nothing is buffered */
-    *enterEventMode = *terminateSimulation = fmi2False;
+    if (enterEventMode) *enterEventMode = fmi2False;
+    if (terminateSimulation) *terminateSimulation = fmi2False;
     return LW_OK(lw_check_vector(self, "fmi2CompletedIntegratorStep", false, 0, 0)
                  && lw_in_mode(self, "fmi2CompletedIntegratorStep", LW_CONTINUOUS));
 }
@@ -304,6 +306,7 @@ fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *FMUstate) {
 fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate FMUstate, size_t *size) {
     LW_SELF;
     (void)FMUstate;
+    if (!lw_has_room(self, "fmi2SerializedFMUstateSize", size)) return fmi2Error;
     *size = LW_SERIALIZED;
     return fmi2OK;
 }

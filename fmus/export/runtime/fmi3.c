@@ -17,17 +17,20 @@ const char *fmi3GetVersion(void) { return fmi3Version; }
 
 fmi3Status fmi3SetDebugLogging(fmi3Instance instance, fmi3Boolean loggingOn, size_t nCategories, const fmi3String categories[]) {
     LW_SELF;
+    if (!categories) nCategories = 0;
     unsigned chosen = nCategories ? 0 : LW_LOG_WARNING | LW_LOG_ERROR, known = LW_LOG_WARNING | LW_LOG_ERROR;
     bool all_known = true;
     for (size_t i = 0; i < nCategories; i++) {
-        if (!strcmp(categories[i], "logStatusError")) chosen |= LW_LOG_ERROR;
+        if (!categories[i]) all_known = false;
+        else if (!strcmp(categories[i], "logStatusError")) chosen |= LW_LOG_ERROR;
         else if (!strcmp(categories[i], "logStatusWarning")) chosen |= LW_LOG_WARNING;
         else all_known = false;
     }
     self->categories = loggingOn ? known : 0;
     for (size_t i = 0; i < nCategories && !all_known; i++)
-        if (strcmp(categories[i], "logStatusError") && strcmp(categories[i], "logStatusWarning"))
-            lw_warn(self, "fmi3SetDebugLogging: there is no log category %s, only logStatusWarning and logStatusError.", categories[i]);
+        if (!categories[i] || (strcmp(categories[i], "logStatusError") && strcmp(categories[i], "logStatusWarning")))
+            lw_warn(self, "fmi3SetDebugLogging: there is no log category %s, only logStatusWarning and logStatusError.",
+                    categories[i] ? categories[i] : "NULL");
     self->categories = loggingOn ? chosen : 0;
     return all_known ? fmi3OK : fmi3Warning;
 }
@@ -105,6 +108,9 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String instanceName, fmi3String ins
     bool ok = true;
     if (eventModeUsed && !LW_N_Z)
         ok = lw_fail(self, "this FMU has no events, and no Event Mode. Instantiate it with eventModeUsed = fmi3False.");
+    if (ok && nRequiredIntermediateVariables && !requiredIntermediateVariables)
+        ok = lw_fail(self, "requiredIntermediateVariables is NULL, and nRequiredIntermediateVariables is %zu. Give as many value "
+                     "references, or 0.", nRequiredIntermediateVariables);
     for (size_t i = 0; ok && i < nRequiredIntermediateVariables; i++)
         ok = lw_is_intermediate(self, requiredIntermediateVariables[i]);
     if (ok && intermediateUpdate) {
@@ -217,6 +223,7 @@ fmi3Status fmi3FreeFMUState(fmi3Instance instance, fmi3FMUState *FMUState) {
 fmi3Status fmi3SerializedFMUStateSize(fmi3Instance instance, fmi3FMUState FMUState, size_t *size) {
     LW_SELF;
     (void)FMUState;
+    if (!lw_has_room(self, "fmi3SerializedFMUStateSize", size)) return fmi3Error;
     *size = LW_SERIALIZED;
     return fmi3OK;
 }

@@ -47,11 +47,24 @@ static bool lw_is_model_exchange(lw_instance *self, const char *function) {
 }
 
 /* Is the call allowed, and is the number of values right? */
-static bool lw_check_vector(lw_instance *self, const char *function, bool initializing, size_t found, size_t expected) {
+static bool lw_check_vector(lw_instance *self, const char *function, bool reading, size_t found, size_t expected) {
     if (!lw_is_model_exchange(self, function)) return false;
-    if (!(initializing && self->s.mode == LW_INITIALIZING) && !lw_is_initialized(self, function)) return false;
+    if (!(reading && lw_is_readable(self)) && !lw_is_initialized(self, function)) return false;
     if (found == expected) return true;
     return lw_fail(self, "%s: found room for %zu values, expected %zu.", function, found, expected);
+}
+
+/* Outside of the model's domain the importer may try a shorter step (FMI 3.0, 2.2.3), so the instance is not terminated. */
+static fmi3Status lw_evaluated(lw_instance *self, int32_t mode, bool ok) {
+    if (ok) return fmi3OK;
+    if (mode != LW_CONTINUOUS) return fmi3Error;
+    self->s.mode = mode;
+    return fmi3Discard;
+}
+
+static bool lw_copy(double *to, const double *from, size_t n) {
+    if (n) memcpy(to, from, n * sizeof(double));
+    return true;
 }
 
 fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance instance) {
@@ -83,37 +96,34 @@ fmi3Status fmi3SetContinuousStates(fmi3Instance instance, const fmi3Float64 cont
 
 fmi3Status fmi3GetContinuousStates(fmi3Instance instance, fmi3Float64 continuousStates[], size_t nContinuousStates) {
     LW_SELF;
-    if (!lw_check_vector(self, "fmi3GetContinuousStates", true, nContinuousStates, LW_N_X)) return fmi3Error;
-    memcpy(continuousStates, self->s.values + LW_X, LW_N_X * sizeof(double));
-    return fmi3OK;
+    return LW_OK(lw_check_vector(self, "fmi3GetContinuousStates", true, nContinuousStates, LW_N_X)
+                 && lw_copy(continuousStates, self->s.values + LW_X, LW_N_X));
 }
 
 fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance instance, fmi3Float64 derivatives[], size_t nContinuousStates) {
     LW_SELF;
+    int32_t mode = self->s.mode;
     if (!lw_check_vector(self, "fmi3GetContinuousStateDerivatives", true, nContinuousStates, LW_N_X)) return fmi3Error;
-    if (!lw_update_derivatives(self)) return fmi3Error;
-    memcpy(derivatives, self->s.values + LW_DX, LW_N_X * sizeof(double));
-    return fmi3OK;
+    return lw_evaluated(self, mode, lw_update_derivatives(self) && lw_copy(derivatives, self->s.values + LW_DX, LW_N_X));
 }
 
 fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 eventIndicators[], size_t nEventIndicators) {
     LW_SELF;
+    int32_t mode = self->s.mode;
     if (!lw_check_vector(self, "fmi3GetEventIndicators", true, nEventIndicators, LW_N_Z)) return fmi3Error;
-    if (!lw_update_indicators(self)) return fmi3Error;
-    memcpy(eventIndicators, self->s.values + LW_Z, LW_N_Z * sizeof(double));
-    return fmi3OK;
+    return lw_evaluated(self, mode, lw_update_indicators(self) && lw_copy(eventIndicators, self->s.values + LW_Z, LW_N_Z));
 }
 
 fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance instance, fmi3Float64 nominals[], size_t nContinuousStates) {
     LW_SELF;
-    if (!lw_check_vector(self, "fmi3GetNominalsOfContinuousStates", true, nContinuousStates, LW_N_X)) return fmi3Error;
-    memcpy(nominals, lw_nominals, LW_N_X * sizeof(double));
-    return fmi3OK;
+    return LW_OK(lw_check_vector(self, "fmi3GetNominalsOfContinuousStates", true, nContinuousStates, LW_N_X)
+                 && lw_copy(nominals, lw_nominals, LW_N_X));
 }
 
 fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *nContinuousStates) {
     LW_SELF;
     if (!lw_is_model_exchange(self, "fmi3GetNumberOfContinuousStates")) return fmi3Error;
+    if (!lw_has_room(self, "fmi3GetNumberOfContinuousStates", nContinuousStates)) return fmi3Error;
     *nContinuousStates = LW_N_X;
     return fmi3OK;
 }
@@ -121,6 +131,7 @@ fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance instance, size_t *nConti
 fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance instance, size_t *nEventIndicators) {
     LW_SELF;
     if (!lw_is_model_exchange(self, "fmi3GetNumberOfEventIndicators")) return fmi3Error;
+    if (!lw_has_room(self, "fmi3GetNumberOfEventIndicators", nEventIndicators)) return fmi3Error;
     *nEventIndicators = LW_N_Z;
     return fmi3OK;
 }

@@ -182,7 +182,7 @@ def test_calls_out_of_order(fmi, build, exchange):
     fails(me.item, lambda: me.set(0.0, [0.0, 0.0]), f"fmi{fmi}SetContinuousStates was called in state Event Mode")
     me.start()
     me.fmu.terminate()
-    fails(me.item, lambda: me.dx, "called in state Terminated, expected Continuous-Time Mode")
+    fails(me.item, lambda: me.set(0.0, [0.0, 0.0]), "called in state Terminated, expected Continuous-Time Mode")
 
 
 def test_functions_of_the_other_interface_are_refused(build, instance):
@@ -239,17 +239,72 @@ def test_reset_keeps_the_interface_type(build, exchange):
     assert me.start().x == [0.1, 0.0]
 
 
-def test_outside_of_its_domain_the_importer_may_try_again(exchange):
-    """sqrt(x) at x < 0: fmi2Discard asks for a shorter step (FMI 2.0, 2.1.3)."""
+def test_outside_of_its_domain_the_importer_may_try_again(build, exchange):
+    """sqrt(x) at x < 0: Discard asks for a shorter step (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)."""
     t, x, u, p = ca.SX.sym("t"), ca.SX.sym("x"), ca.SX.sym("u", 0), ca.SX.sym("p", 0)
     f, g = ca.Function("f", [t, x, u, p], [-ca.sqrt(x)]), ca.Function("g", [t, x, u, p], [x])
     spec = ModelSpec("tank", "", (), (Variable("y", "output"),), (), (Variable("x", start=4.0, state=True),), f, g)
-    me = exchange(build_fmu(spec, fmi=2)).start()
+    me = exchange(build(spec)).start()
     with pytest.raises(fmpy.fmi1.FMICallException) as caught:
         me.rhs(0.1, [-1.0])
-    assert caught.value.status == fmpy.fmi2.fmi2Discard
+    assert caught.value.status == (fmpy.fmi2.fmi2Discard if me.fmi == 2 else fmpy.fmi3.fmi3Discard)
     assert "der(x) (element 0) became" in me.item.log[-1][2]
     assert me.rhs(0.1, [9.0]) == [-3.0]
+
+
+def test_when_it_has_ended_its_last_values_can_be_read(build, exchange):
+    """In state Terminated states, derivatives and nominal values may be read (FMI 3.0, 2.3.8; FMI 2.0, 3.2.3)."""
+    me = exchange(build(mass_spring_damper())).start()
+    x, rates = me.x, me.dx
+    me.fmu.terminate()
+    assert (me.x, me.dx) == (x, rates)
+    assert len(me.nominals) == len(x)
+    fails(me.item, lambda: me.set(0.1, [1.0, 0.0]), "Terminated")
+
+
+def test_null_is_refused_or_passed_over_and_nothing_crashes(build, exchange):
+    me = exchange(build(mass_spring_damper())).start()
+    lib, item = me.fmu.dll, ctypes.c_void_p(me.fmu.component)
+    ok, error = 0, 3
+    if me.fmi == 2:
+        assert lib.fmi2CompletedIntegratorStep(item, 0, None, None) == ok
+        assert lib.fmi2EnterEventMode(item) == ok
+        assert lib.fmi2NewDiscreteStates(item, None) == ok
+        assert lib.fmi2SetDebugLogging(item, 1, ctypes.c_size_t(1), None) == ok
+        names = (ctypes.c_char_p * 1)(None)
+        assert lib.fmi2SetDebugLogging(item, 1, ctypes.c_size_t(1), names) == 1  # a warning
+        assert lib.fmi2SerializedFMUstateSize(item, None, None) == error
+        assert lib.fmi2Reset(item) == ok
+        assert lib.fmi2GetFMUstate(item, None) == error
+    else:
+        assert lib.fmi3CompletedIntegratorStep(item, ctypes.c_bool(False), None, None) == ok
+        assert lib.fmi3SetDebugLogging(item, ctypes.c_bool(True), ctypes.c_size_t(1), None) == ok
+        names = (ctypes.c_char_p * 1)(None)
+        assert lib.fmi3SetDebugLogging(item, ctypes.c_bool(True), ctypes.c_size_t(1), names) == 1
+        for call in ("GetNumberOfContinuousStates", "GetNumberOfEventIndicators"):
+            assert lib[f"fmi3{call}"](item, None) == error
+        assert lib.fmi3SerializedFMUStateSize(item, None, None) == error
+        assert lib.fmi3Reset(item) == ok
+        assert lib.fmi3GetFMUState(item, None) == error
+        token, size = me.item.description.guid.encode(), ctypes.c_size_t
+        made = lib["fmi3InstantiateCoSimulation"]  # without the types of arguments that FMPy gives it
+        made.restype = ctypes.c_void_p
+        false = ctypes.c_bool(False)
+        assert made(b"i", token, None, false, false, false, false, None, size(1), None, None, None) is None
+
+
+def test_a_state_is_read_into_a_pointer_that_holds_anything(build, exchange):
+    me = exchange(build(mass_spring_damper())).start()
+    state = me.fmu.getFMUState()
+    data = bytes(me.fmu.serializeFMUState(state))
+    name = "fmi2DeSerializeFMUstate" if me.fmi == 2 else "fmi3DeserializeFMUState"
+    read, pointer = me.fmu.dll[name], ctypes.c_void_p(0xDEAD0)
+    item, size = ctypes.c_void_p(me.fmu.component), ctypes.c_size_t(len(data))
+    assert read(item, data, size, ctypes.byref(pointer)) == 0
+    assert pointer.value not in (None, 0xDEAD0)
+    changed = bytearray(data)
+    changed[len(data) // 2] ^= 1
+    fails(me.item, lambda: me.fmu.deserializeFMUState(bytes(changed)), "the checksum of these bytes is wrong")
 
 
 # ---- events ----
