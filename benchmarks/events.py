@@ -1,4 +1,4 @@
-"""What an event costs: python benchmarks/events.py.
+"""Cost of an event: python benchmarks/events.py.
 
 Everyday diagrams that switch often: a thermostat, a PWM by a comparator, a bouncing ball, a wheel that an anti-lock
 brake holds by a relay. Printed are the events of a run, the time for one event to be found in a step (the search), and

@@ -275,7 +275,7 @@ class PeriodicMarginFinder:
         if n < RENEWALS:
             how = f"{EIGENVALUES}, delayed by whole renewals: stable at {n}, unstable at {n + 1}"
             samples, seconds = float(n), n * T
-        elif all(np.linalg.norm(self.r.matrix(np.array([1j * w / self.r.dt]))[0], 2) < 1 for w in self.theta):
+        elif self._is_small():
             how = "the largest singular value of the lifted loop is below 1 at all frequencies: no delay matters"
             samples = seconds = np.inf
         else:
@@ -286,6 +286,13 @@ class PeriodicMarginFinder:
             "delay_margin_samples": Number(samples, "samples", error, how),
             "delay_margin_s": Number(seconds, "s", error, how),
         }
+
+    def _is_small(self) -> bool:
+        """Return whether the largest singular value of the lifted loop is below 1 at all frequencies."""
+        try:
+            return all(np.linalg.norm(self.r.matrix(np.array([1j * w / self.r.dt]))[0], 2) < 1 for w in self.theta)
+        except np.linalg.LinAlgError:  # a pole on the limit, such as an integrator's: the loop is unbounded there
+            return False
 
     def _find_disk_margin(self) -> tuple[dict[str, Number], complex]:
         from scipy.optimize import minimize_scalar

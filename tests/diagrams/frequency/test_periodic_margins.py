@@ -210,6 +210,15 @@ def test_an_integrator_that_is_renewed_twice_is_that_integrator():
     assert found.disk_margin.value == pytest.approx(one, rel=1e-9)
 
 
+def test_an_integrator_with_a_small_gain_has_margins():
+    # x⁺ = x + T u: it bears 2/T, and a phase of arccos(T/2); its delay is beyond what is looked for
+    T = 0.005
+    found = periodic_margins(control.ss([[1.0]], [[T]], [[1.0]], [[0.0]], T))
+    assert found.gain_margin_high.value == pytest.approx(2 / T, rel=1e-9)
+    assert found.phase_margin_deg.value == pytest.approx(np.degrees(np.arccos(T / 2)), rel=1e-9)
+    assert np.isnan(found.delay_margin_s.value)
+
+
 def test_an_unstable_periodic_loop_says_so_with_its_poles():
     found = periodic_margins(unlifted(3.0))
     assert not found.stable

@@ -186,7 +186,9 @@ def test_states_of_others_are_refused(fmi, msd, pendulum, instance):
     like = instance(build_fmu(mass_spring_damper(internal_step=2e-3), fmi=fmi))  # same size, another model
     data = state_of(like)
     fails(item, lambda: item.fmu.deserializeFMUState(data), "no state of this FMU")
-    fails(like, lambda: like.fmu.deserializeFMUState(data[:60] + b"?" + data[61:]), "the checksum of these bytes is wrong")
+    fails(
+        like, lambda: like.fmu.deserializeFMUState(data[:60] + b"?" + data[61:]), "the checksum of these bytes is wrong"
+    )
 
 
 def test_a_state_brings_a_failed_fmu_back(msd, instance):
