@@ -238,6 +238,7 @@ def test_seeds_give_independent_noise():
     assert np.abs(np.corrcoef(y) - np.eye(3)).max() < 4.0 / math.sqrt(N)
 
 
+@pytest.mark.slow
 def test_noise_has_its_variance_mean_and_density():
     source = BandLimitedNoise.from_density(density=0.04, sample_time=0.005, mean=3.0, seed=4)
     y = values_of(source)

@@ -175,6 +175,7 @@ def test_sampled_exactly_the_pulse_response_of_a_filter_at_one_kilohertz_is_that
     np.testing.assert_allclose(got, np.diff(np.r_[0.0, step]), rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("zeta", [0.1, 0.6])
 def test_a_step_in_continuous_time_is_the_closed_form(zeta):
     w = 7.0

@@ -84,6 +84,7 @@ def test_linear_blocks_in_a_loop_are_the_matrix_exponential():
     np.testing.assert_allclose(run["motor.y"], want, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_pid_at_ticks_tracks_its_set_point_through_a_saturated_actuator():
     plant = TransferFunction(numerator=1.0, denominator=[1.0, 1.0, 0.0], name="plant")
 

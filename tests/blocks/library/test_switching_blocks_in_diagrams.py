@@ -140,6 +140,7 @@ def test_logic_that_changes_together_makes_no_glitch():
     assert not run["ever.y"].any()
 
 
+@pytest.mark.slow
 def test_a_switch_changes_where_its_condition_does():
     wave, area = Wave(), Area()
     run = Diagram("d", area(Switch()(Compare("<")(wave.y, 0.5), wave.y, 2.0))).simulate(3.0, **TIGHT)
@@ -170,6 +171,7 @@ def test_a_run_of_approach_contact_and_retract_in_continuous_time():
     assert run["machine.mode"][-1] == 2.0
 
 
+@pytest.mark.slow
 def test_a_body_comes_off_a_damped_wall_as_scipy_says():
     k, d = 400.0, 6.0
     body, wall = Mass(speed=1.0, name="body"), Wall(stiffness=k, damping=d, point=0.5, normal=-1.0, name="wall")

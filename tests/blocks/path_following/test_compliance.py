@@ -110,6 +110,7 @@ class Given(Block):
         return np.where(t >= 1.0, 4.0, 0.0) + 3.0 * np.sin(7.0 * t), moving
 
 
+@pytest.mark.slow
 @EVERY
 @pytest.mark.parametrize("method", ["exact", "semi_implicit"])
 def test_a_run_goes_by_the_recurrence_into_the_limits_and_out_of_them(limits, method):

@@ -278,6 +278,7 @@ def test_perimeter_of_the_papers_ellipse():
     assert Ellipse(semi_axes=(1, 1)).length == pytest.approx(2 * np.pi, rel=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(3)
 @pytest.mark.parametrize("axes", [(A, B), (B, A), (0.4, 0.4), (0.7, 0.1), (0.8, 0.1), (1.0, 0.01), (1.0, 1e-4)])
 def test_arc_length_of_ellipses_agrees_with_elliptic_integrals(axes):
@@ -550,6 +551,7 @@ def test_projection_of_special_points():
         assert path.project(np.ones((2, 3))).shape == (3,)
 
 
+@pytest.mark.slow
 @EVERY
 def test_newton_converges_quadratically_to_the_foot_point(path):
     rng = np.random.default_rng(6)

@@ -101,6 +101,7 @@ def test_a_large_state_space_in_a_sampled_subsystem_is_held_exactly():
     assert run["y"][:6] == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.5, 0.99])
 def test_exact_zeros_of_a_large_matrix_are_structure(share):
     A = matrix(8)

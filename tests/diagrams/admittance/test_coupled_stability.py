@@ -475,6 +475,7 @@ MASSES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MASSES)
 def test_the_co_simulation_grows_as_predicted_on_both_sides_of_a_mass_limit(name):
     # Beyond, the sign of the force alternates and grows by 1e7 to 1e13 in 1 s: 0.3 s are taken, of the acceleration.

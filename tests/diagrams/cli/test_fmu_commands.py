@@ -710,6 +710,7 @@ def test_terminal_without_greek(lag):
     assert b"First-order lags: T ? = u - y [both]." in result.stdout
 
 
+@pytest.mark.slow
 def test_a_reader_that_has_had_enough(lag):
     command = [sys.executable, "-m", "loopwright.diagrams", "inspect", str(lag / "lag.fmu")]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)

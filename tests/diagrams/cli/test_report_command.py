@@ -79,6 +79,7 @@ def test_options_reach_the_experiment(folder, asked):
     assert (folder / "c.html").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["loop.py:loop", "loop.py:make", "loop.py"])
 def test_a_diagram_of_a_users_file(what, folder, asked):
     assert main(["report", what, "--pdf"]) == 0

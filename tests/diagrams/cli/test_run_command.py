@@ -47,6 +47,7 @@ def done(tmp_path_factory):
 # --- what a run writes ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_samples_are_written_exactly(done):
     folder, _, run = done
     with (folder / "A.csv").open() as file:

@@ -147,6 +147,7 @@ def test_a_vector_that_would_need_an_event_for_each_entry_is_refused_by_its_fram
     assert "Index the signal" in report.kinds["continuous"]
 
 
+@pytest.mark.slow
 def test_inputs_are_ranges_or_signals():
     report = check_block(Saturation(limit=1.0), {"u": (-0.5, 0.5)})
     assert report.unseen["sampled"] == {("u", "excess")}  # it is never beyond the limit

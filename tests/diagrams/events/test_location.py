@@ -256,6 +256,7 @@ def test_a_ball_that_loses_no_energy_is_not_taken_for_zeno():
     assert len(run.events) == int((200.0 / half + 1) / 2)
 
 
+@pytest.mark.slow
 def test_a_decay_that_crosses_ever_faster_but_not_for_ever_is_not_taken_for_zeno():
     """A chirp: the intervals shrink, but their ratio tends to one."""
     chirp = Chirp(start_frequency=1.0, end_frequency=200.0, duration=2.0, phase=0.3)

@@ -1,6 +1,7 @@
 """Random linear diagrams: nested, flattened, and the matrix exponential; any order of definition."""
 
 import numpy as np
+import pytest
 from hypothesis import assume
 from hypothesis import strategies as st
 
@@ -51,6 +52,7 @@ def test_nested_flattened_and_matrix_exponential_agree(spec):
     check(spec)
 
 
+@pytest.mark.slow
 @random_cases(3, 40, specs(least=12, clocked=False))
 def test_without_any_clock_it_is_one_matrix_exponential(spec):
     check(spec)

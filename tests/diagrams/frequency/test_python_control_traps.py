@@ -126,6 +126,7 @@ def test_a_gain_margin_at_the_nyquist_frequency_is_reported():
     assert radius[0] < 1 < radius[1]
 
 
+@pytest.mark.slow
 def test_the_headline_gain_margin_is_the_reduction_for_one_loop_and_the_increase_for_another():
     one, other = (quiet(control.stability_margins, delayed(p))[0] for p in (20.0, 40.0))
     assert one < 1 < other

@@ -366,6 +366,7 @@ def asked(s):
     return np.array([60 * s**2 + 1200 * s + 8000, 120 * s**2 + 4800 * s + 64000])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("theta", "worst"), [(0.0, 0.0), (0.07, 0.378)])
 def test_a_mass_mismatch_couples_the_directions_and_moves_the_poles(theta, worst):
     """With plant masses m (1 + e) each double integrator is G / s², G = Nᵀ diag(1 / (1 + e)) N in path coordinates."""

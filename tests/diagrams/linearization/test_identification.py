@@ -95,6 +95,7 @@ def test_it_can_be_asked_for_where_there_are_derivatives():
     np.testing.assert_allclose(b(z), a(z), rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize(("pulse", "bound"), [(1e-2, 1e-6), (20.0, 1e-4)])
 def test_friction_in_the_pulse_is_taken_away(tmp_path, monkeypatch, pulse, bound):

@@ -295,6 +295,7 @@ def test_bent_ones_on_the_move_against_differences_of_the_simulation(seed, clock
 # --- boxes that are enabled ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("T", [None, 0.01], ids=["continuous", "sampled"])
 @pytest.mark.parametrize("on", [0.0, 1.0])
 @random_cases(3, 30, seed=seeds, fresh=True)

@@ -194,6 +194,7 @@ def test_the_estimate_knows_when_the_amplitude_is_too_large():
     assert small.compare(model) < 1e-4 < 1e-2 < large.compare(model)
 
 
+@pytest.mark.slow
 def test_an_operating_point_that_moves_is_seen():
     ramp = Integrator(name="ramp")(Constant(value=1.0, name="rate"))
     place = Integrator(name="x")

@@ -258,6 +258,7 @@ def test_a_users_loop_around_an_fmu_gets_a_report_without_the_sections_of_fig3()
     assert numbers["injection.voltage.sampled_d1.deviation"].value < 1e-3
 
 
+@pytest.mark.slow
 def test_a_source_that_steps_during_the_injection_leaves_no_number():
     report = analyse(speed_control(step_at=0.1), loops=["controller.voltage"], only=("injection",))
     assert not report.numbers()

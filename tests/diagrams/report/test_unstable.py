@@ -63,6 +63,7 @@ def test_nothing_is_injected_into_an_unstable_loop(report):
     assert all("not stable" in text for text in injection.text)
 
 
+@pytest.mark.slow
 def test_a_measurement_of_an_unstable_loop_ends_where_the_signals_have_grown():
     with pytest.raises(SimulationError, match=r"controller.gain.y, t = .*grown to .*not stable") as caught:
         servo().frequency_response("u", [30.0], amplitude=1e-3)

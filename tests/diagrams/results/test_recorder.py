@@ -42,6 +42,7 @@ def record(recorder, t, vectors):
     return recorder.finish(elapsed=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("to", [False, True], ids=["memory", "disk"])
 @pytest.mark.parametrize("residual", [False, True])
 @pytest.mark.parametrize("columns", [None, [0, 2, 5]])

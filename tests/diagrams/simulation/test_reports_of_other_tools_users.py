@@ -509,6 +509,7 @@ def test_start_values_hold_in_every_run_and_unknown_ones_are_refused(spring):
         Fmu(spring, name="m", start={"stifness": 1.0})
 
 
+@pytest.mark.slow
 def test_an_fmu_is_loaded_over_and_over_in_one_process(spring):
     diagram = Diagram("d", Fmu(spring, name="m")(force=0.0))
     count = len(os.listdir("/proc/self/fd")) if os.path.isdir("/proc/self/fd") else 0

@@ -189,12 +189,14 @@ def test_a_branch_goes_on_with_other_parameters_from_the_same_state():
 # --- with FMUs ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("letter", "cut"), [("A", 5.5), ("C", 6.0)])
 def test_the_papers_experiments_go_on_to_the_last_bit_from_half_way(letter, cut):
     experiment = experiments.EXPERIMENTS[letter]()
     assert_same_bits(experiment.diagram, cut, experiment.duration - cut)
 
 
+@pytest.mark.slow
 def test_an_ideal_controller_beside_an_fmu_goes_on_to_the_last_bit():
     diagram = experiments.path_following().diagram.continuous()
     assert_same_bits(diagram, 0.4, 0.3, step=1e-3)

@@ -45,6 +45,7 @@ def method_of_steps(t, tau=0.25, gain=1.0):
     return sum(terms)
 
 
+@pytest.mark.slow
 def test_a_delay_in_a_loop_is_the_method_of_steps():
     run = delayed_feedback().simulate(5.0, step=0.01, **TIGHT)
     assert np.max(np.abs(run["i.y"] - method_of_steps(run.t))) < 1e-11

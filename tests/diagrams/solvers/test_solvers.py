@@ -140,6 +140,7 @@ def test_the_global_error_scales_with_the_tolerance(name, pendulum):
     assert 0.7 < slope(tolerances, errors) < (1.5 if name == "auto" else 1.3), errors
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(2)
 @pytest.mark.parametrize("name", STIFF)
 def test_a_stiff_van_der_pol_oscillator_is_followed_through_its_jumps(name):
@@ -218,6 +219,7 @@ def test_the_dense_output_of_a_one_step_method_has_its_order(name, order, pendul
     assert slope(steps, errors) > order + 1 - 0.35  # local: one more than the order
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VARIABLE)
 def test_the_dense_output_is_as_good_as_the_steps(name, pendulum):
     for rtol in (1e-5, 1e-8):

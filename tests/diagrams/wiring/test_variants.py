@@ -56,6 +56,7 @@ def test_continuous_is_the_ideal_controller():
     assert np.max(np.abs(run["plant.y"] - ideal(run.t))) < 1e-11
 
 
+@pytest.mark.slow
 def test_the_sampled_controller_tends_to_the_ideal_one():
     errors = []
     for T in (0.02, 0.01, 0.005):

@@ -63,6 +63,7 @@ def test_a_compiler_that_does_not_end_is_stopped_with_its_children(tmp_path, spi
     assert_ended(pids)
 
 
+@pytest.mark.slow
 @LINUX
 def test_an_interrupt_ends_the_compiler(tmp_path, spinning):
     compiler, pids = spinning

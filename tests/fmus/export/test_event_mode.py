@@ -50,6 +50,7 @@ def test_an_unhandled_event_is_not_passed_over(ball_fmu, instance):
     assert item.step(last, 1.0) == (True, False, True, last)
 
 
+@pytest.mark.slow
 def test_outputs_follow_the_inputs_in_event_mode(instance):
     spec = counter(lambda t, x, u, p, fired: [x[0], x[1] + fired[0]])
     item = instance(build_fmu(spec), eventModeUsed=True, earlyReturnAllowed=True)

@@ -148,6 +148,7 @@ def test_initialization_fires_nothing(instance):
     assert item["n"] == 0.0
 
 
+@pytest.mark.slow
 def test_a_jump_may_fire_again_and_events_at_one_instant_fire_at_once(instance):
     """The first jump lifts x over the second threshold: 10 n + m counts both events, in two iterations."""
     spec = counter(

@@ -248,6 +248,7 @@ def test_capabilities_of_fmi_3_are_true(uncompiled):
 # ---- binary and sources ----
 
 
+@pytest.mark.slow
 @version
 def test_exports_every_function_of_the_standard(fmi, tmp_path):
     loaded = ctypes.CDLL(str(library(build_fmu(mass_spring_damper(), fmi=fmi), tmp_path)))
@@ -302,6 +303,7 @@ def test_compiles_from_its_sources_without_warnings(uncompiled, fmi, tmp_path):
 SLOW_LEVELS = [pytest.param(level, marks=pytest.mark.slow) for level in ("-O0", "-O2", "-O3", "-Os")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", ["-O1", *SLOW_LEVELS])
 def test_equations_that_are_inlined_compile_at_every_level(uncompiled, level, tmp_path):
     if (gcc := shutil.which("gcc")) is None:

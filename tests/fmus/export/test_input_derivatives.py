@@ -54,6 +54,7 @@ def polynomial(s, x, v, *u):
     return x, v, now
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("slopes", [(2.0,), (-3.0, 4.0), (0.0, 1.5)])
 def test_polynomials_up_to_the_order_of_the_integrator_are_exact(integrators2, instance, integrator, slopes):
@@ -92,6 +93,7 @@ def wave(t):
     return 0.3 + np.sin(2.0 * t)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_a_broken_line_against_scipy(instance, integrator):
     """An importer that joins samples of a wave by lines."""
@@ -113,6 +115,7 @@ def test_a_broken_line_against_scipy(instance, integrator):
         assert [item["x"], item["y"]] == pytest.approx(list(x), abs=2e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("integrator", "order"), [(RK4, 4.0), (RODAS, 4.0), (DOPRI5, 5.0)])
 def test_the_order_is_kept(driven2, instance, integrator, order):
     """One internal step for each communication step. Rosenbrock methods lose order if the input's rate is left out."""

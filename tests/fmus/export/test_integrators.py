@@ -47,6 +47,7 @@ def test_order_on_a_linear_model(instance, integrator, order, counts):
     assert measured == pytest.approx(order, abs=0.2), errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", [RK4, RODAS])
 def test_order_where_time_enters_a_nonlinear_model(instance, integrator):
     """Rosenbrock methods lose order here if the derivative by time is wrong; for DOPRI5, see the tolerances below."""
@@ -57,6 +58,7 @@ def test_order_where_time_enters_a_nonlinear_model(instance, integrator):
     assert -np.polyfit(np.log(counts), np.log(errors), 1)[0] == pytest.approx(4.0, abs=0.2), errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", [DOPRI5, RODAS])
 def test_the_error_follows_the_tolerance(instance, integrator):
     item, reference = instance(build_fmu(driven())), truth(driven_rhs, [1.0, 0.5], (0.0, 5.0))[-1]
@@ -88,6 +90,7 @@ def test_a_stiff_model_against_radau(instance, tolerance, end):
         assert item["v"] == pytest.approx(v, abs=20.0 * max(tolerance, 1e-9) * scale)
 
 
+@pytest.mark.slow
 def test_an_explicit_method_on_a_stiff_model_stays_accurate(instance):
     item = instance(build_fmu(van_der_pol()))
     item.initialize(integrator=DOPRI5)
@@ -185,6 +188,7 @@ def test_the_importers_tolerance_counts_unless_the_parameter_is_set(instance):
     assert end[0] != end[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", [DOPRI5, RODAS])
 def test_a_solution_that_ends_stops_the_step(instance, integrator):
     """x' = x^2, x(0) = 1: no solution beyond t = 1."""

@@ -464,6 +464,7 @@ def test_the_status_of_a_step_in_fmi_2(instance):
     item.step(0.1, 0.1)  # it has done no harm
 
 
+@pytest.mark.slow
 def test_a_state_that_explodes_stops_the_step(fmi, instance):
     item = instance(build_fmu(explosive(), fmi=fmi)).initialize()
     item.step(0.0, 0.5 + 1e-3)

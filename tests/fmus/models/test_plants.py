@@ -87,6 +87,7 @@ def test_the_gantries_have_the_ports_of_the_experiments(build, name):
 # --- gantry_elastic ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_elastic_gantry_is_two_masses_on_each_axis(build):
     T, n = 1e-3, 400
     motor, external = pushes(n, T, np.array([250.0, 140.0]))
@@ -148,6 +149,7 @@ def test_a_stiff_screw_is_the_gantry(build):
 # --- gantry_stiction --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize("scales", [(1.0, 1.0), (0.6, 2.0)])
 def test_the_gantry_with_stiction_obeys_the_lugre_model(build, scales):

@@ -52,6 +52,7 @@ COST = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize(("plant", "letter"), COST, ids=lambda v: getattr(v, "__name__", v).rpartition(".")[2])
 def test_what_another_plant_costs_in_tracking(runs, plant, letter):

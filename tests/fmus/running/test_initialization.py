@@ -44,6 +44,7 @@ def through(cache):
     return build(Through())
 
 
+@pytest.mark.slow
 def test_the_first_outputs_are_those_under_the_first_inputs(through):
     run = Diagram("d", Fmu(through, name="plant")(u=3.0)).simulate(0.3, step=0.1, progress=False)
     assert run["plant.y"].tolist() == [6.0, 6.0, 6.0, 6.0]
@@ -104,6 +105,7 @@ def dotted(cache):
     )
 
 
+@pytest.mark.slow
 def test_ports_with_dots_in_their_names_run(dotted):
     plant = Fmu(dotted, name="plant")
     run = Diagram("d", plant(**{"axis.tau": -2.0 * plant["axis.phi"]})).simulate(0.03, step=0.01, progress=False)

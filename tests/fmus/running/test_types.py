@@ -88,6 +88,7 @@ def test_values_of_every_type_pass_through(file, end):
     assert point["inputs"]["u_vector"].tolist() == [EXTREMES["vector"][end]] * 3
 
 
+@pytest.mark.slow
 def test_fmpy_reads_the_same_values(folder, fmi):
     file = typed_fmu(folder, fmi, complete=True)
     start = {"u_Integer": -5, "u_Boolean": True} if fmi == 2 else {"u_Int8": -5, "u_UInt64": 7, "u_Boolean": True}
