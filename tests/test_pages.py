@@ -61,6 +61,7 @@ def test_the_readme_opens_with_a_closed_loop_in_ten_lines_that_runs(tmp_path):
     run_commands((ROOT / "README.md").read_text(encoding="utf-8"), tmp_path)
 
 
+@pytest.mark.slow
 def test_the_page_on_diagrams_runs(tmp_path):
     scope = {}
     with chdir(tmp_path):

@@ -194,6 +194,7 @@ def test_a_system_of_another_sample_time_is_refused_when_the_diagram_is_built(bl
         good.replace({"box.sample_time": T})
 
 
+@pytest.mark.slow
 def test_states_of_any_width_go_through_a_diagram():
     block = StateSpace(A=[[0, 1], [-4, -1]], B=np.eye(2), C=[[1, 0]], initial_state=[1, 0], name="s")
     run = tight(block([0.0, 0.0]), duration=2.0)

@@ -168,6 +168,7 @@ def test_a_clamped_integral_is_held_between_the_events():
     assert [(round(t, 9), name) for t, name in alone.occurred] == [(1.0, "clamp"), (2.0, "release")]
 
 
+@pytest.mark.slow
 def test_an_integral_that_would_chatter_at_the_limit_takes_steps_of_its_clearance():
     # e falls slowly: P takes v inside again, I drives it out: v slides along the limit
     block = PID(kp=1.0, ki=1.0, lower=-2.0, upper=2.0, anti_windup="clamping", clearance=0.01)

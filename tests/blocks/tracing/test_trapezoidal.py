@@ -131,6 +131,7 @@ class Spring(Block):
         return x.v, u.u - force[0]
 
 
+@pytest.mark.slow
 def test_a_table_is_solved_too():
     run = run_of(Spring(name="s"), Constant(value=0.1), "trapezoidal")
     x, rows = np.array([1.5, 0.0]), []

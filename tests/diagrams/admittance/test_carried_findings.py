@@ -1,6 +1,7 @@
 """Kinks and stairs of a diagram, carried by the reduced loop to its numbers."""
 
 import numpy as np
+import pytest
 
 from loopwright.blocks import AdmittanceFilter, Ellipse, Reference
 from loopwright.diagrams import (
@@ -28,6 +29,7 @@ def robot(**limits):
     return fig3(plant, PATH, par, perp, model=gantry.nominal.replace(**SMOOTH))
 
 
+@pytest.mark.slow
 def test_a_limit_that_1_newton_reaches_is_carried_and_one_beyond_is_not():
     """1 N on 2 kg is 0.5 m/s²: the nominal range of a force of zero reaches an acceleration limit below that."""
     assert AdmittanceLoop.of(robot()).findings == ()

@@ -153,6 +153,7 @@ def test_the_fundamental_is_that_of_the_running_co_simulation(name, hertz):
     assert abs((fine + (fine - coarse) / 99.0) / want - 1.0) < 2e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOOPS)
 def test_the_discrete_system_is_that_of_a_held_force(name):
     model = loop(**LOOPS[name])

@@ -363,6 +363,7 @@ def test_a_report_without_a_contact_to_tell_says_why(made):
     assert not words.sections
 
 
+@pytest.mark.slow
 def test_a_report_of_the_time_runs_alone_says_why_there_are_none():
     found = analyse(diagram(gantry_elastic), only=("time_domain",))
     assert [(s.key, s.text[1]) for s in found.sections] == [("time_domain", ELASTIC)]

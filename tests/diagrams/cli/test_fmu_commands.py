@@ -177,6 +177,7 @@ def test_a_model_of_ones_own_goes_all_the_way(here, capsys):
         assert values == pytest.approx([*y, sum(y) + 10.0], abs=1e-11)  # (4e-3)⁵ / 120 a step, 1000 steps
 
 
+@pytest.mark.slow
 def test_nothing_of_the_file_stays_loaded(here, capsys, uncompiled):
     """A second build finds what has changed, and another file of the same name."""
     before, path = dict(sys.modules), list(sys.path)

@@ -58,6 +58,7 @@ def test_samples_are_written_exactly(done):
     assert np.array_equal(table, np.hstack(signals))  # 17 digits: bit for bit
 
 
+@pytest.mark.slow
 def test_key_numbers_are_strict_json(done):
     folder, experiment, run = done
     content = json.loads((folder / "A.json").read_text(), parse_constant=finite)

@@ -268,6 +268,7 @@ def test_json_refuses_a_number_above_other_numbers():
 # --- files ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_page_pdf_and_json_stand_beside_each_other(tmp_path):
     files = write_report(report(), tmp_path / "r.html", pdf=True, json=True)
     assert [f.name for f in files] == ["r.html", "r.pdf", "r.json"]

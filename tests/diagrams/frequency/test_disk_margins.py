@@ -157,6 +157,7 @@ def test_the_bound_is_exact_for_two_channels(entries):
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(2)
 @pytest.mark.parametrize("seed", range(6))
 def test_three_channels_lie_between_a_perturbation_and_any_scaling(seed):

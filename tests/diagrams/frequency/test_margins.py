@@ -390,6 +390,7 @@ def test_margins_of_random_sampled_loops_are_confirmed(loop):
     return check(loop)
 
 
+@pytest.mark.slow
 @random_cases(6, 60, stabilized_loops(sampled=False), reaching=0.5)
 def test_margins_of_random_continuous_state_feedbacks_are_confirmed(loop):
     return check(loop)

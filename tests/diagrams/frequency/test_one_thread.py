@@ -73,6 +73,7 @@ def test_margins_are_computed_on_one_thread(monkeypatch):
     assert set(threads()) == {2}
 
 
+@pytest.mark.slow
 def test_an_import_limits_nothing():
     code = (
         "import scipy.linalg; from threadpoolctl import threadpool_info as info; before = info();"

@@ -82,6 +82,7 @@ def test_the_answer_does_not_depend_on_the_basis_of_the_states():
     assert max(abs(pm - right) for pm in theirs) > 0.1
 
 
+@pytest.mark.slow
 def test_spurious_crossings_at_low_frequency_are_not_taken_for_margins():
     slow = delayed(0.2)  # the gain margins of this loop are those of its scale: 1/9 and 1/(3 p T), nearly
     found = margins(slow)

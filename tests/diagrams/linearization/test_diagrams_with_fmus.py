@@ -93,6 +93,7 @@ def test_a_sampled_loop_around_an_fmu_at_rest(monkeypatch, interface, exact):
     assert lin.is_equilibrium
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [0.0, 0.05])
 def test_on_the_move_the_step_itself_is_differenced(at):
     lin = around_the_mass(mass()).linearize(at, inputs="u", outputs="u")

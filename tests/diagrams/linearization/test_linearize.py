@@ -154,6 +154,7 @@ def test_time_in_the_flow_counts_even_where_nothing_moves():
     assert A[-1, -1] == pytest.approx(np.exp(40 * (1 - np.cos(2 * np.pi * T)) / (2 * np.pi)), rel=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(2)
 @pytest.mark.parametrize("t", [0.0, 0.1, 0.15, 0.2])
 def test_several_rates_that_move_against_differences_of_the_simulation(t):
@@ -450,6 +451,7 @@ def test_an_instant_of_a_run_is_found_again_with_its_step_its_tolerances_and_its
     close(diagram.linearize(whole.at(0.5)).A, diagram.linearize(second.at(0.5)).A, 1e-7)
 
 
+@pytest.mark.slow
 def test_every_sample_of_a_continuous_run_is_an_operating_point():
     x = Integrator(initial_value=1.0)
     diagram = Diagram("d", x(Function(lambda x: -(x**3))(x.y)))

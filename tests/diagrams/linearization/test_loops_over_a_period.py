@@ -153,6 +153,7 @@ def test_a_report_has_the_margins_of_a_periodic_wire_with_slow_loops_open_and_cl
     assert numbers["injection.reference.sampled_d0.deviation"].value < 1e-5
 
 
+@pytest.mark.slow
 def test_a_report_names_the_state_that_keeps_an_operating_point_from_rest():
     angle = Integrator(name="angle", initial_value=0.0)
     plant = TransferFunction(numerator=[2.0], denominator=[1.0, 1.0], name="plant")

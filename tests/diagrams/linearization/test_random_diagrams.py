@@ -276,6 +276,7 @@ def test_the_poles_do_not_depend_on_the_tick_at_which_the_period_begins(seed):
         close(np.poly(A)[:size], want[:size], 1e-9)
 
 
+@pytest.mark.slow
 @random_cases(2, 12, seeds, RATES, st.integers(0, 3), fresh=True)
 def test_bent_ones_on_the_move_against_differences_of_the_simulation(seed, clocks, k):
     diagram = Loop(seed, clocks).diagram(bend=np.sin)

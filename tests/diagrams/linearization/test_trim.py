@@ -90,6 +90,7 @@ def test_an_fmu_stands_where_it_is_asked_to_and_the_run_from_there_stays():
     assert run["force.y"][0] == pytest.approx(20.0, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_an_fmus_own_parameter_is_found():
     """a = (F − d v − k s)/m: 0.5 = (20.5 − 0 − 20)/m."""
     diagram = mass().replace({"force.value": 20.5})

@@ -120,6 +120,7 @@ CASES = [
 ]
 
 
+@pytest.mark.drawn(2)
 @pytest.mark.parametrize("name", sorted(QUICK))
 def test_an_option_acts_as_in_the_first_seconds_of_the_independent_solution(runs, name):
     options, letter = OPTIONS[name]

@@ -182,6 +182,7 @@ def test_an_option_that_the_plants_start_values_contradict():
     assert float(path_following(plant=plant, coulomb_scale=1).diagram["plant"].start["coulomb_scale"]) == 1.0
 
 
+@pytest.mark.slow
 def test_an_option_that_the_plant_does_not_have(carriage):
     plant = Fmu(carriage, start={"carriage": (0.7, 0.3)})
     with pytest.raises(

@@ -75,6 +75,7 @@ def test_tolerances_hold_the_exact_loop_where_an_fmu_was_differenced(delay):
     holds("ms", -peak.fun)
 
 
+@pytest.mark.slow
 def test_tolerances_stay_where_derivatives_are_exact():
     n = moving_report().numbers()["inner.u.continuous.phase_margin_deg"]
     assert n.tolerance < 1e-9

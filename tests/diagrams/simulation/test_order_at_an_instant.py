@@ -558,6 +558,7 @@ def test_a_diagram_of_events_alone_runs():
     assert [e.t for e in run.events] == pytest.approx([0.5 * k - 0.1 / (2 * np.pi) for k in (1, 2, 3, 4)], abs=1e-13)
 
 
+@pytest.mark.slow
 def test_an_event_whose_jump_changes_nothing_does_not_change_the_solution():
     class Watched(Block):
         y = State(output=True, start=1.0)

@@ -51,6 +51,7 @@ def test_a_delay_in_a_loop_is_the_method_of_steps():
     assert np.max(np.abs(run["i.y"] - method_of_steps(run.t))) < 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(3)
 @pytest.mark.parametrize("solver", ["RK45", "Radau", "BDF", "LSODA", "CVODE_BDF", "auto"])
 def test_every_solver_meets_its_tolerance_with_a_delay(solver):

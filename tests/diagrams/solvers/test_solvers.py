@@ -256,6 +256,7 @@ def test_a_solver_lands_on_its_stops_and_never_looks_beyond(name):
     assert x[0] == pytest.approx(math.exp(-2), rel={"euler": 0.05, "heun": 2e-3}.get(name, 2e-4))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VARIABLE)
 def test_rounding_does_not_carry_a_stage_beyond_the_stop(name):
     rng, stop = np.random.default_rng(3), 0.0
@@ -383,6 +384,7 @@ def test_an_unstable_fixed_step_ends_in_an_error_that_names_the_state(name):
         run(make_solver(name, of, step=0.1), [0.0, 1.0], [30.0])
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(2)
 @pytest.mark.parametrize("name", VARIABLE)
 def test_a_jump_that_is_no_event_ends_in_an_error_not_in_a_hang(name):

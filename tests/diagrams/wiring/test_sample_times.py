@@ -130,6 +130,7 @@ def test_an_fmu_that_takes_steps_of_one_length_steps_at_the_base(cache, monkeypa
     assert "0.0001 s, 7 times finer than the fastest subsystem" in message
 
 
+@pytest.mark.slow
 def test_a_linear_model_over_uneven_ticks_is_that_of_the_run(cache):
     """A is the product of the exact transitions over the ticks of a period, by hand."""
     plant = oscillator()

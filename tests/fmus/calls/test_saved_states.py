@@ -119,6 +119,7 @@ def test_a_run_that_is_cut_and_restored_goes_on_bit_by_bit(loop):
             assert two.instance.t == pytest.approx(CUT * loop.T, rel=1e-15)
 
 
+@pytest.mark.drawn(2)
 def test_a_state_restored_from_bytes_into_a_fresh_instance_goes_on_bit_by_bit(loop):
     with loop.open() as one:
         straight = one.go(0, N)
@@ -199,6 +200,7 @@ def test_a_saved_state_outlives_an_error(file):
         assert np.array_equal(one.go(10, 20), straight)
 
 
+@pytest.mark.slow
 def test_states_are_freed_once_by_hand_by_their_end_or_with_the_instance(file, monkeypatch):
     import fmpy.fmi3
 

@@ -68,6 +68,7 @@ def test_a_start_on_the_floor_without_a_way_out_is_a_rest(path, instance, speed)
     assert RESTS + "0 s" in item.log[-1][2] or float(item.log[-1][2].split("t = ")[1].split(" s")[0]) < 1e-6
 
 
+@pytest.mark.slow
 def test_an_importer_sees_an_indicator_leave_the_border(path, exchange):
     me = exchange(path).start(height=0.0, velocity=-1.0, e=0.5)
     assert me.z[0] == pytest.approx(1e-10)  # on the border, from where it can only fall

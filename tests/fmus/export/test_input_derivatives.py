@@ -151,6 +151,7 @@ def ramps(item, first, last, between=None):
     return [item[name] for name in ("time", "x", "y", "u", "der(x)")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_they_are_part_of_the_state(instance, integrator):
     path = build_fmu(driven(), fmi=2)
@@ -175,6 +176,7 @@ def test_they_are_part_of_the_state(instance, integrator):
     assert item["u"] == 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_derivatives_of_zero_change_no_bit(driven2, instance, integrator):
     found = []
@@ -237,6 +239,7 @@ def test_orders_that_are_refused(integrators2, instance, order):
     fails(item, lambda: call(item.references["u"], [order], [1.0]), f"derivative of u is {order}, expected 1 to 4")
 
 
+@pytest.mark.slow
 def test_what_is_refused(integrators2, instance):
     item = instance(integrators2).initialize()
     fails(item, lambda: move(item, 1.0, name="x"), "x is no continuous input")
@@ -257,6 +260,7 @@ def test_what_is_refused(integrators2, instance):
     assert "this is a Model Exchange instance" in item.log[-1][2]
 
 
+@pytest.mark.slow
 def test_a_step_that_fails_keeps_them(instance):
     item = instance(build_fmu(mass_spring_damper(), fmi=2)).initialize(integrator=RK4)
     item["force"] = 1.0

@@ -106,6 +106,7 @@ def wavy(item, t, n, h=0.07):
     return [item[name] for name in ("time", "x", "y", "der(x)", "der(y)")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", [RK4, DOPRI5, RODAS])
 def test_a_cut_run_continues_bit_identically(instance, integrator):
     path = build_fmu(driven())

@@ -47,6 +47,7 @@ def test_times_and_flags(msd, instance, early):
     assert [call[1:] for call in importer.calls] == [(True, True, True, early)] * 3 + [(True, True, True, False)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_what_is_read_belongs_to_the_time(msd, instance, integrator):
     found = []
@@ -248,6 +249,7 @@ def test_an_input_set_in_between_fires_events_at_once(instance, integrator):
     assert item["x"] == next(t for t in importer.times if t >= 0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_an_input_set_in_between_returns_to_event_mode(instance, integrator):
     importer = event_by_input(instance, integrator, eventModeUsed=True, earlyReturnAllowed=True)

@@ -141,6 +141,7 @@ def test_indicators_have_a_hysteresis(build, exchange):
     assert me.z[0] == pytest.approx(1.1e-10)
 
 
+@pytest.mark.slow
 def test_discrete_inputs_and_parameters_are_set_in_event_mode(fmi, build, exchange):
     me = exchange(build(thermostat())).start()
     fails(me.item, lambda: me.item.__setitem__("set_point", 1.0), "set_point is a discrete input; set it in Event Mode")
@@ -414,6 +415,7 @@ def test_fmpy_agrees_with_scipy(build, interface):
     assert np.abs(np.array([result["x"], result["y"]]) - truth).max() < bound
 
 
+@pytest.mark.slow
 def test_a_stiff_model_under_cvode(build):
     result = fmpy.simulate_fmu(
         str(build(van_der_pol())), fmi_type="ModelExchange", stop_time=200.0, output_interval=10.0,

@@ -219,6 +219,7 @@ def test_two_instances_in_two_threads_are_independent(msd, instance):
     assert results[1] != expected
 
 
+@pytest.mark.slow
 def test_many_instances_leave_nothing_behind(msd, tmp_path):
     psutil = pytest.importorskip("psutil")
     item = open_instance(msd, tmp_path)
@@ -347,6 +348,7 @@ def test_a_stiff_model_in_steps_a_thousand_times_its_time_constant(fmi, instance
     fails(item, lambda: item.initialize(integrator=4.0), "integrator", "was set to 4")
 
 
+@pytest.mark.slow
 def test_the_importers_tolerance_counts_unless_the_parameter_is_set_in_fmi_2(instance):
     item = instance(build_fmu(stiff(), fmi=2))
     item.fmu.setupExperiment(tolerance=1e-5)
@@ -478,6 +480,7 @@ def test_a_state_that_explodes_stops_the_step(fmi, instance):
     assert 1.0 < when < 1.05  # the substep, not the end of the step
 
 
+@pytest.mark.slow
 def test_an_output_that_is_not_finite_stops_the_step(fmi, instance):
     item = instance(build_fmu(explosive(), fmi=fmi))
     fails(item, lambda: item.initialize(x=2.0), "y (element 0) became inf at t = 0 s")

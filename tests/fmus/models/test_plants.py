@@ -104,6 +104,7 @@ def test_the_elastic_gantry_is_two_masses_on_each_axis(build):
     assert np.abs(got["acceleration"][1:] - at_ticks).max() < 1e-5  # m/s2, of 8
 
 
+@pytest.mark.slow
 def test_a_deflected_screw_rings_at_its_resonance(build):
     # without friction, weight and forces: delta'' + (1/m_t + 1/m_J) (d delta' + k delta) = 0
     T, n, e0 = 1e-3, 60, np.array([1e-4, -2e-4])
@@ -293,6 +294,7 @@ def test_the_scaras_fmu_agrees_with_scipy(build):
     assert np.abs(got["position"] - np.stack(tip(x[:, :2].T), axis=1)).max() < 3e-9
 
 
+@pytest.mark.slow
 def test_the_scaras_velocity_and_acceleration_are_the_derivatives_of_its_position(build):
     T, n = 1e-4, 60
     torque, force = np.tile([20.0, -12.0], (n, 1)), np.tile([5.0, 3.0], (n, 1))

@@ -168,6 +168,7 @@ def follow(plant, model, motor, coordinate, rate):
     return Diagram("d", plant(**{motor: command}, external_force=np.zeros(2))).simulate(11.0, progress=False)
 
 
+@pytest.mark.slow
 def test_an_arm_follows_the_ellipse_as_well_as_the_gantry():
     start = PATH.to_plane(0.10, 0.01)
     axes = Fmu(gantry.build(), name="plant", start={"position": start})
