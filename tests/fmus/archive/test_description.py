@@ -175,7 +175,8 @@ def test_another_version_in_the_description_is_refused(file, tmp_path, version):
 
 
 def test_a_patch_of_fmi_3_0_is_read(file, tmp_path):
-    Fmu(changed(file, tmp_path / "patch.fmu", (b'fmiVersion="3.0"', b'fmiVersion="3.0.2"')))
+    patched = Fmu(changed(file, tmp_path / "patch.fmu", (b'fmiVersion="3.0"', b'fmiVersion="3.0.2"')))
+    assert list(patched.outputs) == list(Fmu(file).outputs)
 
 
 def test_a_library_of_another_version_is_refused(file, monkeypatch):
