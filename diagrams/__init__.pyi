@@ -22,7 +22,6 @@ from .admittance import (
 )
 from .contract import BlockReport, check_block
 from .diagram import Diagram
-from .document import Plot, Report, Section, Table
 from .drawing import Drawing
 from .flat import FlatDiagram, Layout
 from .frequency import (
@@ -56,6 +55,7 @@ from .linearization import Kink, Linearization, MeanSlope, StepsOnly, ZeroSlope
 from .measure import FrequencyResponse
 from .paper import Channel, Fig3Diagram, Rig, experiments, fig3
 from .report import analyse
+from .report_writing import Plot, Report, Section, Table
 from .results import Occurrence, OperatingPoint, Run, RunState, Snapshot, Stopped
 from .simulation import Interrupted, RunOptions, Simulation, SimulationView
 from .wiring import Subsystem, SubsystemSettings, Wire, subsystem

@@ -15,10 +15,10 @@ from .simulation import SimulatedDiagram
 
 if TYPE_CHECKING:
     from .admittance import Contact
-    from .document import Report
     from .drawing import Drawing
     from .linearization import Linearization
     from .measure import FrequencyResponse
+    from .report_writing import Report
 
 
 class Diagram(SimulatedDiagram):
@@ -282,8 +282,8 @@ class Diagram(SimulatedDiagram):
         OptionError, ConfirmationError
             A path that does not end in ``.html``, a PDF without its library; a number that its confirmation refutes.
         """
-        from .document import check_files, write_report
         from .report import analyse, with_drawing
+        from .report_writing import check_files, write_report
 
         check_files(path, pdf=pdf, json=json)
         made = with_drawing(analyse(self, **options), self)

@@ -22,7 +22,9 @@ WORDS = re.compile(r"[A-Za-z]{2,}[^\n]* |\A[A-Z]?[a-z]{4,}[a-z ,.;:]*\Z| [^\n]*[
 ALLOWED = {
     "blocks/core/block.py": {"trapezoidal step"},  # the name of a guard, not a text about it
     "blocks/library/python_control.py": {"Discrete"},  # the beginning of a class's name
-    "diagrams/document/figures.py": {r'<svg[^>]*?\bwidth="([\d.]+)(pt|px)?" height="([\d.]+)'},  # Matplotlib's SVG
+    "diagrams/report_writing/figures.py": {
+        r'<svg[^>]*?\bwidth="([\d.]+)(pt|px)?" height="([\d.]+)'
+    },  # Matplotlib's SVG
     "fmus/checks/summary.py": {
         r"^\s*(\S+) => not found",
         r"undefined symbol:\s*([^\s,]+)",

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator, Mapping
 from ...blocks.core import DefinitionError, FmuError, FmuFileError, LoopwrightError, OptionError, near
 from ...fmus.models import gantry
 from ..diagram import Diagram
-from ..document import Report
 from ..paper import EXPERIMENTS, Experiment
+from ..report_writing import Report
 from .options import parse_options, share
 from .text import say
 from .user_models import load_user_file
@@ -55,7 +55,7 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def report_command(arguments: argparse.Namespace) -> int:
     """Make the diagram, analyse it, write the files; return the exit status."""
-    from ..document import check_files, write_report
+    from ..report_writing import check_files, write_report
 
     subject = arguments.diagram or DEFAULT
     with contextlib.ExitStack() as open_file:

@@ -18,9 +18,9 @@ from ..admittance import (
     stability_limit,
     target_admittance,
 )
-from ..document import Plot, Section, Table, Texts
 from ..frequency import Number, with_findings
 from ..report import Implementation
+from ..report_writing import Plot, Section, Table, Texts
 from .reduced_loops import ReducedLoops, each_implementation
 from .report_case import Fig3Case
 from .report_contact import DAMPINGS, SPRING, again, contact_sections, find_contacts

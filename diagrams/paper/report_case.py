@@ -14,9 +14,9 @@ from ...blocks.core import LoopwrightError
 from ...fmus.models import Gantry
 from ...fmus.running import Fmu
 from ..admittance import check_plant, control_rate, is_discrete
-from ..document import Texts
 from ..flat import WiredDiagram
 from ..report import Basis, Case, Implementation, InjectionPlan, Variant, point_of
+from ..report_writing import Texts
 from ..results import OperatingPoint
 from .reduced_loops import FRICTION, NO_FRICTION, ReducedLoops
 

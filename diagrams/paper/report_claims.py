@@ -9,9 +9,9 @@ import numpy as np
 from ...blocks import PlanarModel
 from ...blocks.core import LoopwrightError
 from ...fmus.models import Gantry
-from ..document import Section, Table, Texts
 from ..frequency import Number, relative_difference, with_findings
 from ..report import POLES_TITLE, Implementation, Variant, in_s, scatter, without_memory
+from ..report_writing import Section, Table, Texts
 from .report_case import COORDINATES, Fig3Case, linearization_of
 
 TEXTS = Texts(__package__, "poles")

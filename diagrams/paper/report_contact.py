@@ -10,10 +10,10 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError
 from ..admittance import SIDES, Contact, ContactLimit, StabilityLimit, make_contact
-from ..document import Plot, Section, Table, Texts
 from ..frequency import Number, with_findings
 from ..linearization import StepsOnly
 from ..report import Implementation
+from ..report_writing import Plot, Section, Table, Texts
 from .report_case import PLANT, Fig3Case
 from .report_figures import TARGET, draw_admittances
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..document import Plot, Texts
 from ..report import Implementation, look_of
+from ..report_writing import Plot, Texts
 from ..results import BLUE, DARK, GREEN, VERMILION, new_figure, style
 
 TEXTS = Texts(__package__, "admittance")

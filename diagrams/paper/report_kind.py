@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from ..document import DEFINITIONS, Section, Texts, read_definitions
 from ..report import (
     CLOSED_LOOPS,
     INJECTION,
@@ -18,6 +17,7 @@ from ..report import (
     ReportKind,
     ReportPart,
 )
+from ..report_writing import DEFINITIONS, Section, Texts, read_definitions
 from .reduced_loops import ReducedLoops
 from .report_admittance import admittance, has_admittance
 from .report_case import Fig3Case

@@ -8,9 +8,9 @@ from typing import Any
 
 from ...blocks.core import ConfirmationError, LoopwrightError
 from ..admittance import AdmittanceLoop, growth_rate
-from ..document import Section, Table, Texts
 from ..frequency import Number
 from ..report import Implementation
+from ..report_writing import Section, Table, Texts
 from .moored_gantry import deviation, measured_growth, moored_diagram
 from .reduced_loops import FRICTION, ReducedLoops, each_implementation
 from .report_admittance import not_shown

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from ...blocks.core import LoopwrightError
-from ..document import Section, Table, Texts
 from ..frequency import Number, mimo_disk_margin
 from ..report import Implementation, disk_numbers, disk_range
+from ..report_writing import Section, Table, Texts
 from .report_case import Fig3Case
 
 TEXTS = Texts(__package__, "motor_forces")

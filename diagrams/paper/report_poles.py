@@ -9,9 +9,9 @@ import numpy as np
 
 from ...blocks import ErrorDynamics
 from ...blocks.core import LoopwrightError
-from ..document import Section, Table, Texts
 from ..frequency import Number, Realization, relative_difference, sampled_gains, sampled_poles, with_findings
 from ..report import POLES_TITLE, Variant, in_s, list_poles
+from ..report_writing import Section, Table, Texts
 from .report_case import Fig3Case
 
 TEXTS = Texts(__package__, "poles")

@@ -7,10 +7,10 @@ from datetime import UTC, datetime
 from typing import Any
 
 from ...fmus.running import Fmu
-from ..document import DEFINITIONS, Report
 from ..flat import WiredDiagram
 from ..frequency import on_one_thread
 from ..linearization import find_signal
+from ..report_writing import DEFINITIONS, Report
 from .case import Case, ReportedExperiment
 from .parts import HasReportKind, MakesSections, ReportKind, ReportPart
 from .points import STEP

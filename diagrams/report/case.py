@@ -8,9 +8,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ...blocks.core import LoopwrightError
-from ..document import Texts
 from ..flat import WiredDiagram
 from ..linearization import UnusualStart
+from ..report_writing import Texts
 from .variant import Implementation, Variant, in_s
 from .wires import wires_on_loops
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ...blocks.core import LoopwrightError, PeriodicLoopError
-from ..document import Section, Table
 from ..frequency import DiskMargin, Number, mimo_disk_margin, with_findings
+from ..report_writing import Section, Table
 from .case import Case
 from .uncertainty import LoopPart, cut_key
 from .variant import Cut, Variant

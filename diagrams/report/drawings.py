@@ -6,9 +6,9 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 
-from ..document import Plot, Report, Texts
 from ..drawing import draw
 from ..flat import WiredDiagram
+from ..report_writing import Plot, Report, Texts
 
 TEXTS = Texts(__package__, "figures")
 

@@ -12,8 +12,8 @@ from itertools import chain
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from ...blocks.core import OptionError
-from ..document import Section
 from ..flat import WiredDiagram
+from ..report_writing import Section
 from .case import Case, ReportedExperiment
 
 C = TypeVar("C", bound=Case)

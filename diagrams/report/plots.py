@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..document import Plot, Texts
+from ..report_writing import Plot, Texts
 from ..results import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, new_figure, style
 from .variant import Implementation
 

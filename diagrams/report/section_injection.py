@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import LoopwrightError
-from ..document import Plot, Section, Table, Texts
 from ..frequency import Number
 from ..linearization import Linearization
 from ..measure import FrequencyResponse, frequency_response
+from ..report_writing import Plot, Section, Table, Texts
 from . import plots as figures
 from .case import Case
 from .stability import Stability

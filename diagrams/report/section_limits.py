@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ...blocks import AdmittanceFilter, Backlash, DeadZone, Encoder, Quantizer, RateLimiter, Relay, Saturation
-from ..document import Section, Texts
 from ..linearization import MeanSlope
+from ..report_writing import Section, Texts
 from .case import Case
 
 TEXTS = Texts(__package__, "limits")

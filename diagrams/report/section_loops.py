@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import LoopwrightError, PeriodicLoopError
-from ..document import Section, Table, Texts
 from ..frequency import (
     Comparison,
     Margins,
@@ -21,6 +20,7 @@ from ..frequency import (
     periodic_margins,
     with_findings,
 )
+from ..report_writing import Section, Table, Texts
 from . import plots as figures
 from .case import Case
 from .disks import several

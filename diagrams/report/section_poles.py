@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..document import Section, Table, Texts
 from ..frequency import Number, with_findings
+from ..report_writing import Section, Table, Texts
 from .case import Case
 from .stability import ON_THE_LIMIT, Stability, scatter
 from .variant import in_s

@@ -10,8 +10,8 @@ import numpy as np
 
 from ...blocks.core import Block
 from ...fmus.running import Fmu
-from ..document import Section, Table, Texts, symbol
 from ..frequency import Number
+from ..report_writing import Section, Table, Texts, symbol
 from ..results import PointOrigin
 from ..wiring import Wire
 from .case import Case

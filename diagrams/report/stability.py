@@ -6,7 +6,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from ..document import Section, Texts
+from ..report_writing import Section, Texts
 from .case import Case
 from .section_subject import SUBJECT_TITLE
 from .variant import Variant, in_s

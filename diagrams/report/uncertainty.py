@@ -11,9 +11,9 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError
 from ...fmus.running import DerivativeMethod
-from ..document import Section, Table, Texts
 from ..frequency import Number, margins
 from ..linearization import StepsOnly, linearize
+from ..report_writing import Section, Table, Texts
 from .case import Case
 from .variant import Cut, Variant
 

@@ -9,9 +9,9 @@ import pytest
 
 from loopwright.blocks import ConfirmationError
 from loopwright.diagrams.cli.command_line import _make_parser, main
-from loopwright.diagrams.document.model import Section
-from loopwright.diagrams.document.report import Report
 from loopwright.diagrams.frequency.number import Number
+from loopwright.diagrams.report_writing.model import Section
+from loopwright.diagrams.report_writing.report import Report
 
 LOOP = """
 from loopwright.blocks import Gain, Integrator, Sine, Sum

@@ -7,9 +7,9 @@ import scipy.optimize
 from loopwright.blocks import PID, Constant, Gain, Integrator, TransferFunction
 from loopwright.blocks.core.errors import ConfirmationError, WiringError
 from loopwright.diagrams import Diagram, margins, subsystem
-from loopwright.diagrams.document.definitions import definition
 from loopwright.diagrams.linearization.loops_over_a_period import confirm_loop
 from loopwright.diagrams.linearization.over_a_period import Model
+from loopwright.diagrams.report_writing.definitions import definition
 
 
 def offset(phase, gain=1.0, behind=False):

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 import loopwright.diagrams.report
 from loopwright.diagrams import Number, Plot, Report, Section, Table
-from loopwright.diagrams.document.html import to_html
-from loopwright.diagrams.document.templating import Texts, environment
+from loopwright.diagrams.report_writing.html import to_html
+from loopwright.diagrams.report_writing.templating import Texts, environment
 
 ROOM = Path(loopwright.diagrams.report.__file__).parents[1]
 EVIL = "<script>alert('x')</script> & \"y\""

@@ -12,15 +12,23 @@ from matplotlib.figure import Figure
 
 from loopwright.blocks import DefinitionError, Gain, OptionError, Sine
 from loopwright.diagrams import Diagram, experiments
-from loopwright.diagrams.document.definitions import definition
-from loopwright.diagrams.document.files import check_files, write_report
-from loopwright.diagrams.document.html import to_html
-from loopwright.diagrams.document.json import to_json
-from loopwright.diagrams.document.model import Plot, Section, Table
-from loopwright.diagrams.document.report import Report
-from loopwright.diagrams.document.values import cell, is_numeric, plain, quantity, symbol, tolerance_text, value_text
 from loopwright.diagrams.frequency.number import Number
 from loopwright.diagrams.report.drawings import with_drawing
+from loopwright.diagrams.report_writing.definitions import definition
+from loopwright.diagrams.report_writing.files import check_files, write_report
+from loopwright.diagrams.report_writing.html import to_html
+from loopwright.diagrams.report_writing.json import to_json
+from loopwright.diagrams.report_writing.model import Plot, Section, Table
+from loopwright.diagrams.report_writing.report import Report
+from loopwright.diagrams.report_writing.values import (
+    cell,
+    is_numeric,
+    plain,
+    quantity,
+    symbol,
+    tolerance_text,
+    value_text,
+)
 
 BY_EIGENVALUES, BY_GRID = "closed-loop eigenvalues <both> sides", "a grid ten times as fine"
 
