@@ -210,7 +210,7 @@ PUBLIC = {
         PlanarModel Product Pulse PulseTrain PythonFunction Quantizer Ramp RateLimiter Recorded Reference Relay
         Requirement ResettableIntegrator SampleTimeError Saturation ShapeError Signal SimulationError Sine
         SmoothStep SpringDamper State StateMachine StateSpace Step StopCondition Sum Switch TraceError
-        TransferFunction TransportDelay TransverseTransform Unit UnitDelay UnitError UnknownNameError
+        TransferFunction TransportDelay TransverseTransform Unit UnitConversion UnitDelay UnitError UnknownNameError
         UnwiredInputError Value Wall WiringError ZeroPoleGain hold parameter parse_unit
     """,
     "fmus": """

@@ -40,7 +40,17 @@ from .parameters import ParameterSpec
 from .ports import Event, Input, Output, Port, PortUnit, Shape, State
 from .signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, recorder
 from .source import Constant, Source
-from .units import BASE_UNITS, Unit, describe_mismatch, parse_unit, rate_of, same_unit
+from .units import (
+    BASE_UNITS,
+    DefinedUnit,
+    Unit,
+    convert_unit,
+    describe_mismatch,
+    parse_unit,
+    rate_of,
+    same_dimension,
+    same_unit,
+)
 from .values import Array, Value, identity, parameter, shorten
 
 __all__ = [
@@ -54,6 +64,7 @@ __all__ = [
     "CompilerError",
     "ConfirmationError",
     "Constant",
+    "DefinedUnit",
     "DefinitionError",
     "DoubleDriveError",
     "DuplicateNameError",
@@ -100,6 +111,7 @@ __all__ = [
     "check_name",
     "check_shapes",
     "close_names",
+    "convert_unit",
     "describe_mismatch",
     "elements",
     "identity",
@@ -117,6 +129,7 @@ __all__ = [
     "recorder",
     "replace_file",
     "right_of",
+    "same_dimension",
     "same_unit",
     "shape_of",
     "shorten",

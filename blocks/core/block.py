@@ -96,6 +96,9 @@ class Block(Value, Wireable):
     """True where the equations are not traced: any Python, called with numbers, differentiated by differences."""
     same_units: ClassVar[bool] = False
     """True where all inputs must be in one unit, as in a sum."""
+    converts_units: ClassVar[bool | None] = None
+    """True where a wire to or from the block is converted if its ends are in different units of one dimension; False
+    where the block's user could ask for that."""
     stops: ClassVar[str | None] = None
     """Name of a scalar output that ends the run, without an error, at the first instant at which it is above 0.5."""
     transport: ClassVar[bool] = False

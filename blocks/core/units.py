@@ -30,18 +30,52 @@ class Unit:
         Exponents of kg, m, s, A, K, mol, cd, rad.
     factor, offset : float
         Conversion to base units.
+    relative : bool
+        Whether numbers in it are differences, for which no offset counts (FMI's ``relativeQuantity``).
+    loose_angle : bool
+        Whether the exponent of rad is not known: tools define angles with and without it.
     """
 
     text: str
     exponents: tuple[int, int, int, int, int, int, int, int]
     factor: float = 1.0
     offset: float = 0.0
+    relative: bool = False
+    loose_angle: bool = False
 
     @property
     def base_text(self) -> str:
         """The dimension in base units, such as ``kg.m.s-2``; ``1`` if it has none."""
         powers = [(b, n) for b, n in zip(BASE_UNITS, self.exponents, strict=True) if n]
         return ".".join(base if n == 1 else f"{base}{n}" for base, n in powers) or "1"
+
+
+class DefinedUnit(str):
+    """Name of a unit that is defined elsewhere, as in an FMU's description; it counts as the definition says.
+
+    Parameters
+    ----------
+    unit : Unit
+        The definition, with the name as its text.
+
+    Examples
+    --------
+    >>> inch = DefinedUnit(Unit("in", (0, 1, 0, 0, 0, 0, 0, 0), 0.0254))
+    >>> inch, convert_unit("mm", inch)
+    ('in', (0.03937007874015748, 0.0))
+    """
+
+    unit: Unit
+
+    def __new__(cls, unit: Unit) -> DefinedUnit:
+        """Return the name with its definition."""
+        made = super().__new__(cls, unit.text)
+        made.unit = unit
+        return made
+
+    def __getnewargs__(self) -> tuple[Unit]:  # type: ignore[override]
+        """Return the arguments with which a copy or a pickle makes it anew."""
+        return (self.unit,)
 
 
 def _unit(factor: float = 1.0, offset: float = 0.0, **powers: int) -> Unit:
@@ -112,7 +146,6 @@ def _factors(part: str, text: str) -> list[tuple[Unit, int]]:
     return found
 
 
-@lru_cache(maxsize=1024)
 def parse_unit(text: str) -> Unit:
     """Read a unit string.
 
@@ -137,6 +170,11 @@ def parse_unit(text: str) -> Unit:
     >>> parse_unit("mm").factor
     0.001
     """
+    return text.unit if isinstance(text, DefinedUnit) else _parse(text)
+
+
+@lru_cache(maxsize=1024)
+def _parse(text: str) -> Unit:
     top, slash, bottom = text.partition("/")
     bottom = bottom.strip()
     if slash and bottom.startswith("(") and bottom.endswith(")"):
@@ -158,11 +196,42 @@ def _read(unit: Unit | str) -> Unit:
     return parse_unit(unit) if isinstance(unit, str) else unit
 
 
+def _offsets(a: Unit, b: Unit) -> tuple[float, float]:
+    return (0.0, 0.0) if a.relative or b.relative else (a.offset, b.offset)
+
+
+def same_dimension(a: Unit | str, b: Unit | str) -> bool:
+    """Whether numbers in ``a`` can be converted to ``b``."""
+    a, b = _read(a), _read(b)
+    n = len(BASE_UNITS) - 1 if a.loose_angle or b.loose_angle else len(BASE_UNITS)  # rad is the last one
+    return a.exponents[:n] == b.exponents[:n]
+
+
 def same_unit(a: Unit | str, b: Unit | str) -> bool:
     """Whether a number in ``a`` means the same in ``b``: equal dimension, factor and offset."""
     a, b = _read(a), _read(b)
-    close = math.isclose(a.factor, b.factor, rel_tol=1e-12) and math.isclose(a.offset, b.offset)
-    return close and a.exponents == b.exponents
+    close = math.isclose(a.factor, b.factor, rel_tol=1e-12) and math.isclose(*_offsets(a, b))
+    return close and same_dimension(a, b)
+
+
+def convert_unit(a: Unit | str, b: Unit | str) -> tuple[float, float]:
+    """Return the factor and the offset by which a number in ``a`` becomes one in ``b``: factor · number + offset.
+
+    Raises
+    ------
+    UnitError
+        If they are of different dimensions.
+
+    Examples
+    --------
+    >>> convert_unit("°C", "K")
+    (1.0, 273.15)
+    """
+    a, b = _read(a), _read(b)
+    if not same_dimension(a, b):
+        raise UnitError(f"{describe_mismatch(a, b)}.")
+    ours, theirs = _offsets(a, b)
+    return a.factor / b.factor, (ours - theirs) / b.factor
 
 
 def describe_mismatch(a: Unit | str, b: Unit | str) -> str:
@@ -176,11 +245,15 @@ def describe_mismatch(a: Unit | str, b: Unit | str) -> str:
     a, b = _read(a), _read(b)
     if same_unit(a, b):
         return f"{a.text} and {b.text} are the same"
-    if a.exponents != b.exponents:
+    if not same_dimension(a, b):
         both = f"{a.text} ({a.base_text}) and {b.text} ({b.base_text})"
         return f"{both} are of different dimensions: check which ports are meant"
-    if not math.isclose(a.offset, b.offset):
-        return f"{a.text} and {b.text} differ by an offset of {a.offset - b.offset:.12g}: give both in {b.base_text}"
+    if not math.isclose(*_offsets(a, b)):
+        factor, offset = convert_unit(a, b)
+        if factor != 1.0:
+            law = f"{b.text} = {factor:.12g} · {a.text} + {offset:.12g}".replace("+ -", "- ")
+            return f"{a.text} and {b.text} differ by a factor and an offset, {law}: give both in {b.base_text}"
+        return f"{a.text} and {b.text} differ by an offset of {offset:.12g}: give both in {b.base_text}"
     gain = f"{a.factor / b.factor:.12g}"
     return f"{a.text} and {b.text} differ by a factor of {gain}: put Gain(gain={gain}) between"
 

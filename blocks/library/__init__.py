@@ -18,6 +18,7 @@ from .requirements import Requirement, StopCondition
 from .sampled import Encoder, ForceSensor, Hold, UnitDelay
 from .sources import Pulse, Reference, Sine, SmoothStep, Step
 from .state_machine import StateMachine
+from .unit_conversion import UnitConversion
 from .zero_pole import DiscreteZeroPoleGain, ZeroPoleGain
 
 __all__ = [
@@ -79,6 +80,7 @@ __all__ = [
     "Switch",
     "TransferFunction",
     "TransportDelay",
+    "UnitConversion",
     "UnitDelay",
     "Wall",
     "ZeroPoleGain",

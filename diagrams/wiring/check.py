@@ -14,19 +14,16 @@ from ...blocks.core import (
     SampleTimeError,
     Shape,
     ShapeError,
-    UnitError,
     UnknownNameError,
     UnwiredInputError,
     WiringError,
-    describe_mismatch,
     near,
-    same_unit,
 )
 from ...blocks.library import FixedSampleTime
 from ...blocks.tracing import Traced, start_shapes, trace, traced_parameters
 from .structure import Structure, Wire
+from .units import Unit, check_units
 
-Unit = str | tuple[str, ...] | None
 Port = tuple[str, str]
 
 
@@ -53,7 +50,7 @@ def check(table: Structure) -> Checked:
     traced, shapes = _infer_shapes(table)
     _check_subsystems(table, traced, shapes)
     _check_stops(table, shapes)
-    return Checked(traced, shapes, _check_units(table, shapes))
+    return Checked(traced, shapes, check_units(table))
 
 
 def part_shape(shape: Shape, wire: Wire, consumer: str, port: str) -> Shape:
@@ -312,64 +309,3 @@ def _input_shapes(
         else:
             found[port] = part_shape(shapes[wire.block, wire.port], wire, path, port)
     return found
-
-
-def _check_units(table: Structure, shapes: dict[Port, Shape]) -> dict[Port, Unit]:
-    units: dict[Port, Unit] = {}
-    for path, block in table.blocks.items():
-        for name, port in block.outputs.items():
-            if port.unit is not None:
-                units[path, name] = port.unit
-    followers: dict[Port, list[tuple[Port, Wire]]] = {}  # outputs with the unit of an input
-    for path, block in table.blocks.items():
-        for name, port in block.outputs.items():
-            like = getattr(port, "like", None)
-            wire = table.wires.get((path, like)) if like and not hasattr(port, "start") else None
-            if wire is not None and (path, name) not in units:
-                followers.setdefault((wire.block, wire.port), []).append(((path, name), wire))
-    told = list(units)
-    while told:
-        for output, wire in followers.get(told.pop(), ()):
-            unit = _part_unit(units, wire)
-            if unit is not None:
-                units[output] = unit
-                told.append(output)
-    for path, block in sorted(table.blocks.items()):
-        seen: tuple[Wire, Unit] | None = None
-        for name, spec in block.inputs.items():
-            wire = table.wires.get((path, name))
-            unit = None if wire is None else _part_unit(units, wire)
-            if wire is None or unit is None:
-                continue
-            expected, relation = spec.unit, "expected"
-            if block.same_units:
-                if seen is None:
-                    seen = (wire, unit)
-                expected, relation = seen[1], f"{seen[0]} beside it is"
-            problem = _unit_mismatch(unit, expected)
-            if problem:
-                raise UnitError(
-                    f"{wire} is in {_unit_text(unit)}; {relation} in {_unit_text(expected)}: {problem}",
-                    block=path,
-                    port=name,
-                )
-    return units
-
-
-def _part_unit(units: dict[Port, Unit], wire: Wire) -> Unit:
-    unit = units.get((wire.block, wire.port))
-    if isinstance(unit, tuple) and wire.index is not None:
-        return unit[wire.index]
-    return unit
-
-
-def _unit_text(unit: Unit) -> str:
-    return ", ".join(unit) if isinstance(unit, tuple) else str(unit)
-
-
-def _unit_mismatch(found: Unit, expected: Unit) -> str:
-    if found is None or expected is None:
-        return ""
-    n = max(len(u) if isinstance(u, tuple) else 1 for u in (found, expected))
-    left, right = (u if isinstance(u, tuple) else (u,) * n for u in (found, expected))
-    return next((describe_mismatch(a, b) for a, b in zip(left, right, strict=False) if not same_unit(a, b)), "")

@@ -14,6 +14,7 @@ from .delay_blocks import add_delay_blocks
 from .order import evaluation_order
 from .structure import Collector, Structure, SubsystemSettings, Wire, stepped_blocks
 from .subsystems import exact_time
+from .units import add_unit_conversions
 from .variants import apply_changes, find_path
 
 LOOPS = ("error", "solve")
@@ -57,12 +58,12 @@ class CheckedDiagram:
     structure: Structure
     """Blocks, wires and subsystems as they were wired."""
     scheduled: Structure
-    """The structure that the scheduler sees: computational delays have become blocks."""
+    """The structure that the scheduler sees: computational delays and conversions of units have become blocks."""
     checked: Checked
     """Traces of the scheduled blocks, and shapes and units of their ports."""
 
     def _set(self, name: str, table: Structure, loops: str) -> None:
-        runs = add_delay_blocks(table)
+        runs = add_unit_conversions(add_delay_blocks(table))
         checked = check(runs)
         for start in (False, True):
             evaluation_order(runs, checked.traced, start=start, solve=loops == "solve")

@@ -208,7 +208,7 @@ def _read_variables(path: Path, entries: set[str], root: ET.Element, model: Any)
             flags["model_exchange_binary"] = _find_binary(path, entries, version, flags["model_exchange"])
         except FmuFileError:
             flags["model_exchange"] = None
-    bounds, units = _unsigned_bounds(root), FmuUnits({u.name: u for u in model.unitDefinitions})
+    dropped, units = _dropped_attributes(root), FmuUnits({u.name: u for u in model.unitDefinitions})
     scalars, other, texts = {}, {}, {}
     for v in model.modelVariables:
         if v.causality == "independent":
@@ -216,7 +216,7 @@ def _read_variables(path: Path, entries: set[str], root: ET.Element, model: Any)
         if v.name in scalars or v.name in other:
             raise FmuFileError(f"{str(path)!r} has two variables {v.name!r}. Export it again.")
         if fmi3_type(v.type) in WIRE_TYPES:
-            scalars[v.name] = read_variable(v, bounds, units)
+            scalars[v.name] = read_variable(v, dropped.get(v.name, {}), units)
         else:
             other[v.name] = OtherVariable(v.name, v.type, v.causality or "local")
             if v.type == "String" and not v.shape:
@@ -313,8 +313,12 @@ def _flag(interface: ET.Element | None, name: str) -> bool:
     return interface is not None and interface.get(name) in ("true", "1")
 
 
-def _unsigned_bounds(root: ET.Element) -> dict[int, Mapping[str, str]]:
-    """Return the attributes of unsigned integers of FMI 3.0 by value reference; FMPy drops their bounds."""
+def _dropped_attributes(root: ET.Element) -> dict[str, Mapping[str, str]]:
+    """Return attributes that FMPy drops, by the variable's name: bounds of unsigned integers, relative quantities."""
     variables = root.find("ModelVariables")
-    found = [] if variables is None else [e for e in variables if e.tag.startswith("UInt")]
-    return {int(e.attrib["valueReference"]): e.attrib for e in found}
+    found: dict[str, Mapping[str, str]] = {}
+    for element in () if variables is None else variables:
+        inner = next((e for e in element if e.tag == "Real"), element)  # of FMI 2.0
+        if element.tag.startswith("UInt") or "relativeQuantity" in inner.attrib:
+            found[element.attrib.get("name", "")] = inner.attrib
+    return found

@@ -131,14 +131,13 @@ def inexact(values: np.ndarray) -> bool:
     return bool(np.any((values > _EXACT) | (values < -_EXACT)))
 
 
-def read_variable(v: Any, bounds: Mapping[int, Mapping[str, str]], units: FmuUnits) -> FmuVariable:
-    """Return a variable that FMPy has read; ``bounds`` holds attributes that it drops, by value reference."""
+def read_variable(v: Any, dropped: Mapping[str, str], units: FmuUnits) -> FmuVariable:
+    """Return a variable that FMPy has read; ``dropped`` holds attributes that it drops."""
     declared = v.declaredType
-    given = bounds.get(v.valueReference, {})
 
     def attribute(name: str) -> Any:
         found = getattr(v, name, None)
-        found = given.get(name) if found is None else found
+        found = dropped.get(name) if found is None else found
         return getattr(declared, name, None) if found is None else found
 
     shape, type_ = tuple(v.shape or ()), fmi3_type(v.type)
@@ -148,7 +147,7 @@ def read_variable(v: Any, bounds: Mapping[int, Mapping[str, str]], units: FmuUni
         (v.valueReference,),
         v.causality or "local",
         shape,
-        units[attribute("unit")],
+        units.find(attribute("unit"), relative=attribute("relativeQuantity") in (True, "true", "1")),
         None if v.start is None else _start(v.start, shape),
         v.description or (declared.description if declared is not None else None) or "",
         _number(attribute("min")),

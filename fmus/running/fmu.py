@@ -62,6 +62,10 @@ class Fmu(Block):
         description="FMU's names of the variables that are ports: inputs, outputs, local variables, tunable "
         "parameters as inputs; None for all inputs and outputs",
     )
+    convert_units: bool = parameter(
+        default=False,
+        description="convert wires to and from other units of a port's dimension, which else are refused",
+    )
 
     def check(self) -> None:
         """Check the file, the names of ``ports`` and ``rename``, and names, shapes and values of ``start``."""
@@ -115,6 +119,11 @@ class Fmu(Block):
             For an unknown variable, one that can't be set, another shape or type, and a value out of its range.
         """
         return check_value(description, name, value, self.label)
+
+    @property
+    def converts_units(self) -> bool | None:  # type: ignore[override]
+        """Whether wires in other units of its ports' dimensions are converted."""
+        return self.convert_units
 
     @property
     def input_variables(self) -> Mapping[str, FmuVariable]:

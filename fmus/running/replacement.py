@@ -19,6 +19,7 @@ from ...blocks.core import (
     UnwiredInputError,
     WiringError,
     describe_mismatch,
+    same_dimension,
     same_unit,
 )
 from ..archive import FmuVariable
@@ -39,6 +40,8 @@ class _WithVariables(Protocol):
     def drawn_as(self) -> str: ...
     @property
     def rename(self) -> Mapping[str, str]: ...
+    @property
+    def convert_units(self) -> bool: ...
     @property
     def inputs(self) -> Mapping[str, Input]: ...
     @property
@@ -81,7 +84,8 @@ def check_replacement(fmu: _WithVariables, old: Block, wired: Collection[str], r
         note = ", and nothing is wired to it" if side == "input" else ""
         misfits += [_Misfit(error, f"{_text(side, n, ports[n])} is extra{note}") for n in extra[:_SHOWN]]
         for name in (name for name in before if name in used and name in ports):
-            misfits += _compare(side, name, ports[name], before[name], variables[name], _variable(old, side, name))
+            pair = ports[name], before[name], variables[name], _variable(old, side, name)
+            misfits += _compare(side, name, *pair, converts=fmu.convert_units)
         pairs = _match({n: before[n] for n in missing}, {n: ports[n] for n in spare if n not in before})
         rename |= {variables[new].name: name for name, new in pairs.items()}
     if not misfits:
@@ -114,14 +118,21 @@ def _compare(
     old: Input | Output | State,
     variable: FmuVariable,
     before: FmuVariable | None,
+    *,
+    converts: bool,
 ) -> list[_Misfit]:
     """Return the differences in shape, unit and type of a port that both blocks have."""
     found = list[_Misfit]()
     if old.shape is not None and new.shape != old.shape:
         found.append(_Misfit(ShapeError, f"{side} {name}: found shape {new.shape}; expected {old.shape}"))
-    if isinstance(new.unit, str) and isinstance(old.unit, str) and not same_unit(new.unit, old.unit):
-        way = (old.unit, new.unit) if side == "input" else (new.unit, old.unit)
-        text = f"{side} {name}: found the unit {new.unit}; expected {old.unit}: {describe_mismatch(*way)}"
+    one, other = new.unit, old.unit
+    if (
+        isinstance(one, str)
+        and isinstance(other, str)
+        and not (same_unit(one, other) or (converts and same_dimension(one, other)))
+    ):
+        way = (other, one) if side == "input" else (one, other)
+        text = f"{side} {name}: found the unit {one}; expected {other}: {describe_mismatch(*way)}"
         found.append(_Misfit(UnitError, text))
     if side == "input" and before is not None and _kind(variable) not in _ACCEPTED_BY[_kind(before)]:
         text = f"input {name}: found the type {variable.type}; expected {before.type}, whose values it would refuse"

@@ -77,6 +77,7 @@ from loopwright.blocks import (
     TransferFunction,
     TransportDelay,
     TransverseTransform,
+    UnitConversion,
     UnitDelay,
     Wall,
     ZeroPoleGain,
@@ -145,6 +146,8 @@ CASES = [
     (Lookup1D(breakpoints=(-1.0, 0.5, 2.0), values=(1.0, 0.0, 3.0)), {}, BOTH),
     (Lookup1D(breakpoints=(-1.0, 0.5, 2.0, 2.5), values=(1.0, 0.0, 3.0, 1.0), interpolation="cubic", beyond="extrapolate"), {}, BOTH),
     (Lookup2D(rows=(0.0, 1.0), columns=(0.0, 1.0, 2.0), values=((0.0, 1.0, 2.0), (3.0, 1.0, 0.0))), {}, BOTH),
+    (UnitConversion(from_unit="degC", to_unit="K"), {}, BOTH),
+    (UnitConversion(from_unit="mm", to_unit="m"), VECTOR, BOTH),
     # what jumps or remembers
     (Quantizer(interval=0.3), {}, BOTH),
     (Quantizer(interval=0.3), VECTOR, SAMPLED),

@@ -108,19 +108,21 @@ def test_an_fmu_whose_outputs_are_all_of_other_types_is_refused(file, tmp_path):
         ("degC", 'K="1" offset="273.15"', "degC", 0),
         ("newton", 'kg="1" m="1" s="-2"', "kg.m.s-2", 0),
         ("count", "", "1", 0),
-        ("m", 's="1" factor="60"', None, 1),  # minutes
+        ("m", 's="1" factor="60"', "m", 1),  # minutes
         ("h", 'kg="1" m="2" s="-1"', "kg.m2.s-1", 1),  # Planck's
-        ("inch", 'm="1" factor="0.0254"', None, 0),
+        ("inch", 'm="1" factor="0.0254"', "inch", 0),
     ],
 )
 def test_a_unit_is_read_as_the_fmu_defines_it(name, base, expected, complaints):
     unit = BaseUnit(**{k: float(v) if "." in v or k in ("factor", "offset") else int(v)
                        for k, v in re.findall(r'(\w+)="([^"]+)"', base)})  # fmt: skip
     units = FmuUnits({name: UnitDefinition(name=name, baseUnit=unit)})
-    assert units[name] == expected
-    assert expected is None or parse_unit(expected)
+    found = units.find(name)
+    assert found == expected
+    if 'factor="60"' in base or name == "inch":
+        assert (parse_unit(found).factor, parse_unit(found).exponents[1:3]) == (unit.factor, (unit.m, unit.s))
     assert len(units.complaints) == complaints
-    assert units[None] is None
+    assert units.find(None) is None
 
 
 # --- mutations ----------------------------------------------------------------------------------------------------------

@@ -1,0 +1,152 @@
+"""Units along the wires: followed from output to input, checked, and converted where a block asks for that."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from ...blocks.core import PortUnit, UnitError, describe_mismatch, same_dimension, same_unit
+from ...blocks.library import UnitConversion
+from .structure import Structure, Wire, join
+
+Unit = PortUnit
+Port = tuple[str, str]
+_MOST_ROUNDS = 100
+
+
+def follow_units(table: Structure, converted: Mapping[Port, Unit]) -> dict[Port, Unit]:
+    """Return the unit of every output that has one: declared, or that of the input which the output is like.
+
+    Parameters
+    ----------
+    table : Structure
+        Blocks and wires.
+    converted : mapping
+        Units to which wires are converted, by the input at their end.
+    """
+    units: dict[Port, Unit] = {}
+    for path, block in table.blocks.items():
+        for name, port in block.outputs.items():
+            if port.unit is not None:
+                units[path, name] = port.unit
+    followers: dict[Port, list[tuple[Port, Port, Wire]]] = {}  # outputs with the unit of an input
+    for path, block in table.blocks.items():
+        for name, port in block.outputs.items():
+            like = getattr(port, "like", None)
+            wire = table.wires.get((path, like)) if like and not hasattr(port, "start") else None
+            if wire is not None and (path, name) not in units:
+                followers.setdefault((wire.block, wire.port), []).append(((path, name), (path, str(like)), wire))
+    told = list(units)
+    while told:
+        for output, end, wire in followers.get(told.pop(), ()):
+            unit = converted.get(end) or _part_unit(units, wire)
+            if unit is not None:
+                units[output] = unit
+                told.append(output)
+    return units
+
+
+def check_units(table: Structure) -> dict[Port, Unit]:
+    """Return the units of all outputs that have one.
+
+    Raises
+    ------
+    UnitError
+        For a wire between two units.
+    """
+    units = follow_units(table, {})
+    for path, block in sorted(table.blocks.items()):
+        beside: tuple[Wire, Unit] | None = None
+        for name, spec in block.inputs.items():
+            wire = table.wires.get((path, name))
+            unit = None if wire is None else _part_unit(units, wire)
+            if wire is None or unit is None:
+                continue
+            expected, relation = spec.unit, "expected"
+            if block.same_units:
+                if beside is None:
+                    beside = (wire, unit)
+                expected, relation = beside[1], f"{beside[0]} beside it is"
+            a, b = next(_mismatches(unit, expected), ("", ""))
+            if a:
+                ends = (block, table.blocks[wire.block])
+                advice = ", or give its FMU convert_units=True"
+                can = same_dimension(a, b) and any(end.converts_units is False for end in ends)
+                raise UnitError(
+                    f"{wire} is in {_text(unit)}; {relation} in {_text(expected)}: {describe_mismatch(a, b)}"
+                    f"{advice if can else ''}",
+                    block=path,
+                    port=name,
+                )
+    return units
+
+
+def add_unit_conversions(table: Structure) -> Structure:
+    """Return the structure with a `UnitConversion` in each wire between two units where one of its blocks converts.
+
+    The block stands beside the consumer, and is called ``convert_`` and the names of the consumer and its input. A
+    block whose inputs are all in one unit, such as a sum, takes that of the first input whose source does not convert.
+    """
+    if not any(block.converts_units for block in table.blocks.values()):
+        return table
+    inputs = {path: block.inputs for path, block in table.blocks.items()}
+    found: dict[Port, tuple[Unit, Unit]] = {}
+    for _ in range(_MOST_ROUNDS):  # a conversion changes the units of outputs that are like the input
+        units = follow_units(table, {end: to for end, (_, to) in found.items()})
+        fresh: dict[Port, tuple[Unit, Unit]] = {}
+        for (path, port), wire in table.wires.items():
+            block, unit = table.blocks[path], _part_unit(units, wire)
+            if unit is None or not (block.converts_units or table.blocks[wire.block].converts_units):
+                continue
+            spec = inputs[path].get(port)
+            expected = _shared_unit(table, units, path) if block.same_units else None if spec is None else spec.unit
+            differing = [*_mismatches(unit, expected)]
+            if differing and all(same_dimension(a, b) for a, b in differing):
+                fresh[path, port] = unit, expected
+        if fresh == found:
+            break
+        found = fresh
+    return _insert(table, found)
+
+
+def _insert(table: Structure, conversions: Mapping[Port, tuple[Unit, Unit]]) -> Structure:
+    table = table.copy()
+    for (path, port), (unit, expected) in sorted(conversions.items(), key=lambda item: item[0]):
+        subsystem = table.subsystem_of[path]
+        base = f"convert_{path.rpartition('.')[2]}_{port if port.isidentifier() else 'input'}"
+        name, count = base, 2
+        while join(subsystem, name) in table.blocks:
+            name, count = f"{base}_{count}", count + 1
+        made = join(subsystem, name)
+        table.blocks[made] = UnitConversion(from_unit=unit, to_unit=expected, name=name)
+        table.subsystem_of[made] = subsystem
+        table.wires[made, "u"] = table.wires[path, port]
+        table.wires[path, port] = Wire(made, "y")
+    return table
+
+
+def _shared_unit(table: Structure, units: dict[Port, Unit], path: str) -> Unit:
+    """Return the unit that all inputs of a block get: of the first whose source does not convert, else of the first."""
+    wires = [table.wires[path, name] for name in table.blocks[path].inputs if (path, name) in table.wires]
+    known = [(wire, unit) for wire in wires if (unit := _part_unit(units, wire)) is not None]
+    firm = [unit for wire, unit in known if not table.blocks[wire.block].converts_units]
+    return firm[0] if firm else known[0][1] if known else None
+
+
+def _part_unit(units: Mapping[Port, Unit], wire: Wire) -> Unit:
+    unit = units.get((wire.block, wire.port))
+    if isinstance(unit, tuple) and wire.index is not None:
+        return unit[wire.index]
+    return unit
+
+
+def _text(unit: Unit) -> str:
+    return ", ".join(unit) if isinstance(unit, tuple) else str(unit)
+
+
+def _mismatches(found: Unit, expected: Unit) -> Iterator[tuple[str, str]]:
+    """Yield the pairs of units, entry by entry, that are not the same."""
+    if found is None or expected is None:
+        return
+    n = max(len(u) if isinstance(u, tuple) else 1 for u in (found, expected))
+    left, right = (u if isinstance(u, tuple) else (u,) * n for u in (found, expected))
+    yield from ((a, b) for a, b in zip(left, right, strict=False) if not same_unit(a, b))

@@ -1,0 +1,113 @@
+"""Units of an FMU's ports: refused with the factor, or converted at the port."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Constant, Gain, Sine, Sum, UnitConversion, UnitError
+from loopwright.diagrams import Diagram
+from loopwright.fmus import Fmu
+from support.typed_fmus import typed_fmu
+
+UNITS = {
+    "K": 'K="1"', "degF": 'K="1" factor="0.5555555555555556" offset="255.37222222222223"', "N": 'kg="1" m="1" s="-2"',
+    "lbf": 'kg="1" m="1" s="-2" factor="4.4482216152605"', "degC": 'K="1" offset="273.15"', "rad": 'rad="1"',
+}  # fmt: skip
+PORTS = [("T", "K", ""), ("F", "degF", ""), ("rise", "degC", ' relativeQuantity="true"'), ("force", "lbf", ""),
+         ("angle", "rad", "")]  # fmt: skip
+"""Each input u_<name>, and the output y_<name> that is equal to it after a step."""
+
+
+@pytest.fixture(scope="module")
+def file(cache, tmp_path_factory):
+    rows = "".join(
+        f'<Float64 name="{side}_{name}" valueReference="{i + k}" causality="{causality}" unit="{unit}"{more}{start}/>'
+        for i, (name, unit, more) in enumerate(PORTS)
+        for side, causality, k, start in (("u", "input", 0, ' start="0"'), ("y", "output", 50, ""))
+    )
+    units = "".join(f'<Unit name="{name}"><BaseUnit {base}/></Unit>' for name, base in UNITS.items())
+    outputs = "".join(f'<Output valueReference="{50 + i}"/>' for i in range(len(PORTS)))
+    text = (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<fmiModelDescription fmiVersion="3.0" modelName="typed" '
+        f'instantiationToken="x"><CoSimulation modelIdentifier="typed"/><UnitDefinitions>{units}</UnitDefinitions>'
+        f"<ModelVariables>{rows}</ModelVariables><ModelStructure>{outputs}</ModelStructure></fmiModelDescription>"
+    )
+    return typed_fmu(tmp_path_factory.mktemp("units"), 3, text)
+
+
+def wired(plant, **inputs):
+    """Wire inputs of any unit, the others to 1."""
+    return plant(**{f"u_{n}": inputs.get(n, Constant(value=1.0)) for n, _, _ in PORTS})
+
+
+@pytest.mark.parametrize(
+    ("port", "unit", "text"),
+    [
+        ("force", "N", r"N and lbf differ by a factor of 0\.224808943\d*: put Gain"),
+        ("T", "degC", r"degC and K differ by an offset of 273\.15"),
+        ("F", "K", r"K and degF differ by a factor and an offset, degF = 1\.8 · K - 459\.67"),
+        ("force", "m", r"m \(m\) and lbf \(kg\.m\.s-2\) are of different dimensions: check which ports are meant$"),
+        ("angle", "deg", r"deg and rad differ by a factor of 0\.0174532\d*: .*, or give its FMU convert_units=True$"),
+    ],
+)
+def test_another_unit_is_refused_with_the_way_between(file, port, unit, text):
+    with pytest.raises(UnitError, match=text):
+        Diagram("d", wired(Fmu(file, name="plant"), **{port: Constant(value=1.0, unit=unit)}))
+
+
+@pytest.mark.parametrize(
+    ("port", "unit", "value", "expected"),
+    [
+        ("T", "degC", 20.0, 293.15),
+        ("F", "degC", 100.0, 212.0),
+        ("F", "K", 273.15, 32.0),
+        ("rise", "K", 5.0, 5.0),
+        ("rise", "degC", 5.0, 5.0),  # 5 °C of difference are 5 K
+        ("force", "kN", 1.0, 1000.0 / 4.4482216152605),
+        ("angle", "deg", 180.0, np.pi),
+        ("angle", "rad", 0.1, 0.1),
+    ],
+)
+def test_another_unit_is_converted_at_an_input(file, port, unit, value, expected):
+    plant = Fmu(file, name="plant", convert_units=True)
+    run = Diagram("d", wired(plant, **{port: Constant(value=value, unit=unit)})).simulate(0.1, step=0.1, progress=False)
+    assert run[f"plant.y_{port}"][-1] == pytest.approx(expected, rel=1e-12)
+    assert run.unit(f"plant.y_{port}") == plant.outputs[f"y_{port}"].unit
+
+
+def test_another_dimension_stays_refused(file):
+    plant = Fmu(file, name="plant", convert_units=True)
+    with pytest.raises(UnitError, match="of different dimensions"):
+        Diagram("d", wired(plant, force=Constant(value=1.0, unit="m")))
+
+
+def test_outputs_are_converted_for_their_consumers_and_recorded_in_their_own_unit(file):
+    plant = Fmu(file, name="plant", convert_units=True)
+    closed = wired(plant, T=Constant(value=300.0, unit="K"), F=Constant(value=10.0, unit="degC"))
+    difference = Sum(signs="+-", name="difference")(Constant(value=30.0, unit="degC"), plant.y_T)
+    twice = Sum(signs="++", name="mean")(plant.y_F, plant.y_T)  # both are of the FMU: in the first one's unit
+    run = Diagram("d", closed, difference, twice).simulate(0.1, step=0.1, progress=False)
+    assert run["plant.y_T"][-1] == 300.0
+    assert run.unit("plant.y_T") == "K"
+    assert run["difference.y"][-1] == pytest.approx(30.0 - 26.85, rel=1e-12)
+    assert run.unit("difference.y") == "degC"
+    assert run["mean.y"][-1] == pytest.approx(50.0 + (300.0 * 1.8 - 459.67), rel=1e-12)
+
+
+def test_jacobians_have_the_factor(file):
+    plant = Fmu(file, name="plant", convert_units=True)
+    push = Gain(gain=1.0, name="push")(Sine(amplitude=1.0, frequency=1.0, unit="kN", name="hand"))
+    hand = UnitConversion(from_unit="kN", to_unit="kN", name="shown")(push)
+    diagram = Diagram("d", wired(plant, force=hand))
+    model = diagram.linearize(step=0.1, inputs=["push.y"], outputs=["plant.y_force"])
+    gain = model.C @ np.linalg.solve(np.eye(len(model.A)) - model.A, model.B) + model.D
+    assert gain.item() == pytest.approx(1000.0 / 4.4482216152605, rel=1e-7)
+
+
+def test_a_replacement_in_other_units_fits_if_it_converts(file):
+    near = Fmu(file, name="plant", convert_units=True)
+    diagram = Diagram("d", wired(near, angle=Constant(value=90.0, unit="deg")))
+    assert diagram.replace(plant=Fmu(file, convert_units=True)).simulate(0.1, step=0.1, progress=False)[
+        "plant.y_angle"
+    ][-1] == pytest.approx(np.pi / 2)
+    with pytest.raises(UnitError, match="deg and rad"):
+        diagram.replace(plant=Fmu(file))
