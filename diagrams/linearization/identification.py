@@ -22,6 +22,7 @@ import numpy as np
 
 from ...blocks.core import FmuError
 from ...fmus.calls import LoadedFmu
+from ...fmus.isolation import open_fmu
 from ...fmus.running import Derivation, DerivativeMethod
 
 if TYPE_CHECKING:
@@ -124,7 +125,7 @@ class _Runner:
         self.inputs = {variables[port].name: np.array(v, dtype=float) for port, v in point["inputs"].items()}
         self.start = {n: v for n, v in point["state"].items() if self.about.find(n).initial == "exact"}
         self.outputs = [v.name for v in block.output_variables.values()]
-        self.instance = LoadedFmu(block)
+        self.instance = open_fmu(LoadedFmu, block)
         self._steps, self._fresh = 0, True
         self._saved: Any = None
         self._begin()

@@ -1,12 +1,22 @@
 """FMI calls into a library that is loaded in this process."""
 
+from .fmi2 import Fmi2Calls
+from .fmi3 import Fmi3Calls
+from .fmi_calls import BoundCalls, Call, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance, FmuState
-from .loaded_library import LoadedFmu
+from .loaded_library import LoadedFmu, MakeCalls
 
 __all__ = [
+    "BoundCalls",
+    "Call",
+    "Fmi2Calls",
+    "Fmi3Calls",
+    "FmiCalls",
     "FmuBlock",
     "FmuInstance",
     "FmuState",
     "LoadedFmu",
+    "Log",
+    "MakeCalls",
 ]

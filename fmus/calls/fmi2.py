@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .fmi_calls import DISCARD, PENDING, FmiCalls, Log, StepCall, TypeCalls, allow_missing
+from .fmi_calls import DISCARD, PENDING, FmiCalls, Log, StepCall, TypeCalls
 from .printf import Logger, format_message
 
 _LONGEST_WAIT = 0.01  # s between two looks at a step that is pending
@@ -33,8 +33,9 @@ class Fmi2Calls(FmiCalls):
     def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
         from fmpy.fmi2 import FMU2Model, FMU2Slave
 
-        kind = allow_missing(FMU2Model if model_exchange else FMU2Slave, self.prefix, _REQUIRED)
-        self.fmu = kind(
+        self.fmu = self._open(
+            FMU2Model if model_exchange else FMU2Slave,
+            _REQUIRED,
             guid=token,
             modelIdentifier=library.stem,
             unzipDirectory=str(folder),
@@ -84,11 +85,13 @@ class Fmi2Calls(FmiCalls):
     @property
     def final(self) -> ctypes.c_int:
         """The flag noSetFMUStatePriorToCurrentPoint."""
-        return ctypes.c_int(True)
+        value = self.variable(ctypes.c_int)
+        value.value = True
+        return value
 
     def step_call(self, now: ctypes.c_double, width: ctypes.c_double, final: Any) -> StepCall:
         """Return fmi2DoStep with its arguments (4.2.2)."""
-        flags, component = (ctypes.c_bool * 4)(), ctypes.c_void_p(self.fmu.component)
+        flags, component = self.variable(ctypes.c_bool * 4), ctypes.c_void_p(self.fmu.component)
         any_flag = ctypes.c_uint32.from_buffer(flags)
         arguments = (component, now, width, final)
         return StepCall(self._function("fmi2DoStep"), arguments, any_flag, flags, ctypes.c_double(-math.inf))

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .fmi_calls import FmiCalls, Log, StepCall, TypeCalls, allow_missing
+from .fmi_calls import FmiCalls, Log, StepCall, TypeCalls
 
 _INTEGERS = {f"{sign}Int{bits}": getattr(ctypes, f"c_{sign.lower()}int{bits}")
              for sign in ("", "U") for bits in (8, 16, 32, 64)}  # fmt: skip
@@ -30,8 +30,14 @@ class Fmi3Calls(FmiCalls):
     def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
         from fmpy.fmi3 import FMU3Model, FMU3Slave
 
-        kind = allow_missing(FMU3Model if model_exchange else FMU3Slave, self.prefix, _REQUIRED)
-        self.fmu = kind(guid=token, modelIdentifier=library.stem, unzipDirectory=str(folder), instanceName=name)
+        self.fmu = self._open(
+            FMU3Model if model_exchange else FMU3Slave,
+            _REQUIRED,
+            guid=token,
+            modelIdentifier=library.stem,
+            unzipDirectory=str(folder),
+            instanceName=name,
+        )
 
     def instantiate(self, log: Log) -> None:
         """Make the instance; its messages go to ``log``."""
@@ -59,12 +65,15 @@ class Fmi3Calls(FmiCalls):
     @property
     def final(self) -> ctypes.c_bool:
         """The flag noSetFMUStatePriorToCurrentPoint."""
-        return ctypes.c_bool(True)
+        value = self.variable(ctypes.c_bool)
+        value.value = True
+        return value
 
     def step_call(self, now: ctypes.c_double, width: ctypes.c_double, final: Any) -> StepCall:
         """Return fmi3DoStep with its arguments (FMI 3.0, 4.2.1)."""
-        flags = (ctypes.c_bool * 4)()  # event, terminate, early return, and one that is never set
-        reached, address, at = ctypes.c_double(-math.inf), ctypes.c_void_p, ctypes.addressof(flags)
+        flags = self.variable(ctypes.c_bool * 4)  # event, terminate, early return, and one that is never set
+        reached, address, at = self.variable(ctypes.c_double), ctypes.c_void_p, ctypes.addressof(flags)
+        reached.value = -math.inf
         arguments = (
             *(ctypes.c_void_p(self.fmu.component), now, width, final),
             *(address(at), address(at + 1), address(at + 2), ctypes.byref(reached)),

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,9 @@ WARNING, DISCARD, ERROR, FATAL, PENDING = range(1, 6)
 
 Log = Callable[[int, str], None]
 """Takes the status and the text of a message."""
+Call = tuple[Callable[..., int], tuple[Any, ...]]
+"""A C function, and its arguments."""
+C = TypeVar("C")
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,41 @@ def allow_missing(kind: Any, prefix: str, required: tuple[str, ...]) -> Any:
     return type(kind.__name__, (kind,), {"_loadFunctions": load})  # FMPy reads the version from the class's name
 
 
+class BoundCalls:
+    """C functions with their arguments, bound once and called one after the other.
+
+    Parameters
+    ----------
+    calls : sequence of (function, arguments)
+        Functions of the library, with arguments that are C values; their memory is that of `FmiCalls.allocate` and
+        `FmiCalls.variable`, or doesn't change.
+    """
+
+    failed = 0
+    """Place of the call that has failed last."""
+
+    def __init__(self, calls: Sequence[Call]):
+        self._calls = tuple(calls)
+
+    def run(self) -> int:
+        """Call the functions up to the first that fails; return its status, else 1 after a warning, else 0."""
+        worst = 0
+        for place, (function, arguments) in enumerate(self._calls):
+            status = function(*arguments)
+            if not 0 <= status <= WARNING:
+                self.failed = place
+                return status
+            worst |= status
+        return worst
+
+    def start(self) -> None:
+        """Begin to run, if that can go on by itself; `finish` ends it."""
+
+    def finish(self) -> int:
+        """Return the status of what `start` has begun."""
+        return self.run()
+
+
 class FmiCalls(ABC):
     """Functions of an FMU's library for one instance.
 
@@ -88,6 +126,27 @@ class FmiCalls(ABC):
     @abstractmethod
     def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
         """Load a library, of an FMU that is unpacked into a folder; a name is given to the instance."""
+
+    def _open(self, kind: Any, required: tuple[str, ...], **arguments: Any) -> Any:
+        """Return an object of FMPy's class, with its library loaded; see `allow_missing`."""
+        return allow_missing(kind, self.prefix, required)(**arguments)
+
+    # ---- memory and calls that are bound once ----
+
+    in_process: ClassVar[bool] = True
+    """Whether the library reads and writes this process's memory; else `allocate` and `variable` alone."""
+
+    def allocate(self, n: int, ctype: type[Any]) -> np.ndarray:
+        """Return an array (n,) of zeros of a C type that bound calls can read and write."""
+        return np.zeros(max(1, n), dtype=ctype)[:n]
+
+    def variable(self, ctype: type[C]) -> C:
+        """Return a C value, array or structure that bound calls can read and write."""
+        return ctype()
+
+    def bind(self, calls: Sequence[Call]) -> BoundCalls:
+        """Bind functions of the library to their arguments, to be called one after the other."""
+        return BoundCalls(calls)
 
     # ---- the life of an instance ----
 
@@ -122,6 +181,9 @@ class FmiCalls(ABC):
     def free_instance(self) -> None:
         """Free the instance and unload the library."""
         self.fmu.freeInstance()
+
+    def end(self) -> None:  # noqa: B027 (in process there is nothing else)
+        """Give up everything else, at the end of the instance and after an error, too."""
 
     # ---- values ----
 

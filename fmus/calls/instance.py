@@ -15,7 +15,7 @@ from ..archive import FmuVariable
 from ..platform import native_platform
 from .fmi_calls import DISCARD, ERROR, FATAL, StepCall
 from .fmu_block import FmuBlock
-from .loaded_library import LoadedFmu
+from .loaded_library import LoadedFmu, MakeCalls
 from .transfer import Transfer, UnfitError
 
 _HEADER = struct.Struct("<8s32s24sd?")  # of a serialized state: magic, FMU's digest, platform, time, running
@@ -64,11 +64,11 @@ class FmuInstance(LoadedFmu):
     exchange: Callable[[], None]
     """In Initialization Mode: set the inputs and get the outputs (after `bind`)."""
 
-    def __init__(self, block: FmuBlock, wired: Sequence[str]):
-        super().__init__(block)
+    def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
+        super().__init__(block, make_calls=make_calls)
         variables = block.input_variables
         self._inputs, self._outputs = {port: variables[port] for port in wired}, dict(block.output_variables)
-        self._now, self._width = ctypes.c_double(), ctypes.c_double()
+        self._now, self._width = self.fmi.variable(ctypes.c_double), self.fmi.variable(ctypes.c_double)
         self._final = self.fmi.final  # noSetFMUStatePriorToCurrentPoint, until a state has been saved
         self._vector = np.zeros(0)
         self._handles: dict[int, Any] = {}

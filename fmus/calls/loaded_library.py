@@ -24,15 +24,19 @@ from .fmu_block import FmuBlock
 
 _CALLS: dict[str, type[FmiCalls]] = {"2": Fmi2Calls, "3": Fmi3Calls}
 """Functions by the major version of FMI."""
+MakeCalls = Callable[..., FmiCalls]
 R = TypeVar("R")
 _OPEN: WeakSet[LoadedFmu] = WeakSet()
 """Open instances of FMUs of which a process can have one only."""
 
 
 class LoadedFmu:
-    """Instance of an FMU: log, initialization, variables, end."""
+    """Instance of an FMU: log, initialization, variables, end.
 
-    def __init__(self, block: FmuBlock, *, model_exchange: bool = False):
+    ``make_calls`` makes its functions, with the library in another process, say; by default it is loaded in this one.
+    """
+
+    def __init__(self, block: FmuBlock, *, model_exchange: bool = False, make_calls: MakeCalls | None = None):
         self.block, self.description = block, block.description
         self.model_exchange, self.failed, self.fatal = model_exchange, False, False
         self.messages: list[str] = self._list_limits()
@@ -40,14 +44,16 @@ class LoadedFmu:
         self._open = self._running = False
         self._began = 0.0
         description, folder = self.description, Path.cwd()
-        self._refuse_second()
+        if make_calls is None:
+            self._refuse_second()
+        make = make_calls or _CALLS[description.fmi[0]]
         try:
             files = unpack(description)
         except FmuError as error:
             error.at(block=block.label)
             raise
         try:
-            self.fmi = _CALLS[description.fmi[0]](
+            self.fmi = make(
                 name=block.label,
                 token=description.token,
                 folder=files,
@@ -68,7 +74,7 @@ class LoadedFmu:
         finally:
             os.chdir(folder)  # FMPy stays in the binary's folder if loading fails
         self._open = True
-        if description.only_once:
+        if description.only_once and self.fmi.in_process:
             _OPEN.add(self)
 
     def _refuse_second(self) -> None:
@@ -331,13 +337,16 @@ class LoadedFmu:
             return
         self._open = False
         _OPEN.discard(self)
-        if self.fatal:  # nothing may be called any more, not even to free it (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)
-            return
-        with suppress(Exception):
-            if self._running and not self.failed:
-                self.fmi.terminate()
-        with suppress(Exception):
-            self.fmi.free_instance()
+        try:
+            if self.fatal:  # nothing may be called any more, not even to free it (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)
+                return
+            with suppress(Exception):
+                if self._running and not self.failed:
+                    self.fmi.terminate()
+            with suppress(Exception):
+                self.fmi.free_instance()
+        finally:
+            self.fmi.end()
 
 
 def unpack(description: FmuDescription) -> Path:

@@ -25,6 +25,7 @@ from ...blocks.core import (
 )
 from ..archive import FmuDescription, FmuVariable, read_description
 from ..calls import FmuInstance
+from ..isolation import open_fmu
 from .linearization import STEP, FmuLinearization, linear_model, step_difference
 from .ports import FmuPorts, choose_ports
 from .replacement import check_replacement
@@ -371,7 +372,7 @@ class Fmu(Block):
         start_time : float
             Start of the run in s.
         """
-        instance = FmuInstance(self, wired)  # it reads the description, and so checks the file
+        instance = open_fmu(FmuInstance, self, wired)  # it reads the description, and so checks the file
         try:
             instance.initialize(stop_time, start_time=start_time)
             yield instance

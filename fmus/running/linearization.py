@@ -12,6 +12,7 @@ import numpy as np
 from ...blocks.core import FmuError, Layout, ParameterError, UnknownNameError, elements, near
 from ..archive import FmuDescription
 from ..calls import FmuBlock, LoadedFmu
+from ..isolation import open_fmu
 from .derivation import Derivation, DerivativeMethod
 from .differences import Column, differentiate
 
@@ -198,7 +199,7 @@ def _interface_name(exchange: bool) -> str:
 @contextmanager
 def _initialize(point: _OperatingPoint, exchange: bool) -> Iterator[LoadedFmu]:
     """Load the FMU and enter Initialization Mode at the operating point."""
-    instance = LoadedFmu(point.block, model_exchange=exchange)
+    instance = open_fmu(LoadedFmu, point.block, model_exchange=exchange)
     try:
         exact = {n: v for n, v in point.given.items() if point.about.find(n).initial == "exact"}
         instance.initialize(None, start_time=point.t, values=exact)
