@@ -207,7 +207,7 @@ def make_contact(
     check_options(diagram, options, "contact")
     point = operating_point(diagram, at, options)
     diagram = diagram.replace(point.parameters) if point.parameters else diagram  # parameters that a trim has found
-    ports = Ports.find(diagram, diagram.flatten(point.base), port, position, velocity)
+    ports = Ports.find(diagram, diagram.flatten_like(point), port, position, velocity)
     parts, unusual = take_apart(diagram, ports, force, point, taken)
     if unusual:  # such as a sensor's first sample: at rest, the next tick has the same states
         point = _move_on(point)

@@ -157,7 +157,7 @@ def take_apart(
         If the diagram has several rates, or signals around a plant with equations change between the ticks.
     """
     path, block = ports.plant, diagram.blocks[ports.plant]
-    flat = diagram.flatten(point.base)
+    flat = diagram.flatten_like(point)
     all_wires = flat.table.wires  # with the delays of subsystems
     wires = {
         port: Source(wire.block, wire.port, wire.index)

@@ -168,7 +168,7 @@ def _make_traced_linearizer(diagram: WiredDiagram, path: str, point: OperatingPo
             block=path,
         )
     point = operating_point(diagram, None, {}) if point is None else point
-    t, here = point.t, point.x[diagram.flatten(point.base).states.slices[path]]
+    t, here = point.t, point.x[diagram.flatten_like(point).states.slices[path]]
     names = [tuple(_elements(ports)) for ports in (trace.states, trace.inputs, trace.outputs)]
     x, ports = ca.MX.sym("x", len(names[0])), [ca.MX.sym(n, int(np.prod(s))) for n, s in trace.inputs.items()]
     results = trace.function(t, x, *ports, trace.pack(block, np.inf))

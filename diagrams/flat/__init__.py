@@ -1,11 +1,13 @@
 """A whole diagram as functions of (t, x, w, p)."""
 
 from ...blocks.core import Layout
+from .clocks import EVERY, NONE, TickPattern
 from .evaluation import Apart, Instant, evaluate
 from .flat_diagram import FlatDiagram
 from .functions import indicators_of
-from .layout import NONE, FlatEvent, StateLayout, TickPattern
+from .layout import FlatEvent, StateLayout
 from .logic import TRUE, is_true
+from .plant_ticks import own_step, takes_any_step
 from .stages import Bound, Evaluators, Schedule, evaluate_apart
 from .total_derivative import Derivative
 from .trace_stages import trace_schedule
@@ -13,6 +15,7 @@ from .vectors import join_columns, loop_mismatch, next_x, plant_inputs, rates
 from .wired_diagram import WiredDiagram
 
 __all__ = [
+    "EVERY",
     "NONE",
     "TRUE",
     "Apart",
@@ -34,7 +37,9 @@ __all__ = [
     "join_columns",
     "loop_mismatch",
     "next_x",
+    "own_step",
     "plant_inputs",
     "rates",
+    "takes_any_step",
     "trace_schedule",
 ]

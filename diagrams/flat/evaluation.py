@@ -17,7 +17,8 @@ from ...blocks.core import Layout, SimulationError
 from ...blocks.tracing import GUARDS, NEXT, size
 from ..wiring import OrderStep, Wire, join
 from .block_functions import BlockFunctions, call_block
-from .layout import FlatLayout, TickPattern
+from .clocks import TickPattern
+from .layout import FlatLayout
 from .logic import choose, is_true, logic_and, logic_not, logic_or, to_number
 
 INDICATORS, JUMP = "indicators", "jump"

@@ -17,7 +17,8 @@ from ...blocks.core import Block
 from ..wiring import Checked
 from . import functions
 from .block_functions import BlockFunctions
-from .layout import FlatLayout, TickPattern, sample_time_of
+from .clocks import TickPattern
+from .layout import FlatLayout, sample_time_of
 from .stages import Schedule
 from .total_derivative import Derivative
 

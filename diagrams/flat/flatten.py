@@ -9,13 +9,21 @@ from fractions import Fraction
 import numpy as np
 
 from ...blocks.core import Layout, SampleTimeError, Shape
-from ..wiring import Checked, Structure, evaluation_order, join
+from ..wiring import Checked, Structure, evaluation_order, join, stepped_blocks
+from .clocks import TickPattern
 from .flat_diagram import FlatDiagram
-from .layout import FlatEvent, StateLayout, TickPattern, sample_time_of
+from .layout import FlatEvent, StateLayout, sample_time_of
+from .plant_ticks import own_step
 
 
 def flatten(
-    table: Structure, checked: Checked, step: Fraction | None = None, *, name: str = "", solve: bool = False
+    table: Structure,
+    checked: Checked,
+    step: Fraction | None = None,
+    *,
+    asked: bool | None = None,
+    name: str = "",
+    solve: bool = False,
 ) -> FlatDiagram:
     """Flatten a checked diagram.
 
@@ -23,6 +31,8 @@ def flatten(
     ----------
     step : Fraction, optional
         Seconds between two ticks; required where there is no other clock.
+    asked : bool, optional
+        Whether ``step`` was asked for, and is not that of the clocks; by default it was if it is given.
     name : str
         The diagram's name, for errors.
     solve : bool
@@ -104,6 +114,7 @@ def flatten(
         order=order,
         start_order=start_order,
         ports=ports,
+        asked=step is not None if asked is None else asked,
     )
 
 
@@ -145,15 +156,16 @@ def _clocks(table: Structure, step: Fraction | None, name: str) -> tuple[Fractio
     """Return the seconds between two ticks, and the ticks of every subsystem that is sampled."""
     found = {path: clock for path in table.subsystems if (clock := table.clock(path)) is not None}
     used = {c.path: c for c in found.values()}
+    own = {path: wanted for path, plant in stepped_blocks(table).items() if (wanted := own_step(plant)) is not None}
     base = step
     if base is None:
-        if not used:
+        if not used and not own:
             raise SampleTimeError(
                 "no subsystem has a sample time, so there is no clock. Give simulate(…, step=1e-3), or a "
                 "@subsystem(sample_time=1e-3).",
                 block=name or None,
             )
-        times = [t for c in used.values() for t in (c.sample_time, c.offset) if t]
+        times = [*own.values(), *(t for c in used.values() for t in (c.sample_time, c.offset) if t)]
         whole = math.lcm(*(t.denominator for t in times))
         base = Fraction(math.gcd(*(int(t * whole) for t in times)), whole)
     for subsystem in used.values():
@@ -164,6 +176,13 @@ def _clocks(table: Structure, step: Fraction | None, name: str) -> tuple[Fractio
                     f"divides it.",
                     block=subsystem.path or name or None,
                 )
+    for path, wanted in own.items():
+        if (wanted / base).denominator != 1:
+            raise SampleTimeError(
+                f"its communication step {float(wanted):g} s is no multiple of the step {float(base):g} s; choose a "
+                "step that divides it.",
+                block=path,
+            )
     return base, {
         path: TickPattern(int(c.sample_time / base), int(c.offset / base))
         for path, c in found.items()

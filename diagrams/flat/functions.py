@@ -17,8 +17,9 @@ import casadi as ca
 import numpy as np
 
 from .block_functions import BlockFunctions
+from .clocks import NONE, TickPattern
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, rows
-from .layout import NONE, FlatLayout, TickPattern
+from .layout import FlatLayout
 from .logic import choose, is_true, logic_and, logic_not
 from .stages import Schedule
 from .total_derivative import Derivative

@@ -19,6 +19,8 @@ import numpy as np
 
 from ...blocks.core import Layout, Shape
 from ..wiring import Order, Structure, join, stepped_blocks
+from .clocks import EVERY, TickPattern, in_order
+from .plant_ticks import find_plant_ticks, takes_any_step
 
 
 @dataclass(frozen=True)
@@ -55,26 +57,6 @@ class StateLayout(Layout):
     def labels(self) -> list[str]:
         """Names of all entries: ``path.name``, with the index of an element behind it."""
         return self.each.labels
-
-
-@dataclass(frozen=True)
-class TickPattern:
-    """The ticks at which a sampled subsystem acts: ``offset``, ``offset + every``, …, on the common base."""
-
-    every: int = 1
-    offset: int = 0
-
-    def acts(self, k: int) -> bool:
-        """Whether it acts at tick ``k``."""
-        return k >= self.offset and (k - self.offset) % self.every == 0
-
-    def after(self, k: int) -> int:
-        """Return the first of its ticks after tick ``k``."""
-        return self.offset if k < self.offset else k + self.every - (k - self.offset) % self.every
-
-
-NONE: frozenset[TickPattern] = frozenset()
-"""The clocks that act between two ticks."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +101,8 @@ class FlatLayout:
         Block and port behind every dotted path; an FMU's port may have dots of its own.
     apart : frozenset of str
         Blocks that are evaluated from outside, in stages of their own; see `loopwright.diagrams.flat.stages`.
+    asked : bool
+        Whether ``base`` was asked for, as a ``step``: then something happens at every tick.
     """
 
     table: Structure
@@ -141,6 +125,7 @@ class FlatLayout:
     start_order: Order
     ports: dict[str, tuple[str, str]]
     apart: frozenset[str] = frozenset()
+    asked: bool = False
 
     def __post_init__(self) -> None:
         for values in (self.continuous, self.x0, self.p):
@@ -165,7 +150,7 @@ class FlatLayout:
     @cached_property
     def distinct(self) -> tuple[TickPattern, ...]:
         """The different clocks."""
-        return tuple(sorted(set(self.clocks.values()), key=lambda c: (c.every, c.offset)))
+        return in_order(set(self.clocks.values()))
 
     @cached_property
     def hybrid(self) -> bool:
@@ -174,25 +159,28 @@ class FlatLayout:
         return bool(self.continuous.size or self.events or delayed)
 
     @cached_property
-    def plants_at_every_tick(self) -> bool:
-        """Whether what is stepped from outside, such as FMUs, steps at every tick, and not only where a clock acts.
+    def plant_ticks(self) -> dict[str, tuple[TickPattern, ...]]:
+        """The ticks at which each plant steps, by path; see `loopwright.diagrams.flat.plant_ticks`."""
+        return find_plant_ticks(self.table, self.clocks, self.base, every=self.asked)
 
-        It does where the base was asked for, finer than the clocks need, and where one of them takes steps of one
-        length only.
-        """
-        numbers = [n for clock in self.distinct for n in (clock.every, clock.offset)]
-        if math.gcd(*numbers) != 1:
-            return bool(stepped_blocks(self.table))
-        return bool(self.even_plants)
+    @cached_property
+    def visited(self) -> tuple[TickPattern, ...]:
+        """The ticks at which a subsystem acts or a plant steps."""
+        found = {*self.distinct, *(clock for clocks in self.plant_ticks.values() for clock in clocks)}
+        return (EVERY,) if EVERY in found or not found else in_order(found)
 
     @cached_property
     def even_plants(self) -> tuple[str, ...]:
         """Paths of what is stepped from outside in steps of one length only."""
-        return tuple(
-            path
-            for path, plant in stepped_blocks(self.table).items()
-            if not getattr(plant, "variable_step", False) or getattr(plant, "fixed_internal_step", None) is not None
-        )
+        return tuple(path for path, plant in stepped_blocks(self.table).items() if not takes_any_step(plant))
+
+    def steps_at(self, path: str, k: int) -> bool:
+        """Whether tick ``k`` is a communication point of a plant."""
+        return any(clock.acts(k) for clock in self.plant_ticks[path])
+
+    def next_step(self, path: str, k: int) -> int:
+        """Return the first communication point of a plant after tick ``k``."""
+        return min(clock.after(k) for clock in self.plant_ticks[path])
 
     def acting(self, k: int) -> frozenset[TickPattern]:
         """Return the clocks that tick at tick ``k``."""
@@ -200,10 +188,10 @@ class FlatLayout:
 
     def ticks(self, k: int, last: int, *, every: bool) -> Iterator[int]:
         """Yield the ticks to visit after tick ``k``: all, or those at which something acts, and the last one."""
-        if every or not self.distinct or TickPattern() in self.distinct:
+        if every or EVERY in self.visited:
             yield from range(k + 1, last + 1)
             return
-        while (k := min(c.after(k) for c in self.distinct)) < last:
+        while (k := min(c.after(k) for c in self.visited)) < last:
             yield k
         yield last
 

@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 from fractions import Fraction
+from typing import Protocol
 
 from ..wiring import CheckedDiagram, Structure, exact_time
 from .flat_diagram import FlatDiagram
 from .flatten import flatten
 
 
+class HasBase(Protocol):
+    """Anything that says where the ticks are."""
+
+    @property
+    def base(self) -> Fraction:
+        """Seconds between two ticks."""
+
+    @property
+    def asked(self) -> bool:
+        """Whether ``base`` was asked for, as a ``step``."""
+
+
 class WiredDiagram(CheckedDiagram):
     """A wired diagram with its functions, each made once: the diagram that runs, and that linear models are made of."""
 
-    _flat: dict[Fraction | None, FlatDiagram]
+    _flat: dict[tuple[Fraction | None, bool], FlatDiagram]
 
     def _set(self, name: str, table: Structure, loops: str) -> None:
         super()._set(name, table, loops)
@@ -28,9 +41,23 @@ class WiredDiagram(CheckedDiagram):
         """
         return self.flattened(None if step is None else exact_time(step, block=self.name))
 
-    def flattened(self, key: Fraction | None) -> FlatDiagram:
-        """Return the same for a step that is exact already; None takes that of the clocks."""
+    def flatten_like(self, other: HasBase) -> FlatDiagram:
+        """Return the diagram with the ticks of an operating point, or of another flat diagram."""
+        return self.flattened(other.base, asked=other.asked)
+
+    def flattened(self, step: Fraction | None, *, asked: bool | None = None) -> FlatDiagram:
+        """Return the diagram for a step that is exact already; None takes that of the clocks.
+
+        Parameters
+        ----------
+        step : Fraction, optional
+            Seconds between two ticks.
+        asked : bool, optional
+            Whether it was asked for, and is not that of the clocks; by default it was if it is given.
+        """
+        asked = step is not None if asked is None else asked
+        key = (step, asked)
         if key not in self._flat:
             solve = self.loops == "solve"
-            self._flat[key] = flatten(self.scheduled, self.checked, key, name=self.name, solve=solve)
+            self._flat[key] = flatten(self.scheduled, self.checked, step, asked=asked, name=self.name, solve=solve)
         return self._flat[key]

@@ -54,7 +54,7 @@ def split_consumers(
             block=diagram.name,
             port="to",
         )
-    flat = diagram.flatten(point.base)
+    flat = diagram.flatten_like(point)
     signal, table = find_signal(flat, wires[0]), diagram.structure.copy()
     inputs = [_find_input(diagram, name) for name in to]
     for block, port in inputs:

@@ -34,7 +34,7 @@ def split_inputs(
     """
     found: dict[str, str] = {}
     for name in dict.fromkeys(names):
-        flat = diagram.flatten(point.base)
+        flat = diagram.flatten_like(point)
         try:
             find_signal(flat, name)
         except UnknownNameError as error:
@@ -97,7 +97,7 @@ def insert_ahead(
         table.handed.pop(each, None)
     split = diagram.with_structure(table)
     value = read_log(flat, point)[flat.log.slices[join(*source)]][list(entries)]
-    return split, _carry_point(flat, split.flatten(point.base), point, path, value), f"{path}.y"
+    return split, _carry_point(flat, split.flatten_like(point), point, path, value), f"{path}.y"
 
 
 def _carry_point(

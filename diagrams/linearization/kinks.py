@@ -87,7 +87,7 @@ def find_kinks_between(
 ) -> tuple[Finding, ...]:
     """Return the findings at a point, the start without one, on loops and on the ways from ports to ports."""
     at = operating_point(diagram, point, {})
-    flat = diagram.flatten(at.base)
+    flat = diagram.flatten_like(at)
     ways, found = SignalPaths(flat), find_kinks(flat, at)
     return tuple(dict.fromkeys((*ways.between(found, sources, sinks), *ways.on_loops(found))))
 

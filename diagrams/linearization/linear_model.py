@@ -26,6 +26,7 @@ from .consumers import find_cut_findings, split_consumers
 from .continuous_model import model_continuous
 from .derivatives import LocalDerivatives, find_signal
 from .findings import EntryTaken
+from .flow_model import EQUILIBRIUM
 from .input_ports import name_inputs, split_inputs
 from .kinks import find_kinks
 from .loops_over_a_period import (
@@ -36,7 +37,7 @@ from .loops_over_a_period import (
     ticks_to_renewal,
 )
 from .operating_points import PointLike, check_options, operating_point
-from .over_a_period import EQUILIBRIUM, Model, model_period, period_of
+from .over_a_period import Model, model_period, period_of
 from .signal_paths import SignalPaths
 
 if TYPE_CHECKING:
@@ -152,7 +153,7 @@ class Linearization:
     @cached_property
     def findings_on_loops(self) -> tuple[Finding, ...]:
         """Those of the findings that limit numbers about all loops together, such as the poles."""
-        flat = self.diagram.flatten(self.point.base)
+        flat = self.diagram.flatten_like(self.point)
         return SignalPaths(flat, [find_signal(flat, wire).port for wire in self.openings]).on_loops(self.findings)
 
     @property
@@ -244,7 +245,7 @@ class Linearization:
                 block=self.diagram.name,
                 port="wires",
             )
-        flat = self.diagram.flatten(self.point.base)
+        flat = self.diagram.flatten_like(self.point)
         at, shift, frozen = self.point, 0, NONE
         ports = [find_signal(flat, w).port for w in wires]
         if slow == "open":
@@ -307,7 +308,7 @@ def _linearize(
             port="step",
         )
     names = [_as_list(n) for n in (inputs, outputs, openings)]
-    flat = diagram.flatten(at.base)
+    flat = diagram.flatten_like(at)
     at.check_fits(flat, diagram.name)
     refuse_transport_delays(flat)
     found = [[find_signal(flat, n) for n in group] for group in names]

@@ -21,7 +21,7 @@ from ...blocks.core import ConfirmationError, OptionError, PeriodicLoopError
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
 from .derivatives import LocalDerivatives, Tap
-from .over_a_period import Chain, Model, find_needed, own_states, period_of, ticks_of_period
+from .over_a_period import Chain, Model, find_needed, own_states, period_of
 
 SAME_ROWS = 1e-12
 """Relative difference up to which a wire counts as unchanged from one tick to the next."""
@@ -108,9 +108,8 @@ def advance_point(flat: FlatDiagram, at: OperatingPoint, way: str | None, count:
     """Return the operating point ``count`` ticks later."""
     if not count:
         return at
-    chain = Chain(flat, LocalDerivatives(flat, (), (), ()), at, way)
-    for k, following in ticks_of_period(flat, at.tick, count):
-        chain.go(k, following - k)
+    chain = Chain(flat, LocalDerivatives(flat, (), (), ()), at, way, count)
+    chain.go_on()
     return chain.here
 
 
@@ -131,10 +130,8 @@ def model_loop(
         If a wire is renewed, and used, several times in the period, unless ``lifted``.
     """
     period, m = period_of(flat, frozen), local.n_inputs
-    chain = Chain(flat, local, at, way, frozen)
-    ticks = list(ticks_of_period(flat, at.tick, period))
-    for k, following in ticks:
-        chain.go(k, following - k)
+    chain = Chain(flat, local, at, way, period, frozen)
+    chain.go_on()
     A, B, C, D = _model_each_tick(chain)
     plants = set(range(flat.width, flat.width + chain.n_p))
     keep = find_needed(A, C, own_states(flat, frozen), plants)
@@ -146,7 +143,7 @@ def model_loop(
         signal = next(s for s in local.inputs if labels[many[0]] in s.labels)
         raise _make_error(signal, len(groups[many[0]]), float(flat.base * period))
     if many:  # all renewals, so that a delay of one is a shift by one channel
-        renewals = _find_renewals(flat, local.inputs, [k for k, _ in ticks])
+        renewals = _find_renewals(flat, local.inputs, [k for k, _ in chain.ticks])
         groups = [renewals if renewals and len(group) > 1 else group for group in groups]
     chosen = [(e, j, group) for e in range(m) for j, group in enumerate(groups[e])]
     into = np.zeros((B.shape[1], len(chosen)))

@@ -42,6 +42,7 @@ def capture(simulation: Simulation, how: PointOrigin = PointOrigin.RUN) -> Opera
         how=how,
         values=values,
         layout=layout_of(flat),
+        asked=flat.asked,
     )
     return with_residual(flat, point, view.x_next)
 

@@ -15,17 +15,24 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ...blocks.core import Finding, left_of
+from ...blocks.core import Finding, Layout
 from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
-from ..simulation import announcers
 from .derivatives import LocalDerivatives, Numbers, Tap
 from .findings import EventWithinPeriod, MemoryActs, UnusualStart
-from .plant_models import PlantModel, fmu_at, inputs_before, join_matrices, model_steps, states_of
+from .flow_model import EQUILIBRIUM, differentiate_flow
+from .plant_models import (
+    PlantModel,
+    check_way,
+    fmu_at,
+    inputs_before,
+    join_matrices,
+    model_step,
+    plant_paths,
+    states_of,
+)
 
-EQUILIBRIUM = 1e-9
-"""Largest residual of an equilibrium."""
 SAME = 1e-12
 """Largest difference of values that are the same, relative to 1 + their size."""
 Four: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -46,8 +53,9 @@ class Model:
 
 
 def period_of(flat: FlatDiagram, frozen: frozenset[TickPattern] = NONE) -> int:
-    """Return the least common period of all clocks that are not frozen, in ticks of the base."""
-    return math.lcm(*(clock.every for clock in flat.distinct if clock not in frozen))
+    """Return the least common period of all clocks and FMUs that are not frozen, in ticks of the base."""
+    plants = {clock for clocks in flat.plant_ticks.values() for clock in clocks}
+    return math.lcm(*(clock.every for clock in {*flat.distinct} | plants if clock not in frozen))
 
 
 def model_period(
@@ -59,9 +67,8 @@ def model_period(
 ) -> Model:
     """Return the model over the least common period of all clocks; those that are frozen do not act."""
     period = period_of(flat, frozen)
-    chain = Chain(flat, local, at, way, frozen)
-    for k, following in ticks_of_period(flat, at.tick, period):
-        chain.go(k, following - k)
+    chain = Chain(flat, local, at, way, period, frozen)
+    chain.go_on()
     A, B = chain.M, chain.N
     names = chain.labels
     keep = find_needed(A, chain.C, own_states(flat, frozen), set(range(flat.width, flat.width + chain.n_p)))
@@ -86,8 +93,7 @@ def ticks_of_period(flat: FlatDiagram, first: int, period: int) -> Iterator[tupl
 
     They are the first one, and those at which a clock acts or an FMU steps.
     """
-    every = flat.plants_at_every_tick
-    ticks = [k for k in range(first, first + period) if every or k == first or flat.acting(k)]
+    ticks = [k for k in range(first, first + period) if k == first or any(c.acts(k) for c in flat.visited)]
     yield from zip(ticks, [*ticks[1:], first + period], strict=True)
 
 
@@ -97,6 +103,9 @@ class Chain:
     M and N lead from the state just before the first tick, and from the injected signals, to the state just before the
     tick that is reached. C and D lead to the signals that are measured at the first tick. ``steps`` holds the four
     matrices of each tick. Clocks that are ``frozen`` do not act: their subsystems hold outputs and states.
+
+    An FMU goes from one of its communication points to the next, with the inputs of the first one. Between them its
+    outputs are held: where an FMU has fewer of them than there are ticks, these outputs are states, too.
     """
 
     def __init__(
@@ -105,30 +114,56 @@ class Chain:
         local: LocalDerivatives,
         at: OperatingPoint,
         way: str | None,
+        count: int,
         frozen: frozenset[TickPattern] = NONE,
     ):
+        check_way(way)
         self.flat, self.local, self.way, self.frozen = flat, local, way, frozen
         self.first = self.here = at
-        self.models: Sequence[PlantModel] = ()
+        self.ticks = list(ticks_of_period(flat, at.tick, count))
+        self._end = at.tick + count
+        self.paths = plant_paths(flat)
+        self._until = dict.fromkeys(self.paths, at.tick)
+        self._holds = any(not self._steps_at(path, k) for path in self.paths for k, _ in self.ticks[1:])
+        self._models: dict[str, PlantModel] = {}
         self.derivations: dict[str, Derivation] = {}
         self.uncertainty, self.n_p = 0.0, 0
-        self._known_plants: tuple[float, np.ndarray, np.ndarray, Sequence[PlantModel]] | None = None
+        self._known_plants: dict[str, tuple[float, np.ndarray, np.ndarray, PlantModel]] = {}
         self._known_flow: tuple[float, np.ndarray, np.ndarray, Four] | None = None
         self._begun = False
         self.steps: list[Four] = []
         self._fired: list[Finding] = []
         self._first_tick: Numbers = {}
 
-    def go(self, k: int, count: int) -> None:
-        """Go from tick ``k`` to the tick ``count`` base periods later."""
-        flat, here, h = self.flat, self.here, float(self.flat.base * count)
+    @property
+    def models(self) -> list[PlantModel]:
+        """Models of the FMUs' present steps."""
+        return [self._models[path] for path in self.paths]
+
+    def _steps_at(self, path: str, k: int) -> bool:
+        return any(clock.acts(k) for clock in self.flat.plant_ticks[path] if clock not in self.frozen)
+
+    def go_on(self) -> None:
+        """Go through all ticks."""
+        for k, following in self.ticks:
+            self.go(k, following)
+
+    def go(self, k: int, following: int) -> None:
+        """Go from tick ``k`` to the next one."""
+        flat, here, h = self.flat, self.here, float(self.flat.base * (following - k))
         tick = self.local.differentiate(flat.acting(k) - self.frozen, here.t, here.x, here.w)
-        models = self.models = self._model_plants(tick["z"], h)
+        mid_step = [path for path in self.paths if self._until[path] != k]
+        held = self._begin_steps(k, tick["z"])
+        models = self.models
         Ap, Bp, Cp, Dp = (join_matrices(flat, models, which) for which in "ABCD")
-        nx, nz, n_p = flat.width, flat.plant_inputs.total, len(Ap)
-        n = nx + n_p + nz
-        W = np.zeros((flat.plant_outputs.total, n))  # the FMUs' outputs before the tick
-        W[:, nx : nx + n_p], W[:, nx + n_p :] = Cp, Dp
+        nx, nz, n_p, nw = flat.width, flat.plant_inputs.total, len(Ap), flat.plant_outputs.total
+        n = nx + n_p + nz + (nw if self._holds else 0)
+        W = np.zeros((nw, n))  # the FMUs' outputs before the tick
+        W[:, nx : nx + n_p], W[:, nx + n_p : nx + n_p + nz] = Cp, Dp
+        for path in mid_step:
+            mine = self._models[path].outputs
+            W[mine] = 0.0
+            W[mine, [nx + n_p + nz + i for i in mine]] = 1.0
 
         def eliminate_w(quantity: str) -> tuple[np.ndarray, np.ndarray]:
             by_state = tick[quantity, "w"] @ W
@@ -137,33 +172,58 @@ class Chain:
 
         x_of, x_by_d = eliminate_w("x")
         z_of, z_by_d = eliminate_w("z")
+        for path in held:  # the inputs that it has already
+            mine = self._models[path].inputs
+            z_of[mine], z_by_d[mine] = 0.0, 0.0
+            z_of[mine, [nx + n_p + i for i in mine]] = 1.0
         x1 = tick["x"]
         if flat.continuous.size:
             E, Ew, Ed, x1 = self._differentiate_flow(x1, h)
             x_of, x_by_d = E @ x_of + Ew @ W, E @ x_by_d + Ed
-        P = Bp @ z_of
+        P, P_by_d = Bp @ z_of, Bp @ z_by_d
         P[:, nx : nx + n_p] += Ap
-        M, N = np.vstack([x_of, P, z_of]), np.vstack([x_by_d, Bp @ z_by_d, z_by_d])
+        states = Layout.of({m.path: (len(m.A),) for m in models})
+        for path in self.paths:
+            if self._until[path] != following:  # it is on its way
+                rows = states.entries([path])
+                P[rows], P_by_d[rows] = 0.0, 0.0
+                P[rows, [nx + i for i in rows]] = 1.0
+        M, N = np.vstack([x_of, P, z_of]), np.vstack([x_by_d, P_by_d, z_by_d])
+        if self._holds:
+            M, N = np.vstack([M, W]), np.vstack([N, np.zeros((nw, N.shape[1]))])
         self.steps.append((M, N, *eliminate_w("y")))
         if not self._begun:
             (self.M, self.N, self.C, self.D), self.n_p = self.steps[0], n_p
             self._begun, self._first_tick = True, tick
         else:
             self.M, self.N = M @ self.M, M @ self.N + N
-        self._move(k + count, h, x1, tick["z"])
+        self._move(following, h, x1, tick["z"])
 
-    def _model_plants(self, z: np.ndarray, h: float) -> Sequence[PlantModel]:
-        """Return the models of the FMUs' steps; at rest, those of the last tick are used again."""
-        before, known = inputs_before(self.flat, self.here), self._known_plants
+    def _begin_steps(self, k: int, z: np.ndarray) -> list[str]:
+        """Begin the steps of the FMUs that stand at a tick; return those that keep the inputs that they hold."""
+        held = []
+        for path in self.paths:
+            own = self._steps_at(path, k)
+            if not own:
+                held.append(path)
+            if self._until[path] == k:
+                ends = (clock.after(k) for clock in self.flat.plant_ticks[path] if clock not in self.frozen)
+                self._until[path] = min([*ends, self._end])
+                h = float(self.flat.base * (self._until[path] - k))
+                self._models[path] = self._model_plant(path, z if own else inputs_before(self.flat, self.here), h)
+        return held
+
+    def _model_plant(self, path: str, z: np.ndarray, h: float) -> PlantModel:
+        """Return the model of an FMU's step; at rest, that of the last one is used again."""
+        before, known = inputs_before(self.flat, self.here), self._known_plants.get(path)
         if known is not None and known[0] == h and _are_same(known[1], z) and _are_same(known[2], before):
-            t = {path: point["t"] + h for path, point in self.here.plants.items()}
-            return [replace(m, next={**m.next, "t": t[m.path]}) for m in known[3]]
-        models = model_steps(self.flat, self.here, z, h, self.way)
-        self.derivations |= {m.path: m.derivation for m in models}
-        self.uncertainty = max([self.uncertainty, *(m.uncertainty for m in models)])
-        if all(_are_same(m.f, m.x0) for m in models):  # at rest: the same inputs give the same models
-            self._known_plants = (h, z, before, models)
-        return models
+            return replace(known[3], next={**known[3].next, "t": self.here.plants[path]["t"] + h})
+        model = model_step(self.flat, self.here, path, z, h, self.way)
+        self.derivations[path] = model.derivation
+        self.uncertainty = max(self.uncertainty, model.uncertainty)
+        if _are_same(model.f, model.x0):  # at rest: the same inputs give the same model
+            self._known_plants[path] = (h, z, before, model)
+        return model
 
     def _differentiate_flow(self, x1: np.ndarray, h: float) -> Four:
         """Return `differentiate_flow` from here on; at rest, that of the last tick is used again."""
@@ -192,15 +252,17 @@ class Chain:
         """Move the operating point to tick k."""
         w, plants = self.here.w.copy(), dict(self.here.plants)
         for m in self.models:
-            w[m.outputs] = m.y_next
-            plants[m.path] = m.next
+            if self._until[m.path] == k:
+                w[m.outputs] = m.y_next
+                plants[m.path] = m.next
         t = self.first.t + float((k - self.first.tick) * self.flat.base)
         self.here = replace(self.here, t=t, tick=k, x=x, w=w, z=z, plants=plants)
 
     @property
     def labels(self) -> list[str]:
-        """Names of the model's states: of blocks, of FMUs, and of the inputs that FMUs hold."""
-        held = [f"held({label})" for label in self.flat.plant_inputs.labels]
+        """Names of the model's states: of blocks, of FMUs, and of the inputs and outputs that FMUs hold."""
+        ports = self.flat.plant_inputs.labels + (self.flat.plant_outputs.labels if self._holds else [])
+        held = [f"held({label})" for label in ports]
         return self.flat.labels + states_of(self.models) + held
 
     def affine(self) -> np.ndarray:
@@ -208,7 +270,8 @@ class Chain:
         last, first = self.here, self.first
         inputs = [inputs_before(self.flat, point) for point in (first, last)]
         states = [_plant_states(self.flat, point, self.models) for point in (first, last)]
-        return np.concatenate([last.x - first.x, states[1] - states[0], inputs[1] - inputs[0]])
+        outputs = [last.w - first.w] if self._holds else []
+        return np.concatenate([last.x - first.x, states[1] - states[0], inputs[1] - inputs[0], *outputs])
 
     def findings(self, last: int) -> list[Finding]:
         """Return the events within the period, and a start whose tick is unlike the tick ``last``."""
@@ -238,71 +301,7 @@ def _are_same(a: np.ndarray, b: np.ndarray) -> bool:
     return bool(np.all(np.abs(a - b) <= SAME * (1.0 + np.abs(a))))
 
 
-# --- between ticks ---------------------------------------------------------------------------------------------------
-
-
-def differentiate_flow(
-    flat: FlatDiagram, local: LocalDerivatives, t: float, x1: np.ndarray, w: np.ndarray, h: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the derivatives of x after the time h by x before it, by w and by d, and x after the time h.
-
-    Only continuous states change. At an equilibrium the derivative is a matrix exponential. Elsewhere the variational
-    equation is integrated along the motion (DOP853 at 1e-12), from one discontinuity of a source to the next.
-    """
-    from scipy.linalg import expm
-
-    xc = flat.continuous
-    nc, nx, nw, m = len(xc), flat.width, len(w), local.n_inputs
-    many = nx + nw + m
-
-    def differentiate(time: float, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = x1.copy()
-        x[xc] = state
-        J = local.differentiate(NONE, time, x, w)
-        rest = J["dx", "x"].copy()
-        rest[:, xc] = 0.0
-        return np.hstack([J["dx", "x"][:, xc], rest, J["dx", "w"], J["dx", "d"]]), J["dx"]
-
-    start, end = x1[xc], t + h
-    F, f0 = differentiate(t, start)
-    final = x1.copy()
-    if not local.varies and np.max(np.abs(f0) / (1.0 + np.abs(start)), initial=0.0) <= EQUILIBRIUM:
-        big = np.zeros((nc + many, nc + many))
-        big[:nc] = F
-        whole = np.asarray(expm(big * h))[:nc]
-        final[xc] = start + f0 * h
-    else:
-        from scipy.integrate import solve_ivp
-
-        s = np.concatenate([start, np.hstack([np.eye(nc), np.zeros((nc, many))]).ravel()])
-        for begin, edge in _split_at_discontinuities(flat, t, end):
-            left = left_of(edge) if edge < end else edge
-
-            def rates(time: float, s: np.ndarray, left: float = left) -> np.ndarray:
-                J, dx = differentiate(min(time, left), s[:nc])
-                V = s[nc:].reshape(nc, nc + many)
-                forced = J[:, :nc] @ V
-                forced[:, nc:] += J[:, nc:]
-                return np.concatenate([dx, forced.ravel()])
-
-            found = solve_ivp(rates, (begin, edge), s, method="DOP853", rtol=1e-12, atol=1e-14)
-            s = np.asarray(found.y)[:, -1]
-        final[xc] = s[:nc]
-        whole = s[nc:].reshape(nc, nc + many)
-    E, Ew, Ed = np.eye(nx), np.zeros((nx, nw)), np.zeros((nx, m))
-    E[np.ix_(xc, xc)] = whole[:, :nc]
-    E[xc] += whole[:, nc : nc + nx]
-    Ew[xc], Ed[xc] = whole[:, nc + nx : nc + nx + nw], whole[:, nc + nx + nw :]
-    return E, Ew, Ed, final
-
-
-def _split_at_discontinuities(flat: FlatDiagram, t: float, end: float) -> Iterator[tuple[float, float]]:
-    """Yield the parts of an interval between the discontinuities of the sources."""
-    sources = announcers(flat)
-    while t < end:
-        edge = min([end, *(source.next_instant(t) for _, source in sources)])
-        yield t, edge
-        t = edge
+# --- signals between ticks --------------------------------------------------------------------------------------------
 
 
 def find_moving(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> tuple[str, ...]:

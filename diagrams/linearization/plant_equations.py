@@ -55,7 +55,7 @@ def linearize_plant(diagram: WiredDiagram, at: OperatingPoint, path: str) -> Pla
     ParameterError
         If the block has no equations in continuous time.
     """
-    flat, block = diagram.flatten(at.base), diagram.blocks[path]
+    flat, block = diagram.flatten_like(at), diagram.blocks[path]
     inputs, outputs = (_lay_out(block, kind) for kind in ("inputs", "outputs"))
     if block.stepped:
         m = linearize_equations(flat, at, path, at.z)
@@ -109,7 +109,7 @@ def moves_between_ticks(diagram: WiredDiagram, at: OperatingPoint, outputs: list
     These are outputs of the plant that other continuous blocks follow between the ticks, and inputs of the plant that
     are not held.
     """
-    flat = diagram.flatten(at.base)
+    flat = diagram.flatten_like(at)
     signals = [find_signal(flat, name) for name in outputs]
     local = LocalDerivatives(flat, signals, [], signals)
     sources: list[Tap] = [find_signal(flat, name) for name in inputs]

@@ -142,7 +142,7 @@ def model_equations(flat: FlatDiagram, at: OperatingPoint, way: str | None) -> l
     OptionError
         If the model of a step is asked for: a continuous model has none.
     """
-    _check_way(way)
+    check_way(way)
     if way == "step" and plant_paths(flat):
         raise OptionError(
             'found plants="step" for a continuous model, which has no step; expected None, "equations" or a step. Give '
@@ -159,8 +159,18 @@ def model_equations(flat: FlatDiagram, at: OperatingPoint, way: str | None) -> l
     return models
 
 
-def model_steps(flat: FlatDiagram, at: OperatingPoint, z: np.ndarray, h: float, way: str | None) -> list[PlantModel]:
-    """Return the linear models of one communication step of all FMUs.
+def check_way(way: str | None) -> None:
+    """Refuse an unknown way of linearizing an FMU's step."""
+    if way not in (None, *WAYS):
+        raise OptionError(
+            f"found plants={way!r}; expected one of {', '.join(map(repr, WAYS))}, or None. Choose one of them."
+        )
+
+
+def model_step(
+    flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None
+) -> PlantModel:
+    """Return the linear model of one communication step of an FMU.
 
     Parameters
     ----------
@@ -168,6 +178,8 @@ def model_steps(flat: FlatDiagram, at: OperatingPoint, z: np.ndarray, h: float, 
         Diagram.
     at : OperatingPoint
         Operating point at the beginning of the step.
+    path : str
+        Path of the FMU.
     z : ndarray
         Inputs of all FMUs over the step.
     h : float
@@ -184,20 +196,6 @@ def model_steps(flat: FlatDiagram, at: OperatingPoint, z: np.ndarray, h: float, 
     FmuError
         If an FMU can't be linearized in this way.
     """
-    _check_way(way)
-    return [_model_step(flat, at, path, z, h, way) for path in plant_paths(flat)]
-
-
-def _check_way(way: str | None) -> None:
-    if way not in (None, *WAYS):
-        raise OptionError(
-            f"found plants={way!r}; expected one of {', '.join(map(repr, WAYS))}, or None. Choose one of them."
-        )
-
-
-def _model_step(
-    flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None
-) -> PlantModel:
     mine, w, wired = plant_entries(flat, path)
     block = fmu_at(flat, path)
     m: FmuLinearization | _HeldStep

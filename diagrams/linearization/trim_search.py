@@ -306,10 +306,10 @@ def trim(
     asked: dict[str, Any] = dict(free) if isinstance(free, Mapping) else dict.fromkeys(free or ())
     guess = operating_point(diagram, at, options)
     base = diagram.replace(guess.parameters) if guess.parameters else diagram
-    flat = base.flatten(guess.base)
+    flat = base.flatten_like(guess)
     states = index_states(flat, guess)
     parameters, base = free_parameters(base, {n: b for n, b in asked.items() if n not in states})
-    flat = base.flatten(guess.base)
+    flat = base.flatten_like(guess)
     bounds = {n: b for n, b in asked.items() if n in states}
     target = read_targets(
         flat, states, targets or {}, rates or {}, [fixed] if isinstance(fixed, str) else fixed, bounds
@@ -325,7 +325,7 @@ def point_from_states(
     Signals and the FMUs' outputs follow from the states. See `Diagram.operating_point`.
     """
     guess = operating_point(diagram, t, options)
-    flat = diagram.flatten(guess.base)
+    flat = diagram.flatten_like(guess)
     guess = set_states(flat, guess, states)
     known = index_states(flat, guess)
     target = read_targets(flat, known, {}, {}, list(known), {})
@@ -375,7 +375,7 @@ def _complete_point(
     more: dict[str, Any],
 ) -> OperatingPoint:
     """Return the operating point with all its signals; subsystems hold their outputs."""
-    flat = diagram.flatten(guess.base)
+    flat = diagram.flatten_like(guess)
     at_tick = flat.at_tick(frozenset(flat.clocks.values()))
     x_next, z, log, _ = at_tick(guess.t, x, w, flat.p)
     values = {name: log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}

@@ -168,7 +168,7 @@ class InjectionRun:
         start: dict[str, Any] = {}
         if point is not None:
             before = diagram.replace(point.parameters) if point.parameters else diagram
-            start["start"] = _translate_point(point, before.flatten(point.base), made, signal)
+            start["start"] = _translate_point(point, before.flatten_like(point), made, signal)
         self.simulation = Simulation(
             made.diagram,
             RunOptions.of({**options, **start, "record": record, "states": False}, block=made.diagram.name),
@@ -246,7 +246,7 @@ class InjectionRun:
 
 def _translate_point(point: OperatingPoint, old: FlatDiagram, made: InjectedDiagram, signal: Tap) -> OperatingPoint:
     """Return an operating point of the diagram as one of the diagram with the test signal."""
-    new = made.diagram.flatten(point.base)
+    new = made.diagram.flatten_like(point)
     x = new.x0.copy()
     copy_states(point.x, old, new, x)
     known = {**point.values, f"{made.sum}.y": point.values[".".join(signal.port)]}

@@ -37,7 +37,7 @@ def point_of(diagram: WiredDiagram, where: Any, source: WiredDiagram | None = No
     if not isinstance(where, OperatingPoint):
         return operating_point(diagram, where, options)
     try:
-        where.check_fits(diagram.flatten(where.base), diagram.name)
+        where.check_fits(diagram.flatten_like(where), diagram.name)
     except OptionError:
         return taken_over(diagram, where, diagram if source is None else source, options)
     return where
@@ -53,7 +53,7 @@ def taken_over(
     """
     from ..simulation import RunOptions, Simulation
 
-    old = source.flatten(point.base)
+    old = source.flatten_like(point)
     if not diagram.has_clock:
         options = {**options, "step": point.base}
     with Simulation(apply_point(diagram, point), RunOptions.of(options, block=diagram.name)) as simulation:

@@ -110,6 +110,8 @@ class OperatingPoint:
             port="operating point",
         )
 
+    asked: bool = False
+    """Whether ``base`` was asked for, as a ``step``: FMUs step at every tick then."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """Parameters that a trim has found with it, by path, as `Diagram.replace` takes them."""
     free: tuple[FreeDirection, ...] = ()

@@ -7,7 +7,7 @@ from fractions import Fraction
 from typing import Any
 
 from ...blocks.core import OptionError
-from ..flat import FlatDiagram, WiredDiagram
+from ..flat import FlatDiagram, WiredDiagram, takes_any_step
 from ..wiring import stepped_blocks
 
 FIXED_STEP = ("euler", "heun", "rk4")
@@ -35,7 +35,7 @@ def ticks_in(duration: Any, base: Fraction, name: str) -> tuple[int, Fraction]:
 def refuse_rest(flat: FlatDiagram, n: int, duration: Any, name: str) -> None:
     """Refuse an end between two ticks where an FMU takes steps of one length only."""
     for path, plant in stepped_blocks(flat.table).items():
-        if not getattr(plant, "variable_step", False) or getattr(plant, "fixed_internal_step", None) is not None:
+        if not takes_any_step(plant):
             raise OptionError(
                 f"found a duration of {duration!r} s, no multiple of the {float(flat.base):g} s between ticks, and "
                 f"{path} takes steps of one length only; take {float(max(n, 1) * flat.base)!r} s.",

@@ -9,13 +9,13 @@ from types import MappingProxyType
 import numpy as np
 
 from ...blocks.core import Block, SimulationError, UnknownNameError, near
+from ..coupling import Plant, PlantSteps, load_plants
 from ..flat import FlatDiagram
 from ..results import Occurrence, OperatingPoint
 from ..solvers import solver_name
 from .continuous import Continuous
 from .diagnosis import opaque_failure
 from .initialize import initialize
-from .plants import Plant, bind, load_plants
 from .run_options import RunOptions
 from .start_at_point import start_at, take_over
 from .stops import StopConditions
@@ -73,6 +73,14 @@ class Engine:
         elif options.solver != "auto":
             solver_name(options.solver)  # an unknown one is an error here, too
         self.every_tick = every_tick or (self.continuous is not None and self.continuous.fixed)
+        self.steps = PlantSteps(
+            flat,
+            self.plants,
+            self.workspace.z,
+            self.workspace.here.w,
+            self.position.time_of,
+            every_tick=self.every_tick,
+        )
 
     def load(self, stack: ExitStack, start_time: float) -> None:
         """Load the plants for a run from a time in s on; ``stack`` unloads them."""
@@ -81,8 +89,9 @@ class Engine:
 
     def initialize(self) -> None:
         """Find values of everything at t = 0; the plants are then ready to be stepped."""
-        bind(self.workspace, self.plants)
-        initialize(self.workspace, self.plants, None if self.continuous is None else self.continuous.delays)
+        self.steps.bind()
+        delays = None if self.continuous is None else self.continuous.delays
+        initialize(self.workspace, self.plants, delays, self.steps.take_inputs)
         for plant in self.plants.values():
             plant.begin()
         self.workspace.begun = True
@@ -95,6 +104,7 @@ class Engine:
         now = self.position.time_of(first)
         self.workspace.begin(self.flat.acting(first))
         take_tick(self.workspace, self.continuous, self.plants, now, self.flat.acting(first))
+        self.steps.begin(first)
         row(now, self.workspace.log)
         self._arrive(first)
 
@@ -117,12 +127,12 @@ class Engine:
         try:
             if self.continuous is None:
                 run_ticks(
-                    workspace, [*plants.values()], position.tick, last,
+                    workspace, plants, self.steps, position.tick, last,
                     every=self.every_tick, row=row, arrived=self._arrive, progress=progress,
                 )  # fmt: skip
                 return
             ended = run_hybrid(
-                workspace, self.continuous, plants, position, last,
+                workspace, self.continuous, plants, self.steps, position, last,
                 every=self.every_tick, row=row, arrived=self._arrive, progress=progress,
             )  # fmt: skip
             if ended is not None:
@@ -135,8 +145,7 @@ class Engine:
         """Go on from a tick to the end of the run, before the next tick, and record it; see `go`."""
         position = self.position
         try:
-            now = position.t
-            ended = end_between_ticks(self.workspace, self.continuous, self.plants, now, end, row)
+            ended = end_between_ticks(self.workspace, self.continuous, self.plants, self.steps, position, end, row)
             position.end = end
             if ended is not None:
                 position.stopped = self._stops.met_at(ended)

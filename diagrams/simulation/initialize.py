@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from ...blocks.core import LoopwrightError, NonFiniteError, SimulationError
 from ...blocks.tracing import bundle, initial_state
+from ..coupling import Plant
 from ..flat import NONE, FlatDiagram, Instant, evaluate, evaluate_apart, is_true
 from .diagnosis import inputs_text, shaped_inputs
 from .left_of_start import values_from_left
-from .plants import Plant
 from .transport_delays import Delays
 from .workspace import Workspace
 
@@ -20,7 +20,9 @@ _MAX_PASSES = 100  # over inputs and outputs of the FMUs at the start
 _SETTLED = 1e-13  # relative change of an input between two passes, a few hundred ulps
 
 
-def initialize(workspace: Workspace, plants: Mapping[str, Plant], delays: Delays | None) -> None:
+def initialize(
+    workspace: Workspace, plants: Mapping[str, Plant], delays: Delays | None, take_inputs: Callable[[], None]
+) -> None:
     """Find values of everything at t = 0.
 
     In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). Outputs are passed on
@@ -28,6 +30,8 @@ def initialize(workspace: Workspace, plants: Mapping[str, Plant], delays: Delays
 
     Initial states that are computed from inputs are those of the instant before: a source that jumps at t = 0 has its
     value from the left there, so that a derivative sees the jump, as it sees one at any later time.
+
+    ``take_inputs`` lets the plants see the inputs z.
     """
     flat = workspace.flat
     acting = flat.acting(0)
@@ -42,6 +46,7 @@ def initialize(workspace: Workspace, plants: Mapping[str, Plant], delays: Delays
         workspace.evaluate(acting)
         workspace.check(acting)
         before = workspace.z.copy()
+        take_inputs()
         for plant in plants.values():
             plant.exchange()
         if delays is not None:

@@ -32,6 +32,7 @@ def save_state(engine: Engine) -> RunState:
         layout=layout_of(engine.flat),
         continuous=None if engine.continuous is None else engine.continuous.save(),
         fmus={path: plant.serialize() for path, plant in engine.plants.items()},
+        plant_steps=engine.steps.save(),
         stopped=position.stopped,
     )
 
@@ -44,3 +45,4 @@ def restore_state(engine: Engine, state: RunState) -> None:
     if engine.continuous is not None and state.continuous is not None:
         engine.continuous.restore(state.continuous)
     engine.position.restore(state.tick, state.stopped)
+    engine.steps.restore(state.plant_steps, state.tick)

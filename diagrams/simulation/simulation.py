@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Block, OptionError, SimulationError
-from ..flat import FlatDiagram, WiredDiagram
+from ..coupling import note_fine_steps
+from ..flat import EVERY, FlatDiagram, WiredDiagram
 from ..results import (
     Occurrence,
     OperatingPoint,
@@ -29,7 +30,6 @@ from ..results import (
 from .duration import default_step, refuse_rest, ticks_in
 from .engine import Engine
 from .interrupted import Interrupted
-from .plants import note_fine_steps
 from .progress import progress_bar
 from .run_options import RunOptions
 from .save import can_save, restore_state, save_state
@@ -84,7 +84,7 @@ class Simulation:
         )
         self._stack = ExitStack()
         self._start_state = saved
-        every_tick = base is not None or self.flat.plants_at_every_tick
+        every_tick = base is not None or EVERY in self.flat.visited
         self._notes = note_fine_steps(self.flat) if base is None else ()
         self._last: int | None = None
         if duration is not None:
@@ -102,7 +102,7 @@ class Simulation:
     # --- its parts ---------------------------------------------------------------------------------------------------
 
     def _new_recorder(self) -> Recorder:
-        every_tick = self._engine.every_tick or not self.flat.distinct
+        every_tick = self._engine.every_tick
         return self._recording.begin(None if self._last is None or not every_tick else self._last + 1)
 
     def __enter__(self) -> Simulation:

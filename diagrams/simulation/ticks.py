@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from ...blocks.core import SimulationError
-from ..flat import NONE, TickPattern
+from ..coupling import Plant, PlantSteps
+from ..flat import EVERY, NONE, TickPattern
 from .continuous import Continuous
-from .plants import Plant
 from .view import Position
 from .workspace import Workspace
 
@@ -22,7 +22,8 @@ Progress = Callable[[float], Any]
 
 def run_ticks(
     workspace: Workspace,
-    plants: Sequence[Plant],
+    plants: Mapping[str, Plant],
+    steps: PlantSteps,
     k: int,
     last: int,
     *,
@@ -46,9 +47,10 @@ def run_ticks(
     """
     flat = workspace.flat
     t, log = workspace.here.t, workspace.log
-    only = plants[0].step if len(plants) == 1 else None
+    each = [plant.step for plant in plants.values()] if steps.regular else []
+    only = each[0] if len(each) == 1 else None
     n, d, h = flat.base.numerator, flat.base.denominator, float(flat.base)
-    always = workspace.bind_tick(flat.acting(0)) if all(c == TickPattern() for c in flat.distinct) else None
+    always = workspace.bind_tick(flat.acting(0)) if all(c == EVERY for c in flat.distinct) else None
     count, now, before, width = 0, k * n / d, k, 1
     for k in flat.ticks(k, last, every=every):  # noqa: B020
         if k - before != width:
@@ -58,9 +60,11 @@ def run_ticks(
         try:
             if only is not None:
                 only(now, h)
+            elif steps.regular:
+                for step in each:
+                    step(now, h)
             else:
-                for plant in plants:
-                    plant.step(now, h)
+                steps.step_to(k, last=k == last)
         except SimulationError as error:
             raise error.at(t=k * n / d) from error.__cause__
         t[0] = now = k * n / d
@@ -68,6 +72,8 @@ def run_ticks(
             always()
         else:
             workspace.tick(flat.acting(k))
+        if not steps.regular:
+            steps.hold(k)
         row(now, log)
         if arrived(k):
             return
@@ -82,6 +88,7 @@ def run_hybrid(
     workspace: Workspace,
     continuous: Continuous,
     plants: Mapping[str, Plant],
+    steps: PlantSteps,
     position: Position,
     last: int,
     *,
@@ -103,7 +110,7 @@ def run_hybrid(
         Time in s at which a stop condition has ended the run between two ticks.
     """
     flat, time_of = workspace.flat, position.time_of
-    clocks, count, samples = flat.distinct, 0, 0
+    clocks, count, samples = flat.visited if plants else flat.distinct, 0, 0
 
     def sample(t: float) -> bool:
         nonlocal samples
@@ -113,9 +120,9 @@ def run_hybrid(
             progress(t)
         return continuous.is_stopped()
 
+    sampled = every or not clocks or EVERY in clocks
     while position.tick < last:
         k = position.tick
-        sampled = every or not clocks
         lands = continuous.fixed or (plants and sampled) or (continuous.lands and sampled)
         following = k + 1 if lands else min([*(c.after(k) for c in clocks), last])
         between = range(k + 1, following) if sampled else range(0)
@@ -123,9 +130,14 @@ def run_hybrid(
         ended = continuous.advance(now, time_of(following), map(time_of, between), sample)
         if ended is not None:
             return ended
-        for plant in plants.values():
-            plant.step(now, float(flat.base * (following - k)))
+        if steps.regular:
+            for plant in plants.values():
+                plant.step(now, float(flat.base * (following - k)))
+        else:
+            steps.step_to(following, last=following == last)
         take_tick(workspace, continuous, plants, time_of(following), flat.acting(following))
+        if not steps.regular:
+            steps.hold(following)
         row(time_of(following), workspace.log)
         if arrived(following):
             return None
@@ -140,11 +152,12 @@ def end_between_ticks(
     workspace: Workspace,
     continuous: Continuous | None,
     plants: Mapping[str, Plant],
-    now: float,
+    steps: PlantSteps,
+    position: Position,
     end: float,
     row: Row,
 ) -> float | None:
-    """Go on from the time of a tick to the end of a run before the next one, where nothing sampled acts.
+    """Go on from a tick to the end of a run before the next one, where nothing sampled acts.
 
     Returns
     -------
@@ -157,11 +170,10 @@ def end_between_ticks(
             row(t, workspace.log)
             return continuous.is_stopped()
 
-        ended = continuous.advance(now, end, (), sample)
+        ended = continuous.advance(position.t, end, (), sample)
         if ended is not None:
             return ended
-    for plant in plants.values():
-        plant.step(now, end - now)
+    steps.end_at(end, position.tick)
     if continuous is not None:
         take_tick(workspace, continuous, plants, end, NONE)
     else:  # everything is held but for what has been stepped

@@ -8,8 +8,8 @@ from fractions import Fraction
 
 import numpy as np
 
+from ..coupling import Plant
 from ..results import Occurrence, Stopped
-from .plants import Plant
 from .workspace import Workspace
 
 

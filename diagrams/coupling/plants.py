@@ -9,9 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...blocks.core import Layout, LoopwrightError, SimulationError
-from ..flat import FlatDiagram
+from ..flat import FlatDiagram, own_step
 from ..wiring import stepped_blocks
-from .workspace import Workspace
 
 
 class Plant(Protocol):
@@ -66,17 +65,20 @@ class Stepped(Protocol):
 
 
 def note_fine_steps(flat: FlatDiagram) -> tuple[str, ...]:
-    """Return a message where plants step more finely than any subsystem acts, since one of them can't do otherwise."""
-    shortest = min((clock.every for clock in flat.distinct), default=1)
-    if not flat.even_plants or shortest == 1:
-        return ()
-    text = (
-        f"{', '.join(flat.even_plants)}: takes steps of one length only, so what is stepped from outside goes by the "
-        f"common base of all sample times, {float(flat.base):.6g} s, {shortest} times finer than the fastest "
-        "subsystem. Take sample times of which the shortest divides the others, or an FMU with "
-        "canHandleVariableCommunicationStepSize."
-    )
-    return (text,)
+    """Return a message for each plant that steps more finely than any subsystem acts, as it can't do otherwise."""
+    shortest = min((clock.every for clock in flat.distinct), default=0)
+    found = []
+    for path in flat.even_plants:
+        own = min(clock.every for clock in flat.plant_ticks[path])
+        if own >= shortest or own_step(flat.table.blocks[path]) is not None:
+            continue
+        found.append(
+            f"{path}: takes steps of one length only, so it goes by the common base of the sample times that it is "
+            f"wired to, {float(own * flat.base):.6g} s, {shortest / own:.6g} times finer than the fastest subsystem. "
+            "Take sample times of which the shortest divides the others, or an FMU with "
+            "canHandleVariableCommunicationStepSize."
+        )
+    return tuple(found)
 
 
 def load_plants(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) -> Iterator[tuple[str, Plant]]:
@@ -98,14 +100,14 @@ def load_plants(flat: FlatDiagram, stack: ExitStack, start_time: float = 0.0) ->
             raise
 
 
-def bind(workspace: Workspace, plants: Mapping[str, Plant]) -> None:
-    """Let the plants read their inputs from z and write their outputs to w."""
-    flat = workspace.flat
+def bind(flat: FlatDiagram, plants: Mapping[str, Plant], inputs: np.ndarray, outputs: np.ndarray) -> None:
+    """Let the plants read their inputs from a vector like z, and write their outputs to one like w."""
     for path, plant in plants.items():
-        inputs = _part(flat, flat.plant_inputs, path, workspace.z)
-        plant.bind(inputs, _part(flat, flat.plant_outputs, path, workspace.here.w))
+        own = part_of(flat, flat.plant_inputs, path), part_of(flat, flat.plant_outputs, path)
+        plant.bind(inputs[own[0]], outputs[own[1]])
 
 
-def _part(flat: FlatDiagram, layout: Layout, path: str, vector: np.ndarray) -> np.ndarray:
+def part_of(flat: FlatDiagram, layout: Layout, path: str) -> slice:
+    """Return where the ports of a plant stand in z or w."""
     mine = [s for name, s in layout.slices.items() if flat.ports[name][0] == path]
-    return vector[mine[0].start : mine[-1].stop] if mine else vector[:0]
+    return slice(mine[0].start, mine[-1].stop) if mine else slice(0, 0)

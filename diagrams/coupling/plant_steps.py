@@ -1,0 +1,106 @@
+"""Communication steps of the plants of a run: each from one of its communication points to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ..flat import EVERY, FlatDiagram, takes_any_step
+from .plants import Plant, bind, part_of
+
+
+class PlantSteps:
+    """The plants of a run with their ticks, and the inputs that they hold between them.
+
+    Parameters
+    ----------
+    flat : FlatDiagram
+        The diagram.
+    plants : mapping of str to Plant
+        The plants by path; it may be filled later.
+    z, w : ndarray
+        Inputs of the plants, as the diagram has computed them, and their outputs.
+    time_of : callable
+        Gives the time of a tick in s.
+    every_tick : bool
+        Whether the run visits every tick.
+
+    Attributes
+    ----------
+    regular : bool
+        Whether every plant steps at every tick that the run visits. Then inputs are read from z itself.
+    inputs : ndarray
+        Inputs of the plants, each as of its last communication point.
+    reached : dict
+        Tick at which each plant stands, by path.
+    """
+
+    def __init__(
+        self,
+        flat: FlatDiagram,
+        plants: Mapping[str, Plant],
+        z: np.ndarray,
+        w: np.ndarray,
+        time_of: Callable[[int], float],
+        *,
+        every_tick: bool,
+    ) -> None:
+        self._flat, self._plants, self._time_of = flat, plants, time_of
+        self._z, self._w = z, w
+        visited = {EVERY} if every_tick else {*flat.visited}
+        self.regular = all(EVERY in ticks or visited <= {*ticks} for ticks in flat.plant_ticks.values())
+        self.inputs = z if self.regular else z.copy()
+        self.reached: dict[str, int] = {}
+        self._even = {path for path in flat.plant_ticks if not takes_any_step(flat.table.blocks[path])}
+        self._own = {path: part_of(flat, flat.plant_inputs, path) for path in flat.plant_ticks}
+
+    def bind(self) -> None:
+        """Let the plants read their inputs and write their outputs to w."""
+        bind(self._flat, self._plants, self.inputs, self._w)
+
+    def take_inputs(self) -> None:
+        """Let every plant see its inputs as they are in z."""
+        if not self.regular:
+            self.inputs[:] = self._z
+
+    def begin(self, k: int) -> None:
+        """Let every plant stand at tick ``k``, and hold its inputs from there on."""
+        self.take_inputs()
+        self.reached = dict.fromkeys(self._plants, k)
+
+    def step_to(self, k: int, *, last: bool) -> None:
+        """Step the plants of which a tick is a communication point to it; at the ``last`` tick all that can.
+
+        A plant that stops on its way, at the end of a run, goes on from there with the inputs that it holds.
+        """
+        for path, plant in self._plants.items():
+            if self._flat.steps_at(path, k) or (last and path not in self._even):
+                before = self.reached[path]
+                if k > before:
+                    plant.step(self._time_of(before), float(self._flat.base * (k - before)))
+                    self.reached[path] = k
+
+    def hold(self, k: int) -> None:
+        """Let the plants of which a tick is a communication point hold their inputs from there on."""
+        for path, own in self._own.items():
+            if self._flat.steps_at(path, k):
+                self.inputs[own] = self._z[own]
+
+    def end_at(self, end: float, k: int) -> None:
+        """Step all plants from where they stand to the end of the run, in s, after tick ``k`` and before the next."""
+        for path, plant in self._plants.items():
+            now = self._time_of(k if self.regular else self.reached[path])
+            plant.step(now, end - now)
+
+    def save(self) -> dict[str, Any] | None:
+        """Return where the plants stand and what they hold; None where all of that is in z."""
+        return None if self.regular else {"inputs": self.inputs.copy(), "reached": dict(self.reached)}
+
+    def restore(self, saved: Mapping[str, Any] | None, k: int) -> None:
+        """Go back to what `save` returned at tick ``k``."""
+        self.begin(k)
+        if saved is not None and not self.regular:
+            self.inputs[:] = saved["inputs"]
+            self.reached.update(saved["reached"])
