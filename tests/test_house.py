@@ -25,11 +25,7 @@ ALLOWED = {
     "diagrams/report_writing/figures.py": {
         r'<svg[^>]*?\bwidth="([\d.]+)(pt|px)?" height="([\d.]+)'
     },  # Matplotlib's SVG
-    "fmus/checks/summary.py": {
-        r"^\s*(\S+) => not found",
-        r"undefined symbol:\s*([^\s,]+)",
-        "linux",
-    },  # ldd's output; sys.platform
+    "fmus/checks/libraries.py": {r"^\s*(\S+) => not found", "linux"},  # ldd's output; sys.platform
     "fmus/checks/validation.py": {"has no start value", "is not defined"},  # FMPy's problems are texts alone
     "fmus/export/c_code.py": {"int "},  # in the C code that CasADi writes
     "fmus/export/compiler.py": {"windows"},  # the end of a platform's name

@@ -219,7 +219,28 @@ class FmuError(LoopwrightError, RuntimeError):
 
 
 class FmuFileError(FmuError):
-    """A file is no FMU, or an FMU that can't be used here."""
+    """A file is no FMU, or an FMU that can't be used here.
+
+    Attributes
+    ----------
+    fault : str, optional
+        Kind of the fault, a `loopwright.fmus.FmuFault`; None where no kind is known.
+    subject : str, optional
+        File of the archive, variable, library or attribute concerned.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        fault: str | None = None,
+        subject: str | None = None,
+        block: str | None = None,
+        port: str | None = None,
+        t: float | None = None,
+    ):
+        super().__init__(message, block=block, port=port, t=t)
+        self.fault, self.subject = fault, subject
 
 
 class CompilerError(FmuError):

@@ -1,12 +1,34 @@
-"""FMU files: their description, read and checked."""
+"""FMU files: their archive and description, read, checked and unpacked."""
 
+from .binaries import check_binary, find_binary, missing_functions
 from .description import FmuDescription, read_description
+from .faults import FmuFault, FmuFinding
+from .library import SharedLibrary, read_library
+from .limits import ArchiveLimits
+from .unpacking import unpack, unpack_archive, write_files
 from .variables import FmuVariable, OtherVariable, inexact
+from .xml_text import parse_xml
+from .zip_file import BUILD_DESCRIPTION, DESCRIPTION, FmuArchive
 
 __all__ = [
+    "BUILD_DESCRIPTION",
+    "DESCRIPTION",
+    "ArchiveLimits",
+    "FmuArchive",
     "FmuDescription",
+    "FmuFault",
+    "FmuFinding",
     "FmuVariable",
     "OtherVariable",
+    "SharedLibrary",
+    "check_binary",
+    "find_binary",
     "inexact",
+    "missing_functions",
+    "parse_xml",
     "read_description",
+    "read_library",
+    "unpack",
+    "unpack_archive",
+    "write_files",
 ]

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-import hashlib
+import io
 import os
 import re
 import zipfile
-import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as ET
 
 import numpy as np
 
 from ...blocks.core import FmuFileError, Layout
-from ..platform import native_platform
+from .binaries import find_binary
+from .faults import FmuFault, FmuFinding
 from .gathering import Elements, gather
+from .limits import ArchiveLimits
+from .rules import check_dimensions, check_schema
 from .states import find_states
 from .units import FmuUnits
 from .variables import WIRE_TYPES, FmuVariable, OtherVariable, fmi3_type, read_variable
-
-_FOLDERS2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"}
-"""Folders of binaries in FMI 2.0 (2.3.1), where they differ from FMI 3.0's platform tuples."""
-_SUFFIXES = (".so", ".dll", ".dylib")
+from .xml_text import parse_xml
+from .zip_file import DESCRIPTION, FmuArchive
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +77,10 @@ class FmuDescription:
     """The library of the model-exchange interface for this platform, as its path in the archive."""
     model_exchange_has_derivatives: bool = False
     """Whether the FMU computes directional derivatives in model exchange."""
+    limits: ArchiveLimits = field(default_factory=ArchiveLimits)
+    """Limits within which it is read and unpacked."""
+    findings: tuple[FmuFinding, ...] = ()
+    """Faults of the archive that don't keep the FMU from running."""
 
     def layout(self, names: Iterable[str]) -> Layout:
         """Return the layout of some variables in a flat vector, one after the other."""
@@ -142,70 +145,94 @@ class FmuDescription:
         )
 
 
-def read_description(file: str | os.PathLike[str]) -> FmuDescription:
+def read_description(file: str | os.PathLike[str], *, limits: ArchiveLimits | None = None) -> FmuDescription:
     """Read and check an FMU, without loading its library.
+
+    Parameters
+    ----------
+    file : str or PathLike
+        The FMU.
+    limits : ArchiveLimits, optional
+        Limits of its size; the usual ones without it.
 
     Raises
     ------
     FmuFileError
-        If the file is missing, is no FMU, or has no co-simulation of FMI 2.0 or 3.0 or no binary for this platform.
+        If the file is missing, is no FMU, or has no co-simulation of FMI 2.0 or 3.0 or no binary for this platform; if
+        its archive is unsafe, damaged or beyond the limits. Its ``fault`` is an `FmuFault`.
     """
     path = Path(file).expanduser()
     if not path.is_file():
-        raise FmuFileError(f"there is no file {str(path)!r}; expected an FMU. Check the path.")
+        raise FmuFileError(f"there is no file {str(path)!r}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
     stat = path.stat()
-    return _read(path.resolve(), stat.st_mtime_ns, stat.st_size)
+    return _read(path.resolve(), stat.st_mtime_ns, stat.st_size, limits or ArchiveLimits())
 
 
 @lru_cache(maxsize=256)
-def _read(path: Path, mtime: int, length: int) -> FmuDescription:
-    data, entries, text = _read_archive(path)
-    model, complaints = _parse(path)
-    if not re.fullmatch(r"2\.0|3\.0(\.\d+)?", model.fmiVersion):
+def _read(path: Path, mtime: int, length: int, limits: ArchiveLimits) -> FmuDescription:
+    archive = FmuArchive.open(path, limits)
+    entries, text = set(archive.files), archive.description()
+    root = parse_xml(path, DESCRIPTION, text)
+    version = str(root.get("fmiVersion"))
+    if not re.fullmatch(r"2\.0|3\.0(\.\d+)?", version):
         raise FmuFileError(
-            f"{str(path)!r} is an FMU of FMI {model.fmiVersion}; expected FMI 2.0 or 3.0. Export it again with one of "
-            "them, for co-simulation."
+            f"{str(path)!r} is an FMU of FMI {version}; expected FMI 2.0 or 3.0. Export it again with one of "
+            "them, for co-simulation.",
+            fault=FmuFault.VERSION,
+            subject=version,
         )
+    model, complaints = _parse(path, text, root)
     if model.coSimulation is None:
-        raise FmuFileError(f"{str(path)!r} has no co-simulation interface; export it with one.")
-    version, identifier = model.fmiVersion, model.coSimulation.modelIdentifier
-    binary = _find_binary(path, entries, version, identifier)
+        raise FmuFileError(
+            f"{str(path)!r} has no co-simulation interface; export it with one.", fault=FmuFault.INTERFACE
+        )
+    identifier = model.coSimulation.modelIdentifier
+    binary = find_binary(path, entries, version, identifier)
     try:
-        found = _read_variables(path, entries, ET.fromstring(text), model)
+        check_dimensions(path, model, limits)
+        found = _read_variables(path, entries, root, model)
     except FmuFileError:
         raise
     except Exception as error:  # of a description that breaks its own rules
         raise FmuFileError(
-            f"the modelDescription.xml of {str(path)!r} can't be read: {type(error).__name__}: {error}. "
-            f"{''.join(f'{complaint} ' for complaint in complaints[:3])}Export it again."
+            f"the {DESCRIPTION} of {str(path)!r} can't be read: {type(error).__name__}: {error}. "
+            f"{''.join(f'{complaint} ' for complaint in complaints[:3])}Export it again.",
+            fault=FmuFault.DESCRIPTION,
+            subject=DESCRIPTION,
         ) from error
     return FmuDescription(
-        version, path, hashlib.sha256(data).hexdigest(), model.modelName, identifier, model.instantiationToken or "",
-        binary, complaints=complaints, **found,
+        version, path, archive.digest, model.modelName, identifier, model.instantiationToken or "",
+        binary, complaints=complaints, limits=limits, findings=archive.findings, **found,
     )  # fmt: skip
 
 
-def _parse(path: Path) -> tuple[Any, tuple[str, ...]]:
+def _parse(path: Path, text: bytes, root: Any) -> tuple[Any, tuple[str, ...]]:
     """Return FMPy's reading of a description, and the complaints about one that breaks rules of the standard."""
     import fmpy
-    from fmpy.model_description import ValidationError
+    from fmpy.validation import validate_model_description
 
+    only = io.BytesIO()  # FMPy sees the checked description, and nothing else of the archive
+    with zipfile.ZipFile(only, "w") as archive:
+        archive.writestr(DESCRIPTION, text)
     try:
-        try:
-            return fmpy.read_model_description(str(path)), ()
-        except ValidationError as error:  # many FMUs that run break some rule
-            return fmpy.read_model_description(str(path), validate=False), tuple(map(str, error.problems))
+        model = fmpy.read_model_description(only, validate=False)
+        complaints = check_schema(root) or validate_model_description(model)
     except Exception as error:  # FMPy raises bare exceptions
-        raise FmuFileError(f"the modelDescription.xml of {str(path)!r} can't be read: {error}") from error
+        raise FmuFileError(
+            f"the {DESCRIPTION} of {str(path)!r} can't be read: {error}. Export it again.",
+            fault=FmuFault.DESCRIPTION,
+            subject=DESCRIPTION,
+        ) from error
+    return model, tuple(map(str, complaints))
 
 
-def _read_variables(path: Path, entries: set[str], root: ET.Element, model: Any) -> dict[str, Any]:
+def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dict[str, Any]:
     """Return the variables, states and capabilities of an FMU, as arguments of its description."""
     version = model.fmiVersion
     flags = _capabilities(root, version)
     if flags["model_exchange"] is not None:
         try:
-            flags["model_exchange_binary"] = _find_binary(path, entries, version, flags["model_exchange"])
+            flags["model_exchange_binary"] = find_binary(path, entries, version, flags["model_exchange"])
         except FmuFileError:
             flags["model_exchange"] = None
     dropped, units = _dropped_attributes(root), FmuUnits({u.name: u for u in model.unitDefinitions})
@@ -214,7 +241,11 @@ def _read_variables(path: Path, entries: set[str], root: ET.Element, model: Any)
         if v.causality == "independent":
             continue
         if v.name in scalars or v.name in other:
-            raise FmuFileError(f"{str(path)!r} has two variables {v.name!r}. Export it again.")
+            raise FmuFileError(
+                f"{str(path)!r} has two variables {v.name!r}; expected different names. Export it again.",
+                fault=FmuFault.DUPLICATE_NAME,
+                subject=v.name,
+            )
         if fmi3_type(v.type) in WIRE_TYPES:
             scalars[v.name] = read_variable(v, dropped.get(v.name, {}), units)
         else:
@@ -235,62 +266,7 @@ def _read_variables(path: Path, entries: set[str], root: ET.Element, model: Any)
     }
 
 
-def _read_archive(path: Path) -> tuple[bytes, set[str], bytes]:
-    """Return the content of a file, the names in its archive, and the text of its description."""
-    data = b""
-    try:
-        data = path.read_bytes()
-        with zipfile.ZipFile(path) as archive:
-            entries = set(archive.namelist())
-            text = archive.read("modelDescription.xml") if "modelDescription.xml" in entries else b""
-    except zipfile.BadZipFile as error:
-        raise FmuFileError(
-            f"{str(path)!r} is no FMU: it is no zip archive (it starts with {data[:8]!r}), or a damaged one ({error}). "
-            "Give the .fmu that the tool exported."
-        ) from None
-    except MemoryError:
-        raise FmuFileError(
-            f"{str(path)!r} can't be read: its content does not fit into memory; expected an FMU of a few MB. Look at "
-            "the sizes of the files in it, or export it again."
-        ) from None
-    except RuntimeError as error:  # of an archive that asks for a password, or is packed in an unknown way
-        raise FmuFileError(
-            f"{str(path)!r} can't be read: {error}. Pack it again without a password, by the usual compression."
-        ) from None
-    except (OSError, EOFError, zlib.error) as error:
-        raise FmuFileError(
-            f"{str(path)!r} can't be read: {error}. Check its permissions, or copy or export it again."
-        ) from None
-    if "modelDescription.xml" not in entries:
-        raise FmuFileError(f"{str(path)!r} is a zip archive without modelDescription.xml, so it is no FMU.")
-    return data, entries, text
-
-
-def _find_binary(path: Path, entries: set[str], version: str, identifier: str) -> str:
-    """Return the library for this platform: that of the model identifier, else the only one in the folder."""
-    platform = native_platform()
-    folder = _FOLDERS2.get(platform, platform) if version.startswith("2.") else platform
-    here = sorted(e for e in entries if e.startswith(f"binaries/{folder}/") and e.endswith(_SUFFIXES))
-    named = [e for e in here if e.rpartition("/")[2].rpartition(".")[0] == identifier]
-    direct = named or [e for e in here if e.count("/") == 2]
-    if len(direct) == 1 or named:
-        return direct[0]
-    found = sorted(
-        {e.split("/")[1] for e in entries if e.startswith("binaries/") and e.count("/") > 1 and e[-1] != "/"}
-    )
-    if direct:
-        names = ", ".join(e.rpartition("/")[2] for e in direct)
-        raise FmuFileError(
-            f"{str(path)!r} has several libraries in binaries/{folder}, none with its model identifier: found {names}; "
-            f"expected {identifier}. Export it again."
-        )
-    raise FmuFileError(
-        f"{str(path)!r} has no binary for this platform, {folder} (it has: {', '.join(found) or 'none'}). Export "
-        "or build it for this platform."
-    )
-
-
-def _capabilities(root: ET.Element, version: str) -> dict[str, Any]:
+def _capabilities(root: Any, version: str) -> dict[str, Any]:
     """Return the interfaces' flags (FMI 2.0, 3.3.1 and 4.3.1; FMI 3.0, 3.4 and 4.4), some of which FMPy drops."""
     steps, exchange = root.find("CoSimulation"), root.find("ModelExchange")
     two = version.startswith("2.")
@@ -309,11 +285,11 @@ def _capabilities(root: ET.Element, version: str) -> dict[str, Any]:
     }
 
 
-def _flag(interface: ET.Element | None, name: str) -> bool:
+def _flag(interface: Any, name: str) -> bool:
     return interface is not None and interface.get(name) in ("true", "1")
 
 
-def _dropped_attributes(root: ET.Element) -> dict[str, Mapping[str, str]]:
+def _dropped_attributes(root: Any) -> dict[str, Mapping[str, str]]:
     """Return attributes that FMPy drops, by the variable's name: bounds of unsigned integers, relative quantities."""
     variables = root.find("ModelVariables")
     found: dict[str, Mapping[str, str]] = {}

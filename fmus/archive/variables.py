@@ -171,6 +171,8 @@ def _number(text: Any) -> float | None:
 
 def _start(text: Any, shape: tuple[int, ...]) -> np.ndarray:
     words = {"true": 1.0, "false": 0.0}
+    if not shape and isinstance(text, str) and len(text.split()) == 1 and text not in words:
+        return np.array(float(text))  # most variables, of thousands
     found = text.split() if isinstance(text, str) else np.ravel(text)
     values = np.array([words[x] if x in words else float(x) for x in found])
     full = np.broadcast_to(values, (int(np.prod(shape, dtype=int)),)) if values.size == 1 else values

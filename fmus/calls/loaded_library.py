@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from itertools import groupby
@@ -15,8 +13,7 @@ from weakref import WeakSet
 import numpy as np
 
 from ...blocks.core import FmuError, FmuFileError, FmuRuntimeError, UnknownNameError, near
-from ..archive import FmuDescription, FmuVariable, inexact
-from ..platform import cache_folder, check_cache
+from ..archive import FmuVariable, inexact, unpack
 from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
 from .fmi_calls import FATAL, STATUS, FmiCalls
@@ -347,41 +344,3 @@ class LoadedFmu:
                 self.fmi.free_instance()
         finally:
             self.fmi.end()
-
-
-def unpack(description: FmuDescription) -> Path:
-    """Unpack an FMU, once for each content, and return the folder of its files.
-
-    Raises
-    ------
-    FmuError
-        If the cache can't be written, or is full.
-    FmuFileError
-        If the archive can't be unpacked.
-    """
-    import fmpy
-
-    folder = cache_folder().absolute() / "unpacked" / description.digest[:32]
-    if folder.is_dir():
-        return folder
-    check_cache()
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(dir=folder.parent))
-    try:
-        fmpy.extract(description.file, fresh)
-        try:
-            fresh.rename(folder)
-        except OSError:  # another process was faster
-            if not folder.is_dir():
-                raise
-    except OSError as error:
-        raise FmuError(
-            f"the FMU {str(description.file)!r} can't be unpacked into {str(fresh)!r}: {error}. Make room there, or "
-            "set LOOPWRIGHT_CACHE to another folder."
-        ) from error
-    except Exception as error:
-        raise FmuFileError(f"the FMU {str(description.file)!r} can't be unpacked: {error}. Export it again.") from error
-    finally:
-        if fresh.is_dir():
-            shutil.rmtree(fresh, ignore_errors=True)
-    return folder

@@ -18,6 +18,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ..archive import FmuArchive, check_binary, find_binary, write_files
+
 _MESSAGES = 20
 
 
@@ -41,9 +43,11 @@ def main(file: str, interface: str, report: str) -> None:
 
         try:
             begin("load")
-            fmpy.extract(file, folder)
-            model = fmpy.read_model_description(folder, validate=False)
-            notes = _run(fmpy, folder, model, interface, begin, messages)
+            archive = FmuArchive.open(file)
+            write_files(archive, Path(folder))
+            model = fmpy.read_model_description(archive.for_fmpy(), validate=False)
+            library = _find_library(archive, model, interface)
+            notes = _run(folder, model, interface, library, begin, messages)
         except Exception as error:
             said = [m for m in messages if m.strip()]
             tell("failed", at=stage, error=f"{type(error).__name__}: {error}", messages=said[-3:])
@@ -51,8 +55,16 @@ def main(file: str, interface: str, report: str) -> None:
             tell("done", **notes)
 
 
+def _find_library(archive: FmuArchive, model: Any, interface: str) -> str:
+    """Return the path of the interface's library in the archive, after checking it."""
+    about = model.coSimulation if interface == "CoSimulation" else model.modelExchange
+    library = find_binary(archive.path, archive.files, model.fmiVersion, about.modelIdentifier)
+    check_binary(archive, library, model.fmiVersion, model_exchange=interface == "ModelExchange")
+    return library
+
+
 def _run(
-    fmpy: Any, folder: str, model: Any, interface: str, begin: Callable[[str], None], messages: deque[str]
+    folder: str, model: Any, interface: str, library: str, begin: Callable[[str], None], messages: deque[str]
 ) -> dict[str, Any]:
     from fmpy.simulation import instantiate_fmu
 
@@ -62,7 +74,15 @@ def _run(
         messages.append((parts[-1] or b"").decode(errors="replace"))
 
     start, stop, step = _times(model, interface)
-    fmu = instantiate_fmu(folder, model, fmi_type=interface, logger=log, debug_logging=True)
+    fmu = instantiate_fmu(
+        folder,
+        model,
+        fmi_type=interface,
+        logger=log,
+        debug_logging=True,
+        library_path=str(Path(folder, library)),
+        require_functions=False,
+    )
     begin("initialize")
     if three:
         fmu.enterInitializationMode(startTime=start, stopTime=stop)

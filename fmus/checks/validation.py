@@ -13,7 +13,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import zipfile
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -21,8 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from ...blocks.core import FmuFileError
+from ..archive import BUILD_DESCRIPTION, DESCRIPTION, FmuArchive, parse_xml, read_library
 from ..platform import native_platform
-from .summary import INTERFACES, binaries_of, library_name, platforms_of_binary, read_archive, tuple_of
+from .libraries import binaries_of, library_name, native_libraries, tuple_of
+from .summary import INTERFACES, open_fmu
 from .trial_stages import STAGES
 
 #: Seconds that an FMU may take for its first step before it counts as hung.
@@ -76,22 +77,23 @@ def validate(file: Path, *, run: bool = True) -> ValidationReport:
         Whether to run it, in a process of its own.
     """
     try:
-        entries, root = read_archive(file)
+        archive, root = open_fmu(file)
     except FmuFileError as error:
-        problem = FmuProblem(str(error), "Export it again; the file may be cut off, or no FMU at all.")
+        problem = FmuProblem(str(error), "Take another file: this one is not read any further.")
         return ValidationReport((problem,), (), ())
+    entries = list(archive.files)
     tool = root.get("generationTool") or "not named"
     again = _AGAIN.format(tool=tool)
     fmi = root.get("fmiVersion") or "(none)"
     if not (fmi in ("1.0", "2.0") or fmi.startswith("3.")):
         problem = FmuProblem(f"fmiVersion is {fmi!r}; expected 1.0, 2.0 or 3.0.", again)
         return ValidationReport((problem,), (), ("everything else: the version isn't known",))
-    problems = [*_archive(file, entries, again), *_description(file, again)]
+    problems = [*_archive(archive), *_description(archive, again)]
     done = [f"description against FMI {fmi}'s schema and rules"]
     left: list[str] = []
     if fmi != "1.0":
-        problems += [FmuProblem(found, again) for found in (*_initial_unknowns(root), *_sources(file, root, entries))]
-    problems += [FmuProblem(*pair) for pair in _binaries(file, root, entries, tool)]
+        problems += [FmuProblem(found, again) for found in (*_initial_unknowns(root), *_sources(archive, root))]
+    problems += [FmuProblem(*pair) for pair in _binaries(archive, root, tool)]
     folders = binaries_of(entries)
     if folders:
         done.append(f"binaries for {', '.join(folders)}")
@@ -116,28 +118,23 @@ def validate(file: Path, *, run: bool = True) -> ValidationReport:
 # --- the archive and the description --------------------------------------------------------------------------------
 
 
-def _archive(file: Path, entries: Iterable[str], again: str) -> Iterator[FmuProblem]:
-    with zipfile.ZipFile(file) as archive:
+def _archive(archive: FmuArchive) -> Iterator[FmuProblem]:
+    """Yield the findings about the archive, and the files in it that are damaged."""
+    for finding in archive.findings:
+        yield FmuProblem(finding.found, finding.step)
+    for name in archive.files:
         try:
-            broken = archive.testzip()
-        except Exception as error:  # the exception depends on the kind of damage
-            yield FmuProblem(f"the archive is damaged: {error}.", "Copy or export it again.")
-        else:
-            if broken is not None:
-                yield FmuProblem(f"the archive is damaged: {broken} has a wrong checksum.", "Copy or export it again.")
-    for name, count in Counter(entries).items():
-        if count > 1:
-            yield FmuProblem(f"the archive holds {name} {count} times.", again)
-        if name.startswith("/") or ".." in name.split("/") or ":" in name:
-            found = f"the archive holds {name!r}, which points out of its folder."
-            yield FmuProblem(found, f"Don't unpack it. {again}")
+            for _ in archive.chunks(name):
+                pass
+        except FmuFileError as error:
+            yield FmuProblem(f"the archive is damaged: {name}: {error}", "Copy or export it again.")
 
 
-def _description(file: Path, again: str) -> Iterator[FmuProblem]:
+def _description(archive: FmuArchive, again: str) -> Iterator[FmuProblem]:
     """Yield the faults that FMPy finds: schema, names, start values, units, model structure."""
     from fmpy.validation import validate_fmu
 
-    for found in validate_fmu(str(file)):
+    for found in validate_fmu(archive.for_fmpy()):
         yield FmuProblem(_end_sentence(found), _next_step(found, again))
 
 
@@ -172,24 +169,20 @@ def _initial_unknowns(root: Any) -> Iterator[str]:
         yield "ModelStructure/InitialUnknowns is not in the order of the variables; expected ascending indices."
 
 
-def _sources(file: Path, root: Any, entries: Iterable[str]) -> Iterator[str]:
+def _sources(archive: FmuArchive, root: Any) -> Iterator[str]:
     """Yield faults of declared source files that are missing."""
-    from lxml import etree
-
-    there = set(entries)
-    if "sources/buildDescription.xml" in there:
-        with zipfile.ZipFile(file) as archive:
-            try:
-                build = etree.fromstring(archive.read("sources/buildDescription.xml"))
-            except (etree.XMLSyntaxError, zipfile.BadZipFile):
-                return  # FMPy's validation has reported that
+    if BUILD_DESCRIPTION in archive.files:
+        try:
+            build = parse_xml(archive.path, BUILD_DESCRIPTION, archive.read(BUILD_DESCRIPTION))
+        except FmuFileError:
+            return  # it is reported already
         declared = [e.get("name") for e in build.findall("BuildConfiguration/SourceFileSet/SourceFile")]
-        where = "sources/buildDescription.xml"
+        where = BUILD_DESCRIPTION
     else:
         declared = [e.get("name") for kind in INTERFACES for e in root.findall(f"{kind}/SourceFiles/File")]
-        where = "modelDescription.xml"
+        where = DESCRIPTION
     for name in dict.fromkeys(declared):
-        if f"sources/{name}" not in there:
+        if f"sources/{name}" not in archive.files:
             yield f"{where} declares the source file {name}; there is no sources/{name}."
 
 
@@ -204,34 +197,35 @@ def _identifiers(root: Any) -> dict[str, str]:
     return {name: element.get("modelIdentifier") for name, element in found if element is not None}
 
 
-def _binaries(file: Path, root: Any, entries: list[str], tool: str) -> Iterator[tuple[str, str]]:
-    """Yield faults of libraries: missing, or for another machine than their folder's."""
+def _binaries(archive: FmuArchive, root: Any, tool: str) -> Iterator[tuple[str, str]]:
+    """Yield faults of libraries: missing, of another name, cut off, or for another machine than their folder's."""
     build = f"Export it again with its tool ({tool}); if it has sources, fmpy compile builds it for this machine."
-    folders = binaries_of(entries)
-    if not folders and not any(name.startswith("sources/") for name in entries):
+    folders = binaries_of(archive.files)
+    if not folders and not any(name.startswith("sources/") for name in archive.files):
         yield "it holds neither a binary nor sources, so that nothing can run it.", build
-    with zipfile.ZipFile(file) as archive:
-        for folder, names in folders.items():
-            platform = tuple_of(folder)
-            if platform is None:
-                continue  # a tool may have folders of its own
-            for library in sorted({library_name(i, platform) for i in _identifiers(root).values() if i}):
-                users = [who for who, i in _identifiers(root).items() if i and library_name(i, platform) == library]
-                if library not in names:
-                    has = f"binaries/{folder} has no {library}, needed for {' and '.join(users)}; it has"
-                    step = f"Put {library} there, or take the folder out. {build}"
-                    yield f"{has} {', '.join(names)}.", step
-                    continue
-                try:
-                    found = platforms_of_binary(archive.read(f"binaries/{folder}/{library}"))
-                except Exception:  # damage, which is reported already
-                    continue
-                if platform not in found:
-                    is_for = " and ".join(sorted(found)) or "no platform known here: it is no shared library"
-                    yield (
-                        f"binaries/{folder}/{library} is for {is_for}; expected {platform}.",
-                        f"Put the library that is for {platform} there, or take the folder out.",
-                    )
+    for folder, names in folders.items():
+        platform = tuple_of(folder)
+        if platform is None:
+            continue  # a tool may have folders of its own
+        for library in sorted({library_name(i, platform) for i in _identifiers(root).values() if i}):
+            users = [who for who, i in _identifiers(root).items() if i and library_name(i, platform) == library]
+            if library not in names:
+                has = f"binaries/{folder} has no {library}, needed for {' and '.join(users)}; it has"
+                step = f"Put {library} there, or take the folder out. {build}"
+                yield f"{has} {', '.join(names)}.", step
+                continue
+            try:
+                header = read_library(archive.read(f"binaries/{folder}/{library}"))
+            except FmuFileError:  # damage, which is reported already
+                continue
+            if platform not in header.platforms:
+                is_for = " and ".join(header.platforms) or "no platform known here: it is no shared library"
+                yield (
+                    f"binaries/{folder}/{library} is for {is_for}; expected {platform}.",
+                    f"Put the library that is for {platform} there, or take the folder out.",
+                )
+            elif header.damage:
+                yield f"binaries/{folder}/{library} can't be loaded: {header.damage}.", "Copy or export it again."
 
 
 # --- running --------------------------------------------------------------------------------------------------------
@@ -241,10 +235,8 @@ def _reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]]
     if kind == "ScheduledExecution":
         return "scheduled execution needs a scheduler"
     native = native_platform()
-    identifier = element.get("modelIdentifier") or ""
-    for folder, names in folders.items():
-        if tuple_of(folder) == native and library_name(identifier, native) in names:
-            return ""
+    if native_libraries(native, folders, [element.get("modelIdentifier") or ""]) is not None:
+        return ""
     return f"it has no binary for this machine, {native}"
 
 

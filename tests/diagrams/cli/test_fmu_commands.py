@@ -16,6 +16,7 @@ from lxml import etree
 
 from loopwright.diagrams.cli import fmu as _cli_fmu
 from loopwright.diagrams.cli.command_line import main
+from loopwright.fmus.archive import read_library
 from loopwright.fmus.checks import summary as _summary
 from loopwright.fmus.checks import validation as _validation
 from loopwright.fmus.export.compiler import find_compiler
@@ -502,7 +503,7 @@ def test_files_that_are_no_fmu(command, tmp_path, capsys):
 
     says(
         b"not a zip archive",
-        "is no FMU: it can't be read as a zip archive (File is not a zip file; it starts with b'not a zi')",
+        "is no FMU: it is no zip archive (it starts with b'not a zi')",
     )
     says(_zip({"a.txt": b""}), "is a zip archive without modelDescription.xml, so it is no FMU.")
     says(
@@ -659,7 +660,7 @@ def test_binaries_and_their_folders(lag, altered, capsys):
     [
         (b"\x7fELF\x02\x01" + bytes(12) + b"\x3e\x00", {"x86_64-linux"}),
         (b"\x7fELF\x02\x01" + bytes(12) + b"\xb7\x00", {"aarch64-linux"}),
-        (b"\x7fELF\x02\x01" + bytes(12) + b"\xf3\x00", set()),  # RISC-V
+        (b"\x7fELF\x02\x01" + bytes(12) + b"\x08\x00", set()),  # MIPS
         (b"MZ" + bytes(58) + b"\x40\0\0\0" + b"PE\0\0\x64\x86", {"x86_64-windows"}),
         (b"MZ" + bytes(58) + b"\x40\0\0\0" + b"NE\0\0\x64\x86", set()),
         (b"MZ" + bytes(58) + b"\xff\xff\xff\x7f", set()),
@@ -671,7 +672,7 @@ def test_binaries_and_their_folders(lag, altered, capsys):
     ],
 )  # fmt: skip
 def test_headers_of_libraries(header, platforms):
-    assert _summary.platforms_of_binary(header) == platforms
+    assert set(read_library(header).platforms) == platforms
 
 
 def test_a_damaged_archive(lag, tmp_path, capsys):
@@ -686,7 +687,10 @@ def test_a_damaged_archive(lag, tmp_path, capsys):
 
 def test_paths_that_leave_the_folder(altered, capsys):
     found = problems(altered("lag.fmu", files={"../../escape.txt": b""}), capsys, "--no-run")
-    assert found == ["the archive holds '../../escape.txt', which points out of its folder."]
+    assert len(found) == 1
+    assert (
+        "holds a file '../../escape.txt', which points out of the FMU's folder; expected a path within it" in found[0]
+    )
 
 
 @pytest.mark.slow

@@ -221,7 +221,7 @@ def of_unknown_compression(path):
 
 @pytest.mark.parametrize(
     ("break_it", "text"),
-    [(encrypted, "encrypted"), (damaged, "can't be read|no FMU"), (of_unknown_compression, "compression")],
+    [(encrypted, "encrypted"), (damaged, "damaged zip archive"), (of_unknown_compression, "compression method 99")],
 )
 def test_archives_that_cannot_be_read(tmp_path, capsys, break_it, text):
     path = tmp_path / "broken.fmu"
@@ -240,10 +240,10 @@ def test_a_description_that_does_not_fit_into_memory(tmp_path, monkeypatch, caps
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("modelDescription.xml", "<a/>")
 
-    def read(self, name):
+    def open_(self, name):
         raise MemoryError
 
-    monkeypatch.setattr(zipfile.ZipFile, "read", read)
+    monkeypatch.setattr(zipfile.ZipFile, "open", open_)
     with pytest.raises(FmuFileError, match="does not fit into memory"):
         Fmu(path)
     assert main(["inspect", str(path)]) == 1

@@ -1,0 +1,73 @@
+"""Kinds of faults of FMU files, and findings about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class FmuFault(StrEnum):
+    """Kind of a fault of an FMU file: the field `fault` of errors (`FmuFileError`) and of findings."""
+
+    # the archive
+    NO_FILE = "no file"
+    NO_ARCHIVE = "no archive"
+    DAMAGED = "damaged archive"
+    ENCRYPTED = "encrypted"
+    COMPRESSION = "unknown compression"
+    UNSAFE_PATH = "path out of the folder"
+    BACKSLASH = "backslash in a path"
+    LINK = "link"
+    TOO_LARGE = "too large"
+    TOO_MANY = "too many files"
+    RATIO = "compressed beyond the limit"
+    OVERLAP = "overlapping files"
+    DUPLICATE_FILE = "duplicate file"
+    CASE = "names that differ in case"
+    # the description
+    NO_DESCRIPTION = "no description"
+    XML = "no XML"
+    ENTITY = "XML entities"
+    DESCRIPTION = "description that breaks its rules"
+    VERSION = "unknown version"
+    INTERFACE = "no such interface"
+    DUPLICATE_NAME = "duplicate variable"
+    DUPLICATE_REFERENCE = "duplicate value reference"
+    DIMENSION = "impossible dimension"
+    EXPERIMENT = "impossible default experiment"
+    STANDARD = "violation of the standard"
+    # the libraries
+    NO_BINARY = "no binary for this platform"
+    OTHER_NAME = "library with another name"
+    AMBIGUOUS = "several libraries"
+    TRUNCATED = "truncated library"
+    OTHER_PLATFORM = "library for another platform"
+    MISSING_LIBRARY = "missing shared library"
+    MISSING_SYMBOL = "missing function"
+    UNDEFINED_SYMBOL = "undefined symbol"
+    # running
+    TOOL = "needs another program"
+    PYTHON = "needs Python"
+    TRIAL = "failed trial run"
+
+
+@dataclass(frozen=True)
+class FmuFinding:
+    """Fault of an FMU file that does not keep it from being read.
+
+    Parameters
+    ----------
+    fault : FmuFault
+        Kind of the fault.
+    subject : str
+        File of the archive, variable, library or attribute concerned; empty for the whole FMU.
+    found : str
+        The fault in a sentence, with its place.
+    step : str
+        The next step.
+    """
+
+    fault: FmuFault
+    subject: str
+    found: str
+    step: str

@@ -1,0 +1,96 @@
+"""Unpacking of an FMU into the cache, once for each content."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+from ...blocks.core import FmuError, FmuFileError
+from ..platform import cache_folder, check_cache
+from .binaries import check_binary
+from .description import FmuDescription
+from .faults import FmuFault
+from .zip_file import FmuArchive
+
+
+def unpack(description: FmuDescription) -> Path:
+    """Unpack an FMU, once for each content, and return the folder of its files.
+
+    Raises
+    ------
+    FmuError
+        If the cache can't be written, or is full.
+    FmuFileError
+        If the archive can't be unpacked or is not the file that was described, or if the library for this platform
+        can't be loaded safely.
+    """
+    folder = cache_folder().absolute() / "unpacked" / description.digest[:32]
+    if folder.is_dir():
+        return folder
+    archive = FmuArchive.open(description.file, description.limits)
+    if archive.digest != description.digest:
+        raise FmuFileError(
+            f"{str(description.file)!r} has changed since its description was read; expected the file of before. Make "
+            "the block again, Fmu(…), to take the new one.",
+            fault=FmuFault.DAMAGED,
+        )
+    check_binary(archive, description.binary, description.fmi)
+    unpack_archive(archive, folder)
+    return folder
+
+
+def unpack_archive(archive: FmuArchive, folder: Path) -> None:
+    """Unpack a checked archive into a folder, which appears whole or not at all.
+
+    Raises
+    ------
+    FmuError
+        If the folder can't be written.
+    FmuFileError
+        If a file in the archive is damaged.
+    """
+    check_cache()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    fresh = Path(tempfile.mkdtemp(dir=folder.parent))
+    try:
+        write_files(archive, fresh)
+        try:
+            fresh.rename(folder)
+        except OSError:  # another process was faster
+            if not folder.is_dir():
+                raise
+    except OSError as error:
+        raise FmuError(
+            f"the FMU {str(archive.path)!r} can't be unpacked into {str(fresh)!r}: {error}. Make room there, or "
+            "set LOOPWRIGHT_CACHE to another folder."
+        ) from error
+    finally:
+        if fresh.is_dir():
+            shutil.rmtree(fresh, ignore_errors=True)
+
+
+def write_files(archive: FmuArchive, folder: Path, names: Iterable[str] | None = None) -> None:
+    """Write files of a checked archive, all of them without names, into an empty folder, and nothing outside of it.
+
+    Raises
+    ------
+    FmuFileError
+        If a file in the archive is damaged.
+    OSError
+        If a file can't be written.
+    """
+    root = folder.resolve()
+    for name in archive.files if names is None else names:
+        target = root.joinpath(*name.split("/"))
+        if not target.resolve().is_relative_to(root):  # the names were checked; this holds on any system
+            raise FmuFileError(
+                f"{str(archive.path)!r} holds a file {name!r}, which points out of the FMU's folder. Don't unpack it.",
+                fault=FmuFault.UNSAFE_PATH,
+                subject=name,
+            )
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with target.open("xb") as stream:
+            for part in archive.chunks(name):
+                stream.write(part)

@@ -1,0 +1,209 @@
+"""Archive of an FMU, opened and read with all checks."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import struct
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ...blocks.core import FmuFileError
+from .entries import check_entries
+from .faults import FmuFault, FmuFinding
+from .limits import ArchiveLimits
+from .xml_text import parse_xml
+
+DESCRIPTION = "modelDescription.xml"
+BUILD_DESCRIPTION = "sources/buildDescription.xml"
+_CHUNK = 1 << 20
+_END = struct.Struct("<4s4H2LH")
+"""End of the table of contents of a zip archive."""
+
+
+@dataclass(frozen=True, eq=False)
+class FmuArchive:
+    """Archive of an FMU: the table of contents is checked, files are read within the limits.
+
+    The file is read once, so that a file that changes meanwhile can't pass for the one that was checked.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    limits : ArchiveLimits
+        Limits of its content.
+    files : dict
+        Entries by their paths in the archive, with forward slashes; folders are left out.
+    findings : tuple of FmuFinding
+        Faults that don't keep it from being read.
+    digest : str
+        SHA-256 of the file.
+    size : int
+        Size of the file in bytes.
+    """
+
+    path: Path
+    limits: ArchiveLimits
+    files: dict[str, zipfile.ZipInfo]
+    findings: tuple[FmuFinding, ...]
+    digest: str
+    size: int
+    _zip: zipfile.ZipFile = field(repr=False)
+
+    @classmethod
+    def open(cls, file: str | os.PathLike[str], limits: ArchiveLimits | None = None) -> FmuArchive:
+        """Open an archive and check its table of contents.
+
+        Raises
+        ------
+        FmuFileError
+            If the file is missing or no zip archive, or is refused by `check_entries`.
+        """
+        path, limits = Path(file).expanduser(), limits or ArchiveLimits()
+        if not path.is_file():
+            found = "is a folder" if path.is_dir() else "there is no such file"
+            raise FmuFileError(f"{str(path)!r}: {found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
+        with _reading(path):
+            if path.stat().st_size > limits.size:
+                raise FmuFileError(
+                    f"{str(path)!r} has {path.stat().st_size:.3g} bytes; expected at most {limits.size:.3g}. If you "
+                    "trust it, raise the limit: limits=ArchiveLimits(size=…).",
+                    fault=FmuFault.TOO_LARGE,
+                )
+            data = path.read_bytes()
+            _check_end(path, data, limits)
+            content = zipfile.ZipFile(io.BytesIO(data))
+            files, findings = check_entries(path, content.infolist(), len(data), limits)
+        return cls(path, limits, files, tuple(findings), hashlib.sha256(data).hexdigest(), len(data), content)
+
+    def read(self, name: str, most: int | None = None) -> bytes:
+        """Return the content of a file.
+
+        Parameters
+        ----------
+        name : str
+            Its path in the archive, with forward slashes.
+        most : int, optional
+            Largest size in bytes; the limit of the whole archive without one.
+
+        Raises
+        ------
+        FmuFileError
+            If it is missing, damaged or too large.
+        """
+        return b"".join(self.chunks(name, most))
+
+    def chunks(self, name: str, most: int | None = None) -> Iterator[bytes]:
+        """Yield the content of a file in parts of about 1 MB; parameters and errors are those of `read`."""
+        item = self.files.get(name)
+        if item is None:
+            raise FmuFileError(
+                f"{str(self.path)!r} has no file {name!r}. Export it again.", fault=FmuFault.DAMAGED, subject=name
+            )
+        if most is not None and item.file_size > most:
+            raise FmuFileError(
+                f"{name!r} in {str(self.path)!r} has {item.file_size:.3g} bytes; expected at most {most:.3g}. If you "
+                "trust it, raise the limit: limits=ArchiveLimits(…).",
+                fault=FmuFault.TOO_LARGE,
+                subject=name,
+            )
+        left = item.file_size
+        with _reading(self.path), self._zip.open(item) as stream:
+            while part := stream.read(_CHUNK):
+                left -= len(part)
+                if left < 0:
+                    break
+                yield part
+            if left:
+                raise zipfile.BadZipFile(f"{name} is not as long as the table of contents says")
+
+    def description(self) -> bytes:
+        """Return the text of ``modelDescription.xml``.
+
+        Raises
+        ------
+        FmuFileError
+            If it is missing, damaged or too large.
+        """
+        if DESCRIPTION not in self.files:
+            nested = next((name for name in self.files if name.endswith(f"/{DESCRIPTION}")), None)
+            other = next((name for name in self.files if name.casefold() == DESCRIPTION.casefold()), None)
+            hint = f" There is {nested}: pack the files in that folder, not the folder." if nested else ""
+            hint = f" There is {other}: its name must be {DESCRIPTION}." if other else hint
+            raise FmuFileError(
+                f"{str(self.path)!r} is a zip archive without {DESCRIPTION}, so it is no FMU.{hint}",
+                fault=FmuFault.NO_DESCRIPTION,
+            )
+        return self.read(DESCRIPTION, self.limits.description)
+
+    def for_fmpy(self) -> io.BytesIO:
+        """Return an archive of the checked descriptions only, so that FMPy sees nothing else.
+
+        Raises
+        ------
+        FmuFileError
+            If a description is missing, damaged, too large or unsafe XML.
+        """
+        texts = {DESCRIPTION: self.description()}
+        if BUILD_DESCRIPTION in self.files:
+            texts[BUILD_DESCRIPTION] = self.read(BUILD_DESCRIPTION, self.limits.description)
+        only = io.BytesIO()
+        with zipfile.ZipFile(only, "w") as archive:
+            for name, text in texts.items():
+                parse_xml(self.path, name, text)
+                archive.writestr(name, text)
+        return only
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn every error of reading a zip archive into one of ours."""
+    try:
+        yield
+    except FmuFileError:
+        raise
+    except MemoryError:
+        raise FmuFileError(
+            f"{str(path)!r} can't be read: its content does not fit into memory; expected an FMU of a few MB. Look at "
+            "the sizes of the files in it, or export it again.",
+            fault=FmuFault.TOO_LARGE,
+        ) from None
+    except OSError as error:
+        raise FmuFileError(
+            f"{str(path)!r} can't be read: {error}. Check its permissions, or copy or export it again.",
+            fault=FmuFault.DAMAGED,
+        ) from None
+    except Exception as error:  # zipfile raises many kinds of errors on damaged archives
+        raise FmuFileError(
+            f"{str(path)!r} is no FMU: it is a damaged zip archive ({type(error).__name__}: {error}). Copy it "
+            "again, or export it again.",
+            fault=FmuFault.DAMAGED,
+        ) from None
+
+
+def _check_end(path: Path, data: bytes, limits: ArchiveLimits) -> None:
+    """Refuse a file without a table of contents, or with one that is far too long to be read."""
+    at = data.rfind(b"PK\5\6", max(0, len(data) - 65557))
+    if at < 0 or len(data) < at + _END.size:
+        found = f"it starts with {data[:8]!r}" if data else "it is empty"
+        cut = data.startswith(b"PK\3\4")
+        kind = "a zip archive that is cut off: its table of contents is missing" if cut else f"no zip archive ({found})"
+        step = "Copy or download it again." if cut else "Give the .fmu that the tool exported."
+        raise FmuFileError(
+            f"{str(path)!r} is no FMU: it is {kind}. {step}", fault=FmuFault.DAMAGED if cut else FmuFault.NO_ARCHIVE
+        )
+    count, size = _END.unpack_from(data, at)[4:6]
+    wide = data.rfind(b"PK\6\6", max(0, at - 10**6), at)
+    if 0 <= wide <= len(data) - 48:
+        count, size = struct.unpack_from("<2Q", data, wide + 32)
+    if count > limits.entries or size > 200 * limits.entries:
+        raise FmuFileError(
+            f"{str(path)!r} has a table of contents of {size} bytes with {count} files; expected at most "
+            f"{limits.entries} files. If you trust it, raise the limit: limits=ArchiveLimits(entries=…).",
+            fault=FmuFault.TOO_MANY,
+        )

@@ -1,0 +1,127 @@
+"""Libraries in an FMU, by platform, and the libraries and symbols that they lack on this machine."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from ..archive import FmuArchive, read_library, write_files
+from ..export import SUFFIXES
+
+# Folders of binaries in FMI 1.0 and 2.0 (2.3.1) as platform tuples of FMI 3.0 (2.5.1.4).
+_FOLDERS = {
+    "linux32": "x86-linux",
+    "linux64": "x86_64-linux",
+    "win32": "x86-windows",
+    "win64": "x86_64-windows",
+    "darwin64": "x86_64-darwin",
+}
+_LOAD = "import ctypes, sys\ntry: ctypes.CDLL(sys.argv[1])\nexcept OSError as error: print(error)"
+_FOUND = re.compile(r"^\s*(?:\S+ => )?(/\S+) \(0x[0-9a-f]+\)$", re.MULTILINE)
+_MISSING = re.compile(r"^\s*(\S+) => not found", re.MULTILINE)
+
+
+def tuple_of(folder: str) -> str | None:
+    """Return the FMI 3.0 platform tuple of a folder of binaries; None for an unknown folder."""
+    name = _FOLDERS.get(folder, folder)
+    parts = name.split("-")
+    known = len(parts) in (2, 3) and parts[1] in SUFFIXES  # a third part is the ABI
+    return "-".join(parts[:2]) if known else None
+
+
+def binaries_of(entries: Iterable[str]) -> dict[str, list[str]]:
+    """Return the files directly in each folder of binaries."""
+    found: dict[str, list[str]] = {}
+    for name in sorted(entries):
+        parts = PurePosixPath(name).parts
+        if len(parts) == 3 and parts[0] == "binaries" and not name.endswith("/"):
+            found.setdefault(parts[1], []).append(parts[2])
+    return found
+
+
+def library_name(identifier: str, platform: str) -> str:
+    """Return the file name of an FMU's library on a platform."""
+    return identifier + SUFFIXES[platform.split("-")[1]]
+
+
+def native_libraries(
+    native: str, binaries: Mapping[str, list[str]], identifiers: Iterable[str]
+) -> tuple[str, list[str]] | None:
+    """Return the folder of this machine's platform, and the libraries in it that are the FMU's; None without one.
+
+    They are those of the model identifiers, else the only library in the folder.
+    """
+    suffix = SUFFIXES.get(native.split("-")[1])
+    for folder, names in binaries.items():
+        if tuple_of(folder) != native or suffix is None:
+            continue
+        libraries = [name for name in names if name.endswith(suffix)]
+        named = sorted({library_name(i, native) for i in identifiers} & set(libraries))
+        if named or len(libraries) == 1:
+            return folder, named or libraries
+    return None
+
+
+def native_binary(
+    archive: FmuArchive, native: str, binaries: Mapping[str, list[str]], interfaces: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return whether there is a binary for this machine, and the libraries and symbols that it lacks here."""
+    identifiers = [str(attributes.get("modelIdentifier")) for attributes in interfaces.values()]
+    found = native_libraries(native, binaries, identifiers)
+    missing, undefined = find_missing(archive, native, *found) if found else ([], [])
+    return {
+        "platform": native,
+        "available": found is not None,
+        "missing_libraries": missing,
+        "undefined_symbols": undefined,
+    }
+
+
+def find_missing(archive: FmuArchive, native: str, folder: str, names: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Return the shared libraries and symbols that are missing here, without running code of the FMU's on Linux.
+
+    The system's loader is asked where it finds the libraries; the symbols are read from the files. On other systems
+    the library is loaded by another process.
+
+    Parameters
+    ----------
+    archive : FmuArchive
+        The FMU.
+    native : str
+        This machine's platform.
+    folder : str
+        Folder of binaries for it.
+    names : iterable of str
+        Libraries in it.
+    """
+    missing: set[str] = set()
+    undefined: set[str] = set()
+    ldd = shutil.which("ldd") if sys.platform.startswith("linux") else None
+    with tempfile.TemporaryDirectory(prefix="loopwright-") as made:
+        # all files in the folder, since it may bring its own libraries
+        write_files(archive, Path(made), [name for name in archive.files if name.startswith(f"binaries/{folder}/")])
+        for name in names:
+            header = read_library(archive.read(f"binaries/{folder}/{name}"))
+            if header.damage or native not in header.platforms:
+                continue
+            library = str(Path(made) / "binaries" / folder / name)
+            command = [ldd, library] if ldd else [sys.executable, "-c", _LOAD, library]
+            try:
+                done = subprocess.run(
+                    command, cwd=made, capture_output=True, text=True, errors="replace", timeout=60, check=False
+                )
+            except (OSError, subprocess.TimeoutExpired):
+                continue
+            if not ldd:
+                missing |= {done.stdout.strip().replace(library, name)} if done.stdout.strip() else set()
+                continue
+            missing |= set(_MISSING.findall(done.stdout))
+            exported = [read_library(Path(path).read_bytes()).symbols or set() for path in _FOUND.findall(done.stdout)]
+            undefined |= header.undefined.difference(*exported) if exported else set()
+    return sorted(missing), sorted(undefined)
