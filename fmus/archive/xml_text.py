@@ -37,15 +37,15 @@ def parse_xml(path: Path, name: str, text: bytes) -> Any:
     try:
         root = etree.fromstring(text, parser)
     except etree.XMLSyntaxError as error:
-        entity = b"<!ENTITY" in text
+        bomb = b"<!ENTITY" in text
         raise FmuFileError(
             f"the {name} of {str(path)!r} "
-            + ("defines XML entities, which may be made to fill the memory" if entity else "is no XML")
+            + ("defines XML entities, which may be made to fill the memory" if bomb else "is no XML")
             + f": {error}. Export the FMU again.",
-            fault=FmuFault.ENTITY if entity else FmuFault.XML,
+            fault=FmuFault.ENTITY if bomb else FmuFault.XML,
             subject=name,
         ) from None
-    kinds = root.getroottree().docinfo.internalDTD
+    kinds: Any = root.getroottree().docinfo.internalDTD
     entity = next((e.name for e in kinds.iterentities()), None) if kinds is not None else None
     if entity is not None:
         raise FmuFileError(

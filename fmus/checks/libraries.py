@@ -122,6 +122,7 @@ def find_missing(archive: FmuArchive, native: str, folder: str, names: Iterable[
                 missing |= {done.stdout.strip().replace(library, name)} if done.stdout.strip() else set()
                 continue
             missing |= set(_MISSING.findall(done.stdout))
-            exported = [read_library(Path(path).read_bytes()).symbols or set() for path in _FOUND.findall(done.stdout)]
+            there = [read_library(Path(path).read_bytes()).symbols for path in _FOUND.findall(done.stdout)]
+            exported = [symbols for symbols in there if symbols is not None]
             undefined |= header.undefined.difference(*exported) if exported else set()
     return sorted(missing), sorted(undefined)
