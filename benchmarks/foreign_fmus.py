@@ -1,0 +1,262 @@
+"""FMUs of other tools, run by Loopwright and by FMPy: python benchmarks/foreign_fmus.py FOLDER --table table.md.
+
+FOLDER has one folder for each source of FMUs. Each run has a process of its own, an empty working folder and a time
+limit. Both importers take the FMU's default stop time and step, at most `STEPS` steps, and its start values; inputs
+without one are 0. The table has one row for each FMU and interface.
+
+An FMU is a program: run those of strangers without a network, `unshare -rn python benchmarks/foreign_fmus.py …`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+STEPS = 200
+CLOSE = 1e-9
+"""Difference of two runs, relative to the signal's size, up to which they agree."""
+INTERFACES = {"CoSimulation": "co_simulation", "ModelExchange": "model_exchange"}
+
+
+@dataclass
+class Facts:
+    """Facts of a description that both importers are run with, read without either of them."""
+
+    fmi: str
+    tool: str
+    interfaces: list[str]
+    stop: float
+    step: float
+    names: list[str]
+    """Variables to compare: outputs with numbers, or else the first real local variables."""
+    has_outputs: bool
+    inputs: dict[str, str]
+    """Start values of the inputs with numbers, as texts; 0 where there is none."""
+
+
+def read_facts(file: str) -> Facts:
+    """Read a description of FMI 1.0, 2.0 or 3.0."""
+    with zipfile.ZipFile(file) as archive:
+        root = ElementTree.fromstring(archive.read("modelDescription.xml"))
+    fmi = root.get("fmiVersion", "?")
+    if fmi.startswith("1"):
+        interfaces = ["ModelExchange"] if root.find("Implementation") is None else ["CoSimulation"]
+    else:
+        interfaces = [name for name in INTERFACES if root.find(name) is not None]
+    stop, step = plan(root.find("DefaultExperiment"))
+    outputs, reals, inputs = [], [], {}
+    for element in root.find("ModelVariables") or ():
+        v = element if fmi.startswith("3") else next(iter(element), element)
+        name, causality, kind = element.get("name", ""), element.get("causality", "local"), v.tag
+        if kind in ("String", "Binary", "Clock") or element.get("alias", "noAlias") != "noAlias":
+            continue
+        if causality == "output":
+            outputs.append(name)
+        elif causality == "input":
+            inputs[name] = v.get("start") or ("1" if kind == "Enumeration" else "0")
+        elif causality in ("local", "internal") and kind in ("Real", "Float64"):
+            reals.append(name)
+    return Facts(
+        fmi,
+        (root.get("generationTool") or "").strip(),
+        interfaces,
+        stop,
+        step,
+        outputs or reals[:10],
+        bool(outputs),
+        inputs,
+    )
+
+
+def plan(experiment: ElementTree.Element | None) -> tuple[float, float]:
+    """Return stop time and step in s, from a default experiment; both importers start at 0."""
+    given = {} if experiment is None else experiment.attrib
+    stop, step = (float(given.get(name, "nan")) for name in ("stopTime", "stepSize"))
+    stop = stop if math.isfinite(stop) and stop > 0.0 else 1.0
+    if not 0.0 < step <= stop:
+        step = float(f"{stop / STEPS:.6g}")
+    return round(min(STEPS, max(1, round(stop / step))) * step, 12), step
+
+
+def run_fmpy(file: str, interface: str) -> dict[str, np.ndarray]:
+    """Run by FMPy and return t and the recorded signals.
+
+    It gets no tolerance, as Loopwright gives none: FMPy would take that of the default experiment, and FMUs with a
+    solver of variable step compute other digits.
+    """
+    import fmpy
+
+    facts, about = read_facts(file), fmpy.read_model_description(file, validate=False)
+    if about.defaultExperiment and interface == "CoSimulation":
+        about.defaultExperiment.tolerance = None
+    types = {v.name: v.type for v in about.modelVariables}
+    start = {name: text == "true" if types[name] == "Boolean" else text for name, text in facts.inputs.items()}
+    options = {"relative_tolerance": 1e-8} if interface == "ModelExchange" else {}
+    result = fmpy.simulate_fmu(
+        file, validate=False, start_time=0.0, stop_time=facts.stop, output_interval=facts.step, fmi_type=interface,
+        output=facts.names, record_events=False, start_values=start, model_description=about, **options,
+    )  # fmt: skip
+    return {"time_": result["time"], **{name: result[name] for name in result.dtype.names[1:]}}
+
+
+def run_loopwright(file: str, interface: str) -> dict[str, np.ndarray]:
+    """Run by Loopwright, in a diagram of the FMU alone, and return t and the recorded signals."""
+    from loopwright.diagrams import Diagram
+    from loopwright.fmus import Fmu
+
+    facts = read_facts(file)
+    options = {} if facts.has_outputs else {"ports": [*facts.inputs, *facts.names]}
+    if "interface" in Fmu.__annotations__:
+        options["interface"] = INTERFACES[interface]
+    elif interface != "CoSimulation":
+        raise NotImplementedError("this version runs co-simulation only")
+    plain = Fmu(file, name="fmu", **options)
+    values = {name: np.zeros(v.shape) if v.start is None else v.start for name, v in plain.input_variables.items()}
+    block = Fmu(file, name="fmu", **options, start=values)
+    solver = {"rtol": 1e-8} if interface == "ModelExchange" else {}
+    run = Diagram("alone", block()).simulate(facts.stop, step=facts.step, progress=False, **solver)
+    found = {"time_": run.t}
+    elements = block.description.elements
+    for port, v in block.output_variables.items():
+        signal = np.asarray(run[f"fmu.{port}"], dtype=float)
+        scalars = {index: name for name, (array, index) in elements.items() if array == v.name}
+        if v.shape and scalars:
+            found |= {name: signal[(slice(None), *index)] for index, name in scalars.items()}
+        else:
+            found[v.name] = signal
+    return found
+
+
+TOOLS = {"Loopwright": run_loopwright, "FMPy": run_fmpy}
+
+
+def one(tool: str, interface: str, file: str, out: str) -> None:
+    """Run one FMU with one importer, and write the signals to a file; an error ends the process with its text."""
+    np.seterr(all="ignore")
+    try:
+        signals = TOOLS[tool](file, interface)
+    except BaseException as error:
+        Path(out).write_text(json.dumps({"error": f"{type(error).__name__}: {error}"}))
+        os._exit(1)
+    np.savez(out + ".npz", **{name.replace("/", "\\"): np.asarray(v, dtype=float) for name, v in signals.items()})
+    os._exit(0)  # a library that crashes at the end of the process has done its run
+
+
+def outcome(tool: str, interface: str, file: Path, seconds: float) -> tuple[str, dict[str, np.ndarray]]:
+    """Return "runs", or the reason why not, and the signals of one run in a process of its own."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        out = Path(folder, "out.json")
+        work = Path(folder, "work")
+        work.mkdir()
+        command = [sys.executable, __file__, "--one", tool, interface, str(file), str(out)]
+        try:
+            done = subprocess.run(command, cwd=work, timeout=seconds, capture_output=True, check=False)
+        except subprocess.TimeoutExpired:
+            return f"no end within {seconds:g} s", {}
+        npz = Path(f"{out}.npz")
+        if npz.exists():
+            with np.load(npz) as data:
+                return "runs", {name.replace("\\", "/"): data[name] for name in data.files}
+        if out.exists():
+            return json.loads(out.read_text())["error"], {}
+        return f"process ended by signal {-done.returncode}" if done.returncode < 0 else "process ended", {}
+
+
+def compare(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> tuple[float, str]:
+    """Return the largest difference, relative to the signal's size, at times of both, and its signal."""
+    worst, where = 0.0, ""
+    t, other = ours["time_"], theirs["time_"]
+    places = np.searchsorted(other, t - 1e-9 * (1.0 + np.abs(t)))
+    places = np.minimum(places, len(other) - 1)
+    common = np.abs(other[places] - t) <= 1e-9 * (1.0 + np.abs(t))
+    if not common.any():
+        return math.nan, "no time in common"
+    for name in (ours.keys() & theirs.keys()) - {"time_"}:
+        a, b = ours[name].reshape(len(t), -1)[common], theirs[name].reshape(len(other), -1)[places[common]]
+        if a.shape != b.shape:
+            return math.nan, f"{name}: shapes {a.shape[1:]} and {b.shape[1:]}"
+        gap = np.where(np.isnan(a) & np.isnan(b), 0.0, np.abs(a - b))
+        size = max(float(np.nanmax(np.abs(b), initial=0.0)), 1e-12)
+        if not (found := float(np.max(gap, initial=0.0)) / size) <= worst:
+            worst, where = found, name
+    return worst, where
+
+
+def study(file: Path, seconds: float) -> list[dict[str, object]]:
+    """Return a row for each interface of an FMU."""
+    try:
+        facts = read_facts(str(file))
+    except Exception as error:  # both importers say their own word
+        facts = Facts("?", f"{type(error).__name__}", ["CoSimulation"], 1.0, 0.01, [], True, {})
+    rows = []
+    for interface in facts.interfaces:
+        ours, mine = outcome("Loopwright", interface, file, seconds)
+        fmpy_says, other = outcome("FMPy", interface, file, seconds)
+        gap, where = compare(mine, other) if mine and other else (None, "")
+        rows.append({"fmi": facts.fmi, "tool": facts.tool, "interface": interface,
+                     "ours": ours, "fmpy": fmpy_says, "gap": gap, "where": where})  # fmt: skip
+    return rows
+
+
+def as_table(rows: list[dict[str, object]]) -> str:
+    """Return the rows as Markdown."""
+    lines = [
+        "| source | FMU | tool | FMI | interface | Loopwright | FMPy | difference |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        gap = row["gap"]
+        difference = "" if gap is None else "agree" if gap <= CLOSE else f"{gap:.1e} ({row['where']})"
+        kind = "CS" if row["interface"] == "CoSimulation" else "ME" if row["interface"] == "ModelExchange" else "?"
+        said = (" ".join(str(row[k]).split()).replace("|", "\\|")[:160] for k in ("ours", "fmpy"))
+        lines.append(f"| {row['source']} | {row['file']} | {row['tool']} | {row['fmi']} | {kind} | {' | '.join(said)} "
+                     f"| {difference} |")  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Run all FMUs of a folder, one after the other, and print the counts."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", nargs="?", type=Path)
+    parser.add_argument("--seconds", type=float, default=60.0, help="limit of each run")
+    parser.add_argument("--only", default="", help="part of the path of the FMUs to run")
+    parser.add_argument("--table", type=Path, help="file of the table, in Markdown")
+    parser.add_argument("--json", type=Path, help="file of all results")
+    parser.add_argument("--one", nargs=4, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.one:
+        return one(*given.one)
+    os.nice(10)
+    rows = []
+    for file in sorted(path for path in given.folder.rglob("*.fmu") if given.only in str(path)):
+        source = file.relative_to(given.folder).parts[0].replace("+", "/")
+        for row in study(file, given.seconds):
+            rows.append({"source": source, "file": file.name.split("__")[-1], "path": str(file), **row})
+            print(f"{file.name[-50:]:50} {row['interface'][:5]} {row['fmi']:4} {str(row['ours'])[:60]!r:62} "
+                  f"{str(row['fmpy'])[:40]!r:42} {row['gap']}", flush=True)  # fmt: skip
+        if given.json:
+            given.json.write_text(json.dumps(rows, indent=1))
+        if given.table:
+            given.table.write_text(as_table(rows))
+    counts = Counter((row["interface"], row["ours"] == "runs", row["fmpy"] == "runs") for row in rows)
+    for (interface, ours, fmpy_runs), n in sorted(counts.items(), key=str):
+        print(
+            f"{interface}: Loopwright {'runs' if ours else 'does not'}, FMPy {'runs' if fmpy_runs else 'does not'}: {n}"
+        )
+    return None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""Fig. 3 with its plant from elsewhere: one changed argument.
+
+Builds of both versions of FMI give the numbers of one model; the gantry that another tool has exported from its own
+equations gives those of the gantry.
+"""
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+from loopwright.diagrams import experiments
+from loopwright.fmus import Fmu, gantry, gantry_contact, gantry_elastic, gantry_stiction, scara
+from support.foreign_gantry import by_pythonfmu, by_pythonfmu3
+
+from .test_plants_under_the_controller import PATH, follow
+
+PLANTS = (gantry, gantry_elastic, gantry_stiction, gantry_contact)
+
+
+def run_experiment(plant, duration=None, letter="A", **options):
+    experiment = experiments.EXPERIMENTS[letter](plant=plant)
+    return experiment.diagram.simulate(duration or experiment.duration, progress=False, **options)
+
+
+def largest_differences(run, other, names):
+    """Return the largest difference of each signal, relative to its size."""
+    return {name: float(np.abs(run[name] - other[name]).max() / np.abs(other[name]).max()) for name in names}
+
+
+SIGNALS = ("eta", "xi", "motor_force", "plant.position", "plant.velocity", "plant.acceleration")
+
+
+@pytest.mark.drawn(1)
+@pytest.mark.parametrize("plant", PLANTS, ids=lambda p: p.__name__.rpartition(".")[2])
+def test_builds_of_both_versions_give_the_same_numbers(plant):
+    """The C of a plant is one, whatever its version: not a bit may differ, events and stiff friction included."""
+    runs = [run_experiment(plant.build(fmi=fmi), 1.0) for fmi in (2, 3)]
+    for name in SIGNALS:
+        assert np.array_equal(runs[0][name], runs[1][name]), name
+    assert np.abs(runs[0]["plant.position"] - runs[0]["plant.position"][0]).max() > 0.01  # m: it moves
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("letter", "ABCD")
+@pytest.mark.parametrize("plant", PLANTS, ids=lambda p: p.__name__.rpartition(".")[2])
+def test_whole_experiments_with_builds_of_both_versions(plant, letter):
+    runs = [run_experiment(plant.build(fmi=fmi), letter=letter) for fmi in (2, 3)]
+    for name in SIGNALS:
+        assert np.array_equal(runs[0][name], runs[1][name]), name
+
+
+@pytest.mark.slow
+def test_arms_of_both_versions_follow_alike():
+    start = {"joint_angle": scara.nominal.joint_angles(PATH.to_plane(0.10, 0.01))}
+    runs = []
+    for fmi in (2, 3):
+        arm = Fmu(scara.build(fmi=fmi), name="plant", start=start)
+        runs.append(follow(arm, scara.nominal, "motor_torque", arm.joint_angle, arm.joint_velocity))
+    for name in ("eta", "xi", "command", "plant.joint_angle"):
+        assert np.array_equal(runs[0][name], runs[1][name]), name
+
+
+# --- the gantry of other tools --------------------------------------------------------------------------------------
+
+TOOLS = {"pythonfmu": by_pythonfmu, "pythonfmu3": by_pythonfmu3}
+
+
+@pytest.mark.slow  # an interpreter within this one: what it breaks shall not take the quick set with it
+@pytest.mark.parametrize("letter", "AC")
+@pytest.mark.parametrize("tool", TOOLS)
+def test_a_gantry_that_another_tool_has_exported(tmp_path, tool, letter):
+    """Another text of the equations, in Python, with the steps of the plant's own integrator: rounding remains."""
+    if importlib.util.find_spec(tool) is None:
+        pytest.skip(f"{tool} is not installed (extra: test)")
+    run, own = run_experiment(TOOLS[tool](tmp_path), letter=letter), run_experiment(gantry.build(), letter=letter)
+    assert max(largest_differences(run, own, SIGNALS).values()) < 1e-13
