@@ -56,7 +56,7 @@ from .measure import FrequencyResponse
 from .paper import Channel, Fig3Diagram, Rig, experiments, fig3
 from .report import analyse
 from .report_writing import Plot, Report, Section, Table
-from .results import Occurrence, OperatingPoint, Run, RunState, Snapshot, Stopped
+from .results import Occurrence, OperatingPoint, Run, RunState, Snapshot, Stopped, TextSignal
 from .simulation import Interrupted, RunOptions, Simulation, SimulationView
 from .wiring import Subsystem, SubsystemSettings, Wire, subsystem
 
@@ -108,6 +108,7 @@ __all__ = [
     "Subsystem",
     "SubsystemSettings",
     "Table",
+    "TextSignal",
     "Wire",
     "ZeroSlope",
     "analyse",

@@ -18,10 +18,12 @@ from .plots import (
 )
 from .recorder import Recorder
 from .recording import Recording
-from .run import Run, Snapshot
+from .run import Run
 from .saved_state import RunState, check_fits, layout_of, not_open_error
 from .signal_names import index_of, resolve, split_entry
+from .snapshot import Snapshot
 from .stored import Occurrence, Stopped
+from .texts import TextSignal
 
 __all__ = [
     "BLUE",
@@ -42,6 +44,7 @@ __all__ = [
     "RunState",
     "Snapshot",
     "Stopped",
+    "TextSignal",
     "check_fits",
     "index_of",
     "layout_of",

@@ -12,8 +12,10 @@ import numpy as np
 
 from ...blocks.core import Layout, OptionError, PortUnit, UnknownNameError
 from ..wiring import CheckedDiagram, Wire
-from .signal_names import entries, index_of, resolve, split_entry
+from .signal_names import entries, resolve, split_entry
+from .snapshot import Snapshot
 from .stored import Occurrence, PathLike, Stopped, header, prepare, read, write
+from .texts import TextSignal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -22,27 +24,6 @@ if TYPE_CHECKING:
     from xarray import Dataset
 
     from .saved_state import RunState
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """All signals and states at one recorded instant."""
-
-    t: float
-    tick: int
-    """The sample's number in the run, from 0: the tick, where every tick was recorded."""
-    values: dict[str, Any]
-    state: np.ndarray
-    """The state vector x of the flattened diagram."""
-    names: dict[str, Wire]
-    """The named wires: two of one short name are told apart by their source."""
-    run: Run | None = field(default=None, repr=False, compare=False)
-    """The run that it comes from."""
-
-    def __getitem__(self, name: str) -> Any:
-        full, entry = split_entry(resolve(name, self.names, self.values), self.values)
-        value = self.values[full]
-        return value[index_of(entry, value.shape, full)] if entry else value
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +40,8 @@ class Run:
         Times in s, ascending, up to and including the end.
     messages : tuple of str
         Messages of the FMUs, other solutions of algebraic loops, and whether the run was cut off.
+    texts : mapping of str to TextSignal
+        Texts and binary data that FMUs put out, by the port's dotted path.
     events : sequence of Occurrence
         The events that fired, in their order.
     stopped : Stopped or None
@@ -90,6 +73,7 @@ class Run:
     diagram: CheckedDiagram | None = field(repr=False)
     elapsed: float = float("nan")
     messages: tuple[str, ...] = ()
+    texts: Mapping[str, TextSignal] = field(default_factory=dict, repr=False)
     events: Sequence[Occurrence] = field(default=(), repr=False)
     stopped: Stopped | None = None
     residual: np.ndarray | None = field(default=None, repr=False)
@@ -139,6 +123,7 @@ class Run:
             diagram=None,
             elapsed=end.get("elapsed", float("nan")),
             messages=tuple(end.get("messages", ())),
+            texts={name: TextSignal.from_json(rows) for name, rows in end.get("texts", {}).items()},
             events=stored.events,
             stopped=None if stopped is None else Stopped(**stopped),
             residual=stored.residual,
@@ -176,7 +161,9 @@ class Run:
             residual=self.residual is not None,
         )
         parts = [self.t[:, None], self.data, *([] if self.residual is None else [self.residual[:, None]])]
-        write(folder, head, parts, self.events, elapsed=self.elapsed, messages=self.messages, stopped=self.stopped)
+        end = {"elapsed": self.elapsed, "messages": self.messages, "stopped": self.stopped}
+        texts = {name: text.to_json() for name, text in self.texts.items()}
+        write(folder, head, parts, self.events, **end, texts=texts)
 
     @property
     def real_time_factor(self) -> float:

@@ -109,6 +109,7 @@ class End(TypedDict, total=False):
 
     elapsed: float
     messages: list[str]
+    texts: dict[str, list[list[Any]]]
     stopped: StoppedEntry | None
 
 

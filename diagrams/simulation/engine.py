@@ -11,7 +11,7 @@ import numpy as np
 from ...blocks.core import Block, SimulationError, UnknownNameError, near
 from ..coupling import Plant, PlantSteps, load_plants
 from ..flat import FlatDiagram
-from ..results import Occurrence, OperatingPoint
+from ..results import Occurrence, OperatingPoint, TextSignal
 from ..solvers import solver_name
 from .continuous import Continuous
 from .diagnosis import opaque_failure
@@ -155,6 +155,15 @@ class Engine:
         except SimulationError as error:
             culprit = self.blame(error)
             raise culprit from culprit.__cause__
+
+    def take_texts(self) -> dict[str, TextSignal]:
+        """Return texts and binary data of the plants by dotted path; their record begins anew with the last ones."""
+        found = {}
+        for path, plant in self.plants.items():
+            for port, changes in getattr(plant, "texts", {}).items():
+                found[f"{path}.{port}"] = TextSignal.of(changes)
+                del changes[:-1]
+        return found
 
     def _arrive(self, k: int) -> bool:
         """Take note of a tick that has been recorded; return whether it ends the run."""

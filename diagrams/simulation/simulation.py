@@ -133,7 +133,9 @@ class Simulation:
         """End a run on disk that `run` was not asked for."""
         if self._recorder.is_open:
             cut = [] if error is None else [f"This run was cut off at t = {self.t:g} s: {kind.__name__}: {error}"]
-            self._recorder.finish(elapsed=self._elapsed, messages=(*self._messages, *cut), stopped=self.stopped)
+            texts = {name: text.to_json() for name, text in self._engine.take_texts().items()}
+            messages = (*self._messages, *cut)
+            self._recorder.finish(elapsed=self._elapsed, messages=messages, stopped=self.stopped, texts=texts)
 
     def _begin(self) -> None:
         engine = self._engine
@@ -281,8 +283,9 @@ class Simulation:
         state = self.save() if final and self.can_save else None
         if final and self._begun:
             recorder.last(self.t, self._engine.workspace.log)
-        messages = self._messages
-        t, data = recorder.finish(elapsed=self._elapsed, messages=messages, stopped=self.stopped)
+        messages, texts = self._messages, self._engine.take_texts()
+        written = {name: text.to_json() for name, text in texts.items()}
+        t, data = recorder.finish(elapsed=self._elapsed, messages=messages, stopped=self.stopped, texts=written)
         run = Run(
             t=t,
             data=data,
@@ -292,6 +295,7 @@ class Simulation:
             diagram=self.diagram,
             elapsed=self._elapsed,
             messages=messages,
+            texts=texts,
             events=recorder.events,
             stopped=self.stopped,
             residual=recorder.residual,

@@ -20,11 +20,15 @@ from .faults import FmuFault, FmuFinding
 from .gathering import Elements, gather
 from .limits import ArchiveLimits
 from .rules import check_dimensions, check_schema
+from .sizes import resize
 from .states import find_states
 from .units import FmuUnits
-from .variables import WIRE_TYPES, FmuVariable, OtherVariable, fmi3_type, read_variable
+from .variables import WIRE_TYPES, FmuVariable, OtherVariable, fmi3_type, read_other, read_variable
 from .xml_text import parse_xml
 from .zip_file import DESCRIPTION, FmuArchive
+
+_DROPPED = ("UInt", "Clock")
+"""Beginnings of the types of FMI 3.0 of which FMPy drops attributes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +52,6 @@ class FmuDescription:
     """Other variables, by name: texts, binaries and clocks, which no wire carries."""
     elements: Elements = field(default_factory=dict)
     """Array and index, from 0 on, of each scalar that was gathered."""
-    texts: dict[str, int] = field(default_factory=dict)
-    """Value reference of each variable that is a text, by name."""
     complaints: tuple[str, ...] = ()
     """Rules of the standard that the description breaks, as FMPy's validation words them."""
     unit_complaints: tuple[str, ...] = ()
@@ -125,6 +127,16 @@ class FmuDescription:
         )  # fmt: skip
 
     @property
+    def structural(self) -> dict[str, FmuVariable]:
+        """Structural parameters, on which the sizes of arrays depend, by name."""
+        return self.of("structuralParameter")
+
+    @property
+    def texts(self) -> dict[str, OtherVariable]:
+        """Variables that are texts or binary data, by name."""
+        return {name: v for name, v in self.other.items() if v.is_text}
+
+    @property
     def derivatives_flag(self) -> str:
         """Name of the capability flag of directional derivatives."""
         return "providesDirectionalDerivative" if self.fmi.startswith("2.") else "providesDirectionalDerivatives"
@@ -145,13 +157,17 @@ class FmuDescription:
         )
 
 
-def read_description(file: str | os.PathLike[str], *, limits: ArchiveLimits | None = None) -> FmuDescription:
+def read_description(
+    file: str | os.PathLike[str], sizes: Mapping[str, int] | None = None, *, limits: ArchiveLimits | None = None
+) -> FmuDescription:
     """Read and check an FMU, without loading its library.
 
     Parameters
     ----------
     file : str or PathLike
         The FMU.
+    sizes : mapping, optional
+        Values of structural parameters, on which the shapes of arrays depend; others have their start values.
     limits : ArchiveLimits, optional
         Limits of its size; the usual ones without it.
 
@@ -165,11 +181,15 @@ def read_description(file: str | os.PathLike[str], *, limits: ArchiveLimits | No
     if not path.is_file():
         raise FmuFileError(f"there is no file {str(path)!r}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
     stat = path.stat()
-    return _read(path.resolve(), stat.st_mtime_ns, stat.st_size, limits or ArchiveLimits())
+    return _read(
+        path.resolve(), stat.st_mtime_ns, stat.st_size, limits or ArchiveLimits(), tuple(sorted((sizes or {}).items()))
+    )
 
 
 @lru_cache(maxsize=256)
-def _read(path: Path, mtime: int, length: int, limits: ArchiveLimits) -> FmuDescription:
+def _read(
+    path: Path, mtime: int, length: int, limits: ArchiveLimits, sizes: tuple[tuple[str, int], ...]
+) -> FmuDescription:
     archive = FmuArchive.open(path, limits)
     entries, text = set(archive.files), archive.description()
     root = parse_xml(path, DESCRIPTION, text)
@@ -189,6 +209,7 @@ def _read(path: Path, mtime: int, length: int, limits: ArchiveLimits) -> FmuDesc
     identifier = model.coSimulation.modelIdentifier
     binary = find_binary(path, entries, version, identifier)
     try:
+        resize(model, dict(sizes))
         check_dimensions(path, model, limits)
         found = _read_variables(path, entries, root, model)
     except FmuFileError:
@@ -236,7 +257,7 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
         except FmuFileError:
             flags["model_exchange"] = None
     dropped, units = _dropped_attributes(root), FmuUnits({u.name: u for u in model.unitDefinitions})
-    scalars, other, texts = {}, {}, {}
+    scalars, other = {}, {}
     for v in model.modelVariables:
         if v.causality == "independent":
             continue
@@ -249,16 +270,13 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
         if fmi3_type(v.type) in WIRE_TYPES:
             scalars[v.name] = read_variable(v, dropped.get(v.name, {}), units)
         else:
-            other[v.name] = OtherVariable(v.name, v.type, v.causality or "local")
-            if v.type == "String" and not v.shape:
-                texts[v.name] = v.valueReference
+            other[v.name] = read_other(v, dropped.get(v.name, {}))
     variables, elements = gather(scalars, frozenset(other))
     states, order = find_states(model, scalars, variables, elements)
     return {
         "variables": variables,
         "other": other,
         "elements": elements,
-        "texts": texts,
         "states": states,
         "state_order": order,
         "unit_complaints": tuple(units.complaints),
@@ -290,11 +308,11 @@ def _flag(interface: Any, name: str) -> bool:
 
 
 def _dropped_attributes(root: Any) -> dict[str, Mapping[str, str]]:
-    """Return attributes that FMPy drops, by the variable's name: bounds of unsigned integers, relative quantities."""
+    """Return attributes that FMPy drops, by the variable's name: bounds of unsigned integers, intervals of clocks."""
     variables = root.find("ModelVariables")
     found: dict[str, Mapping[str, str]] = {}
     for element in () if variables is None else variables:
         inner = next((e for e in element if e.tag == "Real"), element)  # of FMI 2.0
-        if element.tag.startswith("UInt") or "relativeQuantity" in inner.attrib:
+        if any(element.tag.startswith(kind) for kind in _DROPPED) or "relativeQuantity" in inner.attrib:
             found[element.attrib.get("name", "")] = inner.attrib
     return found

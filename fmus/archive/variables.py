@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,8 @@ _EXACT = 2**53
 """Largest integer up to which a float64 holds every integer."""
 WIRE_TYPES = ("Float64", "Float32", *_INTEGERS, "Boolean", "Enumeration")
 """Types that a wire carries, as FMI 3.0 names them."""
+TEXT_TYPES = ("String", "Binary")
+"""Types that no wire carries, but that are set at the start and recorded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +123,55 @@ class OtherVariable:
     name: str
     type: str
     causality: str
+    reference: int = 0
+    shape: tuple[int, ...] = ()
+    variability: str = "discrete"
+    interval_variability: str = ""
+    """Kind of a clock: constant, fixed, tunable, changing, countdown or triggered."""
+    interval: float | None = None
+    """Interval of a periodic clock in s, where the description states one."""
+    shift: float = 0.0
+    """First tick of a periodic clock in s."""
+
+    @property
+    def size(self) -> int:
+        """Number of elements."""
+        return int(np.prod(self.shape, dtype=int))
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it is a text or binary data, which can be set at the start and is recorded."""
+        return self.type in TEXT_TYPES
+
+    @property
+    def is_periodic(self) -> bool:
+        """Whether it is a clock that ticks at instants that are known ahead."""
+        return self.type == "Clock" and self.interval_variability in ("constant", "fixed", "tunable")
 
     def __str__(self) -> str:
-        return f"{self.name} ({self.type})"
+        kind = f"{self.interval_variability} Clock" if self.interval_variability else self.type
+        return f"{self.name} ({kind})"
+
+
+def read_other(v: Any, dropped: Mapping[str, str]) -> OtherVariable:
+    """Return a variable without numbers as values that FMPy has read; ``dropped`` holds attributes that it drops."""
+    found = OtherVariable(
+        v.name, v.type, v.causality or "local", v.valueReference, tuple(v.shape or ()), v.variability or "discrete"
+    )
+    if v.type != "Clock":
+        return found
+    interval: str | float | None = dropped.get("intervalDecimal")
+    shift: str | float = dropped.get("shiftDecimal", 0.0)
+    if interval is None and "intervalCounter" in dropped and "resolution" in dropped:
+        resolution = float(dropped["resolution"])
+        interval = float(dropped["intervalCounter"]) / resolution
+        shift = float(dropped.get("shiftCounter", 0)) / resolution
+    return replace(
+        found,
+        interval_variability=dropped.get("intervalVariability", ""),
+        interval=None if interval is None else float(interval),
+        shift=float(shift),
+    )
 
 
 def inexact(values: np.ndarray) -> bool:

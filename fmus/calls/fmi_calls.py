@@ -63,8 +63,10 @@ def allow_missing(kind: Any, prefix: str, required: tuple[str, ...]) -> Any:
     needed = {f"{prefix}{name}" for name in required}
 
     def load(fmu: Any) -> None:
+        fmu.missing_functions = set()
         for name in dir(fmu):
             if name.startswith(prefix) and name not in needed and not hasattr(fmu.dll, name):
+                fmu.missing_functions.add(name)
                 setattr(fmu.dll, name, ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR))
         kind._loadFunctions(fmu)
 
@@ -185,6 +187,10 @@ class FmiCalls(ABC):
     def end(self) -> None:  # noqa: B027 (in process there is nothing else)
         """Give up everything else, at the end of the instance and after an error, too."""
 
+    def lacks(self, function: str) -> bool:
+        """Whether the library does not export a function, such as "GetString", so that its calls return an error."""
+        return f"{self.prefix}{function}" in self.fmu.missing_functions
+
     # ---- values ----
 
     def get(self, type_: str, references: Sequence[int], size: int) -> list[Any]:
@@ -195,9 +201,37 @@ class FmiCalls(ABC):
         """Set the values of variables of one type."""
         getattr(self.fmu, f"set{self.types[type_].suffix}")(list(references), list(values))
 
-    def set_text(self, reference: int, text: str) -> None:
-        """Set a variable that is a text."""
-        self.fmu.setString([reference], [text])
+    def get_texts(self, references: Sequence[int], size: int) -> list[str]:
+        """Return the elements of variables that are texts."""
+        values = (ctypes.c_char_p * size)()
+        self._call_with_values("GetString", references, size, values)
+        return [(value or b"").decode(errors="replace") for value in values]
+
+    def set_texts(self, references: Sequence[int], values: Sequence[str]) -> None:
+        """Set the elements of variables that are texts."""
+        self.fmu.setString(list(references), list(values))
+
+    def get_binaries(self, references: Sequence[int], size: int) -> list[bytes]:
+        """Return the elements of variables that are binary data; only FMI 3.0 has them."""
+        return [value or b"" for value in self.fmu.getBinary(list(references), size)]
+
+    def set_binaries(self, references: Sequence[int], values: Sequence[bytes]) -> None:
+        """Set the elements of variables that are binary data; only FMI 3.0 has them."""
+        self.fmu.setBinary(list(references), list(values))
+
+    def _call_with_values(self, name: str, references: Sequence[int], size: int, values: Any) -> None:
+        """Call a function of FMPy's object that takes references and values."""
+        kept = (ctypes.c_uint * len(references))(*references)
+        length = (size,) if self.prefix == "fmi3" else ()
+        getattr(self.fmu, f"{self.prefix}{name}")(self.fmu.component, kept, len(references), values, *length)
+
+    def enter_configuration_mode(self) -> None:
+        """Enter Configuration Mode, in which structural parameters are set (FMI 3.0, 2.3.4)."""
+        self.fmu.enterConfigurationMode()
+
+    def exit_configuration_mode(self) -> None:
+        """Leave Configuration Mode."""
+        self.fmu.exitConfigurationMode()
 
     @abstractmethod
     def _get(self, suffix: str, references: list[int], size: int) -> list[Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from ..archive import FmuDescription, FmuVariable
+from ..archive import FmuDescription, FmuVariable, OtherVariable
 
 
 class FmuBlock(Protocol):
@@ -30,6 +30,10 @@ class FmuBlock(Protocol):
     @property
     def output_variables(self) -> Mapping[str, FmuVariable]:
         """Variables that are read in a run, by their ports."""
+
+    @property
+    def text_variables(self) -> Mapping[str, OtherVariable]:
+        """Texts and binary data that are recorded in a run, by their ports."""
 
     @property
     def variable_step(self) -> bool:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import ctypes
 import struct
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from ..platform import native_platform
 from .fmi_calls import DISCARD, ERROR, FATAL, StepCall
 from .fmu_block import FmuBlock
 from .loaded_library import LoadedFmu, MakeCalls
+from .texts import Text, TextRecord
 from .transfer import Transfer, UnfitError
 
 _HEADER = struct.Struct("<8s32s24sd?")  # of a serialized state: magic, FMU's digest, platform, time, running
@@ -73,6 +75,7 @@ class FmuInstance(LoadedFmu):
         self._vector = np.zeros(0)
         self._handles: dict[int, Any] = {}
         self._read: Callable[[float], None] = lambda t: None
+        self._texts = TextRecord(self.fmi, block.text_variables)
 
     @property
     def t(self) -> float:
@@ -84,6 +87,7 @@ class FmuInstance(LoadedFmu):
         super().begin()
         self._now.value, self._width.value = self._began, 0.0
         self._read(self._began)
+        self._begin_texts()
 
     def bind(self, inputs: np.ndarray, outputs: np.ndarray) -> None:
         """Bind the vectors of the inputs to set and of the outputs to get, and get the outputs once."""
@@ -92,7 +96,23 @@ class FmuInstance(LoadedFmu):
         call = self.fmi.step_call(self._now, self._width, self._final)
         plain = ins.is_plain and outs.is_plain
         self.step, self.exchange, self._read = (self._bind_plain if plain else self._bind_typed)(ins, outs, call)
+        if self._texts.variables:
+            self.step = partial(self._step_and_note, self.step)
         self._read(self._began)
+
+    def _begin_texts(self) -> None:
+        """Let the record of texts begin anew, at the present time."""
+        lost = self.call("reading its texts", self._texts.begin_anew, self.t)
+        self.messages += [f"{self.block.label}: {text}" for text in lost]
+
+    def _step_and_note(self, step: Callable[[float, float], None], t: float, h: float) -> None:
+        step(t, h)
+        self.call("reading its texts", self._texts.note, t + h)
+
+    @property
+    def texts(self) -> Mapping[str, list[tuple[float, Text]]]:
+        """Texts and binary data by port: each value with the time in s from which on it held."""
+        return self._texts.values
 
     def _bind_plain(self, ins: Transfer, outs: Transfer, call: StepCall) -> _Bound:
         """Return step, exchange and reading where all ports are Float64: one call each way, on the vectors."""
@@ -285,6 +305,7 @@ class FmuInstance(LoadedFmu):
         self.failed, self._running = False, state.running
         self._now.value, self._width.value = state.t, 0.0
         self._read(state.t)
+        self._begin_texts()
 
     def serialize(self, state: FmuState | None = None) -> bytes:
         """Return a saved state, or the present one, as bytes.

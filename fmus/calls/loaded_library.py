@@ -18,6 +18,7 @@ from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
 from .fmi_calls import FATAL, STATUS, FmiCalls
 from .fmu_block import FmuBlock
+from .texts import is_readable, read_text, write_text
 
 _CALLS: dict[str, type[FmiCalls]] = {"2": Fmi2Calls, "3": Fmi3Calls}
 """Functions by the major version of FMI."""
@@ -99,6 +100,7 @@ class LoadedFmu:
         """Return messages on ports that are neither read nor set, and on a description that breaks rules."""
         label, about = self.block.label, self.description
         ins, outs = (about.other_ports(causality) for causality in ("input", "output"))
+        outs = [v for v in outs if not v.is_text]
         parts = [f"the outputs {', '.join(map(str, outs))} are not recorded"] if outs else []
         parts += [f"the inputs {', '.join(map(str, ins))} keep their start values"] if ins else []
         found = [f"{label}: no wire carries texts, binaries and clocks: {'; '.join(parts)}"] if parts else []
@@ -144,8 +146,9 @@ class LoadedFmu:
         self._began = start_time
         given = {**self.block.start, **(values or {})}
         try:
+            self._configure(given)
             self.fmi.set_up(start_time, stop_time, None)
-            self.set_values(given)
+            self.set_values({n: v for n, v in given.items() if n not in self.description.structural})
             self.fmi.enter_initialization_mode(start_time, stop_time, None)
             lost = self._find_lost(given)
             if lost:  # some tools' FMUs drop parameters that are set before this mode
@@ -154,23 +157,36 @@ class LoadedFmu:
         except Exception as error:
             raise self._initialization_error(error) from error
         for name, value in lost.items():
-            found = self.values([name])
+            text = self.description.texts.get(name)
+            kept = self.values([name]).tolist() if text is None else read_text(self.fmi, text)
+            put = value if text is not None else np.ravel(value).tolist()
             raise FmuRuntimeError(
-                f"its start value was set to {np.ravel(value).tolist()}, but is {found.tolist()}: the FMU does not "
-                "keep it. Leave it out, or set the parameters that it depends on.",
+                f"its start value was set to {put!r}, but is {kept!r}: the FMU does not keep it. Leave it out, or set "
+                "the parameters that it depends on.",
                 block=self.block.label,
                 port=f"start.{name}",
                 t=self._began,
             )
+
+    def _configure(self, given: Mapping[str, Any]) -> None:
+        """Set the structural parameters, on which the sizes of arrays depend, in Configuration Mode."""
+        chosen = {name: value for name, value in given.items() if name in self.description.structural}
+        if chosen:
+            self.fmi.enter_configuration_mode()
+            self.set_values(chosen)
+            self.fmi.exit_configuration_mode()
 
     def _find_lost(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return those of the given parameters and inputs that the FMU has not kept."""
         lost = {}
         for name, value in given.items():
             if name in self.description.texts:
+                text = self.description.texts[name]
+                if is_readable(self.fmi, text) and read_text(self.fmi, text) != value:
+                    lost[name] = value
                 continue
             variable = self.description.find(name)
-            if variable.causality in ("parameter", "input"):
+            if variable.causality in ("parameter", "input", "structuralParameter"):
                 found, kept = self.read_variables([variable]), np.ravel(value).astype(float)
                 if not np.allclose(found, kept, rtol=1e-6 if variable.type == "Float32" else 1e-12, atol=0.0):
                     lost[name] = value
@@ -226,7 +242,7 @@ class LoadedFmu:
         """Set variables, by the FMU's names."""
         for name, value in values.items():
             if name in self.description.texts:
-                self.fmi.set_text(self.description.texts[name], value)
+                write_text(self.fmi, self.description.texts[name], value)
                 continue
             variable = self.description.find(name)
             as_type = int if variable.is_integer else float

@@ -23,7 +23,7 @@ from ...blocks.core import (
     near,
     parameter,
 )
-from ..archive import FmuDescription, FmuVariable, read_description
+from ..archive import FmuDescription, FmuVariable, OtherVariable, read_description
 from ..calls import FmuInstance
 from ..isolation import open_fmu
 from .linearization import STEP, FmuLinearization, linear_model, step_difference
@@ -84,10 +84,15 @@ class Fmu(Block):
                 raise ParameterError(f"found {old!r}: {new!r}; expected two names.", block=who, port="rename")
         try:
             description = read_description(self.file)
+            sizes = {n: v for n, v in self.start.items() if n in description.structural}
+            if sizes:
+                sizes = {n: int(check_value(description, n, v, who)) for n, v in sizes.items()}
+                description = read_description(self.file, sizes)
         except FmuError as error:
             error.at(block=who)
             raise
         object.__setattr__(self, "_content", description.digest)
+        object.__setattr__(self, "_sizes", sizes)
         ports, others = self._choose_ports(description), description.other_ports("output")
         if others and not ports.outputs:
             raise FmuFileError(
@@ -137,6 +142,11 @@ class Fmu(Block):
         return self._choose_ports(self.description).outputs
 
     @property
+    def text_variables(self) -> Mapping[str, OtherVariable]:
+        """The FMU's texts and binary data that are recorded in a run (``run.texts``), by their ports."""
+        return self._choose_ports(self.description).texts
+
+    @property
     def left_out(self) -> Mapping[str, str]:
         """Types of the variables that no wire carries, by name: texts, binaries and clocks."""
         return {name: v.type for name, v in self.description.other.items()}
@@ -160,7 +170,7 @@ class Fmu(Block):
             If the file is missing, or has changed since the block was made.
         """
         try:
-            found = read_description(self.file)
+            found = read_description(self.file, self.__dict__["_sizes"])
         except FmuError as error:
             error.at(block=self.label)
             raise

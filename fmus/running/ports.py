@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from ...blocks.core import ParameterError, UnknownNameError, near
-from ..archive import FmuDescription, FmuVariable
+from ..archive import FmuDescription, FmuVariable, OtherVariable
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,6 +16,8 @@ class FmuPorts:
 
     inputs: dict[str, FmuVariable]
     outputs: dict[str, FmuVariable]
+    texts: dict[str, OtherVariable]
+    """Texts and binary data that are recorded."""
 
 
 @lru_cache(maxsize=64)
@@ -63,10 +65,15 @@ def choose_ports(
                 "found one name for two ports; rename them to different names.", block=label, port="rename"
             )
         both[side][port] = variable
+    texts: dict[str, OtherVariable] = {}
+    for name, text in description.texts.items():
+        if text.causality == "output" if chosen is None else name in chosen:
+            known.append(name)
+            texts[names.get(name, name)] = text
     for old in names:
         if old not in known:
             raise UnknownNameError(f"it has no port {old!r} to rename. {near(old, known)}", block=label, port="rename")
-    return FmuPorts(*both)
+    return FmuPorts(*both, texts)
 
 
 def _is_part(description: FmuDescription, name: str) -> bool:
@@ -95,9 +102,13 @@ def _side(variable: FmuVariable) -> int | None:
 
 def _check_chosen(description: FmuDescription, chosen: tuple[str, ...], label: str) -> None:
     for name in chosen:
-        if name in description.other:
+        other = description.other.get(name)
+        if other is not None and other.is_text and other.causality in ("output", "local", "calculatedParameter"):
+            continue
+        if other is not None:
             raise ParameterError(
-                f"found {name!r} of type {description.other[name].type}, which no wire carries. Leave it out.",
+                f"found {name!r}, a {other.causality} of type {other.type}, which no wire carries; expected a "
+                "number, or a text or binary output, which is recorded. Leave it out.",
                 block=label,
                 port="ports",
             )

@@ -57,11 +57,10 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
             block=label,
             port=port,
         )
-    if variable.variability == "constant" or variable.causality in ("calculatedParameter", "structuralParameter"):
-        kind = {"calculatedParameter": "a parameter that is computed", "structuralParameter": "a structural parameter"}
+    if variable.variability == "constant" or variable.causality == "calculatedParameter":
+        kind = "a constant" if variable.variability == "constant" else "a parameter that is computed"
         raise ParameterError(
-            f"found {kind.get(variable.causality, 'a constant')}, which can't be set; expected a parameter, a state or "
-            "an input. Leave it out.",
+            f"found {kind}, which can't be set; expected a parameter, a state or an input. Leave it out.",
             block=label,
             port=port,
         )
@@ -82,18 +81,39 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
     return array
 
 
-def _check_text(description: FmuDescription, name: str, value: Any, label: str) -> str:
-    type_ = description.other[name].type
-    if name in description.texts and isinstance(value, str):
-        return value
-    expected = "a text" if name in description.texts else "numbers or a text, which alone can be set"
-    found = f"{value!r} for" if name in description.texts else ""
-    raise ParameterError(
-        f"found {found} a variable of type {type_}; expected {expected}. "
-        f"{'Give a str' if name in description.texts else 'Leave it out'}.".replace("found  ", "found "),
-        block=label,
-        port=f"start.{name}",
-    )
+def _check_text(description: FmuDescription, name: str, value: Any, label: str) -> Any:
+    """Return a text or binary data; those of an array as a tuple of its elements, in C order."""
+    variable, port = description.other[name], f"start.{name}"
+    if not variable.is_text:
+        raise ParameterError(
+            f"found {value!r} for a {variable.interval_variability} clock, which ticks in a run alone. Leave it out.",
+            block=label,
+            port=port,
+        )
+    if variable.causality in ("output", "local", "calculatedParameter"):
+        raise ParameterError(
+            f"found {_article(variable.causality)} of type {variable.type}, which the FMU computes. Leave it out.",
+            block=label,
+            port=port,
+        )
+    kind, noun = (str, "a text") if variable.type == "String" else (bytes, "bytes")
+    if not variable.shape:
+        if isinstance(value, kind):
+            return value
+        raise ParameterError(
+            f"found {value!r} for a variable of type {variable.type}; expected {noun}. Give a {kind.__name__}.",
+            block=label,
+            port=port,
+        )
+    elements = () if isinstance(value, str | bytes) else tuple(np.ravel(np.array(value, dtype=object)).tolist())
+    if len(elements) != variable.size or not all(isinstance(element, kind) for element in elements):
+        raise ParameterError(
+            f"found {value!r}; expected {noun} for each of {variable.size} elements, of shape {variable.shape}. Give a "
+            f"list of {kind.__name__}.",
+            block=label,
+            port=port,
+        )
+    return elements
 
 
 def _number_items(variable: FmuVariable, value: Any) -> Any:
@@ -117,3 +137,7 @@ def _range_text(variable: FmuVariable) -> str:
     return (
         f"at least {least:g}{_unit_text(variable)}" if np.isfinite(least) else f"at most {most:g}{_unit_text(variable)}"
     )
+
+
+def _article(noun: str) -> str:
+    return f"an {noun}" if noun[0] in "aeio" else f"a {noun}"

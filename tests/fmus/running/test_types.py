@@ -125,13 +125,6 @@ def test_an_integer_that_no_signal_holds_is_an_error_with_its_port(folder):
     assert Diagram("d", chosen(u_Int8=3.0)).simulate(0.02, step=0.01, progress=False)["plant.y_Int8"][-1] == 3.0
 
 
-def test_structural_parameters_give_the_sizes_of_arrays(file3):
-    plant = Fmu(file3, name="plant")
-    assert plant.inputs["u_vector"].shape == plant.outputs["y_vector"].shape == (3,)
-    with pytest.raises(ParameterError, match=r"plant\.start\.n: found a structural parameter, which can't be set"):
-        Fmu(file3, name="plant", start={"n": 4})
-
-
 def test_arrays_of_integers_count_from_0_too(folder):
     plant = Fmu(typed_fmu(folder, 2), name="plant", start={"u_vector[2]": 5})
     assert plant.start["u_vector"].tolist() == [0.0, 0.0, 5.0]
@@ -183,8 +176,8 @@ def test_a_start_value_that_the_fmu_does_not_keep_is_an_error(folder):
         ("u_Enumeration", "middle", "found 'middle'; expected numbers"),
         ("u_Enumeration", 2, "found 2; expected one of its enumeration"),
         ("path", 3, "found 3 for a variable of type String; expected a text"),
-        ("blob", b"x", "found a variable of type Binary; expected numbers or a text"),
-        ("tick", 1, "found a variable of type Clock; expected numbers or a text"),
+        ("blob", b"x", "found an output of type Binary, which the FMU computes"),
+        ("tick", 1, "found 1 for a triggered clock, which ticks in a run alone"),
         ("gain", -1.0, r"found -1\.0; the FMU allows at least 0"),
     ],
 )
@@ -234,7 +227,11 @@ def test_a_tunable_parameter_changes_in_a_run_and_a_local_variable_is_read(file)
     ("ports", "error", "text"),
     [
         (["fixed"], ParameterError, "found 'fixed', a fixed parameter; expected an input, an output, a local"),
-        (["path"], ParameterError, "found 'path' of type String, which no wire carries"),
+        (
+            ["path"],
+            ParameterError,
+            "found 'path', a parameter of type String, which no wire carries; expected a number",
+        ),
         (["y_Int88"], UnknownNameError, r"the FMU has no variable 'y_Int88'.*y_Int8"),
         ("y_Int8", ParameterError, "found 'y_Int8'; expected a list of names"),
     ],
@@ -256,13 +253,11 @@ def test_a_block_with_chosen_ports_is_a_value(file3):
 def test_variables_that_no_wire_carries_are_said(file3):
     plant = Fmu(file3, name="plant")
     assert dict(plant.left_out) == {"path": "String", "blob": "Binary", "tick": "Clock"}
-    assert "without ports for path (String), blob (Binary), tick (Clock)" in repr(plant)
+    assert "without ports for path (String), blob (Binary), tick (triggered Clock)" in repr(plant)
     run = Diagram("d", plant(**rest(plant))).simulate(0.01, step=0.01, progress=False)
     assert run.messages == (
-        (
-            "plant: no wire carries texts, binaries and clocks: the outputs blob (Binary) are not recorded; the inputs tick "
-            "(Clock) keep their start values"
-        ),
+        "plant: no wire carries texts, binaries and clocks: the inputs tick (triggered Clock) keep their start values",
+        "plant: blob (Binary) is not recorded: the library has no fmi3GetBinary",
     )
 
 

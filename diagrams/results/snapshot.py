@@ -1,0 +1,45 @@
+"""All signals of a run at one recorded instant."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from ..wiring import Wire
+from .signal_names import index_of, resolve, split_entry
+
+
+class RecordedRun(Protocol):
+    """Members of a `loopwright.diagrams.Run` with which an instant of it is found again."""
+
+    @property
+    def diagram_name(self) -> str:
+        """Name of its diagram."""
+
+    @property
+    def recipe(self) -> Mapping[str, Any]:
+        """Options of the run."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """All signals and states at one recorded instant."""
+
+    t: float
+    tick: int
+    """The sample's number in the run, from 0: the tick, where every tick was recorded."""
+    values: dict[str, Any]
+    state: np.ndarray
+    """The state vector x of the flattened diagram."""
+    names: dict[str, Wire]
+    """The named wires: two of one short name are told apart by their source."""
+    run: RecordedRun | None = field(default=None, repr=False, compare=False)
+    """The run that it comes from."""
+
+    def __getitem__(self, name: str) -> Any:
+        full, entry = split_entry(resolve(name, self.names, self.values), self.values)
+        value = self.values[full]
+        return value[index_of(entry, value.shape, full)] if entry else value

@@ -1,0 +1,58 @@
+"""Texts and binary data of an FMU in a run: their values, with the times at which they changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from ..archive import OtherVariable
+from .fmi_calls import FmiCalls
+
+Text = str | bytes | tuple[str, ...] | tuple[bytes, ...]
+"""Value of a text or of binary data: a tuple of the elements of an array, in C order."""
+
+
+def read_text(fmi: FmiCalls, variable: OtherVariable) -> Text:
+    """Return the value of a text or of binary data."""
+    get: Callable[..., list[str] | list[bytes]] = fmi.get_texts if variable.type == "String" else fmi.get_binaries
+    found: tuple[str, ...] | tuple[bytes, ...] = tuple(get([variable.reference], variable.size))  # type: ignore[assignment]
+    return found if variable.shape else found[0]
+
+
+def is_readable(fmi: FmiCalls, variable: OtherVariable) -> bool:
+    """Whether the library exports the function that reads a text or binary data; some tools leave it out."""
+    return not fmi.lacks(f"Get{variable.type}")
+
+
+def write_text(fmi: FmiCalls, variable: OtherVariable, value: Text) -> None:
+    """Set a text or binary data."""
+    elements = list(value) if isinstance(value, tuple) else [value]
+    put: Callable[..., None] = fmi.set_texts if variable.type == "String" else fmi.set_binaries
+    put([variable.reference], elements)
+
+
+class TextRecord:
+    """Values of texts and binary data by port, each with the time in s from which on it holds."""
+
+    def __init__(self, fmi: FmiCalls, variables: Mapping[str, OtherVariable]):
+        self.fmi = fmi
+        self.variables = dict(variables)
+        self.values: dict[str, list[tuple[float, Text]]] = {port: [] for port in self.variables}
+
+    def note(self, t: float) -> None:
+        """Read all values at a time in s, and keep those that have changed."""
+        for port, variable in self.variables.items():
+            value, kept = read_text(self.fmi, variable), self.values[port]
+            if not kept or kept[-1][1] != value:
+                kept.append((t, value))
+
+    def begin_anew(self, t: float) -> list[str]:
+        """Forget the values, and keep those at a time in s; return texts on variables that can't be read."""
+        lost = []
+        for port, variable in [*self.variables.items()]:
+            self.values[port].clear()
+            if is_readable(self.fmi, variable):
+                self.values[port].append((t, read_text(self.fmi, variable)))
+            else:
+                del self.variables[port], self.values[port]
+                lost.append(f"{variable} is not recorded: the library has no {self.fmi.prefix}Get{variable.type}")
+        return lost
