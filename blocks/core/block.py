@@ -110,6 +110,14 @@ class Block(Value, Wireable):
     inputs that the run sets, times are in s. It yields a plant, with the methods of the simulation's ``Plant``.
     """
 
+    evaluated_outside: ClassVar[bool] = False
+    """True where a run evaluates the equations from outside of its traced functions, as those of an FMU in model
+    exchange: continuous states that a solver integrates, and events.
+
+    Instead of equations it has ``dependence`` and ``exchange(wired, start_time)``, a context manager: ``wired`` names
+    the inputs that the run sets, times are in s. It yields the simulation's ``ExchangedBlock``.
+    """
+
     inputs: ClassVar[Mapping[str, Input]] = {}
     outputs: ClassVar[Mapping[str, Output | State]] = {}
     states: ClassVar[Mapping[str, State]] = {}
@@ -195,6 +203,21 @@ class Block(Value, Wireable):
         times it. The default is infinity: no limit.
         """
         return math.inf
+
+    def dependence(self, equation: str) -> Mapping[str, Array]:
+        """Return what depends on what in a block that is evaluated from outside.
+
+        Parameters
+        ----------
+        equation : str
+            An output, or ``"next"`` for the rates of all states.
+
+        Returns
+        -------
+        mapping of str to ndarray of bool
+            By input, and by ``"x"`` for all states: which entries of the equation depend on which of these.
+        """
+        return {}
 
     def replace(self, **changes: Any) -> Self:
         """Return a variant with some parameters (or the name) changed; it is another node."""

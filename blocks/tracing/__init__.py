@@ -4,6 +4,7 @@ from .discretization import check_method, hold
 from .equations import initial_state, start_shapes, start_values
 from .numpy_check import GUARDS, NEXT, evaluate
 from .opaque_equations import raise_failure
+from .outside import describe_outside
 from .structure import is_traced_by, traced_parameters
 from .switching_times import Line, switching_times
 from .symbols import bundle, flat_column, has_large_product, size, with_values, wrap
@@ -19,6 +20,7 @@ __all__ = [
     "bundle",
     "check_method",
     "constants_of",
+    "describe_outside",
     "evaluate",
     "flat_column",
     "has_large_product",

@@ -2,7 +2,7 @@
 
 from ...blocks.core import Layout
 from .clocks import EVERY, NONE, TickPattern
-from .evaluation import Apart, Instant, evaluate
+from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator
 from .flat_diagram import FlatDiagram
 from .functions import indicators_of
 from .layout import FlatEvent, StateLayout
@@ -16,6 +16,8 @@ from .wired_diagram import WiredDiagram
 
 __all__ = [
     "EVERY",
+    "INDICATORS",
+    "JUMP",
     "NONE",
     "TRUE",
     "Apart",
@@ -37,6 +39,7 @@ __all__ = [
     "join_columns",
     "loop_mismatch",
     "next_x",
+    "no_evaluator",
     "own_step",
     "plant_inputs",
     "rates",

@@ -45,7 +45,7 @@ class FlatDiagram(FlatLayout):
 
     def with_apart(self, *paths: str) -> FlatDiagram:
         """Return the same diagram with some blocks evaluated from outside, in stages of their own."""
-        return replace(self, apart=frozenset(paths))
+        return replace(self, apart=frozenset(paths) | frozenset(self.outside))
 
     # --- functions ---------------------------------------------------------------------------------------------------
 

@@ -24,7 +24,7 @@ from .logic import choose, is_true, logic_and, logic_not
 from .stages import Schedule
 from .total_derivative import Derivative
 from .trace_stages import trace_schedule
-from .vectors import log, loop_mismatch, next_x, plant_inputs, rates
+from .vectors import join_columns, log, loop_mismatch, next_x, plant_inputs, rates
 
 LARGEST = float(np.finfo(float).max)
 
@@ -111,11 +111,14 @@ def indicators_of(instant: Instant) -> tuple[list[Any], list[Any]]:
 
 
 def trace_jump(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
-    """Return ``(t, x, w, p, fired) -> x_next``: x after the events that fire; each sees the instant before them all."""
+    """Return ``(t, x, w, p, fired) -> x_next``: x after the events that fire; each sees the instant before them all.
+
+    A block that is evaluated from outside is asked whatever fires: it has events of its own.
+    """
     symbols = make_symbols(layout)
     x, fired = symbols["x"], ca.MX.sym("fired", len(layout.events))
     states, starts = layout.states.slices, layout.starts.slices
-    own: dict[str, list[int]] = {}
+    own: dict[str, list[int]] = {path: [] for path in layout.outside}
     for i, event in enumerate(layout.events):
         own.setdefault(event.path, []).append(i)
 
@@ -124,9 +127,11 @@ def trace_jump(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
         for path, indices in own.items():
             if path in layout.table.controls:
                 continue
-            mine = ca.vertcat(*(fired[i] for i in indices))
+            mine = join_columns([fired[i] for i in indices])
             after = instant.events_of(path, JUMP, mine)
-            acts = logic_and(instant.gate_of(path), ca.sum1(mine) > 0.5)
+            acts = instant.gate_of(path)
+            if path not in layout.outside:  # those look at every event themselves
+                acts = logic_and(acts, ca.sum1(mine) > 0.5)
             instant.new[path] = choose(acts, ca.densify(after), rows(x, states[path]))
         for i, event in enumerate(layout.events):
             if event.subsystem and event.name == "enable":

@@ -156,7 +156,12 @@ class FlatLayout:
     def hybrid(self) -> bool:
         """Whether something happens between ticks: continuous states, events, or a transport delay."""
         delayed = any(self.table.blocks[self.ports[name][0]].transport for name in self.plant_inputs.slices)
-        return bool(self.continuous.size or self.events or delayed)
+        return bool(self.continuous.size or self.events or delayed or self.outside)
+
+    @cached_property
+    def outside(self) -> tuple[str, ...]:
+        """Paths of the blocks whose equations a run evaluates from outside, with events of their own."""
+        return tuple(path for path in sorted(self.apart) if self.table.blocks[path].evaluated_outside)
 
     @cached_property
     def plant_ticks(self) -> dict[str, tuple[TickPattern, ...]]:

@@ -64,7 +64,10 @@ class Evaluator(Protocol):
         ...
 
     def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
-        """Return the derivative of `evaluate` by (t, x, u), shape (n, 1 + x.size + u.size); None: by differences."""
+        """Return the derivative of `evaluate` by (t, x, u), shape (n, 1 + x.size + u.size); None: by differences.
+
+        A column by t that is not finite is computed by differences, where it is needed.
+        """
         ...
 
 

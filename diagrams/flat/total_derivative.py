@@ -52,6 +52,7 @@ class Derivative:
             )
         numels = dict(zip(schedule.arguments, (a.numel() for a in schedule.last.arguments), strict=False))
         sizes = [numels[name] if entries is None else len(entries) for name, entries in by]
+        self._sizes = sizes
         self._columns = Layout.of({str(i): (size,) for i, size in enumerate(sizes)})
         traced = [stage for stage in schedule.stages if isinstance(stage, TracedStage)]
         self._functions = {id(stage): self._differentiate(stage) for stage in traced}
@@ -113,7 +114,8 @@ class Derivative:
         D[stage.makes] = J[:, 1:] @ np.vstack([D[stage.states], D[stage.inputs]])
         for (name, _), where in zip(self.by, self._columns.slices.values(), strict=True):
             if name == "t":
-                D[stage.makes, where] += J[:, :1]
+                known = np.isfinite(J[:, :1]).all()
+                D[stage.makes, where] += J[:, :1] if known else _differences(stage, evaluator, t, x, u, count=1)
 
     def bind(
         self,
@@ -124,8 +126,9 @@ class Derivative:
         """Return it bound to vectors; see `Schedule.bind`. Matrices are written column by column."""
         if not self.schedule.opaque:
             return bind_function(self.fast, arguments, results)
-        made = self(*arguments, evaluators=evaluators)
-        into = [np.zeros(v.size) for v in made] if results is None else [*results]
+        rows = [result.numel() for result in self.schedule.last.results]
+        sizes = [*(rows if self.values else ()), *(n * size for n in rows for size in self._sizes)]
+        into = [np.zeros(size) for size in sizes] if results is None else [*results]
 
         def call() -> None:
             for vector, value in zip(into, self(*arguments, evaluators=evaluators), strict=True):
@@ -139,15 +142,20 @@ def _slope(expression: Any, symbol: Any, entries: Sequence[int] | None) -> Any:
     return ca.densify(slope if entries is None else slope[:, list(entries)])
 
 
-def _differences(stage: OpaqueStage, evaluator: Evaluator, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return the derivative of a block by (t, x, u), by central differences of fourth order."""
+def _differences(
+    stage: OpaqueStage, evaluator: Evaluator, t: float, x: np.ndarray, u: np.ndarray, count: int | None = None
+) -> np.ndarray:
+    """Return the derivative of a block by (t, x, u), or the first ``count`` of these, by differences of fourth order.
+
+    The differences are central.
+    """
     at = np.concatenate([[t], x, u])
 
     def evaluate(v: np.ndarray) -> np.ndarray:
         return np.array(evaluator.evaluate(stage.names, float(v[0]), v[1 : 1 + x.size], v[1 + x.size :]))
 
     columns = []
-    for i, middle in enumerate(at):
+    for i, middle in enumerate(at[:count]):
         slopes = []
         for step in (_STEP * max(abs(middle), 1.0), 2.0 * _STEP * max(abs(middle), 1.0)):
             high, low = at.copy(), at.copy()

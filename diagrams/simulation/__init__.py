@@ -1,7 +1,7 @@
 """The loop over ticks, and between them."""
 
 from .announced import announcers
-from .interrupted import Interrupted
+from .progress import Interrupted
 from .run_options import RunKeywords, RunOptions
 from .simulated_diagram import SimulatedDiagram
 from .simulation import Simulation, simulate

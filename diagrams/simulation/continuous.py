@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import NonFiniteError, OptionError, SimulationError, is_before, left_of
-from ..events import Domains, Sliding, evaluate_many
+from ...blocks.core import OptionError, SimulationError, is_before, left_of
+from ..events import Domains, Sliding
+from ..exchange import ExchangedBlocks, OutsideEvents
 from ..results import Occurrence
 from ..solvers import AcceptedStep, Problem, make_solver
 from .announced import Times, announcers
@@ -17,16 +18,18 @@ from .diagnosis import forget_trials, opaque_failure, state_values
 from .left_of_start import domains_from_left
 from .solver_setup import absolute_tolerances, longest_step, next_instant, time_scale_of
 from .transport_delays import delays_of, keep_step
+from .trials import Trials
 from .workspace import Workspace
 
 _ULPS = 4
 """An event within so many ulps of a tick belongs to the tick."""
+_NO_EVENTS = np.zeros(0, dtype=bool)
 NOTHING: frozenset[Any] = frozenset()
 TIGHT, ONE_STEP = 1e-9, ("auto", "RK23", "RK45", "DOP853", "Radau")
 """Below this relative tolerance these methods, to which a stop costs little, land on every sample."""
 
 
-class Continuous:
+class Continuous(Trials):
     """The continuous part of a run.
 
     Parameters
@@ -41,6 +44,8 @@ class Continuous:
         Told every event that fires.
     is_stopped : callable
         Tells whether a stop condition is true in what was evaluated last.
+    exchanged : ExchangedBlocks, optional
+        Blocks that are evaluated from outside.
     """
 
     def __init__(
@@ -53,14 +58,14 @@ class Continuous:
         max_step: float | None,
         on_event: Callable[[Occurrence], None],
         is_stopped: Callable[[], bool],
+        exchanged: ExchangedBlocks | None = None,
     ):
         flat = workspace.flat
         self.workspace, self.flat, self.name = workspace, flat, name
         self.on_event, self.is_stopped = on_event, is_stopped
         self.where = flat.continuous
         self._edge, self._left, self._sources_edge = math.inf, math.inf, math.inf
-        self._beyond: tuple[float, np.ndarray] | None = None
-        """The last trial of the solver at which a rate was not finite."""
+        self._beyond = None
         self._resolution = rtol, atol
         self._loops = flat.active_loops(NOTHING)
         self._opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
@@ -93,71 +98,18 @@ class Continuous:
         if flat.events:
             self._indicators, self._opened = workspace.indicators()
             self.domains = Domains(flat, self._g, self._g_many, self._rate, self._opened, self.time_scale)
+        if flat.events or flat.outside:
             self._jump = workspace.bind_jump()
+        self.outside: OutsideEvents | None = None
+        """Events of blocks that are evaluated from outside; None without such blocks."""
+        if exchanged:
+            self._exchanged = exchanged
+            self.outside = OutsideEvents(exchanged, workspace.here.x, self._jump, self._tell_outside, self._follow)
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
             self._drive = workspace.plain(flat.driven, [self._driven], workspace.trial)
-        self.sources = announcers(flat)
+        self.sources = [*announcers(flat), *(exchanged.evaluators.items() if exchanged else ())]
         self._late = {t: after for _, one in self.sources if isinstance(one, Times) for t, after in one.late.items()}
-
-    # --- functions of a trial: time from the left of the next discontinuity, past inputs of the delays ---------------
-
-    def _time(self, t: float) -> float:
-        t = self._left if t >= self._edge else self._late.get(t, t)
-        if self.delays is not None:
-            self.delays.outputs_at(t, self.workspace.trial.w)
-        if self._loops:  # whatever was tried in between: Newton's method starts from the last accepted solution
-            self.workspace.trial.x[self._loops] = self.workspace.here.x[self._loops]
-        return t
-
-    def _rate(self, t: float, x: np.ndarray) -> np.ndarray:
-        try:
-            rates = self._flow(self._time(t), x)
-        except SimulationError:  # a loop without a solution: the solver shortens the step, if it can
-            rates = np.full(self.where.size, math.nan)
-        if not np.isfinite(rates).all():
-            self._beyond = (t, x.copy())
-        return rates
-
-    def _slope(self, t: float, x: np.ndarray) -> np.ndarray:
-        if self._jacobian is None:
-            self._jacobian = self.workspace.jacobian()  # type: ignore[assignment]
-        return self._jacobian(self._time(t), x)  # type: ignore[misc, no-any-return]
-
-    def _g(self, t: float, x: np.ndarray) -> np.ndarray:
-        g = self._indicators(self._time(t), x)
-        if not math.isfinite(g.sum()) and not np.all(np.isfinite(g[self._opened > 0.5])):
-            raise self._not_finite(t, x, g)
-        return g
-
-    def _g_many(self, times: np.ndarray, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return evaluate_many(lambda t, x: self._indicators(self._time(t), x), self._opened, times, states)
-
-    def _not_finite(self, t: float, x: np.ndarray, g: np.ndarray) -> SimulationError:
-        """Return the error of an indicator that is not finite: that of the block which made the first such value."""
-        event = self.flat.events[int(np.flatnonzero(~np.isfinite(g) & (self._opened > 0.5))[0])]
-        made = self._failure_at(t, x)
-        return made or NonFiniteError(
-            f"its indicator {event.name!r} is not a finite number; expected one. Look at roots and quotients in it.",
-            block=event.path,
-            t=t,
-        )
-
-    def _failure_at(self, t: float, x: np.ndarray) -> SimulationError | None:
-        self._put(t, x)
-        try:
-            self.workspace.evaluate()
-            self.workspace.check()
-        except SimulationError as error:
-            return error
-        return None
-
-    def _inputs_of_delays(self, t: float, x: np.ndarray) -> np.ndarray:
-        trial = self.workspace.trial
-        trial.t[0] = self._time(t)
-        trial.x[self.where] = x
-        self._drive()
-        return self._driven
 
     # --- the instant that is reached ---------------------------------------------------------------------------------
 
@@ -170,13 +122,6 @@ class Continuous:
             self.delays.look_from(t + 1.0)
             self.delays.outputs_at(t, here.w)
         self._synchronize()
-
-    def _put(self, t: float, x: np.ndarray) -> None:
-        here = self.workspace.here
-        here.t[0] = self._left if t >= self._edge else t
-        here.x[self.where] = x
-        if self.delays is not None:
-            self.delays.outputs_at(here.t[0], here.w)
 
     def _synchronize(self) -> None:
         here, trial = self.workspace.here, self.workspace.trial
@@ -193,6 +138,8 @@ class Continuous:
     def begin(self, *, at_start: bool) -> None:
         """Take the domains of the indicators where a run begins, at t = 0 from the left; elsewhere as they are."""
         self.enter(float(self.workspace.here.t[0]))
+        if self.outside is not None:
+            self._follow()
         if self.domains is not None:
             self.domains.begin(float(self.workspace.here.t[0]), self.workspace.here.x[self.where])
             if at_start:
@@ -208,14 +155,45 @@ class Continuous:
         ahead : bool
             Whether the instant is a tick, to which events belong that are a few ulps later.
         """
-        if self.domains is None:
-            return False
-        fired = self.domains.update(t, self.workspace.here.x[self.where])
+        fired = self._changed(t)
         if not fired.any():
-            return ahead and self._fire_ahead(t)
+            ahead = ahead and self._fire_ahead(t)
+            if not self._look_outside(t):
+                return ahead
+            fired = self._changed(t)
+            if not fired.any():
+                self._end_events(t)
+                return True
         self._fire(t, fired)
         self.sliding.switched = True
         return True
+
+    def _changed(self, t: float) -> np.ndarray:
+        """Take over the domains of all indicators, and return which events fire."""
+        if self.domains is None:
+            return _NO_EVENTS
+        return self.domains.update(t, self.workspace.here.x[self.where])
+
+    def _look_outside(self, t: float) -> bool:
+        """Let blocks from outside act that have events of their own at t; return whether any had."""
+        return self.outside is not None and self.outside.settle(t)
+
+    def _tell_outside(self, t: float, path: str, name: str, before: np.ndarray) -> None:
+        states = (state_values(self.flat, path, x) for x in (before, self.workspace.here.x))
+        self.on_event(Occurrence(t, path, name, *states))
+
+    def _follow(self) -> None:
+        """Take over what an event of a block from outside may have changed: states, and their nominal values."""
+        self._synchronize()
+        if self.where.size and not self.fixed:
+            atol = absolute_tolerances(self.flat, self._resolution[1], self._exchanged.nominals())
+            if not np.array_equal(atol, self.solver.atol):
+                self.solver.set_absolute_tolerance(atol)
+
+    def _end_events(self, t: float) -> None:
+        if self.delays is not None:
+            self.delays.note_edge(t)
+        self.accept()
 
     def _fire_ahead(self, t: float) -> bool:
         """Fire at a tick what changes its domain within a few ulps of time; jumps see it on the far side."""
@@ -243,7 +221,10 @@ class Continuous:
         for _ in range(domains.most):
             before = workspace.here.x.copy()
             motion = domains.motion(at, before[self.where], fired)
-            self._jump(fired)
+            if self.outside is None:
+                self._jump(fired)
+            else:
+                self.outside.fire(t, fired)
             for i in np.flatnonzero(fired):
                 self._tell(t, self.flat.events[int(i)], before)
                 self._reset_domains(self.flat.events[int(i)])
@@ -251,10 +232,10 @@ class Continuous:
             domains.count(t, workspace.here.x[self.where], fired)
             domains.land(motion, at, workspace.here.x[self.where], fired)
             fired = domains.update(at, workspace.here.x[self.where])
+            if not fired.any() and self._look_outside(at):
+                fired = domains.update(at, workspace.here.x[self.where])
             if not fired.any():
-                if self.delays is not None:
-                    self.delays.note_edge(t)
-                self.accept()
+                self._end_events(t)
                 return
         raise domains.too_many(t, fired)
 
@@ -301,8 +282,8 @@ class Continuous:
                 self.delays.look_from(0.5 * (t + edge))
             self._synchronize()
             self._restart(t, edge)
-            found = None
-            while found is None and t < edge:
+            found, wanted = None, False
+            while found is None and not wanted and t < edge:
                 step = self._step()
                 if self.domains is not None and not self.sliding.active:
                     found = self.domains.locate(step)
@@ -322,7 +303,10 @@ class Continuous:
                 if found is not None:  # the loops as the indicators saw them, to the last bit
                     workspace.here.x[self._loops] = solved
                 self.accept()
-            happened = found is not None
+                wanted = self.outside is not None and self.outside.complete_step()
+            happened = found is not None or wanted
+            if found is None and wanted:
+                self.settle(t)
             if found is not None:
                 self._fire(t, found[1])
                 workspace.messages += self.sliding.look(self.domains, t)

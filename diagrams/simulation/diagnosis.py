@@ -77,11 +77,11 @@ def _wrong(
 ) -> SimulationError | None:
     trace, block = flat.checked.traced[path], flat.table.blocks[path]
     shaped = shaped_inputs(trace, inputs)
-    u = bundle("u", shaped)
     for name in sorted(made, key=lambda n: n != GUARDS):  # a guard says more than the NaN behind it
         if name == GUARDS:
             for guard, value in zip(trace.guards, made[name], strict=True):
                 if not value > 0:
+                    u = bundle("u", shaped)
                     y = bundle("y", {n: made.get(n) for n in trace.outputs})
                     error = block.guard_error(guard, float(value), u, y, states_of(flat, path, x))
                     error.at(block=path)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...blocks.core import Block, SimulationError, UnknownNameError, near
 from ..coupling import Plant, PlantSteps, load_plants
+from ..exchange import ExchangedBlock, ExchangedBlocks
 from ..flat import FlatDiagram
 from ..results import Occurrence, OperatingPoint, TextSignal
 from ..solvers import solver_name
@@ -51,7 +52,8 @@ class Engine:
         on_event: Callable[[Occurrence], None],
     ):
         self.flat, self.name = flat, name
-        self.workspace = Workspace(flat)
+        self.exchanged = ExchangedBlocks(flat)
+        self.workspace = Workspace(flat, self.exchanged.evaluators)
         self.position = Position(flat.base)
         self.plants: dict[str, Plant] = {}
         self.view = SimulationView.of(self.workspace, MappingProxyType(self.plants), self.position)
@@ -69,6 +71,7 @@ class Engine:
                 options.max_step,
                 self._on_event,
                 self._stops.is_met,
+                self.exchanged,
             )
         elif options.solver != "auto":
             solver_name(options.solver)  # an unknown one is an error here, too
@@ -86,14 +89,26 @@ class Engine:
         """Load the plants for a run from a time in s on; ``stack`` unloads them."""
         for path, plant in load_plants(self.flat, stack, start_time):
             self.plants[path] = plant
+        self.exchanged.load(stack, start_time)
+
+    @property
+    def loaded(self) -> dict[str, Plant | ExchangedBlock]:
+        """All that is loaded for the run, by path."""
+        return {**self.plants, **self.exchanged.loaded}
+
+    @property
+    def has_plants(self) -> bool:
+        """Whether anything is loaded for the run, and freed at its end."""
+        return bool(self.plants or self.exchanged)
 
     def initialize(self) -> None:
         """Find values of everything at t = 0; the plants are then ready to be stepped."""
         self.steps.bind()
         delays = None if self.continuous is None else self.continuous.delays
-        initialize(self.workspace, self.plants, delays, self.steps.take_inputs)
+        initialize(self.workspace, self.plants, delays, self.steps.take_inputs, self.exchanged)
         for plant in self.plants.values():
             plant.begin()
+        self.exchanged.begin(self.workspace.here.x)
         self.workspace.begun = True
 
     def take_first_tick(self, point: OperatingPoint | None, row: Row) -> None:
@@ -182,7 +197,7 @@ class Engine:
 
     def blame(self, error: SimulationError) -> SimulationError:
         """Return the error with the full path of a plant that has failed, or the error of an opaque block behind it."""
-        for path, plant in self.plants.items():
+        for path, plant in self.loaded.items():
             if plant.failed:
                 error.blame(path)
         opaque = opaque_failure(self.flat)

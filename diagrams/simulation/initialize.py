@@ -10,6 +10,7 @@ import numpy as np
 from ...blocks.core import LoopwrightError, NonFiniteError, SimulationError
 from ...blocks.tracing import bundle, initial_state
 from ..coupling import Plant
+from ..exchange import ExchangedBlocks
 from ..flat import NONE, FlatDiagram, Instant, evaluate, evaluate_apart, is_true
 from .diagnosis import inputs_text, shaped_inputs
 from .left_of_start import values_from_left
@@ -21,7 +22,11 @@ _SETTLED = 1e-13  # relative change of an input between two passes, a few hundre
 
 
 def initialize(
-    workspace: Workspace, plants: Mapping[str, Plant], delays: Delays | None, take_inputs: Callable[[], None]
+    workspace: Workspace,
+    plants: Mapping[str, Plant],
+    delays: Delays | None,
+    take_inputs: Callable[[], None],
+    exchanged: ExchangedBlocks,
 ) -> None:
     """Find values of everything at t = 0.
 
@@ -39,6 +44,12 @@ def initialize(
     if delays is not None:
         delays.outputs_at(0.0, workspace.here.w)
     passes, last = 0, np.full(flat.width, np.nan)
+    jump, nothing = workspace.bind_jump() if exchanged else None, np.zeros(len(flat.events))
+
+    def look() -> None:
+        if jump is not None:
+            jump(nothing)
+
     most = _MAX_PASSES * (10 if workspace.looped else 1)
     while True:
         _set_initial_states(workspace)
@@ -51,8 +62,18 @@ def initialize(
             plant.exchange()
         if delays is not None:
             delays.begin(workspace.z, workspace.here.w)
+        moved = exchanged.exchange(workspace.here.x, look) if exchanged else ""
         workspace.evaluate(acting)
         passes += 1
+        if moved and passes < most:
+            continue
+        if moved:
+            raise SimulationError(
+                f"its states and inputs at the start depend on its own outputs, and are not found: after {passes} "
+                "passes they still change. Put a UnitDelay(initial_value=…) on one of the wires between.",
+                block=moved,
+                t=0.0,
+            )
         found = not workspace.looped or np.allclose(last, workspace.here.x, rtol=_SETTLED, atol=_SETTLED)
         if found and np.allclose(before, workspace.z, rtol=_SETTLED, atol=0.0, equal_nan=True):
             break

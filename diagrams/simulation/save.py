@@ -8,7 +8,7 @@ from .engine import Engine
 
 def can_save(engine: Engine) -> bool:
     """Whether every plant can turn its state into bytes."""
-    return all(plant.can_serialize and not plant.failed for plant in engine.plants.values())
+    return all(plant.can_serialize and not plant.failed for plant in engine.loaded.values())
 
 
 def save_state(engine: Engine) -> RunState:
@@ -31,8 +31,8 @@ def save_state(engine: Engine) -> RunState:
         log=workspace.log.copy(),
         layout=layout_of(engine.flat),
         continuous=None if engine.continuous is None else engine.continuous.save(),
-        fmus={path: plant.serialize() for path, plant in engine.plants.items()},
         plant_steps=engine.steps.save(),
+        fmus={path: plant.serialize() for path, plant in engine.loaded.items()},
         stopped=position.stopped,
     )
 
@@ -41,6 +41,8 @@ def restore_state(engine: Engine, state: RunState) -> None:
     """Put a run into a state that fits it."""
     for path, plant in engine.plants.items():
         plant.restore(plant.deserialize(state.fmus[path]))
+    for path, block in engine.exchanged.loaded.items():
+        block.restore_bytes(state.fmus[path])
     engine.workspace.restore(t=state.t, x=state.x, w=state.w, z=state.z, log=state.log)
     if engine.continuous is not None and state.continuous is not None:
         engine.continuous.restore(state.continuous)

@@ -29,8 +29,7 @@ from ..results import (
 )
 from .duration import default_step, refuse_rest, ticks_in
 from .engine import Engine
-from .interrupted import Interrupted
-from .progress import progress_bar
+from .progress import Interrupted, progress_bar
 from .run_options import RunOptions
 from .save import can_save, restore_state, save_state
 from .start_at_point import apply_point
@@ -314,14 +313,15 @@ class Simulation:
 
     @property
     def _messages(self) -> tuple[str, ...]:
-        plants = self._engine.plants.values()
+        plants = self._engine.loaded.values()
         return (*self._notes, *self._engine.workspace.messages, *(m for p in plants for m in p.messages))
 
     @property
     def can_save(self) -> bool:
         """Whether the complete state can be saved: every FMU can turn its state into bytes."""
         between = self._engine.position.end is not None
-        return self._begun and not between and bool(self._open or not self._engine.plants) and can_save(self._engine)
+        alive = bool(self._open or not self._engine.has_plants)
+        return self._begun and not between and alive and can_save(self._engine)
 
     def save(self) -> RunState:
         """Return the complete state at this tick, that of the FMUs included.
@@ -338,7 +338,7 @@ class Simulation:
                 f"the run has ended at t = {self.t:g} s, between two ticks, and is not saved there. Save it at a tick.",
                 block=self.diagram.name,
             )
-        if not self._begun or (self._engine.plants and not self._open):
+        if not self._begun or (self._engine.has_plants and not self._open):
             raise not_open_error(self._open, self.diagram.name)
         return save_state(self._engine)
 

@@ -25,13 +25,20 @@ def remembers(flat: FlatDiagram) -> bool:
     return any(table.blocks[p].memory and not table.is_sampled(table.subsystem_of[p]) for p in flat.checked.traced)
 
 
-def absolute_tolerances(flat: FlatDiagram, atol: float) -> Any:
-    """Return the absolute tolerance of each continuous state: ``atol`` times its nominal value."""
-    scale = np.ones(flat.width)
+def absolute_tolerances(flat: FlatDiagram, atol: float, nominals: np.ndarray | None = None) -> Any:
+    """Return the absolute tolerance of each continuous state: ``atol`` times its nominal value.
+
+    Parameters
+    ----------
+    nominals : ndarray, optional
+        Nominal values of the entries of x whose blocks declare none.
+    """
+    scale = np.ones(flat.width) if nominals is None else nominals.copy()
     for path, own in flat.states.of_block.items():
         for name, where in own.slices.items():
             nominal = flat.table.blocks[path].states[name].nominal
-            scale[where] = 1.0 if nominal is None else nominal
+            if nominal is not None:
+                scale[where] = nominal
     scale = scale[flat.continuous]
     return atol if np.all(scale == 1.0) or np.ndim(atol) else atol * scale
 

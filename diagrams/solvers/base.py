@@ -131,6 +131,10 @@ class Solver(ABC):
         """Take over the memory that `save` returned; of another method's memory nothing is used."""
         return
 
+    def set_absolute_tolerance(self, atol: float | np.ndarray) -> None:
+        """Take another absolute tolerance; it counts from the next `restart` on."""
+        self.atol = atol
+
     def rate(self, t: float, x: np.ndarray) -> np.ndarray:
         """Evaluate the rates, never beyond ``stop`` (t + h can be one ulp above it). The array is the caller's own."""
         self.statistics.rate_evaluations += 1

@@ -191,7 +191,14 @@ class Cvode(VariableStep):
         library.CVodeSetMaxStep(memory, 0.0 if max_step == np.inf else max_step)  # 0: none
         vectors = (self._x, self._dky, tolerances)
         weakref.finalize(self, _free, calls, memory, (matrix, linear, fixed_point), vectors, context)
+        self._tolerances = tolerances
         self._t, self._x_old, self._fails, self._t_new = 0.0, np.empty(0), 0, c_double()
+
+    def set_absolute_tolerance(self, atol: float | np.ndarray) -> None:
+        """Take another absolute tolerance; see `Solver.set_absolute_tolerance`."""
+        super().set_absolute_tolerance(atol)
+        self._calls.vector(self._tolerances)[:] = atol
+        self._library.CVodeSVtolerances(self._memory, self.rtol, self._tolerances)
 
     def _start(self, t: float, x: np.ndarray) -> None:
         self._fails += self._count_failed_tests()

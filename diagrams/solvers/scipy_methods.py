@@ -41,6 +41,7 @@ class _Method(Protocol):
     y: np.ndarray
     y_old: np.ndarray | None
     h_abs: float
+    atol: float | np.ndarray
     status: str
     f: np.ndarray
     """Rates at (t, y), of the one-step methods."""
@@ -98,6 +99,13 @@ class SciPySolver(VariableStep):
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Plan the step that was saved; see `Solver.restore`."""
         self.planned = saved.get("planned", self.planned)
+
+    def set_absolute_tolerance(self, atol: float | np.ndarray) -> None:
+        """Take another absolute tolerance; see `Solver.set_absolute_tolerance`."""
+        super().set_absolute_tolerance(atol)
+        self._options["atol"] = atol
+        if self._started:
+            self._inner.atol = atol
 
     def _usable_jacobian(self, t: float, x: np.ndarray) -> np.ndarray:
         """Return the Jacobian, or the last finite one: a predictor may reach beyond the domain of the rates."""
@@ -213,6 +221,12 @@ class AutoSolver(VariableStep):
         self.statistics.solver = f"auto ({self._explicit.name})"
         self.statistics.rejected = 0
         self._hits = self._misses = self._easy = self._switches = 0
+
+    def set_absolute_tolerance(self, atol: float | np.ndarray) -> None:
+        """Take another absolute tolerance; see `Solver.set_absolute_tolerance`."""
+        super().set_absolute_tolerance(atol)
+        self._explicit.set_absolute_tolerance(atol)
+        self._implicit.set_absolute_tolerance(atol)
 
     def save(self) -> dict[str, Any]:
         """Return the name of the active method, the steps that both plan, and the counts of signs of stiffness."""

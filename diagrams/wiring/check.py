@@ -20,7 +20,7 @@ from ...blocks.core import (
     near,
 )
 from ...blocks.library import FixedSampleTime
-from ...blocks.tracing import Traced, start_shapes, trace, traced_parameters
+from ...blocks.tracing import Traced, describe_outside, start_shapes, trace, traced_parameters
 from .structure import Structure, Wire
 from .units import Unit, check_units
 
@@ -263,6 +263,8 @@ def _trace(block: Block, shapes: dict[str, Shape], table: Structure, path: str, 
     try:
         if rate is not None and isinstance(block, FixedSampleTime):
             block.check_rate(float(rate))
+        if block.evaluated_outside:
+            return describe_outside(block, shapes, sampled=sampled)
         return trace(block, shapes, sampled=sampled, method=method, cache=shared)
     except LoopwrightError as error:
         error.blame(path)

@@ -2,6 +2,7 @@
 
 from .binaries import check_binary, find_binary, missing_functions
 from .description import FmuDescription, read_description
+from .exchange import ExchangeInfo
 from .faults import FmuFault, FmuFinding
 from .library import SharedLibrary, read_library
 from .limits import ArchiveLimits
@@ -14,6 +15,7 @@ __all__ = [
     "BUILD_DESCRIPTION",
     "DESCRIPTION",
     "ArchiveLimits",
+    "ExchangeInfo",
     "FmuArchive",
     "FmuDescription",
     "FmuFault",

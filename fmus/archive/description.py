@@ -16,6 +16,7 @@ import numpy as np
 
 from ...blocks.core import FmuFileError, Layout
 from .binaries import find_binary
+from .exchange import ExchangeInfo, read_exchange
 from .faults import FmuFault, FmuFinding
 from .gathering import Elements, gather
 from .limits import ArchiveLimits
@@ -83,6 +84,10 @@ class FmuDescription:
     """Limits within which it is read and unpacked."""
     findings: tuple[FmuFinding, ...] = ()
     """Faults of the archive that don't keep the FMU from running."""
+    exchange: ExchangeInfo | None = None
+    """The model-exchange interface, if there is one with a library for this platform."""
+    co_simulation: bool = True
+    """Whether there is a co-simulation interface; ``identifier`` and ``binary`` are else those of model exchange."""
 
     def layout(self, names: Iterable[str]) -> Layout:
         """Return the layout of some variables in a flat vector, one after the other."""
@@ -174,8 +179,8 @@ def read_description(
     Raises
     ------
     FmuFileError
-        If the file is missing, is no FMU, or has no co-simulation of FMI 2.0 or 3.0 or no binary for this platform; if
-        its archive is unsafe, damaged or beyond the limits. Its ``fault`` is an `FmuFault`.
+        If the file is missing, is no FMU, has neither co-simulation nor model exchange of FMI 2.0 or 3.0, or no binary
+        for this platform; if its archive is unsafe, damaged or beyond the limits. Its ``fault`` is an `FmuFault`.
     """
     path = Path(file).expanduser()
     if not path.is_file():
@@ -197,16 +202,18 @@ def _read(
     if not re.fullmatch(r"2\.0|3\.0(\.\d+)?", version):
         raise FmuFileError(
             f"{str(path)!r} is an FMU of FMI {version}; expected FMI 2.0 or 3.0. Export it again with one of "
-            "them, for co-simulation.",
+            "them, for co-simulation or model exchange.",
             fault=FmuFault.VERSION,
             subject=version,
         )
     model, complaints = _parse(path, text, root)
-    if model.coSimulation is None:
+    interface = model.coSimulation or model.modelExchange
+    if interface is None:
         raise FmuFileError(
-            f"{str(path)!r} has no co-simulation interface; export it with one.", fault=FmuFault.INTERFACE
+            f"{str(path)!r} has neither a co-simulation nor a model-exchange interface; export it with one of them.",
+            fault=FmuFault.INTERFACE,
         )
-    identifier = model.coSimulation.modelIdentifier
+    identifier = interface.modelIdentifier
     binary = find_binary(path, entries, version, identifier)
     try:
         resize(model, dict(sizes))
@@ -256,6 +263,9 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
             flags["model_exchange_binary"] = find_binary(path, entries, version, flags["model_exchange"])
         except FmuFileError:
             flags["model_exchange"] = None
+        else:
+            flags["exchange"] = read_exchange(root, model, flags["model_exchange_binary"])
+    flags["co_simulation"] = model.coSimulation is not None
     dropped, units = _dropped_attributes(root), FmuUnits({u.name: u for u in model.unitDefinitions})
     scalars, other = {}, {}
     for v in model.modelVariables:

@@ -1,5 +1,6 @@
 """FMI calls into a library that is loaded in this process."""
 
+from .exchange_instance import ExchangeInstance, is_smooth
 from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
 from .fmi_calls import BoundCalls, Call, FmiCalls, Log
@@ -10,6 +11,7 @@ from .loaded_library import LoadedFmu, MakeCalls
 __all__ = [
     "BoundCalls",
     "Call",
+    "ExchangeInstance",
     "Fmi2Calls",
     "Fmi3Calls",
     "FmiCalls",
@@ -19,4 +21,5 @@ __all__ = [
     "LoadedFmu",
     "Log",
     "MakeCalls",
+    "is_smooth",
 ]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .fmi_calls import DISCARD, PENDING, FmiCalls, Log, StepCall, TypeCalls
+from .fmi_calls import DISCARD, PENDING, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
 from .printf import Logger, format_message
 
 _LONGEST_WAIT = 0.01  # s between two looks at a step that is pending
@@ -28,6 +28,15 @@ class Fmi2Calls(FmiCalls):
         "Int32": TypeCalls("Integer", ctypes.c_int32),
         "Boolean": TypeCalls("Boolean", ctypes.c_int32),
         "Enumeration": TypeCalls("Integer", ctypes.c_int32),
+    }
+
+    exchange_names: ClassVar = {
+        "set_time": "SetTime",
+        "set_states": "SetContinuousStates",
+        "get_states": "GetContinuousStates",
+        "derivatives": "GetDerivatives",
+        "indicators": "GetEventIndicators",
+        "nominals": "GetNominalsOfContinuousStates",
     }
 
     def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
@@ -139,3 +148,8 @@ class Fmi2Calls(FmiCalls):
     def update_discrete_states(self) -> bool:
         """Take a round of the event iteration (3.2.2)."""
         return bool(self.fmu.newDiscreteStates()[0])
+
+    def update_events(self) -> EventUpdate:
+        """Take a round of the event iteration, and return what it says (3.2.2)."""
+        again, terminate, nominals, states, defined, t = self.fmu.newDiscreteStates()
+        return EventUpdate(bool(again), bool(terminate), bool(nominals), bool(states), t if defined else math.inf)

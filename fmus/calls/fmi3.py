@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .fmi_calls import FmiCalls, Log, StepCall, TypeCalls
+from .fmi_calls import EventUpdate, FmiCalls, Log, StepCall, TypeCalls
 
 _INTEGERS = {f"{sign}Int{bits}": getattr(ctypes, f"c_{sign.lower()}int{bits}")
              for sign in ("", "U") for bits in (8, 16, 32, 64)}  # fmt: skip
@@ -25,6 +25,15 @@ class Fmi3Calls(FmiCalls):
         **{name: TypeCalls(name, ctype) for name, ctype in _INTEGERS.items()},
         "Boolean": TypeCalls("Boolean", ctypes.c_bool),
         "Enumeration": TypeCalls("Int64", ctypes.c_int64),
+    }
+
+    exchange_names: ClassVar = {
+        "set_time": "SetTime",
+        "set_states": "SetContinuousStates",
+        "get_states": "GetContinuousStates",
+        "derivatives": "GetContinuousStateDerivatives",
+        "indicators": "GetEventIndicators",
+        "nominals": "GetNominalsOfContinuousStates",
     }
 
     def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
@@ -99,3 +108,8 @@ class Fmi3Calls(FmiCalls):
     def update_discrete_states(self) -> bool:
         """Take a round of the event iteration (FMI 3.0, 2.3.5)."""
         return bool(self.fmu.updateDiscreteStates()[0])
+
+    def update_events(self) -> EventUpdate:
+        """Take a round of the event iteration, and return what it says (FMI 3.0, 2.3.5)."""
+        again, terminate, nominals, states, defined, t = self.fmu.updateDiscreteStates()
+        return EventUpdate(bool(again), bool(terminate), bool(nominals), bool(states), t if defined else math.inf)

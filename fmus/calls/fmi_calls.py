@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -43,6 +43,18 @@ class StepCall:
     """Flags ``event``, ``terminate``, ``early``; all false in FMI 2.0, which has none."""
     reached: ctypes.c_double
     """Time at which a step has ended, in s; −∞ if the FMU does not say it, as in FMI 2.0."""
+
+
+class EventUpdate(NamedTuple):
+    """Answer of a round of the event iteration."""
+
+    again: bool
+    """Whether another round is needed."""
+    terminate: bool
+    nominals_changed: bool
+    states_changed: bool
+    next_time: float
+    """Time of the next time event in s, infinite without one."""
 
 
 @cache
@@ -303,9 +315,40 @@ class FmiCalls(ABC):
 
     # ---- model exchange ----
 
+    exchange_names: ClassVar[dict[str, str]]
+    """Ends of the names of the functions of model exchange that each evaluation calls."""
+
+    def exchange_function(self, name: str) -> Callable[..., int]:
+        """Return the C function "set_time", which takes the instance and a time, or one of vectors of float64.
+
+        These take the instance, an address and a length: "set_states", "get_states", "derivatives", "indicators",
+        "nominals".
+        """
+        return self._function(f"{self.prefix}{self.exchange_names[name]}")
+
+    @property
+    def instance_argument(self) -> ctypes.c_void_p:
+        """The instance, as an argument of C functions."""
+        return ctypes.c_void_p(self.fmu.component)
+
     @abstractmethod
     def update_discrete_states(self) -> bool:
         """Take a round of the event iteration; return whether another one is needed."""
+
+    @abstractmethod
+    def update_events(self) -> EventUpdate:
+        """Take a round of the event iteration, and return what it says."""
+
+    def complete_step(self, final: bool) -> tuple[bool, bool]:
+        """Tell a step of the solver that was accepted; return whether Event Mode is wanted, and the end of the run.
+
+        Parameters
+        ----------
+        final : bool
+            Whether no earlier state will be restored.
+        """
+        enter, terminate = self.fmu.completedIntegratorStep(final)
+        return bool(enter), bool(terminate)
 
     def enter_event_mode(self) -> None:
         """Enter Event Mode."""

@@ -26,13 +26,14 @@ from ...blocks.core import (
 from ..archive import FmuDescription, FmuVariable, OtherVariable, read_description
 from ..calls import FmuInstance
 from ..isolation import open_fmu
+from .exchange import ExchangeMembers, choose_interface
 from .linearization import STEP, FmuLinearization, linear_model, step_difference
 from .ports import FmuPorts, choose_ports
 from .replacement import check_replacement
 from .start_values import check_start, check_value
 
 
-class Fmu(Block):
+class Fmu(ExchangeMembers):
     """Co-simulation FMU of FMI 2.0 or 3.0 as a block; its ports are the FMU's inputs and outputs.
 
     Outputs are attributes (``plant.position``). A port whose name is no identifier is read by index
@@ -52,7 +53,6 @@ class Fmu(Block):
     """
 
     opaque = True
-    stepped = True
     file: str | os.PathLike[str] = parameter(kw_only=False, description="path of the .fmu")
     start: Mapping[str, Any] = parameter(
         default={}, description="start values of parameters, states and inputs, by the FMU's names"
@@ -66,6 +66,10 @@ class Fmu(Block):
     convert_units: bool = parameter(
         default=False,
         description="convert wires to and from other units of a port's dimension, which else are refused",
+    )
+    interface: str | None = parameter(
+        default=None,
+        description="'co_simulation' or 'model_exchange'; None for co-simulation where the FMU offers it",
     )
 
     def check(self) -> None:
@@ -93,6 +97,7 @@ class Fmu(Block):
             raise
         object.__setattr__(self, "_content", description.digest)
         object.__setattr__(self, "_sizes", sizes)
+        choose_interface(description, self.interface, who)
         ports, others = self._choose_ports(description), description.other_ports("output")
         if others and not ports.outputs:
             raise FmuFileError(

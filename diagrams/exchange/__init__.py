@@ -1,0 +1,12 @@
+"""Blocks that a run evaluates from outside, such as FMUs in model exchange: their evaluators and their events."""
+
+from .evaluator import ExchangedBlock, ExchangeEvaluator
+from .events import OutsideEvents
+from .exchanged_blocks import ExchangedBlocks
+
+__all__ = [
+    "ExchangeEvaluator",
+    "ExchangedBlock",
+    "ExchangedBlocks",
+    "OutsideEvents",
+]

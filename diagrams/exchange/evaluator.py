@@ -1,0 +1,194 @@
+"""A block that is evaluated from outside in a run, such as an FMU in model exchange, and its evaluator.
+
+An `ExchangedBlock` is loaded for a run, as a plant is. An `ExchangeEvaluator` lets the stages of the diagram's
+functions call it; it is there before the block is loaded, as the functions are bound first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from enum import Enum
+from typing import Any, Protocol
+
+import numpy as np
+
+from ...blocks.tracing import GUARDS, NEXT
+from ..flat import INDICATORS, JUMP, FlatDiagram, no_evaluator
+
+Values = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
+
+
+class ExchangedBlock(Protocol):
+    """A block whose equations a run evaluates; see `loopwright.fmus.calls.ExchangeInstance`.
+
+    States and inputs are flat, in the order of the block's.
+    """
+
+    @property
+    def messages(self) -> Sequence[str]:
+        """Messages of the run so far."""
+
+    @property
+    def failed(self) -> bool:
+        """Whether its last call failed, so that it can't go on."""
+
+    @property
+    def next_time(self) -> float:
+        """Time in s of its next event that is known beforehand; infinite without one."""
+
+    @property
+    def nominals(self) -> np.ndarray:
+        """Nominal values of its states."""
+
+    def evaluation(self, ports: Sequence[str], *, rates: bool = False, indicators: bool = False) -> Values:
+        """Return the call ``(t, x, u) -> values`` of outputs, rates of the states and indicators, one after the other.
+
+        It leaves everything that the block keeps as it is.
+        """
+
+    def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
+        """Return the derivative of such values by (x, u); None: by differences."""
+
+    def exchange(self, u: np.ndarray) -> np.ndarray:
+        """Set the inputs at the start, and return the states that follow from them."""
+
+    def begin_exchange(self) -> np.ndarray:
+        """End the start, and return the states with which the run begins."""
+
+    def has_jumped(self, u: np.ndarray) -> bool:
+        """Whether an input has jumped since the last instant that was reached."""
+
+    def handle_event(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Let events act, and return the states after them."""
+
+    def accept(self, t: float, x: np.ndarray, u: np.ndarray) -> bool:
+        """Take note of an instant that the solver has reached; return whether an event is wanted there."""
+
+    def operating_point(self) -> dict[str, Any]:
+        """Return its time ``t`` in s, ``state`` and ``inputs`` by name."""
+
+    @property
+    def can_serialize(self) -> bool:
+        """Whether `serialize` works."""
+
+    def serialize(self) -> bytes:
+        """Return its complete state."""
+
+    def restore_bytes(self, data: bytes) -> None:
+        """Go to the state of such bytes."""
+
+
+class Exchangeable(Protocol):
+    """A block whose class says ``evaluated_outside``."""
+
+    def exchange(self, wired: Sequence[str], *, start_time: float) -> AbstractContextManager[ExchangedBlock]:
+        """Load it for a run; see `loopwright.blocks.Block`."""
+
+
+INPUT_EVENT, TIME_EVENT, STEP_EVENT = "input_event", "time_event", "step_event"
+"""Names of events that no indicator fires: an input has jumped, a time has come, a step has ended."""
+
+
+class Look(Enum):
+    """Purpose of an evaluation of `JUMP`, by which a block sees an instant with all its inputs."""
+
+    START = "start"
+    """The start is still sought: the states are the block's own."""
+    STEP = "step"
+    """The solver has accepted a step that ends there."""
+    EVENTS = "events"
+    """Events may act there."""
+
+
+class ExchangeEvaluator:
+    """Evaluator of one block in a run: for the stages, and for the events."""
+
+    def __init__(self, flat: FlatDiagram, path: str):
+        self.path = path
+        self.look = Look.START
+        """Purpose of the next evaluations of `JUMP`."""
+        self._outputs = frozenset(flat.checked.traced[path].outputs)
+        self._count = len(flat.table.blocks[path].events)
+        self._loaded: ExchangedBlock | None = None
+        self._calls: dict[tuple[str, ...], Values] = {}
+        self.u = np.zeros(0)
+        """The inputs at the last look at an instant."""
+        self.event: str | None = None
+        """Name of the event that has acted at the last `JUMP`, "" for those of indicators; None if there was none."""
+        self.wants_event = False
+        """Whether the block wants an event at the instant that was accepted."""
+
+    @property
+    def block(self) -> ExchangedBlock:
+        """The block, once it is loaded."""
+        if self._loaded is None:
+            raise no_evaluator(self.path)
+        return self._loaded
+
+    @property
+    def is_loaded(self) -> bool:
+        """Whether it is loaded."""
+        return self._loaded is not None
+
+    def load(self, block: ExchangedBlock) -> None:
+        """Take the block of a run."""
+        self._loaded = block
+
+    def next_instant(self, t: float) -> float:
+        """Return its first time event after t, in s; infinite without one."""
+        time = self.block.next_time
+        return time if time > t else math.inf
+
+    # --- an Evaluator ------------------------------------------------------------------------------------------------
+
+    def evaluate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Return the equations that are wanted; see `loopwright.diagrams.flat.stages.Evaluator`."""
+        call = self._calls.get(names)
+        if call is None:
+            call = self._calls[names] = self._bind(names)
+        return call(t, x, u)
+
+    def _bind(self, names: tuple[str, ...]) -> Values:
+        if names == (JUMP,):
+            return self._jump
+        ports = [name for name in names if name in self._outputs]
+        known = {*ports, NEXT, GUARDS, INDICATORS}
+        assert known.issuperset(names)
+        return self.block.evaluation(ports, rates=NEXT in names, indicators=INDICATORS in names)
+
+    def _jump(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Look at an instant that is reached: let events act, or take note of a step that the solver has accepted.
+
+        Behind the inputs stands 1 for each event that fires.
+        """
+        n = u.size - self._count
+        u, fired = u[:n], u[n:]
+        self.u = u.copy()
+        block = self.block
+        if self.look is Look.START:
+            return x
+        if self.look is Look.STEP:
+            self.wants_event = block.accept(t, x, u) or self.wants_event
+            return x
+        if fired.any():
+            self.event = ""
+        elif t >= block.next_time:
+            self.event = TIME_EVENT
+        elif self.wants_event:
+            self.event = STEP_EVENT
+        elif block.has_jumped(u):
+            self.event = INPUT_EVENT
+        else:
+            return x
+        self.wants_event = False
+        return block.handle_event(t, x, u)
+
+    def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
+        """Return the derivative of `evaluate` by (t, x, u), NaN by t; None: by differences."""
+        if not {NEXT, GUARDS, *self._outputs}.issuperset(names):
+            return None
+        ports = [name for name in names if name in self._outputs]
+        J = self.block.slopes(ports, rates=NEXT in names, t=t, x=x, u=u)
+        return None if J is None else np.hstack([np.full((len(J), 1), math.nan), J])

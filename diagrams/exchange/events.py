@@ -1,0 +1,93 @@
+"""Events of blocks that are evaluated from outside: those of indicators, of time, of steps, of inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ...blocks.core import SimulationError
+from ..flat import FlatDiagram
+from .evaluator import INPUT_EVENT, Look
+from .exchanged_blocks import ExchangedBlocks
+
+_ROUNDS = 100  # of events at one instant
+
+
+class OutsideEvents:
+    """Events of blocks from outside, in the run that they belong to.
+
+    Parameters
+    ----------
+    blocks : ExchangedBlocks
+        The blocks.
+    x : ndarray
+        The states of the instant that the run has reached.
+    jump : callable
+        Evaluates `JUMP` of all blocks, and takes over the states after it.
+    tell : callable
+        ``tell(t, path, name, before)``: told every event that acts, with all states before it.
+    follow : callable
+        Called after events, which may have changed states and nominal values.
+    """
+
+    def __init__(
+        self,
+        blocks: ExchangedBlocks,
+        x: np.ndarray,
+        jump: Callable[[np.ndarray], None],
+        tell: Callable[[float, str, str, np.ndarray], None],
+        follow: Callable[[], None],
+    ):
+        self.flat: FlatDiagram = blocks.flat
+        self._evaluators, self._x, self._jump = blocks.evaluators, x, jump
+        self._tell, self._follow = tell, follow
+        self._nothing = np.zeros(len(self.flat.events))
+
+    def complete_step(self) -> bool:
+        """Tell the blocks that the solver has accepted a step; return whether one wants an event where it ends."""
+        for e in self._evaluators.values():
+            e.look = Look.STEP
+        try:
+            self._jump(self._nothing)
+        finally:
+            for e in self._evaluators.values():
+                e.look = Look.EVENTS
+        return any(e.wants_event for e in self._evaluators.values())
+
+    def fire(self, t: float, fired: np.ndarray) -> bool:
+        """Let events act, those of indicators that fire and the blocks' own; return whether any block had one."""
+        before = self._x.copy()
+        for e in self._evaluators.values():
+            e.event = None
+        self._jump(fired)
+        found = False
+        for path, e in self._evaluators.items():
+            if e.event is None:
+                continue
+            found, where = True, self.flat.states.slices[path]
+            if e.event and (e.event != INPUT_EVENT or not np.array_equal(before[where], self._x[where])):
+                self._tell(t, path, e.event, before)
+        if found:
+            self._follow()
+        return found
+
+    def settle(self, t: float) -> bool:
+        """Let events of the blocks' own act until there are none; return whether there were any.
+
+        Raises
+        ------
+        SimulationError
+            If they go on without end.
+        """
+        for rounds in range(_ROUNDS):
+            if not self.fire(t, self._nothing):
+                return rounds > 0
+        path, e = next((path, e) for path, e in self._evaluators.items() if e.event is not None)
+        raise SimulationError(
+            f"its events follow each other without end at one instant: after {_ROUNDS} rounds there is still one "
+            f"({e.event or 'of an indicator'}), and its next time event is at {e.block.next_time:.9g} s. Break the "
+            "loop of discrete signals around it with a delay, or report it to its makers.",
+            block=path,
+            t=t,
+        )

@@ -1,0 +1,94 @@
+"""All blocks of a run that are evaluated from outside: loading, and the start."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import LoopwrightError, SimulationError
+from ..flat import FlatDiagram
+from .evaluator import Exchangeable, ExchangedBlock, ExchangeEvaluator, Look
+
+_SETTLED = 1e-13  # relative change of a state between two passes at the start, a few hundred ulps
+
+
+class ExchangedBlocks:
+    """All blocks of a run that are evaluated from outside, with their events.
+
+    Attributes
+    ----------
+    evaluators : dict
+        Their evaluators, by path; they are there before the blocks are loaded.
+    """
+
+    def __init__(self, flat: FlatDiagram):
+        self.flat = flat
+        self.evaluators = {path: ExchangeEvaluator(flat, path) for path in flat.outside}
+
+    def __bool__(self) -> bool:
+        return bool(self.evaluators)
+
+    def load(self, stack: ExitStack, start_time: float) -> None:
+        """Load the blocks for a run from a time in s on; ``stack`` unloads them."""
+        for path, evaluator in self.evaluators.items():
+            made: Any = self.flat.table.blocks[path]
+            block: Exchangeable = made
+            try:
+                wired = [port for port in made.inputs if (path, port) in self.flat.table.wires]
+                evaluator.load(stack.enter_context(block.exchange(wired, start_time=start_time)))
+            except SimulationError as error:
+                error.at(block=path, t=start_time)
+                raise
+            except LoopwrightError as error:
+                error.at(block=path)
+                raise
+
+    @property
+    def loaded(self) -> dict[str, ExchangedBlock]:
+        """The blocks that are loaded, by path."""
+        return {path: e.block for path, e in self.evaluators.items() if e.is_loaded}
+
+    # --- the start ---------------------------------------------------------------------------------------------------
+
+    def exchange(self, x: np.ndarray, look: Callable[[], None]) -> str:
+        """Set the inputs of all blocks, and write the states that follow into x.
+
+        Parameters
+        ----------
+        look : callable
+            Evaluates `JUMP`, which brings the inputs.
+
+        Returns
+        -------
+        str
+            Path of a block whose states or inputs have changed; empty without one.
+        """
+        moved, before = "", {path: e.u for path, e in self.evaluators.items()}
+        look()
+        for path, e in self.evaluators.items():
+            where = self.flat.states.slices[path]
+            states = e.block.exchange(e.u)
+            if not (_is_close(before[path], e.u) and _is_close(x[where], states)):
+                moved = path
+            x[where] = states
+        return moved
+
+    def begin(self, x: np.ndarray) -> None:
+        """End the start: events there act, and the states after them stand in x."""
+        for path, e in self.evaluators.items():
+            x[self.flat.states.slices[path]] = e.block.begin_exchange()
+            e.look = Look.EVENTS
+
+    def nominals(self) -> np.ndarray:
+        """Return the nominal value of each entry of x, 1 for those of other blocks."""
+        found = np.ones(self.flat.width)
+        for path, e in self.evaluators.items():
+            found[self.flat.states.slices[path]] = e.block.nominals
+        return found
+
+
+def _is_close(before: np.ndarray, now: np.ndarray) -> bool:
+    return before.shape == now.shape and np.allclose(before, now, rtol=_SETTLED, atol=0.0, equal_nan=True)

@@ -1,0 +1,122 @@
+"""Model exchange as a description states it: capabilities, states, event indicators, dependencies."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from .variables import FmuVariable, fmi3_type
+
+Key = tuple[str, int]
+"""Type, as FMI 3.0 names it, and value reference of a variable."""
+
+
+@dataclass(frozen=True, eq=False)
+class ExchangeInfo:
+    """Model-exchange interface of an FMU (FMI 2.0, 2.2.8 and 3.3.1; FMI 3.0, 2.4.8 and 3.4)."""
+
+    identifier: str
+    binary: str = ""
+    """The library for this platform, as its path in the archive."""
+    can_save: bool = False
+    """Whether the state of an instance can be saved and restored."""
+    can_serialize: bool = False
+    """Whether a saved state can be turned into bytes."""
+    has_derivatives: bool = False
+    """Whether the FMU computes directional derivatives."""
+    only_once: bool = False
+    """Whether a process can have one instance only."""
+    completes_steps: bool = True
+    """Whether it wants to be told each step of the solver that was accepted."""
+    state_count: int = 0
+    """Number of continuous states."""
+    indicators: tuple[str, ...] = ()
+    """Names of the event indicators."""
+    dependencies: Mapping[Key, frozenset[Key] | None] = field(default_factory=dict)
+    """For each output and derivative of a state, the variables that it depends on; None: all. They stand by type and
+    value reference."""
+
+    def pattern(self, unknown: FmuVariable, known: FmuVariable) -> np.ndarray:
+        """Return which elements of an output or a derivative may depend on which of an input or a state.
+
+        One that the model structure doesn't list may depend on all.
+
+        Returns
+        -------
+        ndarray of bool, shape (unknown.size, known.size)
+        """
+        found = np.ones((unknown.size, known.size), dtype=bool)
+        columns = _keys(known)
+        for row, key in enumerate(_keys(unknown)):
+            of = self.dependencies.get(key)
+            if of is not None:
+                found[row] = [column in of for column in columns]
+        return found
+
+
+def _keys(variable: FmuVariable) -> list[Key]:
+    """Return type and value reference of each element."""
+    keys = [(variable.type, reference) for reference in variable.references]
+    return keys if len(keys) == variable.size else keys * variable.size
+
+
+def read_exchange(root: ET.Element, model: Any, binary: str) -> ExchangeInfo:
+    """Return what a description says of model exchange.
+
+    Parameters
+    ----------
+    root : Element
+        Root of the description.
+    model : fmpy.model_description.ModelDescription
+        The description, as FMPy has read it.
+    binary : str
+        The library for this platform.
+    """
+    two = model.fmiVersion.startswith("2.")
+    given = root.find("ModelExchange")
+    assert given is not None
+    state = "FMUstate" if two else "FMUState"
+    derivative = "providesDirectionalDerivative" if two else "providesDirectionalDerivatives"
+
+    def flag(name: str) -> bool:
+        return given.get(name) in ("true", "1")
+
+    completes = not flag("completedIntegratorStepNotNeeded") if two else flag("needsCompletedIntegratorStep")
+    return ExchangeInfo(
+        identifier=given.get("modelIdentifier", ""),
+        binary=binary,
+        can_save=flag(f"canGetAndSet{state}"),
+        can_serialize=flag(f"canGetAndSet{state}") and flag(f"canSerialize{state}"),
+        has_derivatives=flag(derivative),
+        only_once=flag("canBeInstantiatedOnlyOncePerProcess"),
+        completes_steps=completes,
+        state_count=int(model.numberOfContinuousStates),
+        indicators=_indicators(model),
+        dependencies={
+            _key(unknown.variable): None if unknown.dependencies is None else frozenset(map(_key, unknown.dependencies))
+            for unknown in (*model.outputs, *model.derivatives)
+        },
+    )
+
+
+def _key(variable: Any) -> Key:
+    return fmi3_type(variable.type), variable.valueReference
+
+
+def _indicators(model: Any) -> tuple[str, ...]:
+    """Return names of the event indicators: those of their variables in FMI 3.0, numbers in FMI 2.0."""
+    count = int(model.numberOfEventIndicators)
+    names: list[str] = []
+    for unknown in model.eventIndicators:
+        size = 1
+        for extent in unknown.variable.shape or ():
+            size *= int(extent)
+        name = unknown.variable.name
+        names += [name] if size == 1 and not unknown.variable.shape else [f"{name}[{i + 1}]" for i in range(size)]
+    if len(names) != count or len(set(names)) != count:
+        names = [f"indicator[{i + 1}]" for i in range(count)]
+    return tuple(names)

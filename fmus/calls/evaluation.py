@@ -1,0 +1,107 @@
+"""One evaluation of an FMU in model exchange: a fixed sequence of calls on fixed vectors."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .fmi_calls import WARNING, BoundCalls, FmiCalls
+from .transfer import Transfer
+
+
+@dataclass(frozen=True, eq=False)
+class Vector:
+    """A vector of float64 that one function sets or gets."""
+
+    function: str
+    """Name for `FmiCalls.exchange_function`."""
+    values: np.ndarray
+
+
+class Evaluation:
+    """Calls that set time, states and inputs, and get outputs, derivatives and indicators.
+
+    Each call is bound once, to vectors that stay where they are: a process of its own can make one round trip of it.
+
+    Attributes
+    ----------
+    result : ndarray
+        Outputs, derivatives and indicators, one after the other.
+    rates_at : slice
+        Where the derivatives stand in it.
+    """
+
+    def __init__(
+        self,
+        fmi: FmiCalls,
+        *,
+        time: ctypes.c_double,
+        states: Vector,
+        inputs: Transfer,
+        index: np.ndarray,
+        outputs: Transfer,
+        rates: Vector | None,
+        indicators: Vector | None,
+    ):
+        self._time, self._inputs, self._index, self._outputs = time, inputs, index, outputs
+        self.rates, self.indicators = rates, indicators
+        sizes = [outputs.vector.size, *(0 if v is None else v.values.size for v in (rates, indicators))]
+        self.result = np.zeros(sum(sizes))
+        self.rates_at = slice(sizes[0], sizes[0] + sizes[1])
+        self._outputs_at, self._indicators_at = slice(0, sizes[0]), slice(sizes[0] + sizes[1], sum(sizes))
+        at = [(fmi.exchange_function("set_time"), (fmi.instance_argument, time), "setting the time")]
+        at += _vector_call(fmi, states, "setting the continuous states")
+        more = [(group.function, group.arguments, "setting the inputs") for group in inputs.groups]
+        more += [(group.function, group.arguments, "reading the outputs") for group in outputs.groups]
+        more += _vector_call(fmi, rates, "computing the derivatives of its states")
+        more += _vector_call(fmi, indicators, "computing the event indicators")
+        self._running, self._starting = (_bind(fmi, calls) for calls in ([*at, *more], more))
+
+    def run(self, t: float, u: np.ndarray, *, running: bool) -> tuple[int, str]:
+        """Evaluate it; return the first status that is no success, and the name of that call.
+
+        Parameters
+        ----------
+        t : float
+            Time in s.
+        u : ndarray
+            All inputs.
+        running : bool
+            Whether time and states are set: in Initialization Mode the FMU has its own.
+        """
+        self._time.value = t
+        if self._index.size:
+            vector = self._inputs.vector
+            vector[:] = u[self._index]
+            for group in self._inputs.groups:
+                group.check_and_fill(vector)
+        calls, actions = self._running if running else self._starting
+        status = calls.run()
+        if not 0 <= status <= WARNING:
+            return status, actions[calls.failed]
+        if self._outputs.groups:
+            for group in self._outputs.groups:
+                group.spread(self._outputs.vector)
+            self.result[self._outputs_at] = self._outputs.vector
+        if self.indicators is not None:
+            self.result[self._indicators_at] = self.indicators.values
+        return 0, ""
+
+
+_Named = tuple[Callable[..., int], tuple[Any, ...], str]
+"""A function, its arguments, and the name of the call."""
+
+
+def _vector_call(fmi: FmiCalls, vector: Vector | None, action: str) -> list[_Named]:
+    if vector is None or not vector.values.size:
+        return []
+    address, length = ctypes.c_void_p(vector.values.ctypes.data), ctypes.c_size_t(vector.values.size)
+    return [(fmi.exchange_function(vector.function), (fmi.instance_argument, address, length), action)]
+
+
+def _bind(fmi: FmiCalls, calls: list[_Named]) -> tuple[BoundCalls, list[str]]:
+    return fmi.bind([(function, arguments) for function, arguments, _ in calls]), [action for _, _, action in calls]

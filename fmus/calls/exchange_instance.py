@@ -1,0 +1,388 @@
+"""Instance of an FMU in model exchange: evaluated at any time, states and inputs; events change its discrete states."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import FmuError, FmuRuntimeError, Layout
+from ..archive import ExchangeInfo, FmuVariable
+from .evaluation import Evaluation, Vector
+from .exchange_states import pack_state, unpack_state
+from .fmi_calls import DISCARD, ERROR, FATAL, WARNING
+from .fmu_block import FmuBlock
+from .loaded_library import LoadedFmu, MakeCalls
+from .transfer import Transfer, UnfitError
+
+_ROUNDS = 100  # of an event iteration
+_SAME = 1e-12  # relative change of a continuous input that is no jump
+
+
+class ExchangeInstance(LoadedFmu):
+    """Loaded FMU whose continuous states a solver integrates.
+
+    After `begin` it is in Continuous-Time Mode. There `evaluation` sets time, states and continuous inputs and gets
+    outputs, derivatives and indicators: this leaves its discrete states as they are. `handle_event` goes through Event
+    Mode, where discrete inputs and tunable parameters are set.
+
+    States stand in the order of the description's ``states``, inputs in that of the block's ports.
+
+    Attributes
+    ----------
+    next_time : float
+        Time of its next time event in s, infinite without one.
+    nominals : ndarray
+        Nominal values of the continuous states.
+    """
+
+    def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
+        super().__init__(block, model_exchange=True, make_calls=make_calls)
+        assert self.description.exchange is not None
+        self.about: ExchangeInfo = self.description.exchange
+        self._ports = dict(block.input_variables)
+        self._places = Layout.of({port: v.shape for port, v in self._ports.items()}).slices
+        self._wired = {port: self._ports[port] for port in wired}
+        self._smooth = {port: v for port, v in self._wired.items() if is_smooth(v)}
+        n = self.about.state_count
+        order = self.description.state_order
+        self._order = np.array(order if len(order) == n else range(n), dtype=int)
+        self._time = self.fmi.variable(ctypes.c_double)
+        self._x, self._dx, self._kept = (self._allocate(n) for _ in range(3))
+        self._indicators = self._allocate(len(self.about.indicators))
+        self.next_time, self.nominals = math.inf, np.ones(n)
+        self._evaluations: dict[Any, Evaluation] = {}
+        self._all_inputs: Transfer | None = None
+        self._final = True
+        self._discarded = ""
+        self._u = np.zeros(0)
+        """Values of all inputs at the last instant that was reached."""
+
+    @property
+    def t(self) -> float:
+        """Time that was set last, in s."""
+        return self._time.value if self._running else self._began
+
+    def _allocate(self, n: int) -> np.ndarray:
+        return self.fmi.allocate(n, ctypes.c_double)
+
+    # ---- evaluations ----
+
+    def evaluation(
+        self, ports: Sequence[str], *, rates: bool = False, indicators: bool = False
+    ) -> Callable[[float, np.ndarray, np.ndarray], np.ndarray]:
+        """Return the call ``(t, x, u) -> values`` that gets outputs, then derivatives, then indicators.
+
+        The result is one array, written anew by each call: NaN where the FMU can't compute it there (discard).
+
+        Parameters
+        ----------
+        ports : sequence of str
+            Output ports.
+        rates, indicators : bool
+            Whether the derivatives of the states, and the event indicators, are wanted.
+        """
+        key = (tuple(ports), rates, indicators)
+        if key not in self._evaluations:
+            self._evaluations[key] = self._bind(*key)
+        found = self._evaluations[key]
+
+        def evaluate(t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+            return self._run(found, t, x, u)
+
+        return evaluate
+
+    def _bind(self, ports: tuple[str, ...], rates: bool, indicators: bool) -> Evaluation:
+        outputs = {port: self.block.output_variables[port] for port in ports}
+        used = {port: v for port, v in self._smooth.items() if self._is_used(port, outputs, rates, indicators)}
+        index = [np.arange(self._places[p].start, self._places[p].stop) for p in used]
+        inputs = self._allocate(sum(v.size for v in used.values()))
+        got = self._allocate(sum(v.size for v in outputs.values()))
+        return Evaluation(
+            self.fmi,
+            time=self._time,
+            states=Vector("set_states", self._x),
+            inputs=Transfer(self.fmi, "Set", used, inputs),
+            index=np.concatenate([np.zeros(0, dtype=int), *index]),
+            outputs=Transfer(self.fmi, "Get", outputs, got),
+            rates=Vector("derivatives", self._dx) if rates else None,
+            indicators=Vector("indicators", self._indicators) if indicators else None,
+        )
+
+    def _is_used(self, port: str, outputs: dict[str, FmuVariable], rates: bool, indicators: bool) -> bool:
+        """Whether an input has to be set: what is wanted may depend on it."""
+        if indicators:
+            return True
+        unknown = [*outputs.values()]
+        if rates:
+            unknown += [self.description.find(name) for name in self.description.states.values()]
+            if not self.description.states:
+                return True
+        return any(self.about.pattern(of, self._ports[port]).any() for of in unknown)
+
+    def _run(self, made: Evaluation, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        self._x[:] = x[self._order]
+        try:
+            status, action = made.run(t, u, running=self._running)
+        except UnfitError as error:
+            raise self._unfit(error, t) from None
+        if status:
+            if status != DISCARD:
+                raise self._error(action, status, t)
+            self._discarded = f"{action} at t = {t:.9g} s"
+            made.result[:] = math.nan
+        elif made.rates is not None:
+            made.result[made.rates_at][self._order] = self._dx
+        return made.result
+
+    @property
+    def discarded(self) -> str:
+        """The last evaluation that the FMU could not compute; empty if there is none."""
+        return self._discarded
+
+    def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
+        """Return the derivative of an `evaluation` by (x, u); None if the FMU computes no directional derivatives."""
+        about = self.description
+        if not self.about.has_derivatives or (self._x.size and not about.states):
+            return None
+        self.evaluation(ports, rates=rates)(t, x, u)
+        outputs = [self.block.output_variables[port] for port in ports]
+        unknown = [*outputs, *(about.find(name) for name in about.states.values() if rates)]
+        smooth = [v for v in unknown if v.type == "Float64"]
+        rows = np.concatenate([np.zeros(0, dtype=bool), *(np.full(v.size, v.type == "Float64") for v in unknown)])
+        J = np.zeros((rows.size, x.size + u.size))
+        column = 0
+        known = [(about.find(name), True) for name in about.states]
+        known += [(v, port in self._smooth and v.type == "Float64") for port, v in self._ports.items()]
+        references = [r for v in smooth for r in v.references]
+        count = sum(v.size for v in smooth)
+        for variable, moves in known:
+            for k in range(variable.size):
+                if moves and count:
+                    refs, seed = seeds(variable, k)
+                    purpose = f"the directional derivative by {variable.name}"
+                    J[rows, column] = self.call(purpose, self.fmi.directional_derivative, references, refs, seed, count)
+                column += 1
+        return J
+
+    # ---- the start ----
+
+    def exchange(self, u: np.ndarray) -> np.ndarray:
+        """In Initialization Mode: set the inputs, and return the continuous states that follow."""
+        self._u = u.copy()
+        self._set(u, self._began)
+        return self._states()
+
+    def begin_exchange(self) -> np.ndarray:
+        """Leave Initialization Mode, settle the events at the start, and return the continuous states."""
+        self.begin()
+        self._time.value = self._began
+        x = self._iterate(self._began)
+        self.nominals = self._get("nominals")
+        return x
+
+    def _states(self) -> np.ndarray:
+        return self._get("get_states")
+
+    def _get(self, quantity: str) -> np.ndarray:
+        """Return a vector of the FMU's for its states."""
+        n = self._x.size
+        made = np.zeros(n)
+        if n:
+            address, length = ctypes.c_void_p(self._kept.ctypes.data), ctypes.c_size_t(n)
+            arguments = self.fmi.instance_argument, address, length
+            status = self.fmi.bind([(self.fmi.exchange_function(quantity), arguments)]).run()
+            if not 0 <= status <= WARNING:
+                raise self._error(_READING[quantity], status, self.t)
+            made[self._order] = self._kept
+        return made
+
+    def _set(self, u: np.ndarray, t: float) -> None:
+        """Set all wired inputs, discrete ones too."""
+        if not self._wired:
+            return
+        if self._all_inputs is None:
+            vector = self._allocate(sum(v.size for v in self._wired.values()))
+            self._all_inputs = Transfer(self.fmi, "Set", self._wired, vector)
+        self._all_inputs.vector[:] = np.concatenate([u[self._places[port]] for port in self._wired])
+        try:
+            status = self._all_inputs.set()
+        except UnfitError as error:
+            raise self._unfit(error, t) from None
+        if not 0 <= status <= WARNING:
+            raise self._error("setting the inputs", status, t)
+
+    # ---- events ----
+
+    def has_jumped(self, u: np.ndarray) -> bool:
+        """Whether an input has jumped since the last instant that was reached."""
+        for port, variable in self._wired.items():
+            now, before = u[self._places[port]], self._u[self._places[port]]
+            if port not in self._smooth:
+                if not np.array_equal(now, before):
+                    return True
+            elif np.any(np.abs(now - before) > _SAME * np.maximum(np.abs(now), variable.nominals.ravel())):
+                return True
+        return False
+
+    def handle_event(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Go through Event Mode at an instant, and return the continuous states after it."""
+        self.evaluation((), rates=False, indicators=bool(self.about.indicators))(t, x, u)
+        self.call("entering Event Mode", self.fmi.enter_event_mode)
+        self._set(u, t)
+        self._u = u.copy()
+        return self._iterate(t)
+
+    def _iterate(self, t: float) -> np.ndarray:
+        """Update the discrete states until they settle, and return to Continuous-Time Mode."""
+        nominals = False
+        for _ in range(_ROUNDS):
+            made = self.call("the event iteration", self.fmi.update_events)
+            nominals |= made.nominals_changed
+            if made.terminate:
+                raise self._termination(t, "in Event Mode")
+            if not made.again:
+                break
+        else:
+            raise FmuRuntimeError(
+                f"its discrete states don't settle at t = {t:.9g} s: after {_ROUNDS} rounds of the event iteration it "
+                f"still asks for another one{self._quote_messages()} Report it to its makers, or change the inputs "
+                "there.",
+                block=self.block.label,
+                t=t,
+            )
+        self.next_time = made.next_time
+        x = self._states()
+        if nominals:
+            self.nominals = self._get("nominals")
+        self.call("entering Continuous-Time Mode", self.fmi.enter_continuous_time_mode)
+        return x
+
+    def accept(self, t: float, x: np.ndarray, u: np.ndarray) -> bool:
+        """Note an instant that the solver has reached; return whether the FMU wants an event there (step event)."""
+        discrete = [port for port in self._wired if port not in self._smooth]
+        kept = {port: self._u[self._places[port]].copy() for port in discrete}
+        self._u = u.copy()
+        changed = False
+        for port, values in kept.items():  # they are taken over by an event alone
+            changed |= not np.array_equal(values, u[self._places[port]])
+            self._u[self._places[port]] = values
+        if not self.about.completes_steps:
+            return changed
+        self.evaluation((), rates=True)(t, x, u)
+        wants, terminate = self.call("completing a step", self.fmi.complete_step, self._final)
+        if terminate:
+            raise self._termination(t, "after a step of the solver")
+        return wants or changed
+
+    def _termination(self, t: float, place: str) -> FmuRuntimeError:
+        return FmuRuntimeError(
+            f"the FMU asks to end the simulation (terminateSimulation) {place} at t = {t:.9g} s"
+            f"{self._quote_messages()} End the run there, or look up the reason in the FMU's documentation.",
+            block=self.block.label,
+            t=t,
+        )
+
+    # ---- failures ----
+
+    def _error(self, action: str, status: int, t: float) -> FmuRuntimeError:
+        self.failed, self.fatal = status >= ERROR, status >= FATAL
+        u = ", ".join(f"{port} = {self._u[self._places[port]].tolist()}" for port in self._wired)
+        return FmuRuntimeError(
+            f"{action} failed with {self.fmi.status_name(status)} at t = {t:.9g} s{self._quote_messages()} Its states "
+            f"were {self._x.tolist()}, its inputs at the last step {u or 'none'}. Look at the last samples of "
+            "error.run, or check its inputs and start values.",
+            block=self.block.label,
+            t=t,
+        )
+
+    def _unfit(self, error: UnfitError, t: float) -> FmuRuntimeError:
+        advice = "Convert the signal before this input, with Quantizer, say, or leave this output out, by ports=."
+        return FmuRuntimeError(f"{error.reason}. {advice}", block=self.block.label, port=error.port, t=t)
+
+    # ---- saved states ----
+
+    def operating_point(self) -> dict[str, Any]:
+        """Return the present ``t``, ``state`` and ``inputs``, for `Fmu.linear_model`."""
+        about = self.description
+
+        def read(variable: FmuVariable) -> np.ndarray:
+            return self.read_variables([variable]).reshape(variable.shape)
+
+        state = {name: read(about.find(name)) for name in (*about.states, *about.discrete_states)}
+        return {"t": self.t, "state": state, "inputs": {port: read(v) for port, v in self._ports.items()}}
+
+    @property
+    def can_serialize(self) -> bool:
+        """Whether its state can be turned into bytes."""
+        return self.about.can_serialize
+
+    def serialize(self) -> bytes:
+        """Return its complete state.
+
+        Raises
+        ------
+        FmuError
+            If the FMU can't serialize its state (`can_serialize`).
+        FmuRuntimeError
+            If the FMU's function fails.
+        """
+        self._check_can()
+        self._final = False
+        handle = self.call("saving its state", self.fmi.save_state)
+        try:
+            data = self.call("serializing its state", self.fmi.serialize_state, handle)
+        finally:
+            self.free_state(handle)
+        return pack_state(self.description, self.t, self.next_time, self._u, bytes(data))
+
+    def restore_bytes(self, data: bytes) -> None:
+        """Go to a state that `serialize` has returned.
+
+        Raises
+        ------
+        FmuError
+            If the bytes are no state of this FMU in model exchange on this platform.
+        FmuRuntimeError
+            If the FMU's function fails.
+        """
+        self._check_can()
+        try:
+            t, next_time, u, rest = unpack_state(self.description, data, sum(v.size for v in self._ports.values()))
+        except FmuError as error:
+            raise error.at(block=self.block.label) from None
+        handle = self.call("reading a serialized state", self.fmi.deserialize_state, rest)
+        try:
+            self.call("restoring its state", self.fmi.set_state, handle)
+        finally:
+            self.free_state(handle)
+        self.failed, self._running, self._final = False, True, False
+        self._u, self.next_time, self._time.value = u, next_time, t
+
+    def _check_can(self) -> None:
+        if self.can_serialize:
+            return
+        flag = self.description.state_flags[1 if self.about.can_save else 0]
+        raise FmuError(
+            f"its state can't be turned into bytes: {flag} is false for model exchange in the FMU's description. "
+            "Export it with that capability, or run again from the start.",
+            block=self.block.label,
+        )
+
+
+_READING = {"get_states": "reading the continuous states", "nominals": "reading the nominal values of the states"}
+
+
+def is_smooth(variable: FmuVariable) -> bool:
+    """Whether an input may be set in Continuous-Time Mode: a real number that is not discrete."""
+    return variable.type in ("Float64", "Float32") and variable.variability == "continuous"
+
+
+def seeds(variable: FmuVariable, k: int) -> tuple[list[int], list[float]]:
+    """Return value references and seeds that move one element of a variable."""
+    if len(variable.references) == variable.size:
+        return [variable.references[k]], [1.0]
+    return list(variable.references), np.eye(variable.size)[k].tolist()

@@ -1,0 +1,164 @@
+"""An FMU in model exchange as a block: its states, its events, and what depends on what."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core import Array, Block, Event, FmuError, FmuFileError, ParameterError, State
+from ...blocks.tracing import NEXT
+from ..archive import FmuDescription, FmuVariable
+from ..calls import ExchangeInstance, is_smooth
+from ..isolation import open_fmu
+
+INTERFACES = ("co_simulation", "model_exchange")
+"""Interfaces of an FMU, as the parameter ``interface`` names them."""
+UNNAMED = "continuous_states"
+"""Name of the state of an FMU whose continuous states are no variables."""
+
+
+def choose_interface(description: FmuDescription, asked: str | None, label: str) -> str:
+    """Return the interface by which an FMU runs: that asked for, else co-simulation where it offers it.
+
+    Raises
+    ------
+    ParameterError
+        For an unknown name.
+    FmuFileError
+        If the FMU doesn't offer the interface.
+    """
+    if asked is None:
+        return INTERFACES[0] if description.co_simulation else INTERFACES[1]
+    if asked not in INTERFACES:
+        raise ParameterError(
+            f"found {asked!r}; expected {' or '.join(map(repr, INTERFACES))}, or None for co-simulation where the FMU "
+            "offers it.",
+            block=label,
+            port="interface",
+        )
+    there = description.co_simulation if asked == INTERFACES[0] else description.exchange is not None
+    if not there:
+        other = INTERFACES[asked == INTERFACES[0]]
+        raise FmuFileError(
+            f"{str(description.file)!r} has no {asked.replace('_', '-')} interface with a library for this platform; "
+            f"expected one. Take interface={other!r}, or export it with both.",
+            block=label,
+            port="interface",
+        )
+    return asked
+
+
+class ExchangeMembers(Block):
+    """Members of an FMU's block that make it one of model exchange."""
+
+    if TYPE_CHECKING:
+        interface: str | None
+        start: Mapping[str, Any]
+
+        @property
+        def description(self) -> FmuDescription: ...  # noqa: D102
+        @property
+        def input_variables(self) -> Mapping[str, FmuVariable]: ...  # noqa: D102
+        @property
+        def output_variables(self) -> Mapping[str, FmuVariable]: ...  # noqa: D102
+
+    @property
+    def used_interface(self) -> str:
+        """Interface by which a run uses it: ``"co_simulation"``, or ``"model_exchange"``: a solver integrates it."""
+        return choose_interface(self.description, self.interface, self.label)
+
+    @property
+    def stepped(self) -> bool:  # type: ignore[override]
+        """Whether a run steps it (co-simulation)."""
+        return self.used_interface == INTERFACES[0]
+
+    @property
+    def evaluated_outside(self) -> bool:  # type: ignore[override]
+        """Whether a run's solver integrates its states (model exchange)."""
+        return self.used_interface == INTERFACES[1]
+
+    @property
+    def states(self) -> Mapping[str, State]:  # type: ignore[override]
+        """The continuous states in model exchange; in co-simulation they are the FMU's own."""
+        return states_of(self) if self.evaluated_outside else {}
+
+    @property
+    def events(self) -> Mapping[str, Event]:  # type: ignore[override]
+        """The events of the indicators in model exchange."""
+        return events_of(self) if self.evaluated_outside else {}
+
+    def dependence(self, equation: str) -> Mapping[str, Array]:
+        """Return what depends on what in model exchange, by the model structure; see `loopwright.blocks.Block`."""
+        return dependence(self, equation, NEXT)
+
+    @contextmanager
+    def exchange(self, wired: Sequence[str], *, start_time: float = 0.0) -> Iterator[ExchangeInstance]:
+        """Load the FMU for a run in model exchange; it is terminated and freed at the end, in any case.
+
+        Parameters
+        ----------
+        wired : sequence of str
+            Input ports that the run sets.
+        start_time : float
+            Start of the run in s.
+        """
+        instance = open_fmu(ExchangeInstance, self, wired)
+        try:
+            instance.initialize(None, start_time=start_time)
+            yield instance
+        finally:
+            instance.close()
+
+
+def states_of(block: ExchangeMembers) -> dict[str, State]:
+    """Return the continuous states as those of a block, with start values and nominal values."""
+    about = block.description
+    exchange = about.exchange
+    if exchange is None:
+        raise FmuError("it has no model exchange. Take co-simulation.", block=block.label)
+    if not about.states:
+        n = exchange.state_count
+        return {UNNAMED: State(shape=(n,), name=UNNAMED, description="states that are no variables")} if n else {}
+    return {name: _state(block, about.find(name)) for name in about.states}
+
+
+def _state(block: ExchangeMembers, v: FmuVariable) -> State:
+    start = block.start.get(v.name, v.start)
+    value = np.zeros(v.shape) if start is None else np.broadcast_to(np.asarray(start, dtype=float), v.shape)
+    return State(v.unit, v.description, shape=v.shape, start=np.array(value), name=v.name)
+
+
+def events_of(block: ExchangeMembers) -> dict[str, Event]:
+    """Return one event for each indicator; a change of domain in both directions fires it."""
+    exchange = block.description.exchange
+    return {name: Event(name=name) for name in exchange.indicators} if exchange is not None else {}
+
+
+def dependence(block: ExchangeMembers, equation: str, rates: str) -> dict[str, np.ndarray]:
+    """Return which entries of an output, or of the derivatives (``rates``), depend on which of the states and inputs.
+
+    The states stand under ``"x"``, inputs under their ports. Discrete inputs and parameters act at events alone.
+    """
+    about, exchange = block.description, block.description.exchange
+    assert exchange is not None
+    n = exchange.state_count
+    states = [about.find(name) for name in about.states]
+    if equation != rates:
+        unknown = [block.output_variables[equation]]
+    else:
+        unknown = [about.find(name) for name in about.states.values()]
+    rows = n if equation == rates else unknown[0].size
+    found: dict[str, np.ndarray] = {}
+    for port, v in block.input_variables.items():
+        if is_smooth(v):
+            found[port] = _stack([exchange.pattern(of, v) for of in unknown], rows, v.size)
+    by_states = [_stack([exchange.pattern(of, v) for of in unknown], rows, v.size) for v in states]
+    found["x"] = np.hstack(by_states) if states else np.ones((rows, n), dtype=bool)
+    return found
+
+
+def _stack(parts: list[np.ndarray], rows: int, columns: int) -> np.ndarray:
+    return np.vstack(parts) if parts else np.ones((rows, columns), dtype=bool)
