@@ -1,4 +1,4 @@
-from .archive import FmuDescription, FmuVariable, read_description
+from .archive import ArchiveLimits, FmuDescription, FmuFault, FmuFinding, FmuVariable, read_description
 from .calls import FmuInstance, FmuState
 from .export import ModelSpec, Variable, build, build_fmu, build_python, clear_cache, model_spec
 from .models import (
@@ -14,8 +14,11 @@ from .models import (
 from .running import Fmu, FmuLinearization
 
 __all__ = [
+    "ArchiveLimits",
     "Fmu",
     "FmuDescription",
+    "FmuFault",
+    "FmuFinding",
     "FmuInstance",
     "FmuLinearization",
     "FmuState",

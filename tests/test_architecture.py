@@ -214,7 +214,7 @@ PUBLIC = {
         UnwiredInputError Value Wall WiringError ZeroPoleGain hold parameter parse_unit
     """,
     "fmus": """
-        Fmu FmuDescription FmuInstance FmuLinearization FmuState FmuVariable ModelSpec Variable bouncing_ball
+        ArchiveLimits Fmu FmuDescription FmuFault FmuFinding FmuInstance FmuLinearization FmuState FmuVariable ModelSpec Variable bouncing_ball
         build build_fmu build_python clear_cache dc_motor gantry gantry_contact gantry_elastic gantry_stiction
         mass_spring_damper model_spec read_description scara
     """,

@@ -6,6 +6,7 @@ from .exchange import ExchangeInfo
 from .faults import FmuFault, FmuFinding
 from .library import SharedLibrary, read_library
 from .limits import ArchiveLimits
+from .model import read_model
 from .unpacking import unpack, unpack_archive, write_files
 from .variables import FmuVariable, OtherVariable, inexact
 from .xml_text import parse_xml
@@ -30,6 +31,7 @@ __all__ = [
     "parse_xml",
     "read_description",
     "read_library",
+    "read_model",
     "unpack",
     "unpack_archive",
     "write_files",

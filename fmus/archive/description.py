@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import os
 import re
-import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -20,7 +18,8 @@ from .exchange import ExchangeInfo, read_exchange
 from .faults import FmuFault, FmuFinding
 from .gathering import Elements, gather
 from .limits import ArchiveLimits
-from .rules import check_dimensions, check_schema
+from .model import read_model
+from .rules import check_dimensions
 from .sizes import resize
 from .states import find_states
 from .units import FmuUnits
@@ -198,7 +197,15 @@ def _read(
     archive = FmuArchive.open(path, limits)
     entries, text = set(archive.files), archive.description()
     root = parse_xml(path, DESCRIPTION, text)
-    version = str(root.get("fmiVersion"))
+    version = root.get("fmiVersion")
+    if root.tag != "fmiModelDescription" or version is None:
+        raise FmuFileError(
+            f"the {DESCRIPTION} of {str(path)!r} is none: found the element {root.tag!r} "
+            f"{'without' if version is None else 'with'} an fmiVersion; expected 'fmiModelDescription' with one. "
+            "Export it again.",
+            fault=FmuFault.DESCRIPTION,
+            subject=DESCRIPTION,
+        )
     if not re.fullmatch(r"2\.0|3\.0(\.\d+)?", version):
         raise FmuFileError(
             f"{str(path)!r} is an FMU of FMI {version}; expected FMI 2.0 or 3.0. Export it again with one of "
@@ -206,7 +213,7 @@ def _read(
             fault=FmuFault.VERSION,
             subject=version,
         )
-    model, complaints = _parse(path, text, root)
+    model, complaints = read_model(path, text, root, limits)
     interface = model.coSimulation or model.modelExchange
     if interface is None:
         raise FmuFileError(
@@ -216,8 +223,9 @@ def _read(
     identifier = interface.modelIdentifier
     binary = find_binary(path, entries, version, identifier)
     try:
-        resize(model, dict(sizes))
-        check_dimensions(path, model, limits)
+        if sizes:
+            resize(model, dict(sizes))
+            check_dimensions(path, model, limits)
         found = _read_variables(path, entries, root, model)
     except FmuFileError:
         raise
@@ -232,26 +240,6 @@ def _read(
         version, path, archive.digest, model.modelName, identifier, model.instantiationToken or "",
         binary, complaints=complaints, limits=limits, findings=archive.findings, **found,
     )  # fmt: skip
-
-
-def _parse(path: Path, text: bytes, root: Any) -> tuple[Any, tuple[str, ...]]:
-    """Return FMPy's reading of a description, and the complaints about one that breaks rules of the standard."""
-    import fmpy
-    from fmpy.validation import validate_model_description
-
-    only = io.BytesIO()  # FMPy sees the checked description, and nothing else of the archive
-    with zipfile.ZipFile(only, "w") as archive:
-        archive.writestr(DESCRIPTION, text)
-    try:
-        model = fmpy.read_model_description(only, validate=False)
-        complaints = check_schema(root) or validate_model_description(model)
-    except Exception as error:  # FMPy raises bare exceptions
-        raise FmuFileError(
-            f"the {DESCRIPTION} of {str(path)!r} can't be read: {error}. Export it again.",
-            fault=FmuFault.DESCRIPTION,
-            subject=DESCRIPTION,
-        ) from error
-    return model, tuple(map(str, complaints))
 
 
 def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dict[str, Any]:
@@ -271,12 +259,6 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
     for v in model.modelVariables:
         if v.causality == "independent":
             continue
-        if v.name in scalars or v.name in other:
-            raise FmuFileError(
-                f"{str(path)!r} has two variables {v.name!r}; expected different names. Export it again.",
-                fault=FmuFault.DUPLICATE_NAME,
-                subject=v.name,
-            )
         if fmi3_type(v.type) in WIRE_TYPES:
             scalars[v.name] = read_variable(v, dropped.get(v.name, {}), units)
         else:
@@ -319,10 +301,9 @@ def _flag(interface: Any, name: str) -> bool:
 
 def _dropped_attributes(root: Any) -> dict[str, Mapping[str, str]]:
     """Return attributes that FMPy drops, by the variable's name: bounds of unsigned integers, intervals of clocks."""
-    variables = root.find("ModelVariables")
+    tags = " or ".join(f"starts-with(name(), '{kind}')" for kind in _DROPPED)
     found: dict[str, Mapping[str, str]] = {}
-    for element in () if variables is None else variables:
-        inner = next((e for e in element if e.tag == "Real"), element)  # of FMI 2.0
-        if any(element.tag.startswith(kind) for kind in _DROPPED) or "relativeQuantity" in inner.attrib:
-            found[element.attrib.get("name", "")] = inner.attrib
+    for element in root.xpath(f"ModelVariables/*[{tags} or @relativeQuantity or Real/@relativeQuantity]"):
+        inner = element.find("Real")  # of FMI 2.0
+        found[element.get("name", "")] = (element if inner is None else inner).attrib
     return found

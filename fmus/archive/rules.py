@@ -36,31 +36,74 @@ def _schema(major: str) -> Any:
     return etree.XMLSchema(file=str(folder / f"fmi{major}" / f"{name}.xsd"))
 
 
-def check_dimensions(path: Path, model: Any, limits: ArchiveLimits) -> None:
-    """Refuse variables of impossible or huge shape.
+def check_variables(path: Path, root: Any, model: Any, limits: ArchiveLimits) -> None:
+    """Refuse variables that can't be told apart, or have no possible type or shape.
 
     Parameters
     ----------
     path : Path
         The FMU, for messages.
+    root : lxml.etree.Element
+        Root of its description.
     model : fmpy.model_description.ModelDescription
-        Its description.
+        FMPy's reading of it.
     limits : ArchiveLimits
         Limits; `elements` counts.
 
     Raises
     ------
     FmuFileError
-        If a size is negative, or a variable has too many elements.
+        If two variables have one name, or one value reference with different types or shapes; if a reference is no
+        unsigned integer of 32 bits, a variable of FMI 1.0 or 2.0 has no type, or a variable has a negative size or too
+        many elements.
     """
+
+    def refuse(fault: FmuFault, name: str, text: str) -> FmuFileError:
+        return FmuFileError(f"the variable {name!r} of {str(path)!r} {text}", fault=fault, subject=name)
+
+    if not model.fmiVersion.startswith("3."):
+        for element in root.xpath(f"ModelVariables/*[@name and not({' or '.join(_TYPES2)})]"):
+            # FMPy would give it the type of the variable before
+            text = f"has no type; expected one of {', '.join(_TYPES2)}. Export it again."
+            raise refuse(FmuFault.DESCRIPTION, element.get("name"), text)
+    check_dimensions(path, model, limits)
+    names: set[str] = set()
+    by_reference: dict[int, Any] = {}
+    for v in model.modelVariables:
+        if v.name in names:
+            raise FmuFileError(
+                f"{str(path)!r} has two variables {v.name!r}; expected different names. Export it again.",
+                fault=FmuFault.DUPLICATE_NAME,
+                subject=v.name,
+            )
+        names.add(v.name)
+        if not 0 <= v.valueReference < 2**32:
+            text = f"has the value reference {v.valueReference}; expected 0 to 2**32 - 1. Export it again."
+            raise refuse(FmuFault.DUPLICATE_REFERENCE, v.name, text)
+        if not model.fmiVersion.startswith("3.") or getattr(v, "alias", None) is not None:
+            continue  # variables of one reference are aliases in FMI 2.0 (2.2.7); in FMI 3.0 aliases are elements
+        other = by_reference.setdefault(v.valueReference, v)
+        if (other.type, other.shape) != (v.type, v.shape):
+            text = (
+                f"has the value reference {v.valueReference} of {other.name!r}, but another type or shape; expected a "
+                "reference of its own. Export it again."
+            )
+            raise refuse(FmuFault.DUPLICATE_REFERENCE, v.name, text)
+
+
+_TYPES2 = ("Real", "Integer", "Boolean", "String", "Enumeration")
+
+
+def check_dimensions(path: Path, model: Any, limits: ArchiveLimits) -> None:
+    """Refuse variables with a negative size or too many elements; parameters are those of `check_variables`."""
     for v in model.modelVariables:
         shape = v.shape or ()
         if any(n < 0 for n in shape) or math.prod(shape) > limits.elements:
             sizes = " × ".join(map(str, shape))
+            text = (
+                f"has the dimensions {sizes}; expected none below 0, and at most {limits.elements} elements. Check the "
+                "start values of its dimensions, or raise the limit: limits=ArchiveLimits(elements=…)."
+            )
             raise FmuFileError(
-                f"the variable {v.name!r} of {str(path)!r} has the dimensions {sizes}; expected none below 0, and at "
-                f"most {limits.elements} elements. Check the start values of its dimensions, or raise the limit: "
-                "limits=ArchiveLimits(elements=…).",
-                fault=FmuFault.DIMENSION,
-                subject=v.name,
+                f"the variable {v.name!r} of {str(path)!r} {text}", fault=FmuFault.DIMENSION, subject=v.name
             )

@@ -36,7 +36,7 @@ def unpack(description: FmuDescription) -> Path:
             "the block again, Fmu(…), to take the new one.",
             fault=FmuFault.DAMAGED,
         )
-    check_binary(archive, description.binary, description.fmi)
+    check_binary(archive, description.binary, description.fmi, model_exchange=not description.co_simulation)
     unpack_archive(archive, folder)
     return folder
 

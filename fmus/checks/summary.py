@@ -11,8 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ...blocks.core import FmuFileError
-from ..archive import DESCRIPTION, FmuArchive, FmuFault, parse_xml
+from ..archive import DESCRIPTION, FmuArchive, parse_xml, read_model
 from ..platform import native_platform
 from .libraries import binaries_of, native_binary, tuple_of
 
@@ -43,7 +42,8 @@ def summarize(file: Path) -> dict[str, Any]:
         If it can't be read.
     """
     archive, root = open_fmu(file)
-    entries, model = sorted(archive.files), read_model(archive)
+    entries = sorted(archive.files)
+    model, _ = read_model(file, archive.description(), root)
     fmi = str(model.fmiVersion)
     binaries = binaries_of(entries)
     native = native_platform()
@@ -99,27 +99,6 @@ def open_fmu(file: Path) -> tuple[FmuArchive, Any]:
     """
     archive = FmuArchive.open(file)
     return archive, parse_xml(file, DESCRIPTION, archive.description())
-
-
-def read_model(archive: FmuArchive) -> Any:
-    """Return FMPy's reading of a checked description, without validation.
-
-    Raises
-    ------
-    FmuFileError
-        If FMPy can't read it.
-    """
-    import fmpy
-
-    try:
-        return fmpy.read_model_description(archive.for_fmpy(), validate=False)
-    except Exception as error:  # FMPy raises bare exceptions
-        raise FmuFileError(
-            f"the {DESCRIPTION} of {str(archive.path)!r} can't be read: {error}. List its faults with "
-            f"loopwright validate {archive.path}",
-            fault=FmuFault.DESCRIPTION,
-            subject=DESCRIPTION,
-        ) from error
 
 
 # --- interfaces -----------------------------------------------------------------------------------------------------

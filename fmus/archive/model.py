@@ -1,0 +1,70 @@
+"""Description of an FMU as FMPy reads it, from a text that was checked before."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+from typing import Any
+
+from ...blocks.core import FmuFileError
+from .faults import FmuFault
+from .limits import ArchiveLimits
+from .repair import repair
+from .rules import check_schema, check_variables
+from .zip_file import DESCRIPTION
+
+
+def read_model(path: Path, text: bytes, root: Any, limits: ArchiveLimits | None = None) -> tuple[Any, tuple[str, ...]]:
+    """Return FMPy's reading of a description, and complaints about rules of the standard that it breaks.
+
+    Parameters
+    ----------
+    path : Path
+        The FMU, for messages.
+    text : bytes
+        Its ``modelDescription.xml``.
+    root : lxml.etree.Element
+        The root of that; references that don't exist are taken out of it.
+    limits : ArchiveLimits, optional
+        Limits of the number of elements of a variable.
+
+    Raises
+    ------
+    FmuFileError
+        If it can't be read, or is refused by `check_variables`.
+    """
+    from fmpy.validation import validate_model_description
+    from lxml import etree
+
+    repaired: list[str] = []
+    try:
+        schema = check_schema(root)
+        try:
+            model = _read_model(text)
+        except Exception:  # FMPy raises bare exceptions
+            repaired = repair(root)
+            if not repaired:
+                raise
+            model = _read_model(etree.tostring(root))
+        check_variables(path, root, model, limits or ArchiveLimits())
+        complaints = repaired or schema or validate_model_description(model)
+    except FmuFileError:
+        raise
+    except Exception as error:
+        raise FmuFileError(
+            f"the {DESCRIPTION} of {str(path)!r} can't be read: {error}. Export it again.",
+            fault=FmuFault.DESCRIPTION,
+            subject=DESCRIPTION,
+        ) from error
+    return model, tuple(map(str, complaints))
+
+
+def _read_model(text: bytes) -> Any:
+    """Return FMPy's reading of a checked description; FMPy sees nothing else of the archive."""
+    import fmpy
+
+    only = io.BytesIO()
+    with zipfile.ZipFile(only, "w") as archive:
+        archive.writestr(DESCRIPTION, text)
+    return fmpy.read_model_description(only, validate=False)
