@@ -1,5 +1,6 @@
-from .archive import ArchiveLimits, FmuDescription, FmuFault, FmuFinding, FmuVariable, read_description
+from .archive import ArchiveLimits, FmuDescription, FmuFault, FmuFinding, FmuSeverity, FmuVariable, read_description
 from .calls import FmuInstance, FmuState
+from .checks import FmuDiagnosis, FmuTrial, FmuVerdict, doctor
 from .export import ModelSpec, Variable, build, build_fmu, build_python, clear_cache, model_spec
 from .models import (
     bouncing_ball,
@@ -17,12 +18,16 @@ __all__ = [
     "ArchiveLimits",
     "Fmu",
     "FmuDescription",
+    "FmuDiagnosis",
     "FmuFault",
     "FmuFinding",
     "FmuInstance",
     "FmuLinearization",
+    "FmuSeverity",
     "FmuState",
+    "FmuTrial",
     "FmuVariable",
+    "FmuVerdict",
     "ModelSpec",
     "Variable",
     "bouncing_ball",
@@ -31,6 +36,7 @@ __all__ = [
     "build_python",
     "clear_cache",
     "dc_motor",
+    "doctor",
     "gantry",
     "gantry_contact",
     "gantry_elastic",

@@ -214,8 +214,9 @@ PUBLIC = {
         UnwiredInputError Value Wall WiringError ZeroPoleGain hold parameter parse_unit
     """,
     "fmus": """
-        ArchiveLimits Fmu FmuDescription FmuFault FmuFinding FmuInstance FmuLinearization FmuState FmuVariable ModelSpec Variable bouncing_ball
-        build build_fmu build_python clear_cache dc_motor gantry gantry_contact gantry_elastic gantry_stiction
+        ArchiveLimits Fmu FmuDescription FmuDiagnosis FmuFault FmuFinding FmuInstance FmuLinearization FmuSeverity FmuState
+        FmuTrial FmuVariable FmuVerdict ModelSpec Variable bouncing_ball
+        build build_fmu build_python clear_cache dc_motor doctor gantry gantry_contact gantry_elastic gantry_stiction
         mass_spring_damper model_spec read_description scara
     """,
     "diagrams": """

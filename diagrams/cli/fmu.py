@@ -1,4 +1,4 @@
-"""The commands for FMUs: ``loopwright build``, ``loopwright inspect``, ``loopwright validate``."""
+"""The commands for FMUs: ``loopwright build``, ``inspect``, ``validate``, ``doctor``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from ...fmus.export import TARGETS, build_python
 from ...fmus.export import build as build_model
 from ...fmus.models import gantry
 from ...fmus.platform import native_platform
-from .text import fit, say
+from .doctor import add_doctor, run_doctor
+from .text import check_file, fit, say
 from .user_models import load_user_model
 
 _WIDTH = 120  # of a table that goes into a file
@@ -30,7 +31,7 @@ _STATUS = "\n\nexit status: 0 done, 1 {one}, 2 wrong usage"
 
 
 def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add the three commands to the parser of `main`."""
+    """Add the commands to the parser of `main`."""
     raw = argparse.RawDescriptionHelpFormatter
     build = commands.add_parser(
         "build",
@@ -79,6 +80,7 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     check.add_argument("file", metavar="FILE.fmu")
     check.add_argument("--no-run", action="store_true", help="don't run it: an FMU is a program of its maker's")
+    add_doctor(commands)
 
 
 def _parse_positive(text: str) -> float:
@@ -89,14 +91,6 @@ def _parse_positive(text: str) -> float:
     if not (math.isfinite(value) and value > 0.0):
         raise argparse.ArgumentTypeError(f"found {text!r}; expected a positive number")
     return value
-
-
-def _check_file(name: str) -> Path:
-    path = Path(name).expanduser()
-    if not path.is_file():
-        found = "is a folder" if path.is_dir() else "there is no such file"
-        raise OptionError(f"{found}; expected an FMU. Check the path.", block=str(path))
-    return path
 
 
 def _complain(error: object) -> int:
@@ -221,7 +215,7 @@ def _size_text(n: int) -> str:
 
 def run_inspect(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright inspect``."""
-    path = _check_file(arguments.file)
+    path = check_file(arguments.file)
     try:
         summary = summarize(path)
     except FmuFileError as error:
@@ -317,7 +311,7 @@ def _start_text(value: Any) -> str:
 
 def run_validate(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright validate``."""
-    path = _check_file(arguments.file)
+    path = check_file(arguments.file)
     try:
         report = validate(path, run=not arguments.no_run)
     except KeyboardInterrupt:
@@ -339,5 +333,6 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
     "build": run_build,
     "inspect": run_inspect,
     "validate": run_validate,
+    "doctor": run_doctor,
 }
 """The function of each command, by the command's name."""

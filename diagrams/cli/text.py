@@ -1,9 +1,12 @@
-"""Output of the command line, as the terminal can show it."""
+"""Output of the command line, as the terminal can show it, and files that are named on it."""
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import IO
+
+from ...blocks.core import OptionError
 
 _PLAIN = str.maketrans(
     {"η": "eta", "ξ": "xi", "θ": "theta", "σ": "sigma", "κ": "kappa", "ζ": "zeta", "∥": "_par", "⊥": "_perp", "²": "2"}
@@ -25,3 +28,18 @@ def fit(text: str, stream: IO[str]) -> str:
     except UnicodeEncodeError:
         return text.translate(_PLAIN).encode(encoding, "replace").decode(encoding)
     return text
+
+
+def check_file(name: str) -> Path:
+    """Return the path of an FMU that is named on the command line.
+
+    Raises
+    ------
+    OptionError
+        If there is no such file.
+    """
+    path = Path(name).expanduser()
+    if not path.is_file():
+        found = "is a folder" if path.is_dir() else "there is no such file"
+        raise OptionError(f"{found}; expected an FMU. Check the path.", block=str(path))
+    return path

@@ -3,7 +3,7 @@
 from .binaries import check_binary, find_binary, missing_functions
 from .description import FmuDescription, read_description
 from .exchange import ExchangeInfo
-from .faults import FmuFault, FmuFinding
+from .faults import FmuFault, FmuFinding, FmuSeverity
 from .library import SharedLibrary, read_library
 from .limits import ArchiveLimits
 from .model import read_model
@@ -21,6 +21,7 @@ __all__ = [
     "FmuDescription",
     "FmuFault",
     "FmuFinding",
+    "FmuSeverity",
     "FmuVariable",
     "OtherVariable",
     "SharedLibrary",

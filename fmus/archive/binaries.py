@@ -28,6 +28,9 @@ def find_binary(path: Path, entries: Collection[str], version: str, identifier: 
     """Return the library for this platform: that of the model identifier, else the only one in the folder."""
     platform = native_platform()
     folder = _FOLDERS2.get(platform, platform) if version.startswith("2.") else platform
+    with_abi = {e.split("/")[1] for e in entries if e.startswith(f"binaries/{platform}-")}  # FMI 3.0, 2.5.1.4
+    if with_abi and not any(e.startswith(f"binaries/{folder}/") for e in entries):
+        folder = min(with_abi)
     here = sorted(e for e in entries if e.startswith(f"binaries/{folder}/") and e.endswith(_SUFFIXES))
     named = [e for e in here if e.rpartition("/")[2].rpartition(".")[0] == identifier]
     direct = named or [e for e in here if e.count("/") == 2]

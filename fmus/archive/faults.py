@@ -51,23 +51,34 @@ class FmuFault(StrEnum):
     TRIAL = "failed trial run"
 
 
+class FmuSeverity(StrEnum):
+    """Weight of a finding."""
+
+    ERROR = "error"
+    WARNING = "warning"
+    NOTE = "note"
+
+
 @dataclass(frozen=True)
 class FmuFinding:
-    """Fault of an FMU file that does not keep it from being read.
+    """Fault of an FMU file, or a note on its use.
 
     Parameters
     ----------
     fault : FmuFault
         Kind of the fault.
     subject : str
-        File of the archive, variable, library or attribute concerned; empty for the whole FMU.
+        File of the archive, library, function, variable or attribute concerned; empty for the whole FMU.
     found : str
         The fault in a sentence, with its place.
     step : str
         The next step.
+    severity : FmuSeverity
+        An error keeps the FMU from running here, a warning does not.
     """
 
     fault: FmuFault
     subject: str
     found: str
     step: str
+    severity: FmuSeverity = FmuSeverity.WARNING

@@ -14,7 +14,7 @@ class ArchiveLimits:
 
     Parameters
     ----------
-    size : int
+    size : float
         Bytes of all files, unpacked.
     entries : int
         Number of files and folders.
@@ -37,7 +37,7 @@ class ArchiveLimits:
     100000
     """
 
-    size: int = 8 * 10**9
+    size: float = 8e9
     entries: int = 100_000
     ratio: float = 100.0
     description: int = 10**9

@@ -37,6 +37,22 @@ def read_model(path: Path, text: bytes, root: Any, limits: ArchiveLimits | None 
     from fmpy.validation import validate_model_description
     from lxml import etree
 
+    version = root.get("fmiVersion")
+    if root.tag != "fmiModelDescription" or version is None:
+        raise FmuFileError(
+            f"the {DESCRIPTION} of {str(path)!r} is none: found the element {root.tag!r} "
+            f"{'without' if version is None else 'with'} an fmiVersion; expected 'fmiModelDescription' with one. "
+            "Export it again.",
+            fault=FmuFault.DESCRIPTION,
+            subject=DESCRIPTION,
+        )
+    if version not in ("1.0", "2.0") and not version.startswith("3."):
+        raise FmuFileError(
+            f"{str(path)!r} is an FMU of FMI {version}; expected FMI 1.0, 2.0 or 3.0. Export it again with one of "
+            "them.",
+            fault=FmuFault.VERSION,
+            subject=version,
+        )
     repaired: list[str] = []
     try:
         schema = check_schema(root)

@@ -66,8 +66,8 @@ class FmuArchive:
         """
         path, limits = Path(file).expanduser(), limits or ArchiveLimits()
         if not path.is_file():
-            found = "is a folder" if path.is_dir() else "there is no such file"
-            raise FmuFileError(f"{str(path)!r}: {found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
+            found = f"{str(path)!r} is a folder" if path.is_dir() else f"there is no file {str(path)!r}"
+            raise FmuFileError(f"{found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
         with _reading(path):
             if path.stat().st_size > limits.size:
                 raise FmuFileError(

@@ -1,10 +1,16 @@
-"""Inspection, validation and trial runs of FMUs."""
+"""Inspection, validation, examination and trial runs of FMUs."""
 
+from .diagnosis import FmuDiagnosis, FmuTrial, FmuVerdict
+from .doctor import doctor
 from .summary import INTERFACES, summarize
 from .validation import validate
 
 __all__ = [
     "INTERFACES",
+    "FmuDiagnosis",
+    "FmuTrial",
+    "FmuVerdict",
+    "doctor",
     "summarize",
     "validate",
 ]

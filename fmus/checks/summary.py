@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ..archive import DESCRIPTION, FmuArchive, parse_xml, read_model
+from ..archive import DESCRIPTION, ArchiveLimits, FmuArchive, parse_xml, read_model
 from ..platform import native_platform
 from .libraries import binaries_of, native_binary, tuple_of
 
@@ -23,13 +23,15 @@ INTERFACES = {
 """Names of the interfaces by their elements in ``modelDescription.xml``."""
 
 
-def summarize(file: Path) -> dict[str, Any]:
+def summarize(file: Path, *, limits: ArchiveLimits | None = None) -> dict[str, Any]:
     """Return a summary of an FMU's description and archive.
 
     Parameters
     ----------
     file : Path
         An FMU of FMI 1.0, 2.0 or 3.0.
+    limits : ArchiveLimits, optional
+        Limits of its size; the usual ones without it.
 
     Returns
     -------
@@ -41,9 +43,9 @@ def summarize(file: Path) -> dict[str, Any]:
     FmuFileError
         If it can't be read.
     """
-    archive, root = open_fmu(file)
+    archive, root = open_fmu(file, limits)
     entries = sorted(archive.files)
-    model, _ = read_model(file, archive.description(), root)
+    model, _ = read_model(file, archive.description(), root, limits)
     fmi = str(model.fmiVersion)
     binaries = binaries_of(entries)
     native = native_platform()
@@ -85,11 +87,12 @@ def summarize(file: Path) -> dict[str, Any]:
         "event_indicators": _count(_variable(u.variable, False) for u in model.eventIndicators)
         or int(model.numberOfEventIndicators or 0),
         "variables": variables,
+        "python": _needs_python(entries, model.generationTool or ""),
         "notes": _notes(fmi, entries, interfaces, model.generationTool or ""),
     }
 
 
-def open_fmu(file: Path) -> tuple[FmuArchive, Any]:
+def open_fmu(file: Path, limits: ArchiveLimits | None = None) -> tuple[FmuArchive, Any]:
     """Return an FMU's archive and the root element of its ``modelDescription.xml``.
 
     Raises
@@ -97,7 +100,7 @@ def open_fmu(file: Path) -> tuple[FmuArchive, Any]:
     FmuFileError
         If the archive is unsafe, damaged or no FMU, or if its description can't be read.
     """
-    archive = FmuArchive.open(file)
+    archive = FmuArchive.open(file, limits)
     return archive, parse_xml(file, DESCRIPTION, archive.description())
 
 
@@ -122,6 +125,10 @@ def _flag(text: str) -> Any:
     return _number(text) if text[:1].isdigit() else text
 
 
+def _needs_python(entries: Iterable[str], tool: str) -> bool:
+    return tool.startswith("PythonFMU") or "resources/slavemodule.txt" in set(entries)
+
+
 def _notes(fmi: str, entries: Iterable[str], interfaces: Mapping[str, Mapping[str, Any]], tool: str) -> list[str]:
     """Return notes on the limits of an FMU's use."""
     notes = []
@@ -130,8 +137,7 @@ def _notes(fmi: str, entries: Iterable[str], interfaces: Mapping[str, Mapping[st
             "FMI 1.0 can be read here and nothing else: it can't become a block, and its validation does not run it. "
             "Export it with FMI 3.0."
         )
-    python = tool.startswith("PythonFMU") or "resources/slavemodule.txt" in set(entries)
-    if python:
+    if _needs_python(entries, tool):
         notes.append(
             "It needs Python: its equations are Python code that runs in an interpreter (PythonFMU), with the packages "
             "that they import. On Linux it loads only in a process that has libpython loaded, such as Python's own."

@@ -18,15 +18,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..archive import FmuArchive, check_binary, find_binary, write_files
+from ..archive import DESCRIPTION, FmuArchive, check_binary, find_binary, parse_xml, read_model, write_files
 
 _MESSAGES = 20
 
 
 def main(file: str, interface: str, report: str) -> None:
     """Instantiate, initialize, step once, get the outputs, terminate."""
-    import fmpy
-
     with open(report, "w", encoding="utf-8") as stream, tempfile.TemporaryDirectory(prefix="loopwright-") as folder:
 
         def tell(stage: str, **more: Any) -> None:
@@ -45,12 +43,14 @@ def main(file: str, interface: str, report: str) -> None:
             begin("load")
             archive = FmuArchive.open(file)
             write_files(archive, Path(folder))
-            model = fmpy.read_model_description(archive.for_fmpy(), validate=False)
+            text = archive.description()
+            model, _ = read_model(archive.path, text, parse_xml(archive.path, DESCRIPTION, text))
             library = _find_library(archive, model, interface)
             notes = _run(folder, model, interface, library, begin, messages)
         except Exception as error:
             said = [m for m in messages if m.strip()]
-            tell("failed", at=stage, error=f"{type(error).__name__}: {error}", messages=said[-3:])
+            kind = "" if type(error) is Exception else f"{type(error).__name__}: "  # FMPy raises bare exceptions
+            tell("failed", at=stage, error=f"{kind}{error}", messages=said[-3:])
         else:
             tell("done", **notes)
 

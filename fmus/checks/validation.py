@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import posixpath
 import signal
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from ...blocks.core import FmuFileError
-from ..archive import BUILD_DESCRIPTION, DESCRIPTION, FmuArchive, parse_xml, read_library
+from ..archive import BUILD_DESCRIPTION, DESCRIPTION, ArchiveLimits, FmuArchive, FmuFault, parse_xml, read_library
 from ..platform import native_platform
 from .libraries import binaries_of, library_name, native_libraries, tuple_of
 from .summary import INTERFACES, open_fmu
@@ -41,10 +42,16 @@ class FmuProblem:
         The fault, and its place.
     step : str
         The next step.
+    fault : FmuFault
+        Kind of the fault.
+    subject : str
+        File of the archive concerned; empty for the description, and for a run.
     """
 
     found: str
     step: str
+    fault: FmuFault = FmuFault.STANDARD
+    subject: str = ""
 
 
 @dataclass(frozen=True)
@@ -66,7 +73,7 @@ class ValidationReport:
     left: tuple[str, ...]
 
 
-def validate(file: Path, *, run: bool = True) -> ValidationReport:
+def validate(file: Path, *, run: bool = True, limits: ArchiveLimits | None = None) -> ValidationReport:
     """Validate an FMU.
 
     Parameters
@@ -75,9 +82,11 @@ def validate(file: Path, *, run: bool = True) -> ValidationReport:
         The FMU.
     run : bool
         Whether to run it, in a process of its own.
+    limits : ArchiveLimits, optional
+        Limits of its size; the usual ones without it.
     """
     try:
-        archive, root = open_fmu(file)
+        archive, root = open_fmu(file, limits)
     except FmuFileError as error:
         problem = FmuProblem(str(error), "Take another file: this one is not read any further.")
         return ValidationReport((problem,), (), ())
@@ -93,7 +102,7 @@ def validate(file: Path, *, run: bool = True) -> ValidationReport:
     left: list[str] = []
     if fmi != "1.0":
         problems += [FmuProblem(found, again) for found in (*_initial_unknowns(root), *_sources(archive, root))]
-    problems += [FmuProblem(*pair) for pair in _binaries(archive, root, tool)]
+    problems += _binaries(archive, root, tool)
     folders = binaries_of(entries)
     if folders:
         done.append(f"binaries for {', '.join(folders)}")
@@ -102,7 +111,7 @@ def validate(file: Path, *, run: bool = True) -> ValidationReport:
         if element is None or not run:
             continue
         name = INTERFACES[kind]
-        reason = _reason_not_to_run(kind, element, folders)
+        reason = reason_not_to_run(kind, element, folders)
         if reason:
             left.append(f"{name} was not run: {reason}")
             continue
@@ -121,13 +130,14 @@ def validate(file: Path, *, run: bool = True) -> ValidationReport:
 def _archive(archive: FmuArchive) -> Iterator[FmuProblem]:
     """Yield the findings about the archive, and the files in it that are damaged."""
     for finding in archive.findings:
-        yield FmuProblem(finding.found, finding.step)
+        yield FmuProblem(_end_sentence(finding.found), finding.step, finding.fault, finding.subject)
     for name in archive.files:
         try:
             for _ in archive.chunks(name):
                 pass
         except FmuFileError as error:
-            yield FmuProblem(f"the archive is damaged: {name}: {error}", "Copy or export it again.")
+            found = f"the archive is damaged: {name}: {error}"
+            yield FmuProblem(found, "Copy or export it again.", FmuFault.DAMAGED, name)
 
 
 def _description(archive: FmuArchive, again: str) -> Iterator[FmuProblem]:
@@ -182,7 +192,7 @@ def _sources(archive: FmuArchive, root: Any) -> Iterator[str]:
         declared = [e.get("name") for kind in INTERFACES for e in root.findall(f"{kind}/SourceFiles/File")]
         where = DESCRIPTION
     for name in dict.fromkeys(declared):
-        if f"sources/{name}" not in archive.files:
+        if posixpath.normpath(f"sources/{name}") not in archive.files:
             yield f"{where} declares the source file {name}; there is no sources/{name}."
 
 
@@ -197,12 +207,13 @@ def _identifiers(root: Any) -> dict[str, str]:
     return {name: element.get("modelIdentifier") for name, element in found if element is not None}
 
 
-def _binaries(archive: FmuArchive, root: Any, tool: str) -> Iterator[tuple[str, str]]:
+def _binaries(archive: FmuArchive, root: Any, tool: str) -> Iterator[FmuProblem]:
     """Yield faults of libraries: missing, of another name, cut off, or for another machine than their folder's."""
     build = f"Export it again with its tool ({tool}); if it has sources, fmpy compile builds it for this machine."
     folders = binaries_of(archive.files)
     if not folders and not any(name.startswith("sources/") for name in archive.files):
-        yield "it holds neither a binary nor sources, so that nothing can run it.", build
+        found = "it holds neither a binary nor sources, so that nothing can run it."
+        yield FmuProblem(found, build, FmuFault.NO_BINARY)
     for folder, names in folders.items():
         platform = tuple_of(folder)
         if platform is None:
@@ -212,26 +223,38 @@ def _binaries(archive: FmuArchive, root: Any, tool: str) -> Iterator[tuple[str, 
             if library not in names:
                 has = f"binaries/{folder} has no {library}, needed for {' and '.join(users)}; it has"
                 step = f"Put {library} there, or take the folder out. {build}"
-                yield f"{has} {', '.join(names)}.", step
+                yield FmuProblem(f"{has} {', '.join(names)}.", step, FmuFault.OTHER_NAME, f"binaries/{folder}")
                 continue
+            place = f"binaries/{folder}/{library}"
             try:
-                header = read_library(archive.read(f"binaries/{folder}/{library}"))
+                header = read_library(archive.read(place))
             except FmuFileError:  # damage, which is reported already
                 continue
             if platform not in header.platforms:
                 is_for = " and ".join(header.platforms) or "no platform known here: it is no shared library"
-                yield (
-                    f"binaries/{folder}/{library} is for {is_for}; expected {platform}.",
-                    f"Put the library that is for {platform} there, or take the folder out.",
-                )
+                found = f"{place} is for {is_for}; expected {platform}."
+                step = f"Put the library that is for {platform} there, or take the folder out."
+                yield FmuProblem(found, step, FmuFault.OTHER_PLATFORM, place)
             elif header.damage:
-                yield f"binaries/{folder}/{library} can't be loaded: {header.damage}.", "Copy or export it again."
+                found = f"{place} can't be loaded: {header.damage}."
+                yield FmuProblem(found, "Copy or export it again.", FmuFault.TRUNCATED, place)
 
 
 # --- running --------------------------------------------------------------------------------------------------------
 
 
-def _reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]]) -> str:
+def reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]]) -> str:
+    """Return the reason why an interface can't be run here; empty if there is none.
+
+    Parameters
+    ----------
+    kind : str
+        Element of the interface, such as "CoSimulation".
+    element : mapping
+        Its attributes; an XML element serves.
+    folders : mapping
+        Libraries by folder, as `binaries_of` returns them.
+    """
     if kind == "ScheduledExecution":
         return "scheduled execution needs a scheduler"
     native = native_platform()
@@ -282,24 +305,30 @@ def try_out(file: Path, interface: str) -> FmuProblem | None:
         return FmuProblem(
             f"{name}: {STAGES.get(last['stage'], 'it')} has not ended after {PATIENCE:g} s.{said}",
             "Run it in the tool that exported it; it may wait for a licence or another program.",
+            FmuFault.TRIAL,
         )
     if last["stage"] == "done":
         if last["not_finite"]:
             return FmuProblem(
                 f"{name}: after one step from its start values, {', '.join(last['not_finite'])} is no finite number.",
                 "Check its start values and inputs: see them with loopwright inspect.",
+                FmuFault.TRIAL,
             )
         return None if process.returncode == 0 else FmuProblem(
-            f"{name}: it ran, and then {_describe_exit(process.returncode)}.{said}", "Report it to its makers."
+            f"{name}: it ran, and then {_describe_exit(process.returncode)}.{said}", "Report it to its makers.",
+            FmuFault.TRIAL,
         )  # fmt: skip
     if last["stage"] == "failed":
         step = "Check its start values and inputs: see them with loopwright inspect."
         if last["at"] == "load":
-            step = "Install the libraries that it lacks here: loopwright inspect names them."
-        return FmuProblem(f"{name}: {STAGES[last['at']]} failed: {last['error']}{said}", step)
+            step = "If it says nothing of use, look for libraries that it lacks: loopwright doctor names them."
+        return FmuProblem(
+            f"{name}: {STAGES[last['at']]} failed: {_end_sentence(last['error'])}{said}", step, FmuFault.TRIAL
+        )
     return FmuProblem(
         f"{name}: {STAGES[last['stage']]} {_describe_exit(process.returncode)}.{said}",
         "Don't load it into a program whose work you need. Report it to its makers.",
+        FmuFault.TRIAL,
     )
 
 

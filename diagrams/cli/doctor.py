@@ -1,0 +1,52 @@
+"""The command ``loopwright doctor``: whether an FMU runs here, and if not, what would help."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from ...fmus.archive import ArchiveLimits
+from ...fmus.checks import doctor
+from .text import check_file, say
+
+
+def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add the command to the parser of `main`."""
+    parser = commands.add_parser(
+        "doctor",
+        help="say whether an FMU runs here, and what would help",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Examine an FMU of any tool: content, libraries for this machine, violations of the standard, a\n"
+        "trial run of each interface in a process of its own, and a verdict in the first line.",
+        epilog="exit status: 0 done: it runs here, or should; 1 it does not; 2 wrong usage",
+    )
+    parser.add_argument("file", metavar="FILE.fmu")
+    parser.add_argument(
+        "--run",
+        action=argparse.BooleanOptionalAction,
+        help="try it, or don't: it is a program of its maker's, and may take a licence (default: try it, unless it "
+        "says that it needs another program)",
+    )
+    parser.add_argument(
+        "--max-size", type=float, metavar="GB", help="unpacked size up to which it is read (default: 8)"
+    )
+    parser.add_argument("--json", action="store_true", help="all of it as JSON")
+
+
+def run_doctor(arguments: argparse.Namespace) -> int:
+    """Carry out ``loopwright doctor``."""
+    path = check_file(arguments.file)
+    limits = None
+    if arguments.max_size is not None:
+        limits = ArchiveLimits(size=arguments.max_size * 1e9, ratio=float("inf"))
+    try:
+        diagnosis = doctor(path, run=arguments.run, limits=limits)
+    except KeyboardInterrupt:
+        say("loopwright: interrupted", sys.stderr)
+        return 130
+    if arguments.json:
+        print(json.dumps(diagnosis.as_dict(), indent=2))  # ASCII: it prints on any terminal
+    else:
+        say(str(diagnosis))
+    return 0 if diagnosis.runs else 1

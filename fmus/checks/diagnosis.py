@@ -1,0 +1,160 @@
+"""Result of an FMU's examination: a verdict in one line, findings with next steps, and the content in short."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from ..archive import FmuFault, FmuFinding, FmuSeverity
+from .summary import INTERFACES
+
+_CONTROL = {code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"}
+_MOST = 5
+"""Findings of one kind that the text shows."""
+
+
+class FmuVerdict(StrEnum):
+    """Result of `doctor`."""
+
+    RUNS = "runs here"
+    EXPECTED = "should run here, but was not tried"
+    NOT_HERE = "does not run here"
+    FAILS = "fails here"
+    REFUSED = "is refused"
+
+
+@dataclass(frozen=True)
+class FmuTrial:
+    """Trial run of an interface, in a process of its own.
+
+    Parameters
+    ----------
+    interface : str
+        Element of the description: "CoSimulation", "ModelExchange" or "ScheduledExecution".
+    ran : bool
+        Whether it ran without a fault.
+    seconds : float
+        Duration in s, with the start of the process; 0 if it was not run.
+    left : str
+        Reason for which it was not run; empty if it was.
+    """
+
+    interface: str
+    ran: bool
+    seconds: float = 0.0
+    left: str = ""
+
+
+@dataclass(frozen=True)
+class FmuDiagnosis:
+    """Result of `doctor`; its text is that of ``loopwright doctor``.
+
+    Parameters
+    ----------
+    file : str
+        The FMU.
+    verdict : FmuVerdict
+        Whether it runs here.
+    findings : tuple of FmuFinding
+        Findings, the gravest first.
+    summary : dict
+        Content, as ``loopwright inspect --json`` has it, without the variables; empty if it can't be read.
+    counts : dict
+        Number of variables by causality.
+    trials : tuple of FmuTrial
+        Trial runs.
+    """
+
+    file: str
+    verdict: FmuVerdict
+    findings: tuple[FmuFinding, ...]
+    summary: Mapping[str, Any] = field(default_factory=dict)
+    counts: Mapping[str, int] = field(default_factory=dict)
+    trials: tuple[FmuTrial, ...] = ()
+
+    @property
+    def runs(self) -> bool:
+        """Whether it runs here, or should, where it was not tried."""
+        return self.verdict in (FmuVerdict.RUNS, FmuVerdict.EXPECTED)
+
+    def of(self, severity: FmuSeverity) -> list[FmuFinding]:
+        """Return the findings of a severity."""
+        return [finding for finding in self.findings if finding.severity == severity]
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one line."""
+        errors, warnings = self.of(FmuSeverity.ERROR), self.of(FmuSeverity.WARNING)
+        if errors and self.runs:
+            good = " and ".join(INTERFACES[trial.interface] for trial in self.trials if trial.ran)
+            return f"{self.verdict} by {good} only: {_first_sentence(errors[0].found)}"
+        if errors:
+            more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+            return f"{self.verdict}: {_first_sentence(errors[0].found)}{more}"
+        if not warnings:
+            return f"{self.verdict}; nothing is wrong with it"
+        return f"{self.verdict}, with {len(warnings)} warning{'s' if len(warnings) > 1 else ''}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all of it as dictionaries, lists, numbers and texts, for JSON."""
+        return {
+            "file": self.file,
+            "verdict": self.verdict.name.lower(),
+            "runs": self.runs,
+            "headline": self.headline,
+            "findings": [
+                {**asdict(f), "severity": f.severity.value, "fault": f.fault.name.lower()} for f in self.findings
+            ],
+            "trials": [asdict(trial) for trial in self.trials],
+            "variables": dict(self.counts),
+            "summary": dict(self.summary),
+        }
+
+    def __str__(self) -> str:
+        return "\n".join(line.translate(_CONTROL) for line in self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        yield f"{self.file}: {self.headline}"
+        for label, text in self._content() if self.summary else ():
+            yield f"  {label:<14}{text}"
+        shown = Counter[FmuFault]()
+        for i, finding in enumerate(self.findings, 1):
+            shown[finding.fault] += 1
+            if shown[finding.fault] > _MOST:
+                continue
+            yield f"  {i}. {finding.severity}: {_indent(finding.found)}"
+            yield f"     Next: {_indent(finding.step)}"
+        hidden = sum(n - _MOST for n in shown.values() if n > _MOST)
+        if hidden:
+            yield f"  {hidden} more of these kinds are not shown; --json has them."
+
+    def _content(self) -> Iterator[tuple[str, str]]:
+        s = self.summary
+        kinds = ", ".join(INTERFACES[kind] for kind in s["interfaces"]) or "no interface"
+        yield "model", f"{s['model_name']}, FMI {s['fmi_version']}, {kinds}"
+        yield "made by", s["generation_tool"] or "(not said)"
+        held = [f"{n} {name}{'s' if n > 1 and name != 'local' else ''}" for name, n in self.counts.items()]
+        n = s["continuous_states"]
+        states = f"{n or 'no'} continuous state{'' if n == 1 else 's'}"
+        yield "variables", f"{', '.join(held) or 'none'}; {states}"
+        yield "binaries", ", ".join(s["platforms"]) or "none"
+        yield "this machine", s["native"]["platform"]
+        for trial in self.trials:
+            name = INTERFACES[trial.interface]
+            if trial.left:
+                yield "not tried", f"{name}: {trial.left}"
+            else:
+                yield "tried", f"{name}: {'one step, ' if trial.ran else 'failed after '}{trial.seconds:.1f} s"
+
+
+def _first_sentence(text: str) -> str:
+    line = " ".join(text.split())
+    head = line.partition(". ")[0].rstrip(".")
+    return head if len(head) < 160 else f"{head[:157]}…"
+
+
+def _indent(text: str) -> str:
+    return text.strip().replace("\n", "\n     ")
