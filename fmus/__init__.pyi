@@ -1,5 +1,5 @@
 from .archive import ArchiveLimits, FmuDescription, FmuFault, FmuFinding, FmuSeverity, FmuVariable, read_description
-from .calls import FmuInstance, FmuState
+from .calls import FmuInstance, FmuState, StepOptions, StepTime
 from .checks import FmuDiagnosis, FmuTrial, FmuVerdict, doctor
 from .export import ModelSpec, Variable, build, build_fmu, build_python, clear_cache, model_spec
 from .models import (
@@ -29,6 +29,8 @@ __all__ = [
     "FmuVariable",
     "FmuVerdict",
     "ModelSpec",
+    "StepOptions",
+    "StepTime",
     "Variable",
     "bouncing_ball",
     "build",

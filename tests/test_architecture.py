@@ -215,7 +215,7 @@ PUBLIC = {
     """,
     "fmus": """
         ArchiveLimits Fmu FmuDescription FmuDiagnosis FmuFault FmuFinding FmuInstance FmuLinearization FmuSeverity FmuState
-        FmuTrial FmuVariable FmuVerdict ModelSpec Variable bouncing_ball
+        FmuTrial FmuVariable FmuVerdict ModelSpec StepOptions StepTime Variable bouncing_ball
         build build_fmu build_python clear_cache dc_motor doctor gantry gantry_contact gantry_elastic gantry_stiction
         mass_spring_damper model_spec read_description scara
     """,

@@ -64,6 +64,10 @@ class FmuDescription:
     """Whether the FMU computes directional derivatives in co-simulation (providesDirectionalDerivatives)."""
     only_once: bool = False
     """Whether a process can have one instance only (canBeInstantiatedOnlyOncePerProcess)."""
+    has_event_mode: bool = False
+    """Whether events in co-simulation can be handled in Event Mode (hasEventMode of FMI 3.0)."""
+    interpolates_inputs: bool = False
+    """Whether it takes derivatives of its real inputs (canInterpolateInputs of FMI 2.0)."""
     variable_step: bool = False
     """Whether communication steps may differ in length (canHandleVariableCommunicationStepSize)."""
     fixed_internal_step: float | None = None
@@ -280,6 +284,8 @@ def _capabilities(root: Any, version: str) -> dict[str, Any]:
         "can_serialize": _flag(steps, f"canGetAndSet{state}") and _flag(steps, f"canSerialize{state}"),
         "has_derivatives": _flag(steps, derivative),
         "only_once": _flag(steps, "canBeInstantiatedOnlyOncePerProcess"),
+        "has_event_mode": _flag(steps, "hasEventMode"),
+        "interpolates_inputs": two and _flag(steps, "canInterpolateInputs"),
         "variable_step": _flag(steps, "canHandleVariableCommunicationStepSize"),
         "fixed_internal_step": None if fixed is None else float(fixed),
         "model_exchange": None if exchange is None else exchange.get("modelIdentifier"),

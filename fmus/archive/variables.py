@@ -144,9 +144,14 @@ class OtherVariable:
         return self.type in TEXT_TYPES
 
     @property
+    def type_is_clock(self) -> bool:
+        """Whether it is a clock."""
+        return self.type == "Clock"
+
+    @property
     def is_periodic(self) -> bool:
         """Whether it is a clock that ticks at instants that are known ahead."""
-        return self.type == "Clock" and self.interval_variability in ("constant", "fixed", "tunable")
+        return self.type_is_clock and self.interval_variability in ("constant", "fixed", "tunable")
 
     def __str__(self) -> str:
         kind = f"{self.interval_variability} Clock" if self.interval_variability else self.type

@@ -7,6 +7,7 @@ from .fmi_calls import BoundCalls, Call, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance, FmuState
 from .loaded_library import LoadedFmu, MakeCalls
+from .step_options import StepOptions, StepTime, check_offered
 
 __all__ = [
     "BoundCalls",
@@ -21,5 +22,8 @@ __all__ = [
     "LoadedFmu",
     "Log",
     "MakeCalls",
+    "StepOptions",
+    "StepTime",
+    "check_offered",
     "is_smooth",
 ]

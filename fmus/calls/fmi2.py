@@ -103,7 +103,7 @@ class Fmi2Calls(FmiCalls):
         flags, component = self.variable(ctypes.c_bool * 4), ctypes.c_void_p(self.fmu.component)
         any_flag = ctypes.c_uint32.from_buffer(flags)
         arguments = (component, now, width, final)
-        return StepCall(self._function("fmi2DoStep"), arguments, any_flag, flags, ctypes.c_double(-math.inf))
+        return StepCall(self._function("fmi2DoStep"), arguments, any_flag, flags, ctypes.c_double(math.nan))
 
     def end_step(self, status: int) -> tuple[int, bool]:
         """Wait for a step that is pending, and look whether a discarded one asks to end the simulation (4.2.2, 4.2.3).
@@ -124,6 +124,17 @@ class Fmi2Calls(FmiCalls):
             return status, bool(self.fmu.getBooleanStatus(fmi2Terminated))
         except FMICallException:  # it does not say
             return status, False
+
+    def time_after_discard(self, t: float, h: float) -> float | None:
+        """Return the FMU's lastSuccessfulTime (4.2.3); None if it does not say one within the step."""
+        from fmpy.fmi1 import FMICallException
+        from fmpy.fmi2 import fmi2LastSuccessfulTime
+
+        try:
+            found = float(self.fmu.getRealStatus(fmi2LastSuccessfulTime))
+        except FMICallException:
+            return None
+        return min(max(found, t), t + h) if t - 1e-9 * h <= found <= t + h * (1.0 + 1e-9) else None
 
     def do_step(self, t: float, h: float, final: bool) -> bool:
         """Take a step; return whether it asks to end the simulation."""

@@ -54,7 +54,10 @@ class Fmi3Calls(FmiCalls):
         def message(environment: Any, status: int, category: bytes | None, text: bytes | None) -> None:
             log(status, (text or b"").decode(errors="replace"))
 
-        self.fmu.instantiate(logMessage=message, loggingOn=True)
+        modes = {}
+        if self.event_mode_used or self.early_return_allowed:
+            modes = {"eventModeUsed": self.event_mode_used, "earlyReturnAllowed": self.early_return_allowed}
+        self.fmu.instantiate(logMessage=message, loggingOn=True, **modes)
 
     def set_up(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
         """Do nothing: `enter_initialization_mode` takes them."""
@@ -82,7 +85,7 @@ class Fmi3Calls(FmiCalls):
         """Return fmi3DoStep with its arguments (FMI 3.0, 4.2.1)."""
         flags = self.variable(ctypes.c_bool * 4)  # event, terminate, early return, and one that is never set
         reached, address, at = self.variable(ctypes.c_double), ctypes.c_void_p, ctypes.addressof(flags)
-        reached.value = -math.inf
+        reached.value = math.nan
         arguments = (
             *(ctypes.c_void_p(self.fmu.component), now, width, final),
             *(address(at), address(at + 1), address(at + 2), ctypes.byref(reached)),

@@ -42,7 +42,7 @@ class StepCall:
     flags: Any
     """Flags ``event``, ``terminate``, ``early``; all false in FMI 2.0, which has none."""
     reached: ctypes.c_double
-    """Time at which a step has ended, in s; −∞ if the FMU does not say it, as in FMI 2.0."""
+    """Time at which a step has ended, in s; NaN if the FMU does not say it, as in FMI 2.0."""
 
 
 class EventUpdate(NamedTuple):
@@ -164,6 +164,11 @@ class FmiCalls(ABC):
 
     # ---- the life of an instance ----
 
+    event_mode_used = False
+    """Whether the FMU is told that its events are handled in Event Mode; set it before `instantiate`."""
+    early_return_allowed = False
+    """Whether the FMU is told that it may end a step early; set it before `instantiate`."""
+
     def version(self) -> str:
         """Return the version of FMI that the library states."""
         return str(self.fmu.getVersion())
@@ -284,6 +289,29 @@ class FmiCalls(ABC):
     @abstractmethod
     def do_step(self, t: float, h: float, final: bool) -> bool:
         """Take a step from t over h, both in s; return whether it ended early or asks to end the simulation."""
+
+    def time_after_discard(self, t: float, h: float) -> float | None:
+        """Return the time in s at which the FMU stands after a step from t over h was discarded; None if unknown."""
+        return t
+
+    def set_input_derivatives(self, references: Sequence[int], values: Sequence[float]) -> None:
+        """Tell the first time derivatives of real inputs; only FMI 1.0 and 2.0 have them."""
+        self.fmu.setRealInputDerivatives(list(references), [1] * len(references), list(values))
+
+    def enter_step_mode(self) -> None:
+        """Go back from Event Mode to Step Mode (FMI 3.0, 4.2.1)."""
+        self.fmu.enterStepMode()
+
+    def activate_clocks(self, references: Sequence[int]) -> None:
+        """Let input clocks tick, in Event Mode (FMI 3.0, 2.2.9)."""
+        self.fmu.setClock(list(references), [True] * len(references))
+
+    def clock_intervals(self, references: Sequence[int]) -> list[tuple[float, int]]:
+        """Return the intervals of clocks in s, each with its qualifier: 0 unknown, 1 unchanged, 2 changed."""
+        n = len(references)
+        kept, intervals, qualifiers = (ctypes.c_uint * n)(*references), (ctypes.c_double * n)(), (ctypes.c_int * n)()
+        self.fmu.getIntervalDecimal(kept, intervals, qualifiers)
+        return list(zip(intervals, qualifiers, strict=True))
 
     # ---- saved states and derivatives ----
 

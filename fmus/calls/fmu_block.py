@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 from ..archive import FmuDescription, FmuVariable, OtherVariable
+from .step_options import StepOptions
 
 
 class FmuBlock(Protocol):
@@ -34,6 +35,10 @@ class FmuBlock(Protocol):
     @property
     def text_variables(self) -> Mapping[str, OtherVariable]:
         """Texts and binary data that are recorded in a run, by their ports."""
+
+    @property
+    def stepping(self) -> StepOptions:
+        """Options of its co-simulation."""
 
     @property
     def variable_step(self) -> bool:

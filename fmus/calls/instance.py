@@ -11,18 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuError, FmuRuntimeError
+from ...blocks.core import FmuError
 from ..archive import FmuVariable
 from ..platform import native_platform
-from .fmi_calls import DISCARD, ERROR, FATAL, StepCall
+from .fmi_calls import StepCall
 from .fmu_block import FmuBlock
-from .loaded_library import LoadedFmu, MakeCalls
+from .loaded_library import MakeCalls
+from .step_failures import NEAR, StepFailures
+from .stepping import CarefulSteps, needs_care
 from .texts import Text, TextRecord
 from .transfer import Transfer, UnfitError
 
 _HEADER = struct.Struct("<8s32s24sd?")  # of a serialized state: magic, FMU's digest, platform, time, running
 _MAGIC = b"lw-fmu-1"
-_BEYOND = 1.0 + 1e-6  # end of a step, in steps, beyond which more than rounding has been added
 _Bound = tuple[Callable[[float, float], None], Callable[[], None], Callable[[float], None]]
 
 
@@ -55,7 +56,7 @@ class FmuState:
         return f"FmuState({self.instance.block.label}, t={self.t:.9g}{', freed' if self.is_free else ''})"
 
 
-class FmuInstance(LoadedFmu):
+class FmuInstance(StepFailures):
     """Loaded FMU that takes one step at a time, through vectors that are shared with the scheduler.
 
     Saving and serializing its state depend on the FMU: `can_save`, `can_serialize`.
@@ -68,6 +69,8 @@ class FmuInstance(LoadedFmu):
 
     def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
         super().__init__(block, make_calls=make_calls)
+        self._has_retried = False
+        self._call: StepCall | None = None
         variables = block.input_variables
         self._inputs, self._outputs = {port: variables[port] for port in wired}, dict(block.output_variables)
         self._now, self._width = self.fmi.variable(ctypes.c_double), self.fmi.variable(ctypes.c_double)
@@ -76,6 +79,7 @@ class FmuInstance(LoadedFmu):
         self._handles: dict[int, Any] = {}
         self._read: Callable[[float], None] = lambda t: None
         self._texts = TextRecord(self.fmi, block.text_variables)
+        self._careful: CarefulSteps | None = None
 
     @property
     def t(self) -> float:
@@ -86,6 +90,8 @@ class FmuInstance(LoadedFmu):
         """Leave Initialization Mode and read the outputs at the start of the run."""
         super().begin()
         self._now.value, self._width.value = self._began, 0.0
+        if self._careful is not None:
+            self._careful.begin(self._began)
         self._read(self._began)
         self._begin_texts()
 
@@ -96,14 +102,18 @@ class FmuInstance(LoadedFmu):
         call = self.fmi.step_call(self._now, self._width, self._final)
         plain = ins.is_plain and outs.is_plain
         self.step, self.exchange, self._read = (self._bind_plain if plain else self._bind_typed)(ins, outs, call)
+        self._call = call
+        if needs_care(self.description, self.block.stepping):
+            self._careful = CarefulSteps(self, self._inputs, inputs, outs, call)
+            self.step = self._careful.step
         if self._texts.variables:
             self.step = partial(self._step_and_note, self.step)
         self._read(self._began)
 
     def _begin_texts(self) -> None:
         """Let the record of texts begin anew, at the present time."""
-        lost = self.call("reading its texts", self._texts.begin_anew, self.t)
-        self.messages += [f"{self.block.label}: {text}" for text in lost]
+        for text in self.call("reading its texts", self._texts.begin_anew, self.t):
+            self.add_note(text)
 
     def _step_and_note(self, step: Callable[[float, float], None], t: float, h: float) -> None:
         step(t, h)
@@ -124,22 +134,22 @@ class FmuInstance(LoadedFmu):
 
         def step(t: float, h: float) -> None:
             if has_inputs and (status := set_values(*set_arguments)) > 1:
-                raise self._error("setting the inputs", status, t)
+                raise self.report("setting the inputs", status, t)
             now.value, width.value = t, h
             if (status := do_step(*step_arguments)) > 1:
-                self._end_step(status, t, h)
-            if any_flag.value or reached.value > t + h * _BEYOND:
-                self._check_flags(call, t, h)
+                self.end_step(status, t, h)
+            if any_flag.value or abs(reached.value - t - h) > h * NEAR:
+                self.check_flags(call, t, h)
             if has_outputs and (status := get_values(*get_arguments)) > 1:
-                raise self._error("reading the outputs", status, t)
+                raise self.report("reading the outputs", status, t)
 
         def read(t: float) -> None:
             if has_outputs and (status := get_values(*get_arguments)) > 1:
-                raise self._error("reading the outputs", status, t)
+                raise self.report("reading the outputs", status, t)
 
         def exchange() -> None:
             if has_inputs and (status := set_values(*set_arguments)) > 1:
-                raise self._error("setting the inputs", status, self._began)
+                raise self.report("setting the inputs", status, self._began)
             read(self._began)
 
         return step, exchange, read
@@ -151,26 +161,25 @@ class FmuInstance(LoadedFmu):
             try:
                 status = ins.set()
             except UnfitError as error:
-                raise self._unfit(error, t, "Convert the signal before this input, with Quantizer, say.") from None
+                raise self.refuse_input(error, t) from None
             if status > 1:
-                raise self._error("setting the inputs", status, t)
+                raise self.report("setting the inputs", status, t)
 
         def read(t: float) -> None:
             try:
                 status = outs.get()
             except UnfitError as error:
-                self.failed = True
-                raise self._unfit(error, t, "Leave this output out, by ports=.") from None
+                raise self.refuse_output(error, t) from None
             if status > 1:
-                raise self._error("reading the outputs", status, t)
+                raise self.report("reading the outputs", status, t)
 
         def step(t: float, h: float) -> None:
             write(t)
             self._now.value, self._width.value = t, h
             if (status := call.function(*call.arguments)) > 1:
-                self._end_step(status, t, h)
-            if call.any_flag.value or call.reached.value > t + h * _BEYOND:
-                self._check_flags(call, t, h)
+                self.end_step(status, t, h)
+            if call.any_flag.value or abs(call.reached.value - t - h) > h * NEAR:
+                self.check_flags(call, t, h)
             read(t + h)
 
         def exchange() -> None:
@@ -178,76 +187,6 @@ class FmuInstance(LoadedFmu):
             read(self._began)
 
         return step, exchange, read
-
-    def _unfit(self, error: UnfitError, t: float, advice: str) -> FmuRuntimeError:
-        return FmuRuntimeError(f"{error.reason}. {advice}", block=self.block.label, port=error.port, t=t)
-
-    # ---- failures of a step (FMI 2.0, 2.1.3 and 4.2.2; FMI 3.0, 2.2.3 and 4.2.1) ----
-
-    def _mark_failure(self, status: int) -> None:
-        self.failed = status >= ERROR  # a call that is discarded changes nothing
-        self.fatal = status >= FATAL
-
-    def _error(self, action: str, status: int, t: float, advice: str = "") -> FmuRuntimeError:
-        self._mark_failure(status)
-        return FmuRuntimeError(
-            f"{action} failed with {self.fmi.status_name(status)}{self._quote_messages()} The inputs "
-            f"({', '.join(v.name for v in self._inputs.values())}) were {self._vector.tolist()}. "
-            f"{advice or 'Look at the last samples of error.run, or take a smaller step.'}",
-            block=self.block.label,
-            t=t,
-        )
-
-    def _end_step(self, status: int, t: float, h: float) -> None:
-        """Wait for the end of a step that is pending, and raise the error of one that has failed."""
-        status, ends = self.fmi.end_step(status)
-        if ends:
-            self._width.value = 0.0
-            raise self._termination(t, h)
-        if status > 1:
-            raise self._step_error(status, t, h)
-
-    def _step_error(self, status: int, t: float, h: float) -> FmuRuntimeError:
-        self._width.value = 0.0  # the instance stays where it was
-        action = f"the step from t = {t:.9g} s by {h:g} s"
-        if status != DISCARD:
-            return self._error(action, status, t)
-        steps = "" if self.block.variable_step else " from the start: this FMU takes steps of one length only"
-        return self._error(
-            f"{action} was discarded, as the FMU can't compute it: it",
-            status,
-            t,
-            f"Take a smaller step{steps}, or check the FMU's inputs there.",
-        )
-
-    def _termination(self, t: float, h: float) -> FmuRuntimeError:
-        return FmuRuntimeError(
-            f"the FMU asks to end the simulation (terminateSimulation) in the step from t = {t:.9g} s by {h:g} s"
-            f"{self._quote_messages()} End the run there, or look up the reason in the FMU's documentation.",
-            block=self.block.label,
-            t=t,
-        )
-
-    def _check_flags(self, call: StepCall, t: float, h: float) -> None:
-        _, terminate, early, _ = call.flags
-        if terminate:
-            raise self._termination(t, h)
-        if early:
-            raise FmuRuntimeError(
-                f"the step from t = {t:.9g} s by {h:g} s returned early, at {call.reached.value:.9g} s (earlyReturn), "
-                f"though the FMU was told that it must not (earlyReturnAllowed = false){self._quote_messages()} Take "
-                "steps that end where its events are, or export it without early return.",
-                block=self.block.label,
-                t=t,
-            )
-        if call.reached.value > t + h * _BEYOND + 1e-12 * abs(t):
-            raise FmuRuntimeError(
-                f"the step from t = {t:.9g} s by {h:g} s ended at {call.reached.value:.9g} s (lastSuccessfulTime); "
-                f"expected {t + h:.9g} s{self._quote_messages()} Its outputs belong to another time than the "
-                "diagram's: report it to its makers.",
-                block=self.block.label,
-                t=t,
-            )
 
     def operating_point(self) -> dict[str, Any]:
         """Return the present ``t``, ``state`` and ``inputs``, for `Fmu.linear_model` and `Fmu.step_difference`."""
@@ -304,6 +243,8 @@ class FmuInstance(LoadedFmu):
         self.call("restoring its state", self.fmi.set_state, state._handle)
         self.failed, self._running = False, state.running
         self._now.value, self._width.value = state.t, 0.0
+        if self._careful is not None:
+            self._careful.return_to(state.t)
         self._read(state.t)
         self._begin_texts()
 

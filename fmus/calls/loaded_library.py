@@ -18,6 +18,7 @@ from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
 from .fmi_calls import FATAL, STATUS, FmiCalls
 from .fmu_block import FmuBlock
+from .step_options import allows_early_return, uses_event_mode
 from .texts import is_readable, read_text, write_text
 
 _CALLS: dict[str, type[FmiCalls]] = {"2": Fmi2Calls, "3": Fmi3Calls}
@@ -60,6 +61,7 @@ class LoadedFmu:
             )
             self._fmu = self.fmi.fmu
             self._check_version()
+            self._choose_modes()
             self.fmi.instantiate(self._log)
         except FmuFileError:
             raise
@@ -74,6 +76,13 @@ class LoadedFmu:
         self._open = True
         if description.only_once and self.fmi.in_process:
             _OPEN.add(self)
+
+    def _choose_modes(self) -> None:
+        """Tell the calls whether Event Mode is used and early return allowed, in co-simulation of FMI 3.0."""
+        if not self.model_exchange:
+            options = self.block.stepping
+            self.fmi.event_mode_used = uses_event_mode(self.description, options)
+            self.fmi.early_return_allowed = allows_early_return(self.description, options)
 
     def _refuse_second(self) -> None:
         """Refuse a second instance in this process where the FMU can have one only."""
@@ -117,6 +126,11 @@ class LoadedFmu:
             kind = STATUS[status] if 0 <= status < len(STATUS) else f"status {status}"
             self.messages.append(f"{self.block.label}: {kind}: {text}")
 
+    def add_note(self, text: str) -> None:
+        """Add a message of this library, which is not the FMU's own."""
+        self.messages.insert(self._limits, f"{self.block.label}: {text}")
+        self._limits += 1
+
     def _quote_messages(self) -> str:
         said = self.messages[self._limits :][-5:]
         return f". The FMU says: {' / '.join(m.rstrip('.') for m in said)}." if said else "."
@@ -147,9 +161,10 @@ class LoadedFmu:
         given = {**self.block.start, **(values or {})}
         try:
             self._configure(given)
-            self.fmi.set_up(start_time, stop_time, None)
+            tolerance = self.block.stepping.tolerance
+            self.fmi.set_up(start_time, stop_time, tolerance)
             self.set_values({n: v for n, v in given.items() if n not in self.description.structural})
-            self.fmi.enter_initialization_mode(start_time, stop_time, None)
+            self.fmi.enter_initialization_mode(start_time, stop_time, tolerance)
             lost = self._find_lost(given)
             if lost:  # some tools' FMUs drop parameters that are set before this mode
                 self.set_values(lost)

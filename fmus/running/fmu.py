@@ -24,7 +24,7 @@ from ...blocks.core import (
     parameter,
 )
 from ..archive import FmuDescription, FmuVariable, OtherVariable, read_description
-from ..calls import FmuInstance
+from ..calls import FmuInstance, StepOptions, check_offered
 from ..isolation import open_fmu
 from .exchange import ExchangeMembers, choose_interface
 from .linearization import STEP, FmuLinearization, linear_model, step_difference
@@ -67,6 +67,9 @@ class Fmu(ExchangeMembers):
         default=False,
         description="convert wires to and from other units of a port's dimension, which else are refused",
     )
+    stepping: StepOptions = parameter(
+        default=StepOptions(), description="options of its co-simulation: Event Mode, retries, tolerance and more"
+    )
     interface: str | None = parameter(
         default=None,
         description="'co_simulation' or 'model_exchange'; None for co-simulation where the FMU offers it",
@@ -98,6 +101,7 @@ class Fmu(ExchangeMembers):
         object.__setattr__(self, "_content", description.digest)
         object.__setattr__(self, "_sizes", sizes)
         choose_interface(description, self.interface, who)
+        check_offered(self.stepping, description, who)
         ports, others = self._choose_ports(description), description.other_ports("output")
         if others and not ports.outputs:
             raise FmuFileError(

@@ -1,0 +1,133 @@
+"""Failures of a communication step: their errors, and steps that are taken again in parts."""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+
+from ...blocks.core import FmuRuntimeError
+from ..archive import FmuVariable
+from .fmi_calls import DISCARD, ERROR, FATAL, StepCall
+from .loaded_library import LoadedFmu
+from .stepping import retry_discarded
+from .transfer import UnfitError
+
+NEAR = 1e-6
+"""Distance from the end of a step, in steps, within which a time is that end."""
+
+
+class StepFailures(LoadedFmu):
+    """Part of an instance that judges its steps."""
+
+    _inputs: dict[str, FmuVariable]
+    _vector: np.ndarray
+    _now: ctypes.c_double
+    _width: ctypes.c_double
+    _call: StepCall | None = None
+    _has_retried = _has_been_short = False
+
+    def set_span(self, t: float, h: float) -> None:
+        """Set start and length of the next step in s."""
+        self._now.value, self._width.value = t, h
+
+    def refuse_input(self, error: UnfitError, t: float) -> FmuRuntimeError:
+        """Return the error of an input that doesn't fit."""
+        return self._unfit(error, t, "Convert the signal before this input, with Quantizer, say.")
+
+    def refuse_output(self, error: UnfitError, t: float) -> FmuRuntimeError:
+        """Return the error of an output that doesn't fit."""
+        self.failed = True
+        return self._unfit(error, t, "Leave this output out, by ports=.")
+
+    def _unfit(self, error: UnfitError, t: float, advice: str) -> FmuRuntimeError:
+        return FmuRuntimeError(f"{error.reason}. {advice}", block=self.block.label, port=error.port, t=t)
+
+    # ---- failures of a step (FMI 2.0, 2.1.3 and 4.2.2; FMI 3.0, 2.2.3 and 4.2.1) ----
+
+    def _mark_failure(self, status: int) -> None:
+        self.failed = status >= ERROR  # a call that is discarded changes nothing
+        self.fatal = status >= FATAL
+
+    def report(self, action: str, status: int, t: float, advice: str = "") -> FmuRuntimeError:
+        """Return the error of an action that has failed with a status."""
+        self._mark_failure(status)
+        return FmuRuntimeError(
+            f"{action} failed with {self.fmi.status_name(status)}{self._quote_messages()} The inputs "
+            f"({', '.join(v.name for v in self._inputs.values())}) were {self._vector.tolist()}. "
+            f"{advice or 'Look at the last samples of error.run, or take a smaller step.'}",
+            block=self.block.label,
+            t=t,
+        )
+
+    def end_step(self, status: int, t: float, h: float) -> None:
+        """Wait for the end of a step that is pending, and raise the error of one that has failed."""
+        status, ends = self.fmi.end_step(status)
+        if ends:
+            self._width.value = 0.0
+            raise self.termination(t, h)
+        if status == DISCARD and self._call is not None and retry_discarded(self, self._call, t, h):
+            return
+        if status > 1:
+            raise self._step_error(status, t, h)
+
+    def _step_error(self, status: int, t: float, h: float) -> FmuRuntimeError:
+        self._width.value = 0.0  # the instance stays where it was
+        action = f"the step from t = {t:.9g} s by {h:g} s"
+        if status != DISCARD:
+            return self.report(action, status, t)
+        steps = "" if self.block.variable_step else " from the start: this FMU takes steps of one length only"
+        return self.report(
+            f"{action} was discarded, as the FMU can't compute it: it",
+            status,
+            t,
+            f"Take a smaller step{steps}, or check the FMU's inputs there.",
+        )
+
+    def termination(self, t: float, h: float) -> FmuRuntimeError:
+        """Return the error of an FMU that asks to end the simulation."""
+        return FmuRuntimeError(
+            f"the FMU asks to end the simulation (terminateSimulation) in the step from t = {t:.9g} s by {h:g} s"
+            f"{self._quote_messages()} End the run there, or look up the reason in the FMU's documentation.",
+            block=self.block.label,
+            t=t,
+        )
+
+    def check_flags(self, call: StepCall, t: float, h: float) -> None:
+        """Raise the error of a step that has ended early, elsewhere, or asks for the end of the simulation."""
+        _, terminate, early, _ = call.flags
+        if terminate:
+            raise self.termination(t, h)
+        if early:
+            raise FmuRuntimeError(
+                f"the step from t = {t:.9g} s by {h:g} s returned early, at {call.reached.value:.9g} s (earlyReturn), "
+                f"though the FMU was told that it must not (earlyReturnAllowed = false){self._quote_messages()} Take "
+                "steps that end where its events are, or export it without early return.",
+                block=self.block.label,
+                t=t,
+            )
+        reached, off = call.reached.value, h * NEAR + 1e-12 * abs(t)
+        if reached > t + h + off:
+            raise FmuRuntimeError(
+                f"the step from t = {t:.9g} s by {h:g} s ended at {reached:.9g} s (lastSuccessfulTime); expected "
+                f"{t + h:.9g} s{self._quote_messages()} Its outputs belong to another time than the diagram's: report "
+                "it to its makers.",
+                block=self.block.label,
+                t=t,
+            )
+        if reached < t + h - off and not self._has_been_short:
+            self._has_been_short = True
+            where = "before it began" if reached < t - off else "short of its end"
+            self.add_note(
+                f"t = {t:.9g} s: the FMU says that a step of {h:g} s ended at {reached:.9g} s (lastSuccessfulTime), "
+                f"{where}; its outputs are taken as those of {t + h:.9g} s. Check its steps, or report it to its makers"
+            )
+
+    def note_retry(self, t: float, h: float, count: int) -> None:
+        """Keep the message of the first step that was discarded."""
+        if not self._has_retried:
+            self._has_retried = True
+            self.add_note(
+                f"t = {t:.9g} s: the FMU discarded a step of {h:g} s; it was taken in {count} parts, and so are later "
+                "ones that it discards"
+            )

@@ -1,0 +1,120 @@
+"""Options of the co-simulation of one FMU."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+from ...blocks.core import ParameterError
+from ..archive import FmuDescription
+
+
+class StepTime(Enum):
+    """Arithmetic by which the start of a communication step is computed."""
+
+    MULTIPLIED = "multiplied"
+    """t = i·h, rounded once: it never drifts from the diagram's ticks."""
+    ADDED = "added"
+    """t += h after each step, as some tools do: their records are then met bit for bit."""
+
+
+@dataclass(frozen=True)
+class StepOptions:
+    """Options of the co-simulation of one FMU: ``Fmu(file, stepping=StepOptions(event_mode=True))``.
+
+    Parameters
+    ----------
+    tolerance : float, optional
+        Relative tolerance that the FMU is told (toleranceDefined); None leaves it to the FMU.
+    event_mode : bool, optional
+        Use Event Mode (FMI 3.0, 4.2.1): events end a step, discrete inputs and tunable parameters change there, and
+        periodic input clocks tick. None: where the FMU has clocks and ``hasEventMode``.
+    early_return : bool, optional
+        Allow a step to end early; the rest follows at once, with the inputs held. None: where Event Mode is used.
+    retries : int
+        Number of times that a discarded step is halved. It is done where the FMU takes steps of any length and is in a
+        known state: in FMI 3.0 that before the step, in FMI 2.0 that at its lastSuccessfulTime.
+    input_derivatives : bool
+        Tell an FMU of FMI 2.0 with ``canInterpolateInputs`` the slopes of its real inputs, by the difference from the
+        step before. This helps where inputs are smooth; where they are held or jump, it overshoots.
+    time : StepTime or {"multiplied", "added"}
+        Arithmetic by which the FMU is told the time.
+
+    Raises
+    ------
+    ParameterError
+        For a value out of its range.
+    """
+
+    tolerance: float | None = None
+    event_mode: bool | None = None
+    early_return: bool | None = None
+    retries: int = 10
+    input_derivatives: bool = False
+    time: StepTime | str = StepTime.MULTIPLIED
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.tolerance is not None and not (
+            isinstance(self.tolerance, float | int) and 0.0 < self.tolerance < math.inf
+        ):
+            raise ParameterError(
+                f"found {self.tolerance!r}; expected a positive number, or None. Give one such as 1e-6.",
+                port="stepping.tolerance",
+            )
+        if isinstance(self.retries, bool) or not isinstance(self.retries, int) or not 0 <= self.retries <= 50:
+            raise ParameterError(
+                f"found {self.retries!r}; expected an integer from 0 to 50. Give the number of times that a step is "
+                "halved.",
+                port="stepping.retries",
+            )
+        for name in ("event_mode", "early_return", "input_derivatives"):
+            value = getattr(self, name)
+            if not isinstance(value, bool) and not (value is None and name != "input_derivatives"):
+                raise ParameterError(
+                    f"found {value!r}; expected True or False. Give one of them.", port=f"stepping.{name}"
+                )
+        try:
+            object.__setattr__(self, "time", StepTime(self.time))
+        except ValueError:
+            known = " or ".join(repr(kind.value) for kind in StepTime)
+            raise ParameterError(f"found {self.time!r}; expected {known}. Give one.", port="stepping.time") from None
+
+
+def check_offered(options: object, about: FmuDescription, label: str) -> None:
+    """Refuse options that an FMU does not offer.
+
+    Raises
+    ------
+    ParameterError
+        With the option's name as its port.
+    """
+    if not isinstance(options, StepOptions):
+        raise ParameterError(
+            f"found {options!r}; expected a StepOptions. Give one: StepOptions(event_mode=True).",
+            block=label,
+            port="stepping",
+        )
+    for name, offered, needed in (
+        ("event_mode", about.has_event_mode, "hasEventMode is false in its description"),
+        ("early_return", about.fmi.startswith("3"), f"only FMI 3.0 has that, and it is of FMI {about.fmi}"),
+        ("input_derivatives", about.interpolates_inputs, "canInterpolateInputs is not true in its description"),
+    ):
+        if getattr(options, name) and not offered:
+            raise ParameterError(
+                f"found True; the FMU does not offer it: {needed}. Leave it out.",
+                block=label,
+                port=f"stepping.{name}",
+            )
+
+
+def uses_event_mode(about: FmuDescription, options: StepOptions) -> bool:
+    """Whether an FMU's events are handled in Event Mode."""
+    clocks = any(v.type_is_clock for v in about.other.values())
+    return about.has_event_mode and (clocks if options.event_mode is None else options.event_mode)
+
+
+def allows_early_return(about: FmuDescription, options: StepOptions) -> bool:
+    """Whether an FMU of FMI 3.0 may end a step early."""
+    return uses_event_mode(about, options) if options.early_return is None else options.early_return

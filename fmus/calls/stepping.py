@@ -1,0 +1,397 @@
+"""Co-simulation steps with events: Event Mode, clocks, early return, discarded steps, slopes of inputs.
+
+A plain step sets the inputs, steps, and gets the outputs. These steps do more, and are taken where an FMU or its
+options need that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+
+from ...blocks.core import FmuRuntimeError, Layout
+from ..archive import FmuDescription, FmuVariable, OtherVariable
+from .fmi_calls import DISCARD, FmiCalls, StepCall
+from .fmu_block import FmuBlock
+from .step_options import StepOptions, StepTime, allows_early_return, uses_event_mode
+from .transfer import Transfer, UnfitError
+
+_ROUNDED = 1e-9
+"""Part of a step within which two times are one."""
+_MOST_ROUNDS = 100
+"""Rounds of an event iteration, and steps that end where they began, before an error."""
+R = TypeVar("R")
+_CHANGED = 2
+"""Qualifier of an interval that the FMU has set anew (fmi3IntervalChanged)."""
+
+
+def needs_care(about: FmuDescription, options: StepOptions) -> bool:
+    """Whether an FMU's steps are more than setting, stepping and getting."""
+    return (
+        uses_event_mode(about, options)
+        or allows_early_return(about, options)
+        or options.input_derivatives
+        or options.time is StepTime.ADDED
+    )
+
+
+class SteppedInstance(Protocol):
+    """Members of an instance that its steps need."""
+
+    fmi: FmiCalls
+    messages: list[str]
+
+    @property
+    def block(self) -> FmuBlock:
+        """Its block."""
+
+    @property
+    def description(self) -> FmuDescription:
+        """The FMU's description."""
+
+    def call(self, purpose: str, function: Callable[..., R], *arguments: Any) -> R:
+        """Call a method of ``fmi``; an error begins with the purpose."""
+
+    def set_span(self, t: float, h: float) -> None:
+        """Set start and length of the next step in s."""
+
+    def end_step(self, status: int, t: float, h: float) -> None:
+        """Wait for a step that is pending, and raise the error of one that has failed."""
+
+    def check_flags(self, call: StepCall, t: float, h: float) -> None:
+        """Raise the error of a step that has ended early, elsewhere, or asks for the end."""
+
+    def report(self, action: str, status: int, t: float, advice: str = "") -> FmuRuntimeError:
+        """Return the error of an action that has failed."""
+
+    def termination(self, t: float, h: float) -> FmuRuntimeError:
+        """Return the error of an FMU that asks to end the simulation."""
+
+    def refuse_input(self, error: UnfitError, t: float) -> FmuRuntimeError:
+        """Return the error of an input that doesn't fit."""
+
+    def refuse_output(self, error: UnfitError, t: float) -> FmuRuntimeError:
+        """Return the error of an output that doesn't fit."""
+
+    def note_retry(self, t: float, h: float, count: int) -> None:
+        """Keep the message of a step that was taken in parts."""
+
+
+@dataclass
+class _Clock:
+    """Input clock that ticks at times known ahead; infinite ones never come."""
+
+    variable: OtherVariable
+    interval: float = math.inf
+    next: float = math.inf
+    count: int = 0
+    origin: float = 0.0
+
+    def start(self, t: float, interval: float, shift: float) -> None:
+        """Let it tick at t + shift, and then every interval, in s."""
+        self.interval, self.origin, self.count = interval, t + shift, 0
+        self.next = self.origin
+
+    def tick(self) -> None:
+        """Go on to the next tick."""
+        if self.variable.is_periodic:
+            self.count += 1
+            self.next = self.origin + self.count * self.interval
+        else:
+            self.next = math.inf  # until the FMU says it anew
+
+
+class _Part:
+    """Some of the inputs, in a vector of their own."""
+
+    def __init__(
+        self, instance: SteppedInstance, ports: Mapping[str, FmuVariable], vector: np.ndarray, chosen: list[str]
+    ):
+        places = Layout.of({port: v.shape for port, v in ports.items()}).slices
+        where = [np.arange(places[port].start, places[port].stop) for port in chosen]
+        self.ports = {port: ports[port] for port in chosen}
+        self.places = Layout.of({port: v.shape for port, v in self.ports.items()}).slices
+        self.index = np.concatenate(where) if where else np.zeros(0, dtype=int)
+        self.source = vector
+        self.values = np.array(vector[self.index])
+        self.transfer = Transfer(instance.fmi, "Set", self.ports, self.values)
+
+    def take(self) -> bool:
+        """Copy the values of the diagram; return whether they have changed."""
+        fresh = self.source[self.index]
+        if np.array_equal(fresh, self.values):
+            return False
+        self.values[:] = fresh
+        return True
+
+
+class CarefulSteps:
+    """Steps of an instance with events; its ``step`` has the face of a plain one.
+
+    Parameters
+    ----------
+    instance : SteppedInstance
+        The instance.
+    inputs, outputs : mapping of str to FmuVariable
+        Variables of the ports.
+    vector : ndarray
+        Values of all inputs, shared with the run.
+    outs : Transfer
+        Getting of the outputs.
+    call : StepCall
+        The FMU's step.
+    """
+
+    def __init__(
+        self,
+        instance: SteppedInstance,
+        inputs: Mapping[str, FmuVariable],
+        vector: np.ndarray,
+        outs: Transfer,
+        call: StepCall,
+    ):
+        self.instance, self.outs, self.call = instance, outs, call
+        self.about, self.options = instance.description, instance.block.stepping
+        self.fmi = instance.fmi
+        self.has_events = uses_event_mode(self.about, self.options)
+        jumping = [port for port, v in inputs.items() if self.has_events and v.variability != "continuous"]
+        self.smooth = _Part(instance, inputs, vector, [port for port in inputs if port not in jumping])
+        self.jumping = _Part(instance, inputs, vector, jumping)
+        self.clocks = [
+            _Clock(v)
+            for v in self.about.other.values()
+            if v.type_is_clock and v.causality == "input" and v.interval_variability != "triggered"
+        ]
+        self.next_event = math.inf
+        self._last: tuple[float, np.ndarray] | None = None  # time and values of the inputs of the step before
+        self._added: float | None = None
+        self._fresh = True  # discrete inputs have not been set since the start
+
+    # ---- the start ----
+
+    def begin(self, t: float) -> None:
+        """Settle the events at the start, where the FMU is in Event Mode after its initialization."""
+        self._last, self._added, self._fresh = None, None, True
+        self.next_event = math.inf
+        if not self.has_events:
+            return
+        for clock in self.clocks:
+            if clock.variable.is_periodic and clock.variable.interval is not None:
+                clock.start(t, clock.variable.interval, clock.variable.shift)
+        self._read_intervals(t, [c for c in self.clocks if not c.variable.is_periodic or c.variable.interval is None])
+        self._activate([clock for clock in self.clocks if clock.next <= t])
+        self._settle(t)
+
+    def return_to(self, t: float) -> None:
+        """Go on from a restored state at a time in s."""
+        self._last, self._added, self._fresh = None, None, True
+        for clock in self.clocks:
+            if clock.variable.is_periodic and math.isfinite(clock.interval):
+                ahead = (t - clock.origin) / clock.interval
+                clock.count = max(0, math.ceil(ahead * (1.0 - _ROUNDED)))
+                clock.next = clock.origin + clock.count * clock.interval
+
+    # ---- a step ----
+
+    def step(self, t: float, h: float) -> None:
+        """Set the inputs, go from t to t + h (both in s), and get the outputs."""
+        instance = self.instance
+        start = t
+        if self.options.time is StepTime.ADDED:
+            start = t if self._added is None else self._added
+            self._added = start + h
+        changed = self.jumping.take()
+        due = [c for c in self.clocks if c.next <= start + _ROUNDED * h]
+        if self.has_events and (changed or self._fresh or due or self.next_event <= start + _ROUNDED * h):
+            self._handle_events(start, h, due, set_inputs=True)
+        self._fresh = False
+        self.smooth.take()
+        self._set(self.smooth, start)
+        if self.options.input_derivatives:
+            self._tell_slopes(start)
+        self._go(start, h)
+        instance.set_span(start, h)
+        self._get(start + h)
+
+    def _go(self, t: float, h: float) -> None:
+        """Step from t by h, in parts where events lie between or the FMU ends a step early."""
+        end, now, still = t + h, t, 0
+        while end - now > _ROUNDED * h:
+            target = min([end, self.next_event, *(c.next for c in self.clocks)])
+            if not self.about.variable_step:
+                target = self._check_even(now, end, target, h)
+            target = end if end - target < _ROUNDED * h else target
+            reached, event = self._take(now, (end if target == end else target) - now)
+            still = still + 1 if reached - now <= _ROUNDED * h else 0
+            if still > _MOST_ROUNDS:
+                raise FmuRuntimeError(
+                    f"its steps returned early at {reached:.9g} s {still} times in a row; expected that it goes on. "
+                    "Report it to its makers, or leave early_return out of stepping=.",
+                    block=self.instance.block.label,
+                    t=t,
+                )
+            now = end if end - reached <= _ROUNDED * h else reached
+            due = [c for c in self.clocks if c.next <= now + _ROUNDED * h and now < end]
+            if self.has_events and (event or due or self.next_event <= now + _ROUNDED * h):
+                self._handle_events(now, h, due, set_inputs=False)
+
+    def _check_even(self, now: float, end: float, target: float, h: float) -> float:
+        """Return the end of the step of an FMU that takes steps of one length only; refuse clocks within it."""
+        for clock in self.clocks:
+            if now + _ROUNDED * h < clock.next < end - _ROUNDED * h:
+                raise FmuRuntimeError(
+                    f"its clock {clock.variable.name} ticks at {clock.next:.9g} s, between two communication points, "
+                    "and it takes steps of one length only (canHandleVariableCommunicationStepSize is false); expected "
+                    f"steps that end there. Run with step={clock.interval:.9g}.",
+                    block=self.instance.block.label,
+                    t=now,
+                )
+        return end
+
+    def _take(self, t: float, h: float) -> tuple[float, bool]:
+        """Step once; return the time that was reached, and whether the FMU asks for Event Mode."""
+        instance, call = self.instance, self.call
+        instance.set_span(t, h)
+        if (status := call.function(*call.arguments)) > 1:
+            instance.end_step(status, t, h)
+            return t + h, False
+        event, _, early, _ = call.flags
+        if early and allows_early_return(self.about, self.options):
+            call.flags[2] = False
+            instance.check_flags(call, t, h)
+            return min(max(call.reached.value, t), t + h), bool(event)
+        instance.check_flags(call, t, h)
+        return t + h, bool(event)
+
+    # ---- values ----
+
+    def _set(self, part: _Part, t: float) -> None:
+        if not part.index.size:
+            return
+        try:
+            status = part.transfer.set()
+        except UnfitError as error:
+            raise self.instance.refuse_input(error, t) from None
+        if status > 1:
+            raise self.instance.report("setting the inputs", status, t)
+
+    def _get(self, t: float) -> None:
+        try:
+            status = self.outs.get()
+        except UnfitError as error:
+            raise self.instance.refuse_output(error, t) from None
+        if status > 1:
+            raise self.instance.report("reading the outputs", status, t)
+
+    def _tell_slopes(self, t: float) -> None:
+        """Tell the slopes of the real inputs by their differences from the step before (FMI 2.0, 4.2.1)."""
+        now = np.array(self.smooth.values)
+        if self._last is not None and t > self._last[0]:
+            slopes = (now - self._last[1]) / (t - self._last[0])
+            ports = [port for port, v in self.smooth.ports.items() if v.type == "Float64"]
+            references = [r for port in ports for r in self.smooth.ports[port].references]
+            values = [float(s) for port in ports for s in slopes[self.smooth.places[port]]]
+            if references:
+                call = (self.fmi.set_input_derivatives, references, values)
+                self.instance.call("telling the slopes of its inputs", *call)
+        self._last = t, now
+
+    # ---- events ----
+
+    def _handle_events(self, t: float, h: float, due: list[_Clock], *, set_inputs: bool) -> None:
+        """Enter Event Mode, let clocks tick, and settle (FMI 3.0, 2.3.5 and 4.2.1)."""
+        instance = self.instance
+        instance.call("entering Event Mode", self.fmi.enter_event_mode)
+        if set_inputs:
+            self._set(self.jumping, t)
+        self._activate(due)
+        self._settle(t)
+
+    def _activate(self, due: list[_Clock]) -> None:
+        if due:
+            references = [clock.variable.reference for clock in due]
+            self.instance.call("activating its clocks", self.fmi.activate_clocks, references)
+        for clock in due:
+            clock.tick()
+
+    def _settle(self, t: float) -> None:
+        """Update the discrete states until nothing changes, and go back to Step Mode."""
+        instance = self.instance
+        for _ in range(_MOST_ROUNDS):
+            found = instance.call("updating its discrete states", self.fmi.update_events)
+            if found.terminate:
+                raise instance.termination(t, 0.0)
+            self.next_event = found.next_time
+            if not found.again:
+                break
+        else:
+            raise FmuRuntimeError(
+                f"the events don't settle in {_MOST_ROUNDS} rounds (discreteStatesNeedUpdate); expected that they end. "
+                "Report it to its makers.",
+                block=instance.block.label,
+                t=t,
+            )
+        self._read_intervals(t, [c for c in self.clocks if not c.variable.is_periodic])
+        instance.call("entering Step Mode", self.fmi.enter_step_mode)
+
+    def _read_intervals(self, t: float, clocks: list[_Clock]) -> None:
+        """Ask the FMU for the intervals that its description does not state."""
+        if not clocks:
+            return
+        references = [clock.variable.reference for clock in clocks]
+        found = self.instance.call("reading the intervals of its clocks", self.fmi.clock_intervals, references)
+        for clock, (interval, qualifier) in zip(clocks, found, strict=True):
+            if clock.variable.is_periodic:
+                clock.start(t, interval, clock.variable.shift)
+            elif qualifier == _CHANGED:
+                clock.start(t, math.inf, interval)
+
+
+def retry_discarded(instance: SteppedInstance, call: StepCall, t: float, h: float) -> bool:
+    """Take a step that was discarded in smaller ones; return whether that has worked.
+
+    In FMI 3.0 the FMU is where it was before (4.2.1); in FMI 2.0 it is where its lastSuccessfulTime says (4.2.2), and
+    where it says nothing, the step is not taken again.
+
+    Parameters
+    ----------
+    instance : SteppedInstance
+        The instance.
+    call : StepCall
+        The FMU's step.
+    t, h : float
+        Start and length of the step in s.
+    """
+    options, about = instance.block.stepping, instance.description
+    smallest = h * 0.5**options.retries
+    if not options.retries or not about.variable_step:
+        return False
+    end, now, part, count = t + h, t, h, 0
+    status = DISCARD
+    while True:
+        if status == DISCARD:
+            known = instance.fmi.time_after_discard(now, part)
+            if known is None or part <= smallest * (1.0 + _ROUNDED):
+                return False
+            now = min(max(known, now), end)
+            part = min(0.5 * part, end - now)
+        elif status > 1:
+            return False
+        else:
+            now, count = now + part, count + 1
+        if end - now <= _ROUNDED * smallest:
+            break
+        part = min(part, end - now)
+        instance.set_span(now, part)
+        status = call.function(*call.arguments)
+        if status > 1 and status != DISCARD:
+            instance.end_step(status, now, part)
+        elif status <= 1 and call.any_flag.value:
+            instance.check_flags(call, now, part)
+    instance.set_span(t, h)
+    instance.note_retry(t, h, count)
+    return True

@@ -1,0 +1,322 @@
+"""Event Mode, clocks, early return, discarded steps, slopes of inputs, and the options of a step, against hand calculation."""
+
+import re
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Block, Constant, FmuRuntimeError, Output, ParameterError, Sine
+from loopwright.diagrams import Diagram
+from loopwright.fmus import Fmu, StepOptions
+from support.small_fmus import small_fmu, values
+
+# x' = u as long as x < 0.5; there the FMU asks for Event Mode, in which it turns round. A time event is at 0.25 s.
+EVENTS = (
+    """
+typedef struct { double t, x, u, sign, level, tolerance, told; int mode, beats, timed, rounds, early; } instance;
+void *fmi3InstantiateCoSimulation(const char *n, const char *k, const char *r, bool v, bool l, bool event, bool early) {
+    instance *c = calloc(1, sizeof(instance)); c->sign = 1; c->early = early; c->mode = event ? 1 : 0; return c; }
+int fmi3EnterInitializationMode(void *p, bool defined, double tol) {
+    ((instance *)p)->tolerance = defined ? tol : -1; return 0; }
+int fmi3EnterEventMode(void *p) { instance *c = p; if (c->mode == 1) return 3; c->mode = 1; c->rounds = 0; return 0; }
+int fmi3EnterStepMode(void *p) { instance *c = p; if (c->mode != 1) return 3; c->mode = 2; return 0; }
+int fmi3UpdateDiscreteStates(void *p, bool *more, bool *stop, bool *nominals, bool *v, bool *defined, double *next) {
+    instance *c = p; if (c->mode != 1) return 3;
+    if (!c->rounds && fabs(c->t - 0.25) < 1e-9) c->timed++;
+    if (c->x > 0.5 - 1e-12) c->sign = -1;
+    *more = c->rounds++ < 2; *stop = *nominals = *v = false; *defined = c->t < 0.25 - 1e-9; *next = 0.25; return 0; }
+int fmi3SetClock(void *p, const unsigned vr[], size_t n, const bool v[]) {
+    instance *c = p; if (c->mode != 1) return 3; c->beats += v[0]; return 0; }
+int fmi3DoStep(void *p, double t, double h, bool f, bool *e, bool *stop, bool *early, double *last) {
+    instance *c = p; *e = *stop = *early = false;
+    if (c->mode == 1 || fabs(t - c->t) > 1e-9) return 3;
+    double way = h; c->told = t;
+    if (c->sign > 0 && c->x + c->u * h > 0.5 && c->mode == 2) { way = (0.5 - c->x) / c->u; *e = true; *early = way < h && c->early; }
+    c->x += c->sign * c->u * way; c->t = t + way; *last = c->t; return 0; }
+"""
+    + values("fmi3", "Get", "Float64", "double", {1: "c->x", 3: "c->level", 4: "c->tolerance", 5: "c->told"})
+    + values("fmi3", "Get", "Int32", "int32_t", {6: "c->beats", 7: "c->timed", 9: "c->level"})
+    + values("fmi3", "Set", "Float64", "double", {2: "c->u"})
+    + values("fmi3", "Set", "Int32", "int32_t", {9: "if (c->mode == 2) return 3; c->level"})
+)
+MODEL = """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="{variable}" hasEventMode="true"/>
+<ModelVariables>
+<Float64 name="x" valueReference="1" causality="output"/>
+<Float64 name="u" valueReference="2" causality="input" start="0"/>
+<Float64 name="seen" valueReference="3" causality="output"/>
+<Float64 name="tolerance" valueReference="4" causality="output"/>
+<Float64 name="told" valueReference="5" causality="output"/>
+<Int32 name="beats" valueReference="6" causality="output"/><Int32 name="timed" valueReference="7" causality="output"/>
+<Int32 name="level" valueReference="9" causality="input" variability="discrete" start="0"/>
+{clock}</ModelVariables><ModelStructure>{outputs}</ModelStructure>"""
+CLOCK = (
+    '<Clock name="beat" valueReference="8" causality="input" intervalVariability="constant" intervalDecimal="0.15"/>'
+)
+OUTPUTS = "".join(f'<Output valueReference="{k}"/>' for k in (1, 3, 4, 5, 6, 7))
+
+
+class Level(Block):
+    """2 from 0.3 s on, 1 before it."""
+
+    y = Output()
+
+    def output(self, t, x, u):
+        return np.where(t < 0.299, 1.0, 2.0)
+
+
+@pytest.fixture(scope="module")
+def folder(cache, tmp_path_factory):
+    return tmp_path_factory.mktemp("stepping")
+
+
+@pytest.fixture(scope="module")
+def events(folder):
+    return small_fmu(folder, "fmi3", EVENTS, MODEL.format(clock="", outputs=OUTPUTS, variable="true"))
+
+
+@pytest.fixture(scope="module")
+def clocked(folder):
+    return small_fmu(
+        folder, "fmi3", EVENTS, MODEL.format(clock=CLOCK, outputs=OUTPUTS, variable="true"), name="clocked"
+    )
+
+
+def simulate(plant, duration=1.0, step=0.1, **inputs):
+    wires = {"u": Constant(value=1.0), "level": Level()} | inputs
+    return Diagram("d", plant(**wires)).simulate(duration, step=step, progress=False)
+
+
+# --- Event Mode ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", [0.1, 0.07, 1.0])
+def test_an_event_within_a_step_is_handled_where_it_is(events, step):
+    plant = Fmu(events, name="plant", stepping=StepOptions(event_mode=True))
+    run = simulate(plant, 14 * 0.07 if step == 0.07 else 1.0, step)
+    assert run["plant.x"] == pytest.approx(np.where(run.t < 0.5, run.t, 1.0 - run.t), abs=1e-12)
+    assert run["plant.timed"][-1] == 1.0
+
+
+def test_without_event_mode_the_fmu_is_stepped_as_before(events):
+    run = simulate(Fmu(events, name="plant"), level=Constant(value=0.0))
+    assert run["plant.x"] == pytest.approx(run.t, abs=1e-12)
+    assert run["plant.timed"][-1] == 0.0
+
+
+def test_discrete_inputs_are_set_in_event_mode(events):
+    run = simulate(Fmu(events, name="plant", stepping=StepOptions(event_mode=True)))
+    assert run["plant.seen"].tolist() == [*[1.0] * 4, *[2.0] * 7]  # seen one step after they are set
+
+
+def test_periodic_clocks_tick_at_their_times_whatever_the_step(clocked):
+    for step in (0.1, 0.25):
+        run = simulate(Fmu(clocked, name="plant"), step=step)
+        assert run["plant.beats"].tolist() == [1.0, *[np.floor((t - 1e-9) / 0.15) + 1.0 for t in run.t[1:]]]
+
+
+def test_a_clock_between_the_steps_of_an_fmu_with_even_steps_is_refused(folder):
+    file = small_fmu(folder, "fmi3", EVENTS, MODEL.format(clock=CLOCK, outputs=OUTPUTS, variable="false"), name="even")
+    with pytest.raises(FmuRuntimeError, match=r"^plant, t = 0\.1 s: its clock beat ticks at 0\.15 s, between two") as e:
+        simulate(Fmu(file, name="plant"))
+    assert "Run with step=0.15." in str(e.value)
+    assert simulate(Fmu(file, name="plant"), 0.9, 0.15)["plant.beats"][-1] == 6.0
+
+
+def test_events_that_never_settle_are_an_error(folder):
+    endless = EVENTS.replace("*more = c->rounds++ < 2", "*more = true")
+    file = small_fmu(folder, "fmi3", endless, MODEL.format(clock="", outputs=OUTPUTS, variable="true"), name="endless")
+    with pytest.raises(FmuRuntimeError, match=r"the events don't settle in 100 rounds \(discreteStatesNeedUpdate\)"):
+        simulate(Fmu(file, name="plant", stepping=StepOptions(event_mode=True)))
+
+
+# --- early return -------------------------------------------------------------------------------------------------------
+
+STOPS_OFTEN = (
+    """
+typedef struct { double t; int steps, allowed, stuck; } instance;
+void *fmi3InstantiateCoSimulation(const char *n, const char *k, const char *r, bool v, bool l, bool event, bool early) {
+    instance *c = calloc(1, sizeof(instance)); c->allowed = early; return c; }
+int fmi3DoStep(void *p, double t, double h, bool f, bool *e, bool *stop, bool *early, double *last) {
+    instance *c = p; *e = *stop = *early = false; if (fabs(t - c->t) > 1e-12) return 3;
+    double way = c->allowed && h > 0.04 ? 0.04 : h; if (STUCK) way = 0;
+    *early = way < h; c->t = t + way; c->steps++; *last = c->t; return 0; }
+"""
+    + values("fmi3", "Get", "Float64", "double", {1: "c->t"})
+    + values("fmi3", "Get", "Int32", "int32_t", {2: "c->steps"})
+)
+SIMPLE = """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="true" {more}/><ModelVariables>
+<Float64 name="y" valueReference="1" causality="output"/><Int32 name="steps" valueReference="2" causality="output"/>
+</ModelVariables><ModelStructure><Output valueReference="1"/><Output valueReference="2"/></ModelStructure>"""
+
+
+def test_a_step_goes_on_from_where_it_returned_early(folder):
+    file = small_fmu(folder, "fmi3", STOPS_OFTEN.replace("STUCK", "0"), SIMPLE.format(more=""))
+    plant = Fmu(file, name="plant", stepping=StepOptions(early_return=True))
+    run = Diagram("d", plant()).simulate(0.5, step=0.1, progress=False)
+    assert run["plant.y"] == pytest.approx(run.t, abs=1e-15)
+    assert run["plant.steps"].tolist() == [0, 3, 6, 9, 12, 15]  # 40, 40 and 20 ms
+
+
+def test_an_fmu_that_never_goes_on_is_an_error(folder):
+    file = small_fmu(folder, "fmi3", STOPS_OFTEN.replace("STUCK", "c->t > 0.25"), SIMPLE.format(more=""))
+    plant = Fmu(file, name="plant", stepping=StepOptions(early_return=True))
+    with pytest.raises(FmuRuntimeError, match=r"^plant, t = 0\.2 s: its steps returned early at 0\.28 s 101 times"):
+        Diagram("d", plant()).simulate(0.5, step=0.1, progress=False)
+
+
+# --- discarded steps ----------------------------------------------------------------------------------------------------
+
+DISCARDS3 = (
+    """
+typedef struct { double t; int steps; } instance;
+int fmi3DoStep(void *p, double t, double h, bool f, bool *e, bool *stop, bool *early, double *last) {
+    instance *c = p; *e = *stop = *early = false; *last = -7;
+    if (t + h > 0.2 && h > LONGEST) return 2;
+    c->t = *last = t + h; c->steps++; return 0; }
+"""
+    + values("fmi3", "Get", "Float64", "double", {1: "c->t"})
+    + values("fmi3", "Get", "Int32", "int32_t", {2: "c->steps"})
+)
+DISCARDS2 = (
+    """
+typedef struct { double t; int steps; } instance;
+int fmi2DoStep(void *p, double t, double h, int f) {
+    instance *c = p; if (fabs(t - c->t) > 1e-12) return 3;
+    if (t + h > 0.2 && h > LONGEST) { c->t = t + LONGEST; return 2; }
+    c->t = t + h; c->steps++; return 0; }
+int fmi2GetRealStatus(void *p, int kind, double *v) { if (kind != 2 || SILENT) return 3; *v = ((instance *)p)->t; return 0; }
+int fmi2GetBooleanStatus(void *p, int kind, int *v) { *v = 0; return 0; }
+"""
+    + values("fmi2", "Get", "Real", "double", {1: "c->t"})
+    + values("fmi2", "Get", "Integer", "int", {2: "c->steps"})
+)
+SIMPLE2 = """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="{variable}" {more}/><ModelVariables>
+<ScalarVariable name="y" valueReference="1" causality="output"><Real/></ScalarVariable>
+<ScalarVariable name="steps" valueReference="2" causality="output" variability="discrete"><Integer/></ScalarVariable>
+</ModelVariables><ModelStructure><Outputs><Unknown index="1"/><Unknown index="2"/></Outputs></ModelStructure>"""
+
+
+def discarding(folder, fmi, longest, *, silent=0, variable="true"):
+    if fmi == 3:
+        return small_fmu(folder, "fmi3", DISCARDS3.replace("LONGEST", longest), SIMPLE.format(more=""))
+    source = DISCARDS2.replace("LONGEST", longest).replace("SILENT", str(silent))
+    return small_fmu(folder, "fmi2", source, SIMPLE2.format(variable=variable, more=""))
+
+
+@pytest.mark.parametrize("fmi", [3, 2])
+def test_discarded_steps_are_taken_in_smaller_ones(folder, fmi):
+    plant = Fmu(discarding(folder, fmi, "0.03"), name="plant")
+    run = Diagram("d", plant()).simulate(0.4, step=0.1, progress=False)
+    assert run["plant.y"] == pytest.approx(run.t, abs=1e-15)
+    assert run["plant.steps"][2] == 2.0  # whole steps up to 0.2 s
+    assert run["plant.steps"][-1] > 4.0
+    assert [m for m in run.messages if re.match(r"plant: t = 0\.2 s: the FMU discarded a step of 0\.1 s; it was", m)]
+
+
+@pytest.mark.parametrize(("fmi", "options"), [(3, {}), (2, {"silent": 1}), (2, {"variable": "false"})])
+def test_steps_that_are_always_discarded_end_the_run(folder, fmi, options):
+    plant = Fmu(discarding(folder, fmi, "0", **options), name="plant")
+    with pytest.raises(FmuRuntimeError, match=rf"t = 0\.2 s: .*was discarded.*fmi{fmi}Discard") as e:
+        Diagram("d", plant()).simulate(0.4, step=0.1, progress=False)
+    assert e.value.run["plant.steps"].tolist() == [0, 1, 2]  # what was right is kept
+
+
+def test_no_step_is_tried_again_without_retries(folder):
+    plant = Fmu(discarding(folder, 3, "0.03"), name="plant", stepping=StepOptions(retries=0))
+    with pytest.raises(FmuRuntimeError, match="was discarded"):
+        Diagram("d", plant()).simulate(0.4, step=0.1, progress=False)
+
+
+@pytest.mark.parametrize(("says", "where"), [("-1", "before it began"), ("t + 0.5 * h", "short of its end")])
+def test_a_step_that_says_another_end_is_told_once(folder, says, where):
+    source = DISCARDS3.replace("if (t + h > 0.2 && h > LONGEST) return 2;", "").replace(
+        "*last = t + h", f"t + h; *last = {says}"
+    )
+    plant = Fmu(small_fmu(folder, "fmi3", source, SIMPLE.format(more="")), name="plant")
+    run = Diagram("d", plant()).simulate(0.4, step=0.1, progress=False)
+    (message,) = run.messages
+    assert message.startswith("plant: t = 0 s: the FMU says that a step of 0.1 s ended at ")
+    assert where in message
+    assert run["plant.y"] == pytest.approx(run.t, abs=1e-15)
+
+
+# --- slopes of inputs ---------------------------------------------------------------------------------------------------
+
+INTEGRATOR = (
+    """
+typedef struct { double t, x, u, du; } instance;
+int fmi2SetRealInputDerivatives(void *p, const unsigned vr[], size_t n, const int order[], const double v[]) {
+    for (size_t i = 0; i < n; i++) { if (order[i] != 1 || vr[i] != 2) return 3; ((instance *)p)->du = v[i]; } return 0; }
+int fmi2DoStep(void *p, double t, double h, int f) {
+    instance *c = p; c->x += h * (c->u + 0.5 * h * c->du); c->t = t + h; return 0; }
+"""
+    + values("fmi2", "Get", "Real", "double", {1: "c->x"})
+    + values("fmi2", "Set", "Real", "double", {2: "c->u"})
+)
+INTEGRATOR_MODEL = """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="true" {more}/>
+<ModelVariables><ScalarVariable name="x" valueReference="1" causality="output"><Real/></ScalarVariable>
+<ScalarVariable name="u" valueReference="2" causality="input"><Real start="0"/></ScalarVariable>
+</ModelVariables><ModelStructure><Outputs><Unknown index="1"/></Outputs></ModelStructure>"""
+
+
+@pytest.fixture(scope="module")
+def integrator(folder):
+    return small_fmu(folder, "fmi2", INTEGRATOR, INTEGRATOR_MODEL.format(more='canInterpolateInputs="true"'))
+
+
+@pytest.mark.parametrize(("slopes", "order"), [(False, 1), (True, 2)])
+def test_slopes_of_inputs_raise_the_order(integrator, slopes, order):
+    plant = Fmu(integrator, name="plant", stepping=StepOptions(input_derivatives=slopes))
+    errors = []
+    for n in (160, 320):
+        wave = Sine(amplitude=1.0, frequency=1.0)
+        run = Diagram("d", plant(u=wave)).simulate(1.0, step=1.0 / n, progress=False)
+        errors.append(abs(run["plant.x"][n // 4] - (1.0 - np.cos(2.0 * np.pi * run.t[n // 4])) / (2.0 * np.pi)))
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.25)
+
+
+# --- options ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("time", ["multiplied", "added"])
+def test_the_time_that_the_fmu_is_told_is_that_of_the_chosen_arithmetic(events, time):
+    plant = Fmu(events, name="plant", stepping=StepOptions(time=time))
+    run = simulate(plant, 2.0, 0.1, level=Constant(value=0.0), u=Constant(value=0.01))
+    want, t = [], 0.0
+    for i in range(20):
+        want.append(t if time == "added" else i / 10)
+        t += 0.1
+    assert run["plant.told"][1:].tolist() == want
+    assert want[10] == (0.9999999999999999 if time == "added" else 1.0)
+
+
+def test_the_tolerance_is_told(events):
+    assert simulate(Fmu(events, name="plant"), level=Constant(value=0.0))["plant.tolerance"][-1] == -1.0
+    told = Fmu(events, name="plant", stepping=StepOptions(tolerance=1e-7))
+    assert simulate(told, level=Constant(value=0.0))["plant.tolerance"][-1] == 1e-7
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"tolerance": 0.0}, r"stepping\.tolerance: found 0\.0; expected a positive number"),
+        ({"retries": 1000}, r"stepping\.retries: found 1000; expected an integer from 0 to 50"),
+        ({"event_mode": "yes"}, r"stepping\.event_mode: found 'yes'; expected True or False"),
+        ({"time": "exact"}, r"stepping\.time: found 'exact'; expected 'multiplied' or 'added'"),
+    ],
+)
+def test_wrong_options_are_refused(options, text):
+    with pytest.raises(ParameterError, match=text):
+        StepOptions(**options)
+
+
+@pytest.mark.parametrize(
+    ("name", "flag"),
+    [("event_mode", "hasEventMode"), ("early_return", "FMI 3.0"), ("input_derivatives", "canInterpolateInputs")],
+)
+def test_options_that_the_fmu_does_not_offer_are_refused(folder, name, flag):
+    file = discarding(folder, 2, "0.03")
+    with pytest.raises(ParameterError, match=rf"^plant\.stepping\.{name}: found True; .*{flag}"):
+        Fmu(file, name="plant", stepping=StepOptions(**{name: True}))
+    with pytest.raises(ParameterError, match=r"^plant\.stepping: found 3; expected a StepOptions"):
+        Fmu(file, name="plant", stepping=3)
