@@ -52,10 +52,11 @@ from .frequency import (
     sensitivity,
 )
 from .linearization import Kink, Linearization, MeanSlope, StepsOnly, ZeroSlope
-from .measure import FrequencyResponse
+from .measure import FrequencyResponse, StepResponse
 from .paper import Channel, Fig3Diagram, Rig, experiments, fig3
 from .report import analyse
 from .report_writing import Plot, Report, Section, Table
+from .requirements import Requirements, Review, Verdict
 from .results import Occurrence, OperatingPoint, Run, RunState, Snapshot, Stopped, TextSignal
 from .simulation import Interrupted, RunOptions, Simulation, SimulationView
 from .wiring import Subsystem, SubsystemSettings, Wire, subsystem
@@ -92,6 +93,8 @@ __all__ = [
     "PhaseCrossover",
     "Plot",
     "Report",
+    "Requirements",
+    "Review",
     "Rig",
     "Run",
     "RunOptions",
@@ -103,12 +106,14 @@ __all__ = [
     "Snapshot",
     "StabilityLimit",
     "StabilityMap",
+    "StepResponse",
     "StepsOnly",
     "Stopped",
     "Subsystem",
     "SubsystemSettings",
     "Table",
     "TextSignal",
+    "Verdict",
     "Wire",
     "ZeroSlope",
     "analyse",

@@ -223,10 +223,10 @@ PUBLIC = {
         AdmittanceLoop BlockReport Channel Comparison Contact ContactAdmittance ContactLimit ContactMap Diagram DiskMargin Drawing Fig3Diagram FlatDiagram
         FrequencyResponse GainCrossover GangOfFour Interrupted Kink Layout Linearization Margins MeanSlope Number
         NyquistCount Occurrence
-        OperatingPoint Passivity PeriodicMargins PhaseCrossover Plot Report Rig Run RunOptions RunState SampledDesign
+        OperatingPoint Passivity PeriodicMargins PhaseCrossover Plot Report Requirements Review Rig Run RunOptions RunState SampledDesign
         Section
-        Simulation SimulationView Snapshot StabilityLimit StabilityMap StepsOnly Stopped Subsystem SubsystemSettings Table
-        TextSignal Wire ZeroSlope analyse check_block compare_with_control complementary crossing_frequency delayed_hold
+        Simulation SimulationView Snapshot StabilityLimit StabilityMap StepResponse StepsOnly Stopped Subsystem SubsystemSettings Table
+        TextSignal Verdict Wire ZeroSlope analyse check_block compare_with_control complementary crossing_frequency delayed_hold
         delayed_hold_margin disk_margin experiments fig3 gang_of_four growth_rate loop_at margins
         mimo_disk_margin nyquist_count passivity periodic_margins place poles rendered_admittance rendered_response
         rendered_system rule_of_thumb sampled_gains sampled_poles sensitivity stability_limit stability_map

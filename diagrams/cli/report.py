@@ -8,15 +8,20 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 
-from ...blocks.core import DefinitionError, FmuError, FmuFileError, LoopwrightError, OptionError, near
+from ...blocks.core import DefinitionError, FmuError, FmuFileError, LoopwrightError, OptionError, UnknownNameError, near
 from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..paper import EXPERIMENTS, Experiment
 from ..report_writing import Report
+from ..requirements import Reason, Requirements, Review, Verdict, read_requirements
 from .options import parse_options, share
 from .text import say
 from .user_models import load_user_file
 
+ABOUT = ("title", "author", "project", "date")
+"""Lines of the heading that the command line can give."""
+EXIT_STATUS = {Verdict.PASSED: 0, Verdict.FAILED: 3, Verdict.UNDECIDED: 4}
+"""Exit status of ``--check``."""
 DEFAULT = "B"
 """The experiment whose Fig. 3 is taken: both admittances are in it."""
 
@@ -32,13 +37,22 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "DIAGRAM is an experiment of the paper (A, B, C or D; B without one: Fig. 3 with both admittances)\n"
         "or FILE.py:NAME, a diagram of yours, or a function without arguments that returns one.",
         epilog="options of the experiments: as in loopwright run --help\n\n"
-        "exit status:\n  0    done\n  1    the analysis failed, or a plant could not be built; nothing is written\n"
-        "  2    wrong usage; nothing was analysed\n  130  interrupted (Ctrl-C); nothing is written",
+        "exit status:\n  0    done; with --check: all requirements are met\n"
+        "  1    the analysis failed, or a plant could not be built; nothing is written\n"
+        "  2    wrong usage; nothing was analysed\n  3    with --check: a requirement fails; the files are written\n"
+        "  4    with --check: a requirement is not decided, and none fails; the files are written\n"
+        "  130  interrupted (Ctrl-C); nothing is written",
     )
     report.add_argument("diagram", nargs="?", metavar="DIAGRAM", help="A, B, C, D, or FILE.py:NAME")
     report.add_argument("--out", metavar="FILE.html", help="the page (default: fig3.html, or the diagram's name)")
     report.add_argument("--pdf", action="store_true", help="the same as PDF beside it (pip install 'loopwright[pdf]')")
     report.add_argument("--json", action="store_true", help="all numbers as JSON beside it")
+    report.add_argument(
+        "--requirements", metavar="FILE.toml", help="requirements on loops and responses; see docs/reports.md"
+    )
+    report.add_argument("--check", action="store_true", help="say by the exit status whether they are met")
+    for name in ABOUT:
+        report.add_argument(f"--{name}", metavar="TEXT", help=f"the {name} in the report's heading")
     report.add_argument("--plant", metavar="FILE.fmu", help="another plant in place of the gantry")
     report.add_argument(
         "--stairs", choices=["gain"], help="take stairs, as of quantizers and encoders, as their mean slope"
@@ -57,6 +71,9 @@ def report_command(arguments: argparse.Namespace) -> int:
     """Make the diagram, analyse it, write the files; return the exit status."""
     from ..report_writing import check_files, write_report
 
+    if arguments.check and arguments.requirements is None:
+        raise OptionError("there is nothing to check. Give the file: --requirements loop.toml.", port="--check")
+    asked = None if arguments.requirements is None else read_requirements(arguments.requirements)
     subject = arguments.diagram or DEFAULT
     with contextlib.ExitStack() as open_file:
         try:
@@ -69,9 +86,13 @@ def report_command(arguments: argparse.Namespace) -> int:
         out = arguments.out or (f"{diagram.name}.html" if arguments.diagram else "fig3.html")
         check_files(out, pdf=arguments.pdf, json=arguments.json)
         began = time.perf_counter()
+        about = {name: text for name in ABOUT if (text := getattr(arguments, name)) is not None}
         try:
             with _progress(diagram.name) as tell:
-                report = _analyse(diagram, experiment, arguments.stairs, tell)
+                report = _analyse(diagram, experiment, arguments.stairs, asked, about, tell)
+        except UnknownNameError as error:
+            say(f"loopwright: error: {error}", sys.stderr)
+            return 1 if asked is None else 2
         except LoopwrightError as error:
             say(f"loopwright: error: {error}", sys.stderr)
             return 1
@@ -88,15 +109,34 @@ def report_command(arguments: argparse.Namespace) -> int:
             say("loopwright: interrupted; the report is not written.", sys.stderr)
             return 130
     say(f"Written: {'  '.join(map(str, files))}")
-    return 0
+    if report.review is not None:
+        say(_verdict(report.review))
+    return EXIT_STATUS[report.review.verdict] if arguments.check and report.review is not None else 0
+
+
+def _verdict(reviewed: Review) -> str:
+    """Return the verdict as lines of text: all requirements that are not met, by the paths of their numbers."""
+    lines = [f"Requirements: {reviewed.verdict}."]
+    for result in (*reviewed.of(Verdict.FAILED), *reviewed.of(Verdict.UNDECIDED)):
+        place = result.path or ".".join(part for part in (result.loop, result.variant, result.quantity) if part)
+        found = "" if result.number is None else f" found {result.number},"
+        reason = "" if result.reason is Reason.COMPARED else f" ({result.reason})"
+        lines.append(f"  {result.verdict}: {place}:{found} required {result.limit}{reason}")
+    return "\n".join(lines)
 
 
 def _analyse(
-    diagram: Diagram, experiment: Experiment | None, stairs: str | None, tell: Callable[[str], None]
+    diagram: Diagram,
+    experiment: Experiment | None,
+    stairs: str | None,
+    asked: Requirements | None,
+    about: Mapping[str, str],
+    tell: Callable[[str], None],
 ) -> Report:
     from ..report import analyse, with_drawing
 
-    return with_drawing(analyse(diagram, experiment=experiment, stairs=stairs, progress=tell), diagram)
+    made = analyse(diagram, experiment=experiment, stairs=stairs, requirements=asked, about=about, progress=tell)
+    return with_drawing(made, diagram)
 
 
 @contextlib.contextmanager

@@ -189,8 +189,8 @@ class InjectionRun:
         """Time that the run has reached in s."""
         return self.simulation.t
 
-    def play(self, waveform: Waveform, entry: int, ramp: float) -> None:
-        """Begin a test signal at one entry of the wire, with a ramp in s, now."""
+    def play(self, waveform: Waveform, entry: int, ramp: float, ahead: float = 0.0) -> None:
+        """Begin a test signal at one entry of the wire, with a ramp in s, now, or some seconds ahead of now."""
         path = self.made.source
         block = cast(Excitation, self.flat.table.blocks[path])
         direction = np.zeros(np.size(block.direction))
@@ -198,10 +198,15 @@ class InjectionRun:
         shape = np.shape(block.direction)
         changed = block.replace(
             direction=direction.reshape(shape) if shape else float(direction[0]), amplitude=waveform.amplitude,
-            frequency=waveform.frequency, sweep=waveform.sweep, phase=waveform.phase, start_time=self.t, ramp=ramp,
-            period=waveform.period,
+            frequency=waveform.frequency, sweep=waveform.sweep, phase=waveform.phase, start_time=self.t - ahead,
+            ramp=ramp, period=waveform.period,
         )  # fmt: skip
         self.simulation.set_parameters(path, changed)
+
+    def step(self, size: float, entry: int) -> None:
+        """Add a step of a size at one entry of the wire, from now on: a line of frequency 0 whose ramp is over."""
+        one, zero = np.ones(1), np.zeros(1)
+        self.play(Waveform(size * one, zero, zero, 0.5 * np.pi * one, 1.0), entry, ramp=1.0, ahead=2.0)
 
     def go(self, count: int, every: int) -> None:
         """Advance the run by ``count`` samples of ``every`` ticks."""

@@ -21,7 +21,7 @@ from ..admittance import (
 from ..frequency import Number, with_findings
 from ..report import Implementation
 from ..report_writing import Plot, Section, Table, Texts
-from .reduced_loops import ReducedLoops, each_implementation
+from .reduced_loops import OPTIONS, ReducedLoops, each_implementation
 from .report_case import Fig3Case
 from .report_contact import DAMPINGS, SPRING, again, contact_sections, find_contacts
 from .report_figures import RULE, TARGET, WITH_FRICTION, draw_admittances, draw_stability
@@ -101,7 +101,7 @@ def _passivity(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Ta
 def _limits(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Iterator[Table]:
     for key, kind in loops.kinds(side).items():
         rows = []
-        for name in Implementation:
+        for name in OPTIONS:
             for b in DAMPINGS:
                 found = loops.limit(side, key, name, b)
                 rule = Number(found.rule_of_thumb, "N/m", 0.0, "closed form (d + b_e)/T_d")

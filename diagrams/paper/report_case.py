@@ -9,7 +9,17 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from ...blocks import Constant, ErrorDynamics, FeedbackLinearization, Gain, Path, PlanarModel, Reference, Step
+from ...blocks import (
+    Constant,
+    ErrorDynamics,
+    FeedbackLinearization,
+    Gain,
+    Path,
+    PlanarModel,
+    Reference,
+    Step,
+    UnitDelay,
+)
 from ...blocks.core import LoopwrightError
 from ...fmus.models import Gantry
 from ...fmus.running import Fmu
@@ -58,8 +68,15 @@ class Fig3Case(Case):
         if self.smooth is None:
             yield Basis(self.base)
         else:
-            yield Basis(self.smooth)
-            yield Basis(self.base, FRICTION, ", with friction", is_design=False)
+            yield Basis(self.smooth, lacks=TEXTS.line("without_friction"))
+            yield Basis(self.base, FRICTION, is_design=False)
+
+    def own_delay(self) -> int | None:
+        """Return the samples of delay that the controller has: one where its computation is a unit delay."""
+        own, kept = (of.blocks.get("controller.computation") for of in (self.diagram, self.base))
+        if type(own) is type(kept):  # there is none, or it could not be taken out
+            return super().own_delay()
+        return 1 if isinstance(own, UnitDelay) else None
 
     @cached_property
     def base(self) -> WiredDiagram:
@@ -182,6 +199,10 @@ class Fig3Case(Case):
     def loop_wires(self) -> Mapping[str, str]:
         """Return the virtual inputs."""
         return {side: f"controller.{name}" for side, name in SIDES.items()}
+
+    def extra_loops(self) -> tuple[str, ...]:
+        """Return the loop at both motor forces."""
+        return ("motor_force",)
 
     def excitation(self, variant: Variant, wire: str) -> InjectionPlan:
         """Return the test signal, for a variant whose references are held, so that it stays where it is."""

@@ -11,9 +11,9 @@ from ..report import (
     MEMORY,
     OPERATING_POINTS,
     REMARKS,
+    STEPS,
     SUBJECT,
     SUBJECT_TITLE,
-    UNSTABLE,
     ReportKind,
     ReportPart,
 )
@@ -58,7 +58,6 @@ def friction_not_modelled(case: Fig3Case) -> Section:
 FIG3 = ReportKind(
     Fig3Case,
     (
-        UNSTABLE,
         SUBJECT,
         ReportPart("subject", friction_in_keys, has_friction),
         REMARKS,
@@ -69,6 +68,7 @@ FIG3 = ReportKind(
         ReportPart("poles", claims),
         INNER_LOOPS,
         ReportPart("inner", motor_forces),
+        STEPS,
         ReportPart("admittance", admittance, has_admittance),
         ReportPart("time_domain", limits_tried, is_tried),
         INJECTION,

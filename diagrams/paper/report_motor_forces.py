@@ -19,7 +19,7 @@ def motor_forces(case: Fig3Case) -> Section | None:
     rows: list[tuple[Any, ...]] = []
     notes: list[str] = []
     for v in case.usable():
-        if not v.is_design and v.implementation is not Implementation.SAMPLED:
+        if not (v.is_design or v.is_actual or v.implementation is Implementation.SAMPLED):
             continue
         for place, eta, xi in case.places():
             at = case.at(v, eta, xi)

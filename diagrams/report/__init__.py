@@ -9,8 +9,8 @@ from .analysis import (
     MEMORY,
     OPERATING_POINTS,
     REMARKS,
+    STEPS,
     SUBJECT,
-    UNSTABLE,
     analyse,
 )
 from .case import Basis, Case, InjectionPlan
@@ -37,9 +37,9 @@ __all__ = [
     "OPERATING_POINTS",
     "POLES_TITLE",
     "REMARKS",
+    "STEPS",
     "SUBJECT",
     "SUBJECT_TITLE",
-    "UNSTABLE",
     "Basis",
     "Case",
     "Implementation",

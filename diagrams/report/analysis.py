@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import os
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -11,29 +12,33 @@ from ..flat import WiredDiagram
 from ..frequency import on_one_thread
 from ..linearization import find_signal
 from ..report_writing import DEFINITIONS, Report
+from ..requirements import Requirements, read_requirements
 from .case import Case, ReportedExperiment
+from .content_hash import content_hash
 from .parts import HasReportKind, MakesSections, ReportKind, ReportPart
 from .points import STEP
+from .review import review
 from .section_injection import injected
 from .section_limits import not_modelled
 from .section_loops import inner
 from .section_poles import closed_loops, memory
+from .section_steps import steps
 from .section_subject import operating_points, remarks, subject, versions
-from .stability import unstable_first
+from .section_summary import summary
 
-UNSTABLE = ReportPart("subject", unstable_first)
 SUBJECT = ReportPart("subject", subject)
 REMARKS = ReportPart("subject", remarks)
 OPERATING_POINTS = ReportPart("operating_points", operating_points)
 CLOSED_LOOPS = ReportPart("poles", closed_loops)
 MEMORY = ReportPart("poles", memory)
 INNER_LOOPS = ReportPart("inner", inner)
+STEPS = ReportPart("steps", steps)
 INJECTION = ReportPart("injection", injected)
 LIMITS = ReportPart("limits", not_modelled)
 
 ANY_DIAGRAM = ReportKind(
     Case,
-    (UNSTABLE, SUBJECT, REMARKS, OPERATING_POINTS, CLOSED_LOOPS, MEMORY, INNER_LOOPS, INJECTION, LIMITS),
+    (SUBJECT, REMARKS, OPERATING_POINTS, CLOSED_LOOPS, MEMORY, INNER_LOOPS, STEPS, INJECTION, LIMITS),
     DEFINITIONS,
 )
 """The report of a diagram of which nothing is known but its structure."""
@@ -48,6 +53,8 @@ def analyse(
     experiment: ReportedExperiment | None = None,
     only: tuple[str, ...] | None = None,
     stairs: str | None = None,
+    requirements: Requirements | str | os.PathLike[str] | None = None,
+    about: Mapping[str, str] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Report:
     """Analyse a diagram, and return the content of its report.
@@ -74,6 +81,11 @@ def analyse(
     stairs : {"gain"}, optional
         "gain" takes the stairs of quantizers and encoders as their mean slope in all linear models; without it their
         slope is zero.
+    requirements : Requirements or path, optional
+        Requirements on the design, or a TOML file of them. `Report.review` has the verdicts, which the first page and
+        the JSON tell.
+    about : mapping of str to str, optional
+        Lines of the heading: ``title``, ``author``, ``project``, ``date``, ``revision``, or any other.
     progress : callable, optional
         Told the key of each section before it is made.
 
@@ -89,7 +101,7 @@ def analyse(
     OptionError
         An unknown section.
     UnknownNameError
-        If there is no wire with a name in ``loops``.
+        If there is no wire with a name in ``loops``, or no loop, variant or wire with one in ``requirements``.
     """
     if not isinstance(diagram, WiredDiagram):
         experiment, diagram = diagram, diagram.diagram
@@ -99,14 +111,23 @@ def analyse(
     for wire in wires or ():
         find_signal(diagram.flatten(None if diagram.has_clock else STEP), wire)
     tell = progress or (lambda key: None)
-    case, sections = kind.sections(diagram, point, experiment, wires, only, tell, stairs)
+    asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(requirements)
+    case, sections = kind.sections(diagram, point, experiment, wires, only, tell, stairs, asked)
+    made = Report("", sections).numbers()
+    reviewed = None if asked is None else review(case, asked, made)
+    if only is None or asked is not None:
+        sections = (summary(case, reviewed, made), *sections)
     name = diagram.name if experiment is None else f"Experiment {experiment.letter}: {diagram.name}"
+    lines = {str(key): str(text) for key, text in (about or {}).items()}
+    title = lines.pop("title", f"Design report: {name}")
     meta: dict[str, Any] = {
         "diagram": diagram.name,
+        **lines,
+        "revision": content_hash(diagram),
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": versions(),
         "variants": {key: v.title if not v.problem else f"left out: {v.problem}" for key, v in case.variants.items()},
         "definitions": dict(kind.definitions),
         "fmus": {path: b.description.digest for path, b in diagram.blocks.items() if isinstance(b, Fmu)},
     }
-    return Report(f"Design report: {name}", sections, meta)
+    return Report(title, sections, meta, reviewed)

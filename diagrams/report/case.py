@@ -11,10 +11,13 @@ from ...blocks.core import LoopwrightError
 from ..flat import WiredDiagram
 from ..linearization import UnusualStart
 from ..report_writing import Texts
+from ..requirements import Requirements
 from .variant import Implementation, Variant, in_s
 from .wires import wires_on_loops
 
 TEXTS = Texts(__package__, "subject")
+AS_IT_IS = "as it is"
+"""Title of the variant that leaves nothing out."""
 LATER = 10
 """Ticks after the start that an operating point is at, where the first tick is unlike the others."""
 AMPLITUDE = 1e-4
@@ -36,12 +39,13 @@ class ReportedExperiment(Protocol):
 class Basis(NamedTuple):
     """A diagram whose implementations are analysed.
 
-    ``suffix`` and ``title`` end the keys and titles of its variants; ``is_design`` is as of `Variant`.
+    ``suffix`` ends the keys of its variants, and ``lacks`` their titles: it says what is left out of the diagram, and
+    is empty for the diagram as it is. ``is_design`` is as of `Variant`.
     """
 
     diagram: WiredDiagram
     suffix: str = ""
-    title: str = ""
+    lacks: str = ""
     is_design: bool = True
 
 
@@ -75,11 +79,13 @@ class Case:
     Attributes
     ----------
     variants : dict of str to Variant
-        All variants by key, those that can't be analysed as well.
+        All variants by key, those that can't be analysed as well; the diagram as it is comes first.
     notes : list of str
         Remarks on how the variants were made.
     keys : tuple of str
         Keys of the sections that the report is to have.
+    requirements : Requirements, optional
+        Requirements on the design.
     """
 
     inputs: tuple[str, ...] = ()
@@ -99,10 +105,13 @@ class Case:
         self.stairs = stairs
         self.notes: list[str] = []
         self.keys: tuple[str, ...] = ()
+        self.requirements: Requirements | None = None
         self.variants: dict[str, Variant] = {}
+        own = self.own_delay()
         for basis in self.bases():
-            for implementation, make in _implementations(basis.diagram):
-                self._add(basis, implementation, make)
+            for implementation, make in _implementations(basis.diagram, own):
+                self._add(basis, implementation, make, _title(implementation, basis.lacks, own, diagram.has_clock))
+        self.variants = dict(sorted(self.variants.items(), key=lambda item: not item[1].is_actual))
 
     def bases(self) -> Iterator[Basis]:
         """Yield the diagrams whose implementations are analysed: the diagram itself."""
@@ -112,18 +121,41 @@ class Case:
         """Return the wires at which loops are looked at, by their keys in the report."""
         return wires_on_loops(self.diagram, self.wires)
 
+    def extra_loops(self) -> tuple[str, ...]:
+        """Return the keys of loops that a part of its own adds to those at the wires."""
+        return ()
+
+    def own_delay(self) -> int | None:
+        """Return the samples of computational delay that the diagram has; None where its subsystems' differ."""
+        settings = self.diagram.subsystems
+        delays = {settings[path].delay for path in delayed_subsystems(self.diagram)}
+        return delays.pop() if len(delays) == 1 else None if delays else 0
+
+    @property
+    def actual(self) -> Variant | None:
+        """The diagram as it is; None where no variant is."""
+        return next((v for v in self.variants.values() if v.is_actual), None)
+
+    def judged(self) -> Iterator[Variant]:
+        """Yield the variants that are held against the requirements, those that can't be analysed as well."""
+        further = () if self.requirements is None else self.requirements.further_variants
+        for variant in self.variants.values():
+            if variant.is_actual or variant.key in further:
+                yield variant
+
     def excitation(self, variant: Variant, wire: str) -> InjectionPlan:
         """Return the test signal of the injection check: small, and spread around the poles of the diagram."""
         dt = variant.model.dt
         w = np.abs(in_s(variant.model.poles, dt))
-        w = w[(w > 1e-6) & (w < 0.3 * np.pi / dt)]
-        centre = float(np.median(w)) if len(w) else 0.03 * np.pi / dt
+        fastest = np.pi / dt if dt else np.inf
+        w = w[(w > 1e-6) & (w < 0.3 * fastest)]
+        centre = float(np.median(w)) if len(w) else 0.03 * fastest if dt else 1.0
         source = variant.diagram.names.get(wire)
         path = wire if source is None else f"{source.block}.{source.port}"
         value = np.ravel(variant.point.values.get(path, 0.0))
         return InjectionPlan(
             variant,
-            np.geomspace(centre / 10, min(centre * 3, 0.5 * np.pi / dt), 5),
+            np.geomspace(centre / 10, min(centre * 3, 0.5 * fastest), 5),
             AMPLITUDE * (1.0 + float(np.max(np.abs(value), initial=0.0))),
         )
 
@@ -137,15 +169,16 @@ class Case:
         """Yield those of the usable variants that are the design itself."""
         return (variant for variant in self.usable(*implementations) if variant.is_design)
 
-    def _add(self, basis: Basis, implementation: Implementation, make: Callable[[], WiredDiagram]) -> None:
+    def _add(self, basis: Basis, implementation: Implementation, make: Callable[[], WiredDiagram], title: str) -> None:
         def variant(diagram: WiredDiagram, where: Any) -> Variant:
             return Variant(
                 implementation + basis.suffix,
-                implementation.words + basis.title,
+                title or AS_IT_IS,
                 diagram,
                 where,
                 implementation,
                 basis.is_design,
+                is_actual=not title,
                 source=self.diagram,
                 inputs=self.inputs,
                 outputs=self.outputs,
@@ -164,7 +197,21 @@ class Case:
         self.variants[found.key] = found
 
 
-def _implementations(diagram: WiredDiagram) -> Iterator[tuple[Implementation, Callable[[], WiredDiagram]]]:
+def _title(implementation: Implementation, lacks: str, own: int | None, has_clock: bool) -> str:
+    """Return the title of a variant by what it leaves out or adds; empty for the diagram as it is."""
+    said = []
+    if implementation is Implementation.CONTINUOUS and has_clock:
+        said.append(TEXTS.line("without_sampling"))
+    elif implementation is not Implementation.CONTINUOUS and implementation is not Implementation.OWN:
+        delay = implementation.delay
+        if delay != own:
+            said.append(TEXTS.line("with_delay", samples=delay, own=own))
+    return ", ".join([*said, *([lacks] if lacks else [])])
+
+
+def _implementations(
+    diagram: WiredDiagram, own: int | None
+) -> Iterator[tuple[Implementation, Callable[[], WiredDiagram]]]:
     """Yield the implementations of a diagram, with what makes each."""
     if not diagram.has_clock:
         yield Implementation.CONTINUOUS, lambda: diagram
@@ -175,6 +222,8 @@ def _implementations(diagram: WiredDiagram) -> Iterator[tuple[Implementation, Ca
     if not subsystems:
         yield Implementation.SAMPLED, lambda: diagram
         return
+    if own not in (0, 1):
+        yield Implementation.OWN, lambda: diagram
     for kind in (Implementation.SAMPLED, Implementation.DELAYED):
         yield kind, lambda n=kind.delay: diagram.replace({f"{subsystem}.delay": n for subsystem in subsystems})  # type: ignore[misc]
 

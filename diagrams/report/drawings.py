@@ -17,15 +17,16 @@ ACROSS = 1200.0
 
 
 def with_drawing(report: Report, diagram: WiredDiagram) -> Report:
-    """Return a report with the drawing of its diagram in its first section.
+    """Return a report with the drawing of its diagram in the section about it, or in the first one.
 
     A large one is drawn with closed subsystems, and the inside of each subsystem by itself.
     """
     if not report.sections:
         return report
-    first, *others = report.sections
-    plots = (*_drawings(diagram), *first.plots)
-    return replace(report, sections=(replace(first, plots=plots), *others))
+    at = next((i for i, section in enumerate(report.sections) if section.key == "subject"), 0)
+    sections = list(report.sections)
+    sections[at] = replace(sections[at], plots=(*_drawings(diagram), *sections[at].plots))
+    return replace(report, sections=tuple(sections))
 
 
 def _drawings(diagram: WiredDiagram) -> Iterator[Plot]:

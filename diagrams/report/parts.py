@@ -14,7 +14,9 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 from ...blocks.core import OptionError
 from ..flat import WiredDiagram
 from ..report_writing import Section
+from ..requirements import Requirements
 from .case import Case, ReportedExperiment
+from .review import check_names
 
 C = TypeVar("C", bound=Case)
 C_contra = TypeVar("C_contra", bound=Case, contravariant=True)
@@ -64,6 +66,7 @@ class MakesSections(Protocol):
         only: Iterable[str] | None,
         tell: Callable[[str], None],
         stairs: str | None = None,
+        requirements: Requirements | None = None,
     ) -> tuple[Case, tuple[Section, ...]]:
         """Return the case of a diagram, and its sections."""
 
@@ -121,6 +124,7 @@ class ReportKind(Generic[C]):
         only: Iterable[str] | None,
         tell: Callable[[str], None],
         stairs: str | None = None,
+        requirements: Requirements | None = None,
     ) -> tuple[Case, tuple[Section, ...]]:
         """Return the case of a diagram, and its sections.
 
@@ -130,11 +134,16 @@ class ReportKind(Generic[C]):
             As `Case` takes them.
         only : iterable of str, optional
             Keys of the sections that are made; all without it.
+        requirements : Requirements, optional
+            Requirements on the design, which decide on the variants and steps that are tried.
         tell : callable
             Told "variants" before the case is made, and the key of each section before it is made.
         """
         tell("variants")
         case = self.case(diagram, point, experiment, wires, stairs)
+        if requirements is not None:
+            case.requirements = requirements
+            check_names(case, requirements)
         wanted = set(self.keys if only is None else only)
         case.keys = tuple(key for key in self.keys if key in wanted)
         return case, tuple(self._made(case, tell))

@@ -12,7 +12,10 @@ from ..results import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, new_fi
 from .variant import Implementation
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from ..frequency import Margins
+    from ..measure import StepResponse
 
 TEXTS = Texts(__package__, "figures")
 LOOKS: Mapping[str, tuple[str, Any]] = {
@@ -169,3 +172,32 @@ def injected(key: str, wire: str, curves: Mapping[str, tuple[np.ndarray, ...]]) 
             ax.set_xlabel("ω [rad/s]")
         left.legend(loc="best")
     return Plot(key, TEXTS.line("injected", wire=wire), figure)
+
+
+def step_responses(curves: Mapping[str, StepResponse], *, to_output: bool) -> Figure:
+    """Draw responses to a step: the answer, and of a loop's own wire what is left of a disturbance."""
+    with style():
+        figure = new_figure(2.9)
+        axes = figure.subplots(1, 1 if to_output else 2, squeeze=False)[0]
+        for color, (title, got) in zip((BLUE, VERMILION, GREEN, PURPLE), curves.items(), strict=False):
+            begins = int(np.argmax(got.d != 0.0))
+            t = got.t - got.t[begins]
+            few = np.unique(np.linspace(0, len(t) - 1, 40).astype(int))
+            for ax, whole in zip(axes, (0.0, 1.0), strict=False):
+                y = got.answer(to_output)
+                shown = whole * (got.d != 0.0) - y if whole else y
+                ax.step(t, shown, where="post", color=color, label=title) if got.held else ax.plot(
+                    t, shown, color=color, label=title
+                )
+                if got.prediction is not None:
+                    p = got.answer(to_output, linear=True)
+                    dots = (whole * (got.d != 0.0) - p if whole else p)[few]
+                    ax.plot(t[few], dots, "o", color=color, markersize=2.5)
+        for ax, name in zip(axes, ("answer per unit of the step", "left of a disturbance"), strict=False):
+            ax.set_title(name)
+            ax.set_xlabel("time since the step [s]")
+            ax.axhline(0.0, color=DARK, linewidth=0.6)
+        if not to_output:
+            axes[0].axhline(1.0, color=GREY, linewidth=0.6, linestyle=":")
+        axes[0].legend(loc="best")
+    return figure

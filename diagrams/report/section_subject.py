@@ -161,12 +161,7 @@ def operating_points(case: Case) -> Section:
 
 def _moving(v: Variant) -> str:
     """Return the notes on an operating point that is no equilibrium."""
-    point, model = v.point, v.model
-    moving = [i for i, change in enumerate(model.affine) if not abs(change) <= AT_REST]
-    fed = model.A - np.eye(len(model.A)) if model.dt else model.A
-    alone = moving and np.max(np.abs(fed[:, moving])) <= 1e-9 * (model.dt or 1.0)
-    names = [model.states[i] for i in moving] if alone else []
-    return TEXTS.line("moving", variant=v.title, point=point, alone=names)
+    return TEXTS.line("moving", variant=v.title, point=v.point, alone=v.moving_alone)
 
 
 def _value(v: Variant, wire: Wire) -> Any:

@@ -29,23 +29,13 @@ class Implementation(StrEnum):
     """As it is sampled, without computational delay."""
     DELAYED = "sampled_d1"
     """As it is sampled, with a sample of computational delay."""
-
-    @property
-    def words(self) -> str:
-        """The implementation as a title says it."""
-        return _WORDS[self]
+    OWN = "sampled_own"
+    """As it is sampled, with delays of its own that are neither none nor one sample each."""
 
     @property
     def delay(self) -> int:
         """Samples of computational delay."""
         return 1 if self is Implementation.DELAYED else 0
-
-
-_WORDS = {
-    Implementation.CONTINUOUS: "continuous",
-    Implementation.SAMPLED: "sampled, no delay",
-    Implementation.DELAYED: "sampled, one sample of delay",
-}
 
 
 class Cut(StrEnum):
@@ -84,6 +74,8 @@ class Variant:
     is_design : bool
         Whether it is the design itself. Other variants show what a real plant adds to it; they get margins, but no
         figures, and python-control is not asked about them.
+    is_actual : bool
+        Whether it is the diagram as it is, with nothing left out and nothing added.
     problem : str
         Why it can't be analysed; empty where it can.
     source : WiredDiagram, optional
@@ -100,6 +92,7 @@ class Variant:
     where: Any
     implementation: Implementation
     is_design: bool = True
+    is_actual: bool = False
     problem: str = ""
     source: WiredDiagram | None = None
     inputs: tuple[str, ...] = ()
@@ -137,6 +130,16 @@ class Variant:
             return False
         return moves < AT_REST
 
+    @property
+    def moving_alone(self) -> tuple[str, ...]:
+        """States that move at its operating point though nothing depends on them; empty where others move as well."""
+        model = self.model
+        moving = [i for i, change in enumerate(model.affine) if not abs(change) <= AT_REST]
+        fed = model.A - np.eye(len(model.A)) if model.dt else model.A
+        if not moving or np.max(np.abs(fed[:, moving])) > 1e-9 * (model.dt or 1.0):
+            return ()
+        return tuple(model.states[i] for i in moving)
+
     def with_parameters(self, changes: Mapping[str, Any], where: Any = ...) -> Variant:
         """Return the variant with other parameters, at its own operating point, or at another one.
 
@@ -154,6 +157,7 @@ class Variant:
             self.where if where is ... else where,
             self.implementation,
             self.is_design,
+            self.is_actual,
             source=self.source,
             inputs=self.inputs,
             outputs=self.outputs,

@@ -16,6 +16,8 @@ from .model import Document
 def to_json(report: Document) -> str:
     """Return all numbers, nested by the dots of their paths, with ``meta`` beside them.
 
+    Beside them stands ``requirements``, where there were some: the verdict, the counts, and each requirement.
+
     Every leaf is ``{"value", "unit", "tolerance", "confirmed_by"}``. JSON has no infinity: it is the text "inf" or
     "-inf", which ``float()`` reads; what does not exist (NaN) is null.
 
@@ -25,6 +27,8 @@ def to_json(report: Document) -> str:
         A path that is a number and the beginning of another one's path as well.
     """
     tree: dict[str, Any] = {"meta": _plain(report.meta)}
+    if report.review is not None:
+        tree["requirements"] = _plain(report.review.as_dict())
     for path, number in report.numbers().items():
         *way, last = path.split(".")
         place = tree

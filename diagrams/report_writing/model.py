@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..frequency import Number
+from ..requirements import Review
 
 
 @dataclass(frozen=True)
@@ -55,11 +56,14 @@ class Document:
         In order.
     meta : mapping
         Subject of the analysis, its time, and the versions of the libraries.
+    review : Review, optional
+        Verdicts on the requirements; None where none were given.
     """
 
     title: str
     sections: tuple[Section, ...]
     meta: Mapping[str, Any] = field(default_factory=dict)
+    review: Review | None = None
 
     def numbers(self) -> dict[str, Number]:
         """Return every number by its dotted path, such as ``inner.par.sampled_d0.phase_margin_deg``."""

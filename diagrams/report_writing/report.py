@@ -21,6 +21,8 @@ class Report(Document):
         In order.
     meta : mapping
         Subject of the analysis, its time, and the versions of the libraries.
+    review : Review, optional
+        Verdicts on the requirements; None where none were given.
     """
 
     def _repr_html_(self) -> str:

@@ -1,0 +1,231 @@
+"""Responses of the running diagram to a step that is added to a wire, beside those of its linear model.
+
+The consumers of the wire get its signal v plus a step d, as `frequency_response` adds sines: from the point on, and
+held between the samples where the diagram is sampled. A second run without the step is subtracted, so that a diagram
+which moves by itself, such as one with a reference that turns, gives the step's part only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import LoopwrightError, OptionError, SimulationError
+from ..flat import FlatDiagram, WiredDiagram
+from ..linearization import Linearization, PointLike, find_signal, linearize, operating_point, ticks_to_renewal
+from .injection import InjectionRun, inject_signal
+
+SAMPLES = 1000
+"""Samples of the response of a diagram that is not sampled."""
+GROWN = 1e6
+"""Growth of a signal, relative to the step and to the signal before, that no stable loop makes."""
+CHUNK = 500
+"""Samples between two looks at a signal's growth."""
+
+
+@dataclass(frozen=True, eq=False)
+class StepResponse:
+    """Response to a step.
+
+    Attributes
+    ----------
+    wire : str
+        Wire to whose consumers the step is added.
+    size : float
+        Height of the step.
+    t : (N,) ndarray
+        Time since the step in s. The first sample is that before the step.
+    d : (N,) ndarray
+        The step as the consumers got it.
+    v : (N,) ndarray
+        Change of the wire's own signal; −v/size is the response of T, 1 + v/size that of S.
+    outputs : tuple of str
+        Names of the other signals that were recorded, entry by entry.
+    y : (N, K) ndarray
+        Their changes.
+    before : (K,) ndarray
+        Their values before the step.
+    moved : float
+        Largest change of the wire and of the outputs without the step, relative to 1 + their sizes.
+    dt : float
+        Seconds between two samples.
+    held : bool
+        Whether the wire's signal is held between the samples, so that no peak lies between them.
+    prediction : (N, 1 + K) ndarray, optional
+        v and the outputs as the linear model predicts them; None where it can't.
+    """
+
+    wire: str
+    size: float
+    t: np.ndarray
+    d: np.ndarray
+    v: np.ndarray
+    outputs: tuple[str, ...]
+    y: np.ndarray
+    before: np.ndarray
+    moved: float
+    dt: float
+    held: bool
+    prediction: np.ndarray | None
+
+    def answer(self, to_output: bool = False, *, linear: bool = False) -> np.ndarray:
+        """Return the response per unit of the step: −v/size, the loop's at the wire, or that of the first output.
+
+        Parameters
+        ----------
+        to_output : bool
+            Whether it is that of the first output.
+        linear : bool
+            Whether it is the linear model's prediction.
+
+        Raises
+        ------
+        OptionError
+            There is no prediction.
+        """
+        data = np.column_stack([self.v, self.y])
+        if linear:
+            if self.prediction is None:
+                raise OptionError("found no prediction; expected one. Take the run's response.", port="linear")
+            data = self.prediction
+        return np.asarray(data[:, 1] if to_output else -data[:, 0]) / self.size
+
+
+def step_response(
+    diagram: WiredDiagram,
+    wire: str,
+    *,
+    size: float,
+    length: float,
+    at: PointLike = None,
+    outputs: Iterable[str] = (),
+    stairs: str | None = None,
+) -> StepResponse:
+    """Return the response of the running diagram to a step at a wire, and the linear model's.
+
+    Parameters
+    ----------
+    diagram : WiredDiagram
+        The diagram.
+    wire : str
+        Wire with one entry, or one entry of a wire.
+    size : float
+        Height of the step in the wire's unit.
+    length : float
+        Length of the response in s.
+    at : OperatingPoint, Snapshot or float, optional
+        Beginning; the start without it.
+    outputs : iterable of str
+        Further wires or ports.
+    stairs : {"gain"}, optional
+        Treatment of stairs in the linear model, as of `Diagram.linearize`.
+
+    Raises
+    ------
+    OptionError
+        A wire with several entries, or a step or length that is none.
+    SimulationError
+        The response grows without end.
+    """
+    for name, value in (("size", size), ("length", length)):
+        if not (math.isfinite(value) and (value > 0 or (name == "size" and value < 0))):
+            raise OptionError(f"found {value!r}; expected a number that is not 0. Give one.", port=name)
+    point = operating_point(diagram, at, {})
+    variant = diagram.replace(point.parameters) if point.parameters else diagram
+    sampled = diagram.has_clock or diagram.has_fmu
+    base = point.base if sampled else Fraction(max(1, round(length / SAMPLES * 1e9)), 10**9)
+    flat = variant.flatten(base)
+    signal = find_signal(flat, wire)
+    if len(signal.entries) != 1:
+        raise OptionError(
+            f"found {len(signal.entries)} entries; expected one. Name one of them: {signal.labels[0]}.",
+            block=diagram.name,
+            port=wire,
+        )
+    names = list(outputs)
+    taps = [find_signal(flat, name) for name in names]
+    every = math.lcm(*(clock.every for clock in flat.distinct)) if sampled and flat.distinct else 1
+    period = base * every
+    wait = ticks_to_renewal(flat, [signal.port], point.tick) if sampled and every > 1 else 0
+    held = (period, ((point.tick + wait) % every) * base) if sampled else None
+    made = inject_signal(variant, signal, 1, held)
+    count = max(2, math.ceil(length / float(period)) + 1)
+    options: dict[str, Any] = {"step": None if diagram.has_clock else base}
+    if flat.hybrid:
+        options |= {"rtol": 1e-9, "atol": 1e-12}
+
+    def run_with(height: float) -> tuple[np.ndarray, np.ndarray, bool]:
+        with InjectionRun(variant, made, signal, taps, point if sampled else None, options) as run:
+            if not sampled and point.t > 0:
+                run.simulation.advance(point.t)
+            if wait:
+                run.go(wait, 1)
+            first = run.record(1, every)
+            parts = [tuple(part[:1] for part in first)]
+            if height:
+                run.step(height, signal.entries[0])
+            largest = GROWN * max(abs(size), float(np.max(np.abs(first[0]))))
+            while (done := sum(len(part[0]) for part in parts)) <= count:
+                some = run.record(min(CHUNK, count + 1 - done), every)
+                parts.append(tuple(part[1:] for part in some) if len(parts) > 1 else some)
+                if not float(np.max(np.abs(some[0]))) <= largest:
+                    raise SimulationError(
+                        f"found a response that has grown to {float(np.max(np.abs(some[0]))):.3g} after a step of "
+                        f"{size:g}; expected one that settles: the diagram is not stable there. Look at "
+                        "linearize().poles.",
+                        block=signal.port[0],
+                        port=signal.port[1],
+                        t=run.t,
+                    )
+            v, u, y = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+            return np.hstack([v, y])[1:], (u - v)[1:, 0], run.held
+
+    rest, _, _ = run_with(0.0)
+    stepped, d, steady = run_with(size)
+    change = stepped - rest
+    t = float(period) * np.arange(len(change))
+    if not sampled:
+        d = np.full(len(t), size)
+    moved = float(np.max(np.abs(rest - rest[0]) / (1.0 + np.abs(rest[0])), initial=0.0))
+    try:
+        if wait:
+            raise OptionError("the wire is renewed off the period. Measure another one.", port=wire)
+        model = linearize(variant, point, inputs=[wire], outputs=[wire, *names], stairs=stairs)
+        prediction = predict(model, d, t)
+    except LoopwrightError:
+        prediction = None
+    labels = tuple(label for tap in taps for label in tap.labels)
+    is_held = bool(held) and steady and not _follows_states(flat, signal.port)
+    return StepResponse(
+        wire, float(size), t, d, change[:, 0], labels, change[:, 1:], rest[0, 1:], moved, float(period), is_held,
+        prediction,
+    )  # fmt: skip
+
+
+def predict(model: Linearization, d: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Return the outputs of a linear model with one input d: sampled as it is, or held from the first sample on."""
+    from scipy.linalg import expm
+
+    A, B, C, D = model.A, model.B, model.C, model.D
+    if not model.dt:
+        n, h = len(A), float(t[1] - t[0])
+        both = expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * h)
+        A, B = both[:n, :n], both[:n, n:]
+    x, rows = np.zeros(len(A)), []
+    for value in d:
+        rows.append(C @ x + D[:, 0] * value)
+        x = A @ x + B[:, 0] * value
+    return np.array(rows)
+
+
+def _follows_states(flat: FlatDiagram, port: tuple[str, str]) -> bool:
+    """Return whether a signal changes between two ticks: it is an FMU's, or depends on continuous states or time."""
+    if flat.table.blocks[port[0]].stepped:
+        return True
+    output = flat.output(port)
+    return bool(output.depends("y", "x")[:, flat.continuous].any() or output.depends("y", "t").any())

@@ -1,0 +1,227 @@
+"""Verdicts on the requirements of a case, from the numbers of its report."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+from ...blocks.core import LoopwrightError, UnknownNameError, near
+from ..frequency import Number
+from ..linearization import find_signal
+from ..requirements import Limit, Reason, RequirementResult, Requirements, Review, StepLimits, Verdict, judge
+from .case import Case
+from .points import STEP
+from .section_injection import REFUTED
+from .section_steps import key_of_step
+from .stability import Stability
+from .variant import Cut, Variant
+
+STABLE = Limit(-math.inf, 0.0)
+MANY = 10.0
+"""Times of its own uncertainty that a measurement has to be off by to refute a linear model."""
+
+
+def check_names(case: Case, asked: Requirements) -> None:
+    """Refuse names in requirements that the diagram does not have.
+
+    Raises
+    ------
+    UnknownNameError
+        A loop, a variant or a wire that isn't there.
+    """
+    wires = case.loop_wires()
+    known = {*wires, *wires.values(), *case.extra_loops()}
+    for name in asked.loops:
+        if name not in known:
+            raise UnknownNameError(f"found requirements on a loop {name!r}; expected a loop of the report. "
+                                   f"{near(name, known)}", block=case.diagram.name)  # fmt: skip
+    for key in asked.further_variants:
+        if key not in case.variants:
+            raise UnknownNameError(f"found requirements on a variant {key!r}; expected one of the report. "
+                                   f"{near(key, case.variants)}", block=case.diagram.name)  # fmt: skip
+    flat = case.diagram.flatten(None if case.diagram.has_clock else STEP)
+    for limits in asked.steps:
+        for wire in (limits.input, limits.output):
+            if wire:
+                find_signal(flat, wire)
+
+
+def review(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> Review:
+    """Return the verdicts on requirements.
+
+    Parameters
+    ----------
+    case : Case
+        The diagram with its variants.
+    asked : Requirements
+        The requirements.
+    numbers : mapping of str to Number
+        All numbers of the report by their dotted paths.
+    """
+    return Review(tuple(_results(case, asked, numbers)))
+
+
+def _results(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> Iterator[RequirementResult]:
+    judged = list(case.judged())
+    if case.actual is None:
+        yield RequirementResult("stable", "", "", STABLE, Verdict.UNDECIDED, Reason.NOT_ANALYSED)
+    wires = case.loop_wires()
+    loops = {**{key: (key, wire) for key, wire in wires.items()}, **{key: (key,) for key in case.extra_loops()}}
+    for v in judged:
+        state = _State.of(v)
+        if asked.stable:
+            yield _stable(v, state, numbers)
+        for key, names in loops.items():
+            if not (v.is_actual or asked.judges(names, v.key)):
+                continue
+            own = asked.limits_named(names, v.key)
+            for name, limit in asked.limits_of(names, v.key).items():
+                found = _worst(numbers, f"inner.{key}.{v.key}", name, limit)
+                if found is None and name not in own and _has_channels(numbers, f"inner.{key}"):
+                    continue  # a general limit of single loops
+                result = RequirementResult(name, key, v.key, limit, Verdict.UNDECIDED, Reason.NO_NUMBER)
+                yield _with(state, result, found, _refuted(numbers, key, v.key))
+            step = asked.step_of(names, v.key)
+            if step is not None and key in wires:
+                yield from _step(case, v, state, key, step, numbers)
+        for step in asked.steps:
+            yield from _step(case, v, state, key_of_step(step), step, numbers, loop="")
+    for path, limit in asked.numbers.items():
+        yield _plain(path, limit, numbers)
+
+
+@dataclass(frozen=True)
+class _State:
+    """What stands between a variant's numbers and a verdict: a reason, its verdict, and more in words."""
+
+    verdict: Verdict | None = None
+    reason: Reason = Reason.COMPARED
+    detail: str = ""
+
+    @classmethod
+    def of(cls, v: Variant) -> _State:
+        if v.problem:
+            return cls(Verdict.UNDECIDED, Reason.NOT_ANALYSED, v.problem)
+        try:
+            stability = Stability.of(v)
+        except LoopwrightError as error:
+            return cls(Verdict.UNDECIDED, Reason.NOT_ANALYSED, error.message)
+        if stability is Stability.UNSTABLE:
+            return cls(Verdict.FAILED, Reason.UNSTABLE)
+        return cls(Verdict.UNDECIDED, Reason.MOVING, v.point.largest) if _moves(v) else cls()
+
+
+def _moves(v: Variant) -> bool:
+    """Return whether a variant's operating point is no equilibrium, and what moves acts on anything else."""
+    return not v.rests and not v.moving_alone
+
+
+def _stable(v: Variant, state: _State, numbers: Mapping[str, Number]) -> RequirementResult:
+    path = f"poles.{v.key}.slowest"
+    number = numbers.get(path)
+    result = RequirementResult("stable", "", v.key, STABLE, Verdict.UNDECIDED, Reason.NO_NUMBER)
+    if state.reason is Reason.NOT_ANALYSED:
+        return replace(result, reason=state.reason, detail=state.detail)
+    stability = Stability.of(v)
+    distance = math.nan if number is None else STABLE.distance(number.value)
+    result = replace(result, distance=distance, path=path if number is not None else "", number=number)
+    if stability is Stability.UNSTABLE:
+        return replace(result, verdict=Verdict.FAILED, reason=Reason.UNSTABLE)
+    if stability is Stability.ON_THE_LIMIT:
+        return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.ON_THE_LIMIT)
+    if number is not None and number.findings:
+        return replace(result, reason=Reason.FINDINGS)
+    if state.verdict is not None:
+        return replace(result, verdict=state.verdict, reason=state.reason, detail=state.detail)
+    return result if number is None else replace(result, verdict=Verdict.PASSED, reason=Reason.COMPARED)
+
+
+def _with(
+    state: _State, result: RequirementResult, found: tuple[str, Number] | None, refuted: bool = False
+) -> RequirementResult:
+    """Return a result with the verdict on the number that was found, if nothing stands between them."""
+    if state.verdict is Verdict.FAILED or (state.verdict is not None and found is None):
+        return replace(result, verdict=state.verdict, reason=state.reason, detail=state.detail)
+    if found is None:
+        return result
+    path, number = found
+    verdict, reason, distance = judge(number, result.limit)
+    result = replace(result, verdict=verdict, reason=reason, distance=distance, path=path, number=number)
+    if verdict is Verdict.PASSED and state.verdict is not None:
+        return replace(result, verdict=state.verdict, reason=state.reason, detail=state.detail)
+    if refuted and verdict is not Verdict.UNDECIDED:
+        return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.REFUTED)
+    return result
+
+
+def _worst(numbers: Mapping[str, Number], start: str, name: str, limit: Limit) -> tuple[str, Number] | None:
+    """Return the number of a loop in a variant that is worst for a limit, with its path.
+
+    Of a wire that is renewed several times in the period only the numbers with all loops closed count.
+    """
+    below = [path for path in numbers if path.startswith(f"{start}.")]
+    cut = [path for path in below if path.startswith(f"{start}.{Cut.SLOW_OPEN}.")]
+    places = [path for path in below if path not in cut and path.rpartition(".")[2] == name]
+    own = [path for path in places if not {"control"}.intersection(path[len(start) :].split("."))]
+    own = [path for path in own if not _is_crossing(path[len(start) + 1 :])]
+    if not own:
+        return None
+    decided = sorted(own, key=lambda path: (not math.isnan(numbers[path].value), limit.distance(numbers[path].value)))
+    return decided[0], numbers[decided[0]]
+
+
+def _is_crossing(rest: str) -> bool:
+    return rest.partition(".")[0].rstrip("0123456789") in ("gain_crossover_", "phase_crossover_")
+
+
+def _has_channels(numbers: Mapping[str, Number], start: str) -> bool:
+    """Return whether a loop has several channels, of which there is a disk margin alone."""
+    mine = [path for path in numbers if path.startswith(f"{start}.")]
+    return bool(mine) and not any(path.rpartition(".")[2] == "phase_margin_deg" for path in mine)
+
+
+def _refuted(numbers: Mapping[str, Number], key: str, variant: str) -> bool:
+    found = [numbers.get(f"injection.{key}.{variant}.{name}") for name in ("deviation", "uncertainty")]
+    worst, own = (math.nan if number is None else number.value for number in found)
+    return worst - MANY * own > REFUTED
+
+
+def _step(
+    case: Case,
+    v: Variant,
+    state: _State,
+    key: str,
+    step: StepLimits,
+    numbers: Mapping[str, Number],
+    loop: str | None = None,
+) -> Iterator[RequirementResult]:
+    for name, limit in step.limits.items():
+        path = f"steps.{key}.{v.key}.{name}"
+        number = numbers.get(path)
+        where = key if loop is None else loop
+        result = RequirementResult(f"step.{name}", where, v.key, limit, Verdict.UNDECIDED, Reason.NOT_MEASURED)
+        if loop == "":
+            result = replace(result, detail=key)
+        yield _with(state, result, None if number is None else (path, number))
+
+
+def _plain(path: str, limit: Limit, numbers: Mapping[str, Number]) -> RequirementResult:
+    result = RequirementResult(path, "", "", limit, Verdict.UNDECIDED, Reason.NO_NUMBER)
+    return result if path not in numbers else _with(_State(), result, (path, numbers[path]))
+
+
+def weakest(numbers: Mapping[str, Number], variants: Iterable[str]) -> tuple[str, Number] | None:
+    """Return the smallest disk margin of some variants with its path, or else the smallest modulus margin; or None."""
+    keys = set(variants)
+    for name in ("disk_margin", "modulus_margin"):
+        found = {}
+        for path, number in numbers.items():
+            first, *rest, last = path.split(".")
+            if first == "inner" and len(rest) > 1 and rest[1] in keys and last == name and "control" not in rest:
+                found[path] = number
+        found = {path: number for path, number in found.items() if not math.isnan(number.value)}
+        if found:
+            path = min(found, key=lambda p: found[p].value)
+            return path, found[path]
+    return None

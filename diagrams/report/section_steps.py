@@ -1,0 +1,245 @@
+"""Responses of the running diagram to steps, beside those of its linear model, and the effort that they take."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ...blocks import Saturation
+from ...blocks.core import LoopwrightError
+from ..flat import WiredDiagram
+from ..frequency import Number, Realization
+from ..measure import StepResponse, measure_step, step_response
+from ..report_writing import Plot, Section, Table, Texts
+from ..requirements import StepLimits
+from . import plots as figures
+from .case import Case
+from .stability import Stability
+from .variant import Variant, in_s
+
+TEXTS = Texts(__package__, "steps")
+TITLE = "Step and disturbance responses"
+TIME_CONSTANTS = 10.0
+"""Length of a run, in time constants of the loop's slowest pole."""
+BEYOND = 3.0
+"""Length of a run at least, in times of the limits of its settling and its rise."""
+SAMPLES = (100, 20000)
+"""Fewest and most samples of a run."""
+SIZE = 100.0
+"""Size of a step, in amplitudes of the injection check, where none is given."""
+SLOWEST = 1e-6
+"""Poles slower than that, relative to the fastest, are taken as integrators that nothing feeds back."""
+NAMES: Mapping[str, str] = {
+    "overshoot": "overshoot",
+    "settling": "settling time, 2 %",
+    "rise": "rise time, 10 to 90 %",
+    "peak": "largest change",
+}
+
+
+@dataclass(frozen=True)
+class StepTest:
+    """A step that is tried: its key in the report, the wires, and its limits where there are some."""
+
+    key: str
+    wire: str
+    output: str = ""
+    limits: StepLimits | None = None
+
+
+def step_tests(case: Case, v: Variant) -> Iterator[StepTest]:
+    """Yield the steps that are tried in a variant: at the wire of each loop, and those that are required besides."""
+    asked = case.requirements
+    for key, wire in case.loop_wires().items():
+        yield StepTest(key, wire, "", None if asked is None else asked.step_of((key, wire), v.key))
+    for limits in () if asked is None else asked.steps:
+        yield StepTest(key_of_step(limits), limits.input, limits.output, limits)
+
+
+def key_of_step(limits: StepLimits) -> str:
+    """Return the key of a required step that names its wires."""
+    ends = [limits.input, limits.output] if limits.output else [limits.input]
+    return "_to_".join(end.replace(".", "_") for end in ends)
+
+
+def steps(case: Case) -> Section | None:
+    """Return the section with the responses to steps of the diagram as it is, and of the variants that are judged."""
+    numbers: dict[str, Number] = {}
+    rows: list[tuple[Any, ...]] = []
+    effort: list[tuple[Any, ...]] = []
+    text: list[str] = []
+    found: dict[StepTest, dict[str, StepResponse]] = {}
+    for v in case.judged():
+        if v.problem:
+            continue
+        if Stability.of(v) is Stability.UNSTABLE:
+            text.append(TEXTS.line("unstable", variant=v.title))
+            continue
+        for test in step_tests(case, v):
+            try:
+                got = _run(case, v, test)
+            except LoopwrightError as error:
+                text.append(TEXTS.line("failed", variant=v.title, wire=test.wire, message=str(error)))
+                continue
+            if got is None:
+                continue
+            where = f"{test.key}.{v.key}"
+            own = _numbers(got, test, v)
+            numbers |= {f"{where}.{name}": number for name, number in own.items()}
+            for name, said in NAMES.items():
+                linear = own.get(f"linear.{name}")
+                if name != "peak":
+                    rows.append((_said(test), v.title, said, own[name], linear))
+            saturated = _limits_reached(v.diagram, got)
+            for name, before, change in _effort(got, test):
+                key = f"effort.{name.replace('.', '_')}"
+                numbers[f"{where}.{key}"] = Number(change, "1", 1e-9 * change, _how(got))
+                effort.append((_said(test), v.title, name, before, numbers[f"{where}.{key}"]))
+            text += [TEXTS.line("saturated", variant=v.title, wire=test.wire, blocks=saturated)] if saturated else []
+            if got.moved > 1e-6:
+                text.append(TEXTS.line("moved", variant=v.title, wire=test.wire, moved=got.moved))
+            found.setdefault(replace(test, limits=None), {})[v.title] = got
+    if not found:
+        return Section("steps", TITLE, tuple(dict.fromkeys(text))) if text else None
+    tables = [Table("Step responses", ("step", "variant", "number", "co-simulation", "linear"), tuple(rows))]
+    if effort:
+        tables.append(Table("Effort", ("step", "variant", "signal", "before", "largest change"), tuple(effort)))
+    plots = [_plot(test, curves) for test, curves in found.items()]
+    whole = (*TEXTS.paragraphs("responses"), *dict.fromkeys(text))
+    return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers)
+
+
+def _said(test: StepTest) -> str:
+    return f"{test.wire} → {test.output}" if test.output else test.wire
+
+
+def _run(case: Case, v: Variant, test: StepTest) -> StepResponse | None:
+    """Return a response; None at a wire with several entries, which has no single step."""
+    try:
+        plan = case.excitation(v, test.wire)
+        poles = _poles(v, test)
+        if poles is None:
+            return None
+    except LoopwrightError:
+        if test.limits is None:
+            return None
+        raise
+    limits = test.limits
+    dt = v.model.dt or 0.0
+    s = poles[np.abs(poles.real) > SLOWEST * np.max(np.abs(poles), initial=0.0)]
+    length = TIME_CONSTANTS / float(np.min(np.abs(s.real))) if s.size else 1.0
+    if limits is not None:
+        ends = [limits.limits[name].high for name in ("settling", "rise") if name in limits.limits]
+        length = max([length, *(BEYOND * end for end in ends if math.isfinite(end))])
+    if dt:
+        length = float(np.clip(length, SAMPLES[0] * dt, SAMPLES[1] * dt))
+    if limits is not None and limits.length is not None:
+        length = limits.length
+    size = SIZE * plan.amplitude if limits is None or limits.size is None else limits.size
+    outputs = [*([test.output] if test.output else []), *_commands(v.diagram, test.wire), *_excesses(v.diagram)]
+    return step_response(
+        plan.variant.diagram, test.wire, size=size, length=length, at=plan.variant.point, outputs=outputs,
+        stairs=v.stairs,
+    )  # fmt: skip
+
+
+def _poles(v: Variant, test: StepTest) -> np.ndarray | None:
+    """Return the poles that decide how long a response lasts, in 1/s; None at a wire with several entries."""
+    if test.output:
+        return in_s(v.model.poles, v.model.dt)
+    L = v.loop(test.wire)
+    if L.ninputs > 1:
+        return None
+    r = Realization.of(L)
+    poles = np.linalg.eigvals(r.closed_matrix())
+    return in_s(1 + poles if r.dt else poles, r.dt)
+
+
+def _commands(diagram: WiredDiagram, wire: str) -> list[str]:
+    """Return the signals that drive FMUs, or go from sampled subsystems to continuous blocks."""
+    table = diagram.structure
+    names = {(w.block, w.port): name for name, w in diagram.names.items() if w.index is None}
+    found: dict[str, None] = {}
+    for (block, _), w in table.wires.items():
+        source = table.clock(table.subsystem_of[w.block])
+        sampled = source is not None and table.clock(table.subsystem_of[block]) is None
+        if table.blocks[block].stepped or (sampled and not table.blocks[w.block].stepped):
+            found[names.get((w.block, w.port), f"{w.block}.{w.port}")] = None
+    return [name for name in found if name != wire]
+
+
+def _excesses(diagram: WiredDiagram) -> list[str]:
+    return [f"{path}.excess" for path, block in sorted(diagram.blocks.items()) if isinstance(block, Saturation)]
+
+
+def _limits_reached(diagram: WiredDiagram, got: StepResponse) -> list[str]:
+    """Return the saturations that cut something off during a response."""
+    reached = []
+    for path in (name.rpartition(".")[0] for name in _excesses(diagram)):
+        own = [i for i, label in enumerate(got.outputs) if label.partition("[")[0] == f"{path}.excess"]
+        if own and np.any(np.abs(got.y[:, own]) > 0.0):
+            reached.append(path)
+    return reached
+
+
+def _effort(got: StepResponse, test: StepTest) -> Iterator[tuple[str, float, float]]:
+    if not test.output:
+        yield test.wire, math.nan, float(np.max(np.abs(got.v)))
+    for i, name in enumerate(got.outputs):
+        plain = name.partition("[")[0]
+        if plain.rpartition(".")[2] != "excess":
+            yield name, float(got.before[i]), float(np.max(np.abs(got.y[:, i])))
+
+
+def _numbers(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]:
+    """Return the numbers of a response by the ends of their paths."""
+    output = bool(test.output)
+    begins = int(np.argmax(got.d != 0.0))
+    t = got.t[begins:] - got.t[begins]
+    held = got.held and not output
+    how = _how(got)
+    units = {"settling": "s", "rise": "s"}
+    found = {}
+    known, target = {}, None
+    if got.prediction is not None:
+        known = measure_step(t, got.answer(output, linear=True)[begins:], held=held)
+        target = known["final"].value if math.isfinite(known["final"].value) else None
+    measured = measure_step(t, got.answer(output)[begins:], held=held, target=target)
+    for name, (value, tolerance) in measured.items():
+        factor = abs(got.size) if name == "peak" else 1.0
+        found[name] = Number(factor * value, units.get(name, "1"), factor * tolerance, how)
+    if got.prediction is not None:
+        for name, (value, tolerance) in known.items():
+            factor = abs(got.size) if name == "peak" else 1.0
+            said = "the linear model's matrix, sample by sample"
+            found[f"linear.{name}"] = Number(factor * value, units.get(name, "1"), factor * tolerance, said)
+        found["deviation"] = Number(_deviation(got), "1", 1e-9, "co-simulation and linear model, sample by sample")
+    return found
+
+
+def _deviation(got: StepResponse) -> float:
+    """Return the largest difference of co-simulation and linear model, relative to the largest change."""
+    assert got.prediction is not None  # callers look
+    both = np.column_stack([got.v, got.y])
+    size = np.max(np.abs(both), axis=0)
+    off = np.max(np.abs(both - got.prediction), axis=0)
+    return float(np.max(off[size > 0] / size[size > 0], initial=0.0))
+
+
+def _how(got: StepResponse) -> str:
+    if got.prediction is None:
+        return f"the nonlinear co-simulation, {len(got.t)} samples, with and without the step"
+    return (
+        f"the nonlinear co-simulation, {len(got.t)} samples, with and without the step; the linear model differs by "
+        f"{_deviation(got):.2g} of the largest change"
+    )
+
+
+def _plot(test: StepTest, curves: Mapping[str, StepResponse]) -> Plot:
+    said = _said(test)
+    caption = TEXTS.line("figure_to", said=said) if test.output else TEXTS.line("figure", said=said)
+    return Plot(f"steps_{test.key}", caption, figures.step_responses(curves, to_output=bool(test.output)))

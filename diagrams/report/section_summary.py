@@ -1,0 +1,198 @@
+"""The first page of a report: verdicts, the weakest margin, and all that was not analysed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from ...blocks.core import LoopwrightError
+from ..frequency import Number
+from ..linearization import Linearization
+from ..report_writing import Section, Table, Texts, symbol
+from ..requirements import Limit, RequirementResult, Review, Verdict
+from .case import Case
+from .review import weakest
+from .section_loops import ROWS
+from .section_steps import NAMES
+from .stability import unstable_first
+from .variant import Variant
+
+TEXTS = Texts(__package__, "summary")
+TITLE = "Summary"
+LOOP_NUMBERS = (
+    "phase_margin_deg", "gain_margin_low", "gain_margin_high", "delay_margin_s", "disk_margin", "ms", "bandwidth",
+)  # fmt: skip
+"""Numbers of the loops that stand on the first page."""
+ALIKE = 0.05
+"""Relative difference up to which a margin is hardly changed."""
+ORDER = (Verdict.FAILED, Verdict.UNDECIDED, Verdict.PASSED)
+
+
+def summary(case: Case, reviewed: Review | None, numbers: Mapping[str, Number]) -> Section:
+    """Return the first section of a report.
+
+    Parameters
+    ----------
+    case : Case
+        The diagram with its variants.
+    reviewed : Review, optional
+        The verdicts on its requirements.
+    numbers : mapping of str to Number
+        All numbers of the report by their dotted paths.
+    """
+    unstable = unstable_first(case)
+    text = [*(unstable.text if unstable is not None else ())]
+    tables = []
+    if reviewed is None:
+        text.append(TEXTS.line("no_requirements"))
+    else:
+        counts = {verdict.name.lower(): len(reviewed.of(verdict)) for verdict in Verdict}
+        text.append(TEXTS.line("verdict", verdict=reviewed.verdict.name, total=len(reviewed.results), **counts))
+        tables.append(_requirements(case, reviewed))
+    text += _weakest(case, numbers)
+    loops = _loops(case, numbers)
+    tables += [loops] if loops is not None else []
+    missing = list(dict.fromkeys(_not_analysed(case, numbers)))
+    if missing:
+        text += [TEXTS.line("not_analysed"), *(f"- {line}" for line in missing)]
+    return Section("summary", TITLE, tuple(text), tuple(tables))
+
+
+def _requirements(case: Case, reviewed: Review) -> Table:
+    """Return the table of requirements: those that fail first, then those that are not decided."""
+    ranked = sorted(reviewed.results, key=lambda r: (ORDER.index(r.verdict), _relative(r)))
+    rows = tuple(_row(case, result) for result in ranked)
+    columns = ("requirement", "at", "variant", "required", "found", "distance", "verdict")
+    return Table("Requirements", columns, rows, TEXTS.line("distance"))
+
+
+def _relative(result: RequirementResult) -> float:
+    return math.inf if math.isnan(result.relative) else result.relative
+
+
+def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
+    variant = case.variants.get(result.variant)
+    unit = "" if result.number is None or result.number.unit == "1" else result.number.unit
+    said = TEXTS.line("outcome", verdict=result.verdict.value, reason=result.reason.name, detail=result.detail)
+    distance: Any = "–"
+    if result.number is not None and not math.isnan(result.distance):
+        number = result.number
+        distance = Number(result.distance, number.unit, number.tolerance, number.confirmed_by, findings=number.findings)
+    place = case.loop_wires().get(result.loop, result.loop) or (result.detail if result.quantity[:5] == "step." else "")
+    return (
+        words_of(result.quantity), place or "whole diagram", variant.title if variant else "–",
+        _required(result.limit, unit), result.number if result.number is not None else "–", distance, said,
+    )  # fmt: skip
+
+
+def _required(limit: Limit, unit: str) -> str:
+    shown = symbol(unit) if unit else ""
+    return f"{limit}{'' if shown in ('', '°') else ' '}{shown}"
+
+
+def words_of(quantity: str) -> str:
+    """Return the name of a quantity in words."""
+    if quantity == "stable":
+        return TEXTS.line("stable")
+    head, _, tail = quantity.partition(".")
+    return NAMES.get(tail, tail) if head == "step" else ROWS.get(quantity, quantity)
+
+
+def _weakest(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
+    """Yield the weakest margin of the diagram as it is, and the same place in variants that leave something out."""
+    actual = case.actual
+    if actual is None:
+        return
+    found = weakest(numbers, [actual.key])
+    if found is None:
+        yield TEXTS.line("no_margin")
+        return
+    path, number = found
+    alpha = number.value
+    facts: dict[str, Any] = {"wire": _wire(case, path), "alpha": alpha, "place": _place(path)}
+    if path.rpartition(".")[2] != "disk_margin":
+        yield TEXTS.line("weakest_modulus", **facts)
+        return
+    facts |= {"low": (2 - alpha) / (2 + alpha), "high": (2 + alpha) / (2 - alpha) if alpha < 2 else math.inf}
+    where = next((n for n in _frequencies(path, numbers) if math.isfinite(n.value)), None)
+    facts |= {"phase": 2 * math.degrees(math.atan(alpha / 2)), "frequency": None if where is None else where.value}
+    yield TEXTS.line("weakest", **facts)
+    others = [(v, numbers[p].value) for v, p in _elsewhere(case, path) if p in numbers]
+    raised = [(v.title, value) for v, value in others if value > alpha * (1 + ALIKE)]
+    if raised:
+        best = sorted(raised, key=lambda item: -item[1])
+        yield TEXTS.line("why", others=best)
+    elif others:
+        yield TEXTS.line("why_not", titles=[v.title for v, _ in others])
+
+
+def _frequencies(path: str, numbers: Mapping[str, Number]) -> Iterator[Number]:
+    start = path.rpartition(".")[0]
+    for name in ("disk_frequency", "frequency", "ms_frequency"):
+        if f"{start}.{name}" in numbers:
+            yield numbers[f"{start}.{name}"]
+
+
+def _elsewhere(case: Case, path: str) -> Iterator[tuple[Variant, str]]:
+    first, loop, key, *rest = path.split(".")
+    for v in case.usable():
+        if v.key != key:
+            yield v, ".".join([first, loop, v.key, *rest])
+
+
+def _wire(case: Case, path: str) -> str:
+    key = path.split(".")[1]
+    return case.loop_wires().get(key, key)
+
+
+def _place(path: str) -> str:
+    """Return the part of a path between the variant and the number, such as a point of the path."""
+    return " ".join(path.split(".")[3:-1]).replace("_", " ")
+
+
+def _loops(case: Case, numbers: Mapping[str, Number]) -> Table | None:
+    """Return the table of the loops of the diagram as it is."""
+    actual = case.actual
+    if actual is None:
+        return None
+    found: dict[str, list[Number | None]] = {}
+    for key, wire in case.loop_wires().items():
+        starts = (f"inner.{key}.{actual.key}.{cut}" for cut in ("", "periodic."))
+        start = next((s for s in starts if f"{s}stable" in numbers or f"{s}disk_margin" in numbers), None)
+        if start is not None:
+            found[wire] = [numbers.get(f"{start}{name}") for name in LOOP_NUMBERS]
+    if not found:
+        return None
+    rows = tuple((ROWS[name], *(values[i] for values in found.values())) for i, name in enumerate(LOOP_NUMBERS))
+    return Table(TEXTS.line("loops"), ("", *found), rows)
+
+
+def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
+    if case.actual is None:
+        yield TEXTS.line("no_actual")
+    for v in case.variants.values():
+        if v.problem:
+            yield TEXTS.line("variant_left_out", variant=v.title, problem=v.problem)
+    actual = case.actual
+    if actual is None or actual.problem:
+        return
+    for key, wire in case.loop_wires().items():
+        start = f"inner.{key}.{actual.key}."
+        if "inner" in case.keys and not any(path.startswith(start) for path in numbers):
+            yield TEXTS.line("loop_left_out", wire=wire)
+    model = _model(actual)
+    if model is not None and not actual.rests and not actual.moving_alone:
+        yield TEXTS.line("moving", largest=actual.point.largest)
+    for finding in () if model is None else model.findings:
+        yield str(finding)
+    for key in ("steps", "injection"):
+        if key in case.keys and not any(path.split(".")[0] == key for path in numbers):
+            yield TEXTS.line("no_run", key=key)
+
+
+def _model(v: Variant) -> Linearization | None:
+    try:
+        return v.model
+    except LoopwrightError:
+        return None

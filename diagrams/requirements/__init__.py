@@ -1,0 +1,19 @@
+"""Requirements on a design, and the verdicts on its numbers."""
+
+from .limits import Limit, Reason, Verdict, judge
+from .requirements import LoopLimits, Requirements, StepLimits
+from .results import RequirementResult, Review
+from .toml_file import read_requirements
+
+__all__ = [
+    "Limit",
+    "LoopLimits",
+    "Reason",
+    "RequirementResult",
+    "Requirements",
+    "Review",
+    "StepLimits",
+    "Verdict",
+    "judge",
+    "read_requirements",
+]

@@ -1,0 +1,168 @@
+"""Limits of a number, and the verdict on a number against them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from enum import StrEnum
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from ...blocks.core import OptionError
+from ..frequency import Number
+
+
+class Verdict(StrEnum):
+    """Answer to the question whether a requirement is met; its value stands in the report and in its JSON."""
+
+    PASSED = "passed"
+    """The number is within its limits, with its tolerance."""
+    FAILED = "failed"
+    """The number is beyond a limit, with its tolerance; or the closed loop is unstable."""
+    UNDECIDED = "not decided"
+    """There is no number, or it is not known well enough: no requirement is met."""
+
+
+class Reason(StrEnum):
+    """Cause of a verdict; its value stands in the JSON."""
+
+    COMPARED = "compared"
+    """The number was compared with its limits."""
+    UNSTABLE = "unstable"
+    """The closed loop is unstable, and has no such number."""
+    WITHIN_TOLERANCE = "within tolerance"
+    """The number's tolerance reaches over the limit."""
+    NO_NUMBER = "no number"
+    """The report has no such number."""
+    NO_VALUE = "no value"
+    """The number does not exist (NaN), or its tolerance is not known."""
+    NOT_CONFIRMED = "not confirmed"
+    """No independent computation stands behind the number."""
+    FINDINGS = "findings"
+    """The linear model behind the number leaves something out at its operating point."""
+    REFUTED = "refuted"
+    """The running co-simulation was measured, and contradicts the linear model."""
+    NOT_MEASURED = "not measured"
+    """The co-simulation was to be measured, and gave no number."""
+    MOVING = "moving"
+    """The operating point is not an equilibrium."""
+    ON_THE_LIMIT = "on the limit"
+    """A pole lies on the limit of stability, within rounding."""
+    NOT_ANALYSED = "not analysed"
+    """The variant could not be analysed."""
+
+
+class Limit(NamedTuple):
+    """A range that a number has to be in, ends included; infinite where there is no limit on that side.
+
+    Examples
+    --------
+    >>> Limit(45.0, math.inf).distance(50.0)
+    5.0
+    >>> Limit(-math.inf, 1.6).distance(1.75) < 0
+    True
+    """
+
+    low: float
+    high: float
+
+    def distance(self, value: float) -> float:
+        """Return the distance to the nearest limit, negative beyond it."""
+        below = math.inf if self.low == -math.inf else value - self.low
+        above = math.inf if self.high == math.inf else self.high - value
+        return min(below, above)
+
+    def __str__(self) -> str:
+        if self.high == math.inf:
+            return f"≥ {self.low:g}"
+        if self.low == -math.inf:
+            return f"≤ {self.high:g}"
+        return f"{self.low:g} … {self.high:g}"
+
+
+class Sense(StrEnum):
+    """Meaning of a limit that is given as one number."""
+
+    LEAST = "at least"
+    MOST = "at most"
+
+
+SENSES: Mapping[str, Sense] = MappingProxyType(
+    {
+        "gain_margin_low": Sense.MOST,
+        "gain_margin_high": Sense.LEAST,
+        "phase_margin_deg": Sense.LEAST,
+        "delay_margin_s": Sense.LEAST,
+        "delay_margin_samples": Sense.LEAST,
+        "modulus_margin": Sense.LEAST,
+        "disk_margin": Sense.LEAST,
+        "ms": Sense.MOST,
+        "mt": Sense.MOST,
+        "bandwidth": Sense.LEAST,
+    }
+)
+"""Numbers of a loop that can be limited, by the names that end their paths."""
+
+STEP_SENSES: Mapping[str, Sense] = MappingProxyType(
+    {"overshoot": Sense.MOST, "settling": Sense.MOST, "rise": Sense.MOST, "peak": Sense.MOST}
+)
+"""Numbers of a step response that can be limited."""
+
+
+def make_limit(name: str, given: Any, sense: Sense | None, port: str = "") -> Limit:
+    """Return a limit as a range.
+
+    Parameters
+    ----------
+    name : str
+        Name of the number.
+    given : float or (float, float)
+        One number, which is the least or the most by ``sense``; or both ends, infinite where there is none.
+    sense : Sense or None
+        Meaning of one number; None where both ends are needed.
+    port : str
+        Place of the limit, for errors.
+
+    Raises
+    ------
+    OptionError
+        Neither a number nor two in ascending order.
+    """
+    where = port or name
+    expected = "two numbers, low and high" if sense is None else f"a number ({sense}), or two: low and high"
+    ends = given if isinstance(given, tuple | list) else (given,)
+    good = all(isinstance(end, int | float) and not isinstance(end, bool) and not math.isnan(end) for end in ends)
+    if not good or len(ends) not in ((2,) if sense is None else (1, 2)):
+        raise OptionError(f"found {given!r}; expected {expected}. Give {name} = (low, high).", port=where)
+    if len(ends) == 1:
+        end = float(ends[0])
+        if math.isinf(end):
+            raise OptionError(f"found {given!r}, which limits nothing; expected {expected}. Leave it out.", port=where)
+        return Limit(end, math.inf) if sense is Sense.LEAST else Limit(-math.inf, end)
+    low, high = map(float, ends)
+    if not low <= high or (low == -math.inf and high == math.inf) or low == math.inf or high == -math.inf:
+        raise OptionError(
+            f"found {given!r}; expected a range with low ≤ high, and one of them finite. Give {name} = (low, high).",
+            port=where,
+        )
+    return Limit(low, high)
+
+
+def judge(number: Number, limit: Limit) -> tuple[Verdict, Reason, float]:
+    """Return the verdict on a number, its reason, and the distance to the nearest limit, negative beyond it.
+
+    A number is passed only if it is confirmed, or a given, and within the limits by its tolerance. One whose linear
+    model leaves something out (†) is not passed either; beyond a limit it fails.
+    """
+    distance = limit.distance(number.value)
+    if math.isnan(number.value) or not number.tolerance < math.inf:
+        return Verdict.UNDECIDED, Reason.NO_VALUE, math.nan
+    if not number.confirmed_by.strip():
+        return Verdict.UNDECIDED, Reason.NOT_CONFIRMED, distance
+    if distance + number.tolerance < 0.0:
+        return Verdict.FAILED, Reason.COMPARED, distance
+    if distance - number.tolerance < 0.0:
+        return Verdict.UNDECIDED, Reason.WITHIN_TOLERANCE, distance
+    if number.findings:
+        return Verdict.UNDECIDED, Reason.FINDINGS, distance
+    return Verdict.PASSED, Reason.COMPARED, distance

@@ -1,0 +1,257 @@
+"""Requirements on the loops, step responses and other numbers of a diagram's variants."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from types import MappingProxyType
+from typing import Any
+
+from ...blocks.core import OptionError, near
+from .limits import SENSES, STEP_SENSES, Limit, make_limit
+
+PLACES = ("input", "output", "size", "length")
+"""Entries of a step's requirement that are no limits."""
+
+
+class StepLimits:
+    """Limits of a response to a step that is added to a wire of the running diagram.
+
+    Parameters
+    ----------
+    input : str
+        Wire to whose consumers the step is added; each loop's own wire without it.
+    output : str
+        Wire that responds; without it the loop's own answer at the wire, as the complementary sensitivity T.
+    size : float, optional
+        Height of the step in the wire's unit; small without it, 1e-2 of 1 + the signal's size.
+    length : float, optional
+        Length of the run in s; without it some time constants of the slowest pole, and at least thrice the limits.
+    **limits : float or (float, float)
+        ``overshoot`` (a share of the final change), ``settling`` (s, to within 2 %), ``rise`` (s, 10 % to 90 %),
+        ``peak`` (the largest size of the output's change).
+
+    Raises
+    ------
+    OptionError
+        An unknown name, a limit that is none, or no limit at all.
+    """
+
+    def __init__(
+        self,
+        input: str = "",  # noqa: A002
+        output: str = "",
+        size: float | None = None,
+        length: float | None = None,
+        **limits: Any,
+    ):
+        for name, text in (("input", input), ("output", output)):
+            if not isinstance(text, str):
+                raise OptionError(f"found {text!r}; expected the name of a wire. Give one.", port=f"step.{name}")
+        for name, number in (("size", size), ("length", length)):
+            if number is not None and (
+                isinstance(number, bool) or not isinstance(number, int | float) or not 0 < abs(number) < math.inf
+            ):
+                raise OptionError(f"found {number!r}; expected a number that is not 0. Give one.", port=f"step.{name}")
+        if length is not None and length < 0:
+            raise OptionError(f"found {length!r}; expected a positive time in s. Give one.", port="step.length")
+        for name in limits:
+            if name not in STEP_SENSES:
+                hint = near(name, [*STEP_SENSES, *PLACES])
+                raise OptionError(f"a step response has no {name!r}. {hint}", port="step")
+        self.input, self.output = input, output
+        self.size = None if size is None else float(size)
+        self.length = None if length is None else float(length)
+        found = {name: make_limit(name, given, STEP_SENSES[name], f"step.{name}") for name, given in limits.items()}
+        self.limits: Mapping[str, Limit] = MappingProxyType(found)
+        if not found:
+            raise OptionError(f"found no limit; expected some of {', '.join(STEP_SENSES)}. Give one.", port="step")
+
+    @classmethod
+    def of(cls, given: Any) -> StepLimits:
+        """Return the limits that a mapping has, or `StepLimits` themselves."""
+        if isinstance(given, StepLimits):
+            return given
+        if not isinstance(given, Mapping):
+            raise OptionError(
+                f'found {given!r}; expected a mapping, such as {{"overshoot": 0.3, "settling": 0.5}}. Give one.',
+                port="step",
+            )
+        return cls(**{str(name): value for name, value in given.items()})
+
+
+class LoopLimits:
+    """Limits of a loop's numbers.
+
+    Parameters
+    ----------
+    step : mapping or StepLimits, optional
+        Limits of the loop's response to a step at its wire.
+    variants : mapping or iterable of str, optional
+        Further variants that are judged, by their keys such as ``sampled_d1``, with limits that replace these.
+    **limits : float or (float, float)
+        ``phase_margin_deg``, ``gain_margin_low``, ``gain_margin_high``, ``delay_margin_s``, ``delay_margin_samples``,
+        ``modulus_margin``, ``disk_margin`` and ``bandwidth`` (rad/s): at least; ``ms`` and ``mt``: at most. Of the low
+        gain margin: at most. Two numbers are a range.
+
+    Raises
+    ------
+    OptionError
+        An unknown name, or a limit that is none.
+    """
+
+    def __init__(self, *, step: Any = None, variants: Any = None, **limits: Any):
+        for name in limits:
+            if name not in SENSES:
+                raise OptionError(f"there is no requirement {name!r}. {near(name, self._names())}", port=name)
+        found = {name: make_limit(name, given, SENSES[name]) for name, given in limits.items() if given is not None}
+        self.limits: Mapping[str, Limit] = MappingProxyType(found)
+        self.step = None if step is None else StepLimits.of(step)
+        self.variants: Mapping[str, LoopLimits] = MappingProxyType(_variants(variants))
+
+    @staticmethod
+    def _names() -> tuple[str, ...]:
+        return (*SENSES, "step", "variants")
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing is limited here, in no variant."""
+        return not self.limits and self.step is None and all(v.is_empty for v in self.variants.values())
+
+
+class Requirements(LoopLimits):
+    """Requirements on a design: limits of its loops' margins, its step responses, and any other number of its report.
+
+    The limits hold for every loop of the diagram as it is. ``loops`` has others for single loops, and ``variants`` has
+    further variants that are judged, such as one with a sample of delay more.
+
+    Parameters
+    ----------
+    step : mapping, `StepLimits`, or list of them, optional
+        Limits of responses to a step in the running co-simulation, such as ``{"overshoot": 0.3, "settling": 0.5}``: of
+        every loop at its wire; with ``input``, and ``output``, from one wire to another.
+    loops : mapping of str to mapping, optional
+        By a loop's wire, or its key in the report: limits that replace the general ones, as `LoopLimits`.
+    variants : mapping or iterable of str, optional
+        Further variants that are judged, by their keys such as ``sampled_d1``; with limits that replace the general
+        ones.
+    numbers : mapping of str to (float, float), optional
+        Ranges of any numbers of the report, by their dotted paths.
+    stable : bool
+        Whether all closed-loop poles of the diagram as it is have to be stable.
+    **limits : float or (float, float)
+        As of `LoopLimits`.
+
+    Raises
+    ------
+    OptionError
+        An unknown name, or a limit that is none.
+
+    Examples
+    --------
+    >>> asked = Requirements(phase_margin_deg=45, loops={"u": {"ms": 1.6}}, variants=["sampled_d1"])
+    >>> {name: str(limit) for name, limit in asked.limits_of(["u"], "sampled_d1").items()}
+    {'phase_margin_deg': '≥ 45', 'ms': '≤ 1.6'}
+    """
+
+    def __init__(
+        self,
+        *,
+        step: Any = None,
+        loops: Any = None,
+        variants: Any = None,
+        numbers: Any = None,
+        stable: bool = True,
+        **limits: Any,
+    ):
+        steps = [StepLimits.of(one) for one in (step if isinstance(step, list | tuple) else [step]) if one is not None]
+        own = [one for one in steps if not one.input]
+        if len(own) > 1:
+            raise OptionError("found two without an input; expected one. Name the wires of the others.", port="step")
+        super().__init__(step=own[0] if own else None, variants=variants, **limits)
+        if not isinstance(stable, bool):
+            raise OptionError(f"found {stable!r}; expected True or False.", port="stable")
+        self.stable = stable
+        self.steps: tuple[StepLimits, ...] = tuple(one for one in steps if one.input)
+        if loops is not None and not isinstance(loops, Mapping):
+            raise OptionError(
+                f"found {loops!r}; expected limits by loop, such as {{'u': {{'ms': 1.6}}}}.", port="loops"
+            )
+        self.loops: Mapping[str, LoopLimits] = MappingProxyType(
+            {str(wire): _loop_limits(given, f"loops.{wire}") for wire, given in (loops or {}).items()}
+        )
+        if numbers is not None and not isinstance(numbers, Mapping):
+            raise OptionError(f"found {numbers!r}; expected ranges by dotted path.", port="numbers")
+        self.numbers: Mapping[str, Limit] = MappingProxyType(
+            {str(path): make_limit(str(path), given, None) for path, given in (numbers or {}).items()}
+        )
+
+    @staticmethod
+    def _names() -> tuple[str, ...]:
+        return (*SENSES, "step", "loops", "variants", "numbers", "stable")
+
+    @property
+    def further_variants(self) -> tuple[str, ...]:
+        """Keys of the variants that are judged beside the diagram as it is."""
+        named = [*self.variants, *(key for limits in self.loops.values() for key in limits.variants)]
+        return tuple(dict.fromkeys(named))
+
+    def judges(self, names: Iterable[str], variant: str) -> bool:
+        """Return whether a further variant of a loop is judged; ``names`` are the loop's key and wire."""
+        return variant in self.variants or any(variant in of.variants for of in self._of_loop(names))
+
+    def limits_of(self, names: Iterable[str], variant: str) -> dict[str, Limit]:
+        """Return the limits of a loop in a variant, the special ones in place of the general ones."""
+        found: dict[str, Limit] = {}
+        for limits in self._layers(names, variant):
+            found |= limits.limits
+        return found
+
+    def limits_named(self, names: Iterable[str], variant: str) -> dict[str, Limit]:
+        """Return the limits that a loop has by its own name."""
+        found: dict[str, Limit] = {}
+        for limits in self._of_loop(names):
+            found |= limits.limits
+            if variant in limits.variants:
+                found |= limits.variants[variant].limits
+        return found
+
+    def step_of(self, names: Iterable[str], variant: str) -> StepLimits | None:
+        """Return the limits of the response to a step at a loop's own wire, None where there are none."""
+        found = None
+        for limits in self._layers(names, variant):
+            found = found if limits.step is None else limits.step
+        return found
+
+    def _of_loop(self, names: Iterable[str]) -> list[LoopLimits]:
+        return [self.loops[name] for name in dict.fromkeys(names) if name in self.loops]
+
+    def _layers(self, names: Iterable[str], variant: str) -> Iterator[LoopLimits]:
+        mine = self._of_loop(names)
+        for limits in (self, *mine):
+            yield limits
+            if variant in limits.variants:
+                yield limits.variants[variant]
+
+
+def _variants(given: Any) -> dict[str, LoopLimits]:
+    if given is None:
+        return {}
+    if isinstance(given, str):
+        return {given: LoopLimits()}
+    if isinstance(given, Mapping):
+        return {str(key): _loop_limits(limits, f"variants.{key}") for key, limits in given.items()}
+    if isinstance(given, Iterable):
+        return {str(key): LoopLimits() for key in given}
+    raise OptionError(f"found {given!r}; expected keys of variants, such as ['sampled_d1'].", port="variants")
+
+
+def _loop_limits(given: Any, port: str) -> LoopLimits:
+    if type(given) is LoopLimits:
+        return given
+    if not isinstance(given, Mapping):
+        raise OptionError(f"found {given!r}; expected limits by name, such as {{'ms': 1.6}}.", port=port)
+    try:
+        return LoopLimits(**{str(name): limit for name, limit in given.items()})
+    except OptionError as error:
+        raise OptionError(error.message, port=f"{port}.{error.port}" if error.port else port) from None

@@ -1,0 +1,105 @@
+"""Verdicts on the requirements of a design."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from ..frequency import Number
+from .limits import Limit, Reason, Verdict
+
+
+@dataclass(frozen=True)
+class RequirementResult:
+    """A requirement with its verdict.
+
+    Attributes
+    ----------
+    quantity : str
+        Name of the number, such as ``phase_margin_deg``.
+    loop : str
+        Key of the loop in the report; empty of the whole diagram.
+    variant : str
+        Key of the variant, such as ``sampled_d0``.
+    limit : Limit
+        The range that is required.
+    verdict : Verdict
+        Whether it is met.
+    reason : Reason
+        Why.
+    distance : float
+        Distance to the nearest limit in the number's unit, negative beyond it; NaN where there is no number.
+    path : str
+        Dotted path of the number; empty where there is none.
+    number : Number, optional
+        The number.
+    detail : str
+        More about the reason, in words.
+    """
+
+    quantity: str
+    loop: str
+    variant: str
+    limit: Limit
+    verdict: Verdict
+    reason: Reason
+    distance: float = math.nan
+    path: str = ""
+    number: Number | None = None
+    detail: str = ""
+
+    @property
+    def relative(self) -> float:
+        """The distance over the limit's size, by which results are compared; NaN where there is none."""
+        ends = [abs(end) for end in self.limit if math.isfinite(end)]
+        return self.distance / (max(ends) or 1.0) if ends else math.nan
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the facts by name, as in the JSON."""
+        return {
+            "quantity": self.quantity,
+            "loop": self.loop,
+            "variant": self.variant,
+            "low": self.limit.low,
+            "high": self.limit.high,
+            "verdict": self.verdict.value,
+            "reason": self.reason.value,
+            "distance": self.distance,
+            "path": self.path,
+            "value": math.nan if self.number is None else self.number.value,
+            "detail": self.detail,
+        }
+
+
+@dataclass(frozen=True)
+class Review:
+    """All requirements of a design with their verdicts.
+
+    Attributes
+    ----------
+    results : tuple of RequirementResult
+        In the order of the report.
+    """
+
+    results: tuple[RequirementResult, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Failed if one requirement fails; else not decided if one isn't, or there is none; else passed."""
+        found = {result.verdict for result in self.results}
+        if Verdict.FAILED in found:
+            return Verdict.FAILED
+        return Verdict.PASSED if found == {Verdict.PASSED} else Verdict.UNDECIDED
+
+    def of(self, verdict: Verdict) -> tuple[RequirementResult, ...]:
+        """Return the results with a verdict."""
+        return tuple(result for result in self.results if result.verdict is verdict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the verdict, the counts and all results, as in the JSON."""
+        return {
+            "verdict": self.verdict.value,
+            **{verdict.name.lower(): len(self.of(verdict)) for verdict in Verdict},
+            "results": [result.as_dict() for result in self.results],
+        }

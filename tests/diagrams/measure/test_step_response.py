@@ -1,0 +1,145 @@
+"""Step responses of running diagrams, against closed forms and recurrences written out."""
+
+import control
+import numpy as np
+import pytest
+
+from loopwright.blocks import Gain, Integrator, OptionError, Saturation, SimulationError, Sine
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.measure import measure_step, step_response
+
+
+def spring(damping=3.0):
+    """s² + d s + 40: L = (d s + 40)/s² at the command of a double integrator."""
+    place, speed = Integrator(name="place"), Integrator(name="speed")
+    return Diagram("spring", place(speed((-damping * speed.y - 40.0 * place.y).named("u"))))
+
+
+def sampled(gain=3.0, delay=0, more=0.0):
+    """An integrator behind a sampled gain, T = 0.01 s."""
+    lag = Integrator(name="lag")
+
+    @subsystem(sample_time=0.01, delay=delay)
+    def controller(y):
+        return Gain(gain=gain, name="gain")(more - y).named("u")
+
+    return Diagram("sampled", lag(controller(lag.y)))
+
+
+def test_a_continuous_loop_answers_as_its_complementary_sensitivity():
+    found = step_response(spring(), "u", size=0.1, length=3.0, outputs=["place.y"])
+    s = control.tf("s")
+    for linear in (False, True):
+        _, T = control.step_response((3 * s + 40) / (s**2 + 3 * s + 40), found.t)
+        np.testing.assert_allclose(found.answer(linear=linear), T, atol=1e-7)
+    _, y = control.step_response(1 / (s**2 + 3 * s + 40), found.t)
+    np.testing.assert_allclose(found.answer(True), y, atol=1e-8)
+
+
+def test_overshoot_and_settling_are_those_of_the_closed_form():
+    w, zeta = np.sqrt(40.0), 3.0 / (2 * np.sqrt(40.0))
+    t = np.linspace(0.0, 6.0, 3001)
+    wd = w * np.sqrt(1 - zeta**2)
+    r = 1 - np.exp(-zeta * w * t) * (np.cos(wd * t) + zeta / np.sqrt(1 - zeta**2) * np.sin(wd * t))
+    found = measure_step(t, r, held=False)
+    over = np.exp(-np.pi * zeta / np.sqrt(1 - zeta**2))
+    assert abs(found["overshoot"].value - over) <= found["overshoot"].tolerance < 1e-3
+    envelope = -np.log(0.02 * np.sqrt(1 - zeta**2)) / (zeta * w)
+    assert envelope - np.pi / wd <= found["settling"].value <= envelope
+    assert found["peak"].value == pytest.approx(1 + over, abs=1e-4)
+
+
+def test_a_first_order_response_has_its_times():
+    t = np.linspace(0.0, 12.0, 1201)
+    found = measure_step(t, -2.0 * (1 - np.exp(-t)), held=False)
+    assert abs(found["settling"].value - np.log(50.0)) <= found["settling"].tolerance < 0.02
+    assert abs(found["rise"].value - np.log(9.0)) <= found["rise"].tolerance == t[1]
+    assert found["overshoot"].value <= found["overshoot"].tolerance < 1e-4
+    assert found["final"].value == pytest.approx(-2.0, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "r",
+    [lambda t: t, lambda t: np.sin(5 * t), lambda t: np.exp(-t) * np.sin(t), lambda t: np.exp(0.3 * t)],
+    ids=["ramp", "rings", "back to zero", "grows"],
+)
+def test_a_response_that_does_not_settle_has_no_settling_time_and_no_overshoot(r):
+    t = np.linspace(0.0, 10.0, 1001)
+    found = measure_step(t, r(t), held=False)
+    assert all(np.isnan(found[name].value) for name in ("final", "overshoot", "settling", "rise"))
+    assert found["peak"].value == pytest.approx(np.max(np.abs(r(t))))
+
+
+def test_a_response_that_ends_off_its_target_never_settles():
+    t = np.linspace(0.0, 12.0, 1201)
+    found = measure_step(t, 0.5 * (1 - np.exp(-t)), held=False, target=1.0)
+    assert found["settling"].value == found["rise"].value == np.inf
+    assert found["final"].value == pytest.approx(0.5, rel=1e-3)
+    assert measure_step(t, 0.5 * (1 - np.exp(-t)), held=False, target=0.5)["settling"].value == pytest.approx(
+        3.912, 0.01
+    )
+
+
+@pytest.mark.parametrize("delay", [0, 1])
+def test_a_sampled_loop_is_its_recurrence(delay):
+    found = step_response(sampled(delay=delay), "controller.u", size=0.1, length=2.0, outputs=["lag.y"])
+    assert found.held
+    y, v, before = np.zeros(len(found.t)), np.zeros(len(found.t)), 0.0
+    for k in range(len(y)):
+        command = -3.0 * y[k]
+        v[k], before = (before, command) if delay else (command, before)
+        if k + 1 < len(y):
+            y[k + 1] = y[k] + 0.01 * (v[k] + found.d[k])
+    np.testing.assert_allclose(found.y[:, 0], y, atol=1e-13)
+    np.testing.assert_allclose(found.v, v, atol=1e-13)
+    np.testing.assert_allclose(found.prediction[:, 0], v, atol=1e-13)
+    assert found.d[0] == 0.0
+    assert np.all(found.d[1:] == 0.1)
+
+
+def test_a_diagram_that_moves_by_itself_gives_the_steps_part_alone():
+    lag = Integrator(name="lag")
+
+    @subsystem(sample_time=0.01)
+    def controller(y):
+        return Gain(gain=3.0, name="gain")(Sine(frequency=2.0, name="wish") - y).named("u")
+
+    moving = step_response(Diagram("moving", lag(controller(lag.y))), "controller.u", size=0.1, length=1.0)
+    resting = step_response(sampled(), "controller.u", size=0.1, length=1.0)
+    np.testing.assert_allclose(moving.v, resting.v, atol=1e-13)
+    assert moving.moved > 0.1
+    assert resting.moved == 0.0
+
+
+def test_a_saturation_makes_the_run_differ_from_its_prediction():
+    lag = Integrator(name="lag")
+
+    @subsystem(sample_time=0.01)
+    def controller(y):
+        return Saturation(limit=0.05, name="limit")(Gain(gain=3.0, name="gain")(0.0 - y)).named("u")
+
+    diagram = Diagram("limited", lag(controller(lag.y)))
+    small, large = (
+        step_response(diagram, "controller.u", size=size, length=2.0, outputs=["controller.limit.excess"])
+        for size in (0.01, 0.2)
+    )
+    np.testing.assert_allclose(small.v, small.prediction[:, 0], atol=1e-13)
+    assert np.all(small.y == 0.0)
+    assert np.max(np.abs(large.v - large.prediction[:, 0])) > 0.1
+    assert np.max(np.abs(large.y)) > 0.1
+
+
+def test_an_unstable_loop_ends_where_it_has_grown_and_names_the_wire():
+    with pytest.raises(SimulationError, match=r"controller\..*grown to .* after a step of 0.1.*not stable there"):
+        step_response(sampled(gain=400.0), "controller.u", size=0.1, length=20.0)
+
+
+def test_a_wire_with_several_entries_asks_for_one():
+    place = Integrator(initial_value=[0.0, 0.0], name="place")
+    diagram = Diagram("two", place(Gain(gain=-1.0, name="law")(place.y).named("u")))
+    with pytest.raises(OptionError, match=r"found 2 entries; expected one. Name one of them: u\[1\]"):
+        step_response(diagram, "u", size=0.1, length=1.0)
+    with pytest.raises(OptionError, match="size: found 0"):
+        step_response(spring(), "u", size=0, length=1.0)
+    found = step_response(diagram, "u[1]", size=0.1, length=5.0)
+    np.testing.assert_allclose(found.answer(), 1 - np.exp(-found.t), atol=1e-7)

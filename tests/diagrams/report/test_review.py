@@ -1,0 +1,252 @@
+"""Verdicts on requirements: the page, the JSON and the exit status agree, and seeded failures flip them."""
+
+import json
+import math
+
+import control
+import numpy as np
+import pytest
+
+from loopwright.blocks import Gain, Integrator, Quantizer, Saturation, UnknownNameError
+from loopwright.diagrams import Diagram, Requirements, Verdict, analyse, subsystem
+from loopwright.diagrams.cli.command_line import main
+from loopwright.diagrams.report_writing.html import to_html
+from loopwright.diagrams.report_writing.json import to_json
+from loopwright.diagrams.requirements import Reason
+from tests.support import reviewed
+
+PARTS = ("poles", "inner")
+ASKED = {
+    "drive": {"phase_margin_deg": 55, "delay_margin_samples": 3, "ms": 1.3, "loops": {"voltage": {"disk_margin": 1.5}}},
+    "crane": {"phase_margin_deg": 50, "ms": 1.5, "disk_margin": 1.0, "delay_margin_samples": 10},
+    "tank": {"phase_margin_deg": 80, "ms": 1.4, "disk_margin": 1.1, "bandwidth": (0.5, 0.7)},
+}
+FAULTS = {
+    "drive": [{"gain": 2.0}, {"delay": 2}, {"inertia": 0.5}],
+    "crane": [{"gain": 2.0}, {"delay": 8}, {"rope": 0.5}],
+    "tank": [{"gain": 2.0}, {"delay": 1}, {"area": 0.5}],
+}
+"""A gain doubled, a delay added, a plant softened."""
+
+
+def verdicts(report):
+    """Return the verdict on the first page, and that of the JSON, with the verdicts of all rows."""
+    page, tree = to_html(report), json.loads(to_json(report))
+    words = {verdict.value: page.count(f"Verdict: {verdict.value}.") for verdict in Verdict}
+    (shown,) = (word for word, count in words.items() if count == 1)
+    assert sum(words.values()) == 1
+    first = report.sections[0]
+    assert first.key == "summary"
+    (table,) = (t for t in first.tables if "verdict" in t.columns)
+    rows = sorted(str(row[-1]).partition(":")[0] for row in table.rows)
+    assert rows == sorted(r["verdict"] for r in tree["requirements"]["results"])
+    return shown, tree["requirements"]["verdict"]
+
+
+def reviewed_report(name, fault=None, only=PARTS, **more):
+    diagram = getattr(reviewed, name)(**(fault or {}))
+    return analyse(diagram, only=only, requirements=Requirements(**ASKED[name], **more))
+
+
+QUICK = ("tank",)
+LOOPS = [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in ASKED]
+SEEDED = [
+    pytest.param(
+        name, fault, marks=[] if name in QUICK and i == 0 else [pytest.mark.slow], id=f"{name}-{next(iter(fault))}"
+    )
+    for name, faults in FAULTS.items()
+    for i, fault in enumerate(faults)
+]
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_sound_design_passes_on_the_page_and_in_the_json(name):
+    report = reviewed_report(name)
+    assert verdicts(report) == ("passed", "passed")
+    assert all(r.verdict is Verdict.PASSED and r.distance > 0 for r in report.review.results)
+
+
+@pytest.mark.parametrize(("name", "fault"), SEEDED)
+def test_a_seeded_failure_flips_both(name, fault):
+    report = reviewed_report(name, fault)
+    assert verdicts(report) == ("failed", "failed")
+    assert any(r.distance < 0 for r in report.review.of(Verdict.FAILED) if r.reason is Reason.COMPARED) or any(
+        r.reason is Reason.UNSTABLE for r in report.review.results
+    )
+
+
+def test_the_tanks_numbers_are_those_of_its_loop_by_hand():
+    """1/(A s + c/(2 √h)) behind a hold, under the PI controller's held integral, by python-control."""
+    report = reviewed_report("tank")
+    slope = reviewed.OUTLET / (2 * np.sqrt(reviewed.LEVEL))
+    kp, ki = reviewed.TANK
+    T = reviewed.TANK_T
+    plant = control.c2d(control.ss([[-slope / reviewed.AREA]], [[1 / reviewed.AREA]], [[1.0]], 0), T)
+    found = {r.quantity: r for r in report.review.results}
+    forward = kp + ki * T / (control.tf([1, 0], [1], T) - 1)  # the integral of what came before
+    L = forward * control.tf(plant)
+    _, pm, _, _ = control.margin(L)
+    gm = -1 / L(-1).real  # python-control has no crossing at z = −1
+    assert found["phase_margin_deg"].number.value == pytest.approx(pm, abs=1e-6)
+    assert report.numbers()["inner.q.sampled_d0.gain_margin_high"].value == pytest.approx(gm, rel=1e-6)
+    assert found["phase_margin_deg"].distance == pytest.approx(pm - 80, abs=1e-6)
+
+
+def test_delays_that_are_neither_none_nor_one_sample_are_judged_as_they_are():
+    report = reviewed_report("tank", {"delay": 3})
+    assert {r.variant for r in report.review.results} == {"sampled_own"}
+    margin = report.numbers()["inner.q.sampled_own.delay_margin_samples"].value
+    without = report.numbers()["inner.q.sampled_d0.delay_margin_samples"].value
+    assert margin == pytest.approx(without - 3, abs=1e-6)
+
+
+# --- not decided, never passed -----------------------------------------------------------------------------------------
+
+
+def loop(limit=None, encoder=None, start=0.0):
+    """Return an integrator behind a sampled gain of 3, with a limit or an encoder."""
+    lag = Integrator(initial_value=start, name="lag")
+
+    @subsystem(sample_time=0.01)
+    def controller(y):
+        seen = Quantizer(interval=encoder, name="encoder")(y) if encoder else y
+        command = Gain(gain=3.0, name="gain")(0.0 - seen)
+        return (Saturation(lower=-5.0, upper=limit, name="limit")(command) if limit is not None else command).named("u")
+
+    return Diagram("loop", lag(controller(lag.y)))
+
+
+def by_quantity(report):
+    return {r.quantity: r for r in report.review.results}
+
+
+def test_a_margin_on_a_kink_is_not_decided():
+    found = by_quantity(analyse(loop(limit=0.0), only=PARTS, requirements=Requirements(phase_margin_deg=45)))
+    assert found["phase_margin_deg"].verdict is Verdict.UNDECIDED
+    assert found["phase_margin_deg"].reason is Reason.FINDINGS
+
+
+def test_a_loop_without_a_slope_has_no_margin_and_is_not_decided():
+    report = analyse(loop(encoder=0.01), only=PARTS, requirements=Requirements(phase_margin_deg=45, stable=False))
+    found = by_quantity(report)["phase_margin_deg"]
+    assert (found.verdict, found.reason) == (Verdict.UNDECIDED, Reason.NO_NUMBER)
+    assert verdicts(report) == ("not decided", "not decided")
+    assert any("The loop at controller.u" in text for text in report.sections[0].text)
+
+
+def test_a_moving_operating_point_is_not_decided():
+    found = by_quantity(analyse(loop(start=0.5), only=PARTS, requirements=Requirements(phase_margin_deg=45)))
+    assert (found["phase_margin_deg"].verdict, found["phase_margin_deg"].reason) == (Verdict.UNDECIDED, Reason.MOVING)
+    assert found["phase_margin_deg"].distance > 0
+
+
+def test_a_step_that_was_not_made_is_not_decided():
+    found = by_quantity(analyse(loop(), only=PARTS, requirements=Requirements(step={"overshoot": 0.1})))
+    assert (found["step.overshoot"].verdict, found["step.overshoot"].reason) == (
+        Verdict.UNDECIDED,
+        Reason.NOT_MEASURED,
+    )
+
+
+def test_a_step_is_judged_by_the_running_diagram():
+    asked = Requirements(step={"overshoot": 0.01, "settling": 1.0, "peak": 1.2, "size": 1.0})
+    found = by_quantity(analyse(loop(), only=("poles", "inner", "steps"), requirements=asked))
+    settled = math.ceil(math.log(0.02) / math.log(1 - 0.03)) * 0.01  # y[k + 1] = 0.97 y[k] + …
+    assert found["step.settling"].verdict is Verdict.FAILED
+    assert found["step.settling"].number.value == pytest.approx(settled, abs=0.0201)
+    assert found["step.overshoot"].verdict is Verdict.PASSED
+    assert found["step.peak"].number.value == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_limit_that_acts_fails_a_step_that_the_linear_model_passes():
+    asked = Requirements(step={"settling": 1.5, "size": -1.0})
+    report = analyse(loop(limit=0.5), only=("poles", "inner", "steps"), requirements=asked)
+    linear = report.numbers()["steps.u.sampled_d0.linear.settling"].value
+    assert linear < 1.5
+    found = by_quantity(report)["step.settling"]
+    assert found.verdict is Verdict.FAILED
+    assert found.number.value == math.inf  # the command stays at its limit
+    (steps,) = (s for s in report.sections if s.key == "steps")
+    assert any("limits act, of controller.limit" in text for text in steps.text)
+
+
+def test_a_single_number_is_judged_by_its_path_and_a_missing_one_is_not_decided():
+    ranges = {"inner.u.sampled_d0.mt": (0.0, 1.1), "inner.u.sampled_d0.nothing": (0.0, 1.0)}
+    report = analyse(loop(), only=PARTS, requirements=Requirements(numbers=ranges))
+    found = by_quantity(report)
+    assert found["inner.u.sampled_d0.mt"].verdict is Verdict.PASSED
+    assert found["inner.u.sampled_d0.nothing"].verdict is Verdict.UNDECIDED
+
+
+def test_an_unstable_diagram_fails_in_everything():
+    unstable = analyse(loop().replace({"controller.gain.gain": 400.0}), only=PARTS, requirements=Requirements(ms=9.0))
+    assert {r.verdict for r in unstable.review.results} == {Verdict.FAILED}
+    assert {r.reason for r in unstable.review.results} == {Reason.UNSTABLE}
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"loops": {"w": {"ms": 1.6}}}, "found requirements on a loop 'w'; expected a loop of the report"),
+        ({"variants": ["sampled_d2"]}, "found requirements on a variant 'sampled_d2'.*Did you mean 'sampled_d"),
+        ({"step": {"input": "w", "overshoot": 0.1}}, "there is no signal 'w'"),
+    ],
+)
+def test_names_that_the_diagram_does_not_have_are_refused_before_anything_is_computed(asked, said):
+    with pytest.raises(UnknownNameError, match=said):
+        analyse(loop(), only=PARTS, requirements=Requirements(**asked))
+
+
+# --- the command line ---------------------------------------------------------------------------------------------------
+
+FILE = """
+from loopwright.blocks import Gain, Integrator
+from loopwright.diagrams import Diagram, subsystem
+
+lag = Integrator(name="lag")
+
+
+@subsystem(sample_time=0.01)
+def controller(y):
+    return Gain(gain=3.0, name="gain")(0.0 - y).named("u")
+
+
+loop = Diagram("loop", lag(controller(lag.y)))
+"""
+
+
+def quick(monkeypatch):
+    """Let the command make the parts that these requirements are about: the injection check takes a minute."""
+    monkeypatch.setattr(
+        "loopwright.diagrams.report.analyse", lambda *of, **options: analyse(*of, only=PARTS, **options)
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "verdict"),
+    [
+        ("phase_margin_deg = 45", 0, "passed"),
+        ("phase_margin_deg = 89.9", 3, "failed"),
+        ("[numbers]\n'inner.u.sampled_d0.nothing' = [0, 1]", 4, "not decided"),
+    ],
+)
+def test_the_exit_status_says_the_verdict(tmp_path, monkeypatch, capsys, text, status, verdict):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "loop.py").write_text(FILE, encoding="utf-8")
+    (tmp_path / "limits.toml").write_text(text, encoding="utf-8")
+    quick(monkeypatch)
+    line = ["report", "loop.py:loop", "--requirements", "limits.toml", "--json"]
+    assert main([*line, "--check"]) == status
+    assert json.loads((tmp_path / "loop.json").read_text(encoding="utf-8"))["requirements"]["verdict"] == verdict
+    assert f"Requirements: {verdict}." in capsys.readouterr().out
+
+
+def test_check_without_requirements_and_names_that_are_not_there_are_wrong_usage(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "loop.py").write_text(FILE, encoding="utf-8")
+    assert main(["report", "loop.py:loop", "--check"]) == 2
+    assert "there is nothing to check" in capsys.readouterr().err
+    (tmp_path / "limits.toml").write_text("[loops.w]\nms = 1.6", encoding="utf-8")
+    assert main(["report", "loop.py:loop", "--requirements", "limits.toml"]) == 2
+    assert "a loop 'w'" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.html"))

@@ -1,0 +1,222 @@
+"""Requirements: limits by loop and variant, verdicts on numbers, TOML files, and errors that say what to write."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from loopwright.blocks import OptionError
+from loopwright.diagrams import Number, Requirements, Verdict
+from loopwright.diagrams.requirements import (
+    Limit,
+    Reason,
+    RequirementResult,
+    Review,
+    StepLimits,
+    judge,
+    read_requirements,
+)
+
+OPEN = math.inf
+
+
+def number(value, tolerance=1e-9, confirmed_by="closed-loop eigenvalues", **more):
+    return Number(value, "1", tolerance, confirmed_by, **more)
+
+
+@pytest.mark.parametrize(
+    ("value", "tolerance", "limit", "verdict", "distance"),
+    [
+        (50.0, 1e-9, Limit(45.0, OPEN), Verdict.PASSED, 5.0),
+        (40.0, 1e-9, Limit(45.0, OPEN), Verdict.FAILED, -5.0),
+        (1.75, 1e-9, Limit(-OPEN, 1.6), Verdict.FAILED, -0.15),
+        (120.0, 1e-6, Limit(50.0, 200.0), Verdict.PASSED, 70.0),
+        (190.0, 1e-6, Limit(50.0, 200.0), Verdict.PASSED, 10.0),
+        (210.0, 1e-6, Limit(50.0, 200.0), Verdict.FAILED, -10.0),
+        (45.5, 1.0, Limit(45.0, OPEN), Verdict.UNDECIDED, 0.5),
+        (44.5, 1.0, Limit(45.0, OPEN), Verdict.UNDECIDED, -0.5),
+        (math.inf, 0.0, Limit(2.0, OPEN), Verdict.PASSED, math.inf),
+        (math.inf, 0.0, Limit(50.0, 200.0), Verdict.FAILED, -math.inf),
+        (45.0, 0.0, Limit(45.0, OPEN), Verdict.PASSED, 0.0),
+    ],
+)
+def test_a_number_passes_or_fails_with_its_tolerance(value, tolerance, limit, verdict, distance):
+    found, reason, off = judge(number(value, tolerance), limit)
+    assert found is verdict
+    assert off == pytest.approx(distance)
+    assert reason is (Reason.WITHIN_TOLERANCE if verdict is Verdict.UNDECIDED else Reason.COMPARED)
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"),
+    [
+        (number(math.nan), Reason.NO_VALUE),
+        (number(50.0, math.nan), Reason.NO_VALUE),
+        (number(50.0, math.inf), Reason.NO_VALUE),
+        (number(50.0, 0.0, ""), Reason.NOT_CONFIRMED),
+        (number(50.0, findings=("a kink",)), Reason.FINDINGS),
+    ],
+)
+def test_a_number_that_is_not_known_is_never_passed(bad, reason):
+    verdict, why, _ = judge(bad, Limit(45.0, OPEN))
+    assert verdict is Verdict.UNDECIDED
+    assert why is reason
+
+
+def test_a_number_that_leaves_something_out_can_still_fail():
+    assert judge(number(40.0, findings=("a kink",)), Limit(45.0, OPEN))[0] is Verdict.FAILED
+
+
+@given(
+    st.floats(),
+    st.floats(min_value=0.0),
+    st.floats(-1e6, 1e6),
+    st.floats(0.0, 1e6),
+    st.sampled_from(["", "eigenvalues"]),
+)
+def test_whatever_passes_is_within_the_limits_by_its_tolerance_and_confirmed(value, tolerance, low, width, how):
+    limit = Limit(low, low + width)
+    verdict, _, _ = judge(number(value, tolerance, how), limit)
+    if verdict is Verdict.PASSED:
+        assert how
+        assert limit.low <= value - tolerance
+        assert value + tolerance <= limit.high
+    if verdict is Verdict.FAILED:
+        assert value + tolerance < limit.low or value - tolerance > limit.high
+
+
+def test_limits_of_a_loop_and_a_variant_replace_the_general_ones():
+    asked = Requirements(
+        phase_margin_deg=45,
+        ms=1.6,
+        loops={"u": {"ms": 2.0, "variants": {"sampled_d1": {"ms": 3.0}}}},
+        variants={"sampled_d1": {"phase_margin_deg": 30}},
+    )
+    assert asked.limits_of(["v"], "sampled_d0") == {"phase_margin_deg": Limit(45, OPEN), "ms": Limit(-OPEN, 1.6)}
+    assert asked.limits_of(["u"], "sampled_d0") == {"phase_margin_deg": Limit(45, OPEN), "ms": Limit(-OPEN, 2.0)}
+    assert asked.limits_of(["v"], "sampled_d1") == {"phase_margin_deg": Limit(30, OPEN), "ms": Limit(-OPEN, 1.6)}
+    assert asked.limits_of(["u"], "sampled_d1") == {"phase_margin_deg": Limit(30, OPEN), "ms": Limit(-OPEN, 3.0)}
+    assert asked.further_variants == ("sampled_d1",)
+    assert asked.limits_named(["u"], "sampled_d1") == {"ms": Limit(-OPEN, 3.0)}
+
+
+def test_the_step_of_a_loop_replaces_the_general_one_and_steps_between_wires_stand_beside():
+    between = {"input": "r", "output": "y", "settling": 0.5}
+    asked = Requirements(step=[{"overshoot": 0.3}, between], loops={"u": {"step": {"overshoot": 0.1, "size": 2.0}}})
+    assert asked.step_of(["v"], "sampled_d0").limits == {"overshoot": Limit(-OPEN, 0.3)}
+    assert asked.step_of(["u"], "sampled_d0").limits == {"overshoot": Limit(-OPEN, 0.1)}
+    assert asked.step_of(["u"], "sampled_d0").size == 2.0
+    (other,) = asked.steps
+    assert (other.input, other.output, other.limits) == ("r", "y", {"settling": Limit(-OPEN, 0.5)})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"phase_margin": 45}, "there is no requirement 'phase_margin'. Did you mean 'phase_margin_deg'"),
+        ({"ms": "1.6"}, "ms: found '1.6'; expected a number (at most), or two: low and high"),
+        ({"ms": True}, "ms: found True; expected a number"),
+        ({"ms": math.nan}, "ms: found nan; expected a number"),
+        ({"ms": math.inf}, "ms: found inf, which limits nothing"),
+        ({"bandwidth": (200, 50)}, "found (200, 50); expected a range with low ≤ high"),
+        ({"bandwidth": (1, 2, 3)}, "expected a number (at least), or two"),
+        ({"step": {}}, "step: found no limit; expected some of overshoot, settling, rise, peak"),
+        ({"step": {"overshot": 0.1}}, "a step response has no 'overshot'. Did you mean 'overshoot'"),
+        ({"step": {"overshoot": 0.1, "size": 0}}, "step.size: found 0; expected a number that is not 0"),
+        ({"loops": {"u": 3}}, "loops.u: found 3; expected limits by name"),
+        ({"loops": {"u": {"mss": 3}}}, "loops.u.mss: there is no requirement 'mss'. Did you mean 'ms'"),
+        ({"numbers": {"poles.sampled_d0.slowest": -1.0}}, "found -1.0; expected two numbers, low and high"),
+        ({"stable": 1}, "stable: found 1; expected True or False"),
+    ],
+)  # fmt: skip
+def test_wrong_requirements_are_refused_with_the_next_step(wrong, said):
+    with pytest.raises(OptionError) as caught:
+        Requirements(**wrong)
+    assert said in str(caught.value)
+
+
+TOML = """
+phase_margin_deg = 45
+bandwidth = [50, 200]
+variants = ["sampled_d1"]
+stable = true
+
+[step]
+overshoot = 0.3
+
+[loops.u]
+ms = 1.6
+[loops.u.step]
+settling = 0.5
+"""
+
+
+def test_a_toml_file_says_the_same_as_code(tmp_path):
+    file = tmp_path / "limits.toml"
+    file.write_text(TOML, encoding="utf-8")
+    found = read_requirements(file)
+    said = Requirements(
+        phase_margin_deg=45,
+        bandwidth=(50, 200),
+        variants=["sampled_d1"],
+        step={"overshoot": 0.3},
+        loops={"u": {"ms": 1.6, "step": {"settling": 0.5}}},
+    )
+    for names, variant in ((["u"], "sampled_d0"), (["v"], "sampled_d1")):
+        assert found.limits_of(names, variant) == said.limits_of(names, variant)
+        assert found.step_of(names, variant).limits == said.step_of(names, variant).limits
+    assert found.further_variants == said.further_variants
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("ms = ", "is not TOML"),
+        ("", "requires nothing"),
+        ("variants = ['sampled_d1']", "requires nothing"),
+        ("mss = 1.6", "limits.toml.mss: there is no requirement 'mss'. Did you mean 'ms'"),
+    ],
+)
+def test_a_file_that_requires_nothing_or_something_unknown_is_refused(tmp_path, text, said):
+    file = tmp_path / "limits.toml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(OptionError) as caught:
+        read_requirements(file)
+    assert said in str(caught.value)
+
+
+def test_a_file_that_is_not_there_is_named():
+    with pytest.raises(OptionError, match=r"'nowhere.toml' can't be read: No such file"):
+        read_requirements("nowhere.toml")
+
+
+def result(verdict):
+    return RequirementResult("ms", "u", "sampled_d0", Limit(-OPEN, 1.6), verdict, Reason.COMPARED, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "whole"),
+    [
+        ("PP", "passed"),
+        ("PF", "failed"),
+        ("UF", "failed"),
+        ("PU", "not decided"),
+        ("", "not decided"),
+    ],
+)
+def test_the_whole_passes_only_if_all_do(verdicts, whole):
+    by_letter = {"P": Verdict.PASSED, "F": Verdict.FAILED, "U": Verdict.UNDECIDED}
+    found = Review(tuple(result(by_letter[letter]) for letter in verdicts))
+    assert found.verdict == whole
+    said = found.as_dict()
+    assert said["verdict"] == whole
+    assert (said["passed"], said["failed"], said["undecided"]) == tuple(verdicts.count(letter) for letter in "PFU")
+
+
+def test_step_limits_come_from_a_mapping_or_are_taken_as_they_are():
+    limits = StepLimits.of({"rise": (0.1, 0.2)})
+    assert limits.limits == {"rise": Limit(0.1, 0.2)}
+    assert StepLimits.of(limits) is limits
+    with pytest.raises(OptionError, match="expected a mapping"):
+        StepLimits.of(0.3)
