@@ -97,6 +97,11 @@ class Domains:
         """Distance beyond zero to which an indicator that has just crossed it counts as beyond: that of rounding."""
         self._lows, self._highs = np.full((3, n), -math.inf), np.full((3, n), math.inf)
         self._columns, self._z = np.arange(n), np.zeros(n)
+        self._bounds_of: np.ndarray | None = None  # the domains that these were made for last; no array of them changes
+        self._bounds = self._lows[1], self._highs[1]
+        self._slackens = False
+        self._strict_of: np.ndarray | None = None
+        self._strict: tuple[np.ndarray, np.ndarray] | None = None
         self._set_bounds()
         self.limits = EventLimits(flat.events)
         self._many, self.search = many, EventSearch(self, many, self._spacing)
@@ -107,21 +112,41 @@ class Domains:
 
     def bounds(self, domain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and the largest value of each indicator that leaves it in its domain."""
-        row = domain + 1
-        return self._lows[row, self._columns], self._highs[row, self._columns]
+        if domain is not self._bounds_of:
+            row = domain + 1
+            self._bounds = self._lows[row, self._columns], self._highs[row, self._columns]
+            self._bounds_of = domain
+        return self._bounds
+
+    def _without_slack(self, domain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        low = np.where(domain > 0, self._least, np.where(domain < 0, -math.inf, self._lows[1]))
+        return low, np.where(domain < 0, self._hysteresis, np.where(domain > 0, math.inf, self._highs[1]))
+
+    def strict_bounds(self, domain: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return `bounds` without slack for rounding errors; None if an indicator is on the border."""
+        if domain is not self._strict_of:
+            self._strict = self._without_slack(domain) if domain.all() else None
+            self._strict_of = domain
+        return self._strict
 
     def _set_bounds(self) -> None:
         """Write the table of bounds, one row for each domain: below, on the border, above."""
+        self._bounds_of = None
+        self._slackens = any(self._slack.tolist())  # quicker than NumPy for a few
         np.subtract(self._low, self._rounding, out=self._lows[1])
         np.subtract(self._least, self._slack, out=self._lows[2])
         np.add(self._hysteresis, self._slack, out=self._highs[0])
         np.add(self._high, self._rounding, out=self._highs[1])
 
-    def domains_of(self, z: np.ndarray, before: np.ndarray, opened: np.ndarray | None = None) -> np.ndarray:
+    def domains_of(
+        self, z: np.ndarray, before: np.ndarray, bounds: tuple[np.ndarray, np.ndarray] | None = None
+    ) -> np.ndarray:
         """Return the domains at the values z of the indicators, which come from the domains ``before``."""
-        low, high = self.bounds(before)
+        low, high = self.bounds(before) if bounds is None else bounds
         now = np.where(z > high, 1, np.where(z < low, -1, before))
-        return np.where((self._open if opened is None else opened) > 0.5, now, before)  # a closed subsystem holds them
+        if min(self._open.tolist()) > 0.5:
+            return now
+        return np.where(self._open > 0.5, now, before)  # a closed subsystem holds them
 
     def domains_at(self, z: np.ndarray, before: np.ndarray) -> np.ndarray:
         """Return the domains at an instant: if events fire there, no slack hides another indicator's change.
@@ -130,19 +155,14 @@ class Domains:
         """
         now = self.domains_of(z, before)
         fired = self.fires(before, now)
-        if not fired.any() or not self._slack.any():
+        if not self._slackens or not fired.any():
             return now
-        kept, self._slack = self._slack, np.zeros_like(self._slack)
-        self._set_bounds()
-        strict = self.domains_of(z, before)
-        self._slack = kept
-        self._set_bounds()
+        strict = self.domains_of(z, before, self._without_slack(before))
         return np.where(fired | self.fires(before, strict), now, strict)
 
     def fires(self, before: np.ndarray, now: np.ndarray) -> np.ndarray:
         """Return which events a change of domains fires."""
-        changed = now != before
-        return np.array(changed & ((self.rising & (now > 0)) | (self.falling & (now < 0))))
+        return np.asarray(((now > before) & self.rising) | ((now < before) & self.falling))
 
     def take(self, now: np.ndarray) -> None:
         """Take over the domains at an instant or between events."""
@@ -164,6 +184,7 @@ class Domains:
         """Go back to the domains of the start for the blocks in a subsystem whose states have done so."""
         inside = np.array([e.path.startswith(f"{subsystem}.") and not e.subsystem for e in self.events])
         self.domain = np.where(inside, self._first, self.domain)
+        self._set_bounds()
 
     def update(self, t: float, x: np.ndarray) -> np.ndarray:
         """Take over the domains at one instant, and return which events their changes fire."""
@@ -207,11 +228,56 @@ class Domains:
         self._set_bounds()
         return found.t, fired
 
-    def look_at(self, size: np.ndarray, scatter: np.ndarray) -> None:
+    def look_at(self, size: np.ndarray, scatter: np.ndarray | None) -> None:
         """Note the largest values of the indicators in a step that is searched, and how they scatter at its start."""
         self._size, self._rounding = size, _ROUNDING * size
-        self._slack = np.maximum(self._slack, np.minimum(_SCATTER * scatter, _CONTINUOUS * size))
+        if scatter is not None:
+            self._slack = np.maximum(self._slack, np.minimum(_SCATTER * scatter, _CONTINUOUS * size))
+            self._set_bounds()
+        elif not self.domain.all():  # of rounding there is a matter on the border only
+            self._set_bounds()
+
+    def pass_by(self, size: np.ndarray, later: np.ndarray) -> bool:
+        """Take over a step in which nothing happened; return False, and take nothing, if slack is left after it.
+
+        Parameters
+        ----------
+        size, later : ndarray
+            Largest absolute values of the indicators in the step, and those without its start.
+        """
+        if (self.search.fresh or self._slackens) and not np.all((later > self._slack) & (later > _CONTINUOUS * size)):
+            return False
+        self._size, self._rounding = size, _ROUNDING * size
+        if self._slackens:
+            self._slack = np.zeros_like(self._slack)
+            self._set_bounds()
+        self.take(self.domain)
+        return True
+
+    def clear(self, z: np.ndarray, distance: np.ndarray, size: np.ndarray) -> np.ndarray | None:
+        """Return which values are outside of the strict bounds if all slack is gone before the first one is, else None.
+
+        Slack makes no difference then, and is taken away. Nor does it matter how values scatter where the step begins.
+
+        Parameters
+        ----------
+        z, distance : ndarray
+            The indicators and their absolute values, one instant a row, after the first one.
+        size : ndarray
+            Largest absolute values in the step.
+        """
+        bounds = self.strict_bounds(self.domain)
+        if bounds is None:
+            return None
+        low, high = bounds
+        out = np.asarray((z > high) | (z < low))
+        first = int(out.argmax())
+        row = first // out.shape[1] if out.flat[first] else len(out)
+        if not row or not np.all(distance[:row].max(axis=0) > np.maximum(self._slack, _CONTINUOUS * size)):
+            return None
+        self._size, self._rounding, self._slack = size, _ROUNDING * size, np.zeros_like(size)
         self._set_bounds()
+        return out
 
     def outside(self, z: np.ndarray, domain: np.ndarray) -> np.ndarray:
         """Return which values of the indicators, one instant a row, are outside of the bounds of their domains.
@@ -219,16 +285,17 @@ class Domains:
         One that has just crossed zero, and is far from it at an instant, has done so: no slack is left from there on.
         """
         low, high = self.bounds(domain)
-        if not self._slack.any():
-            return np.asarray((z > high) | (z < low))
-        out = (z > high) | (z < low)
+        out = np.asarray((z > high) | (z < low))
+        if not self._slackens:
+            return out
         far = (np.abs(z) > self._slack) & (self._slack > 0.0)
-        row = int(far.any(axis=1).argmax())
-        if far[row].any() and not out[: row + 1].any():
+        first = int(far.argmax())
+        row = first // far.shape[1]
+        if far.flat[first] and not out[: row + 1].any():
             self._slack = np.where(far[row], 0.0, self._slack)
             self._set_bounds()
             out[row + 1 :] = self.outside(z[row + 1 :], domain) if row + 1 < len(z) else False
-        return np.asarray(out)
+        return out
 
     # --- contact -----------------------------------------------------------------------------------------------------
 

@@ -3,7 +3,8 @@
 The indicators are evaluated at a few instants of each step, no further apart than two ticks or a source's time scale,
 and, after an event, at instants that come geometrically closer to it, all in one pass. An indicator that is closest to
 zero between two of them is followed to where it is closest. Each change of domain that fires is then located on the
-step's dense output with Brent's method, to the resolution of floating point, on the side where the domain has changed.
+step's dense output by interpolation and bisection, to the resolution of floating point, on the side where the domain
+has changed.
 """
 
 from __future__ import annotations
@@ -14,14 +15,17 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ...blocks.core import SimulationError
 from ..solvers import AcceptedStep
+from .bracket import find_root
+from .many import SIZES, ManyInstants, Scan
 
 _SAMPLES = 4
 _HALVINGS = 40
 _CLOSE = 1e-3
 _FEW, _MOST = 48, 1024  # instants that are evaluated in one pass: the first one, and at most
 _PARTS = 0.5 ** np.arange(_HALVINGS, 0, -1)
+_KEPT = 64  # divisions of a step that are remembered
+_APART = 1e-15  # of the time, relative: instants that are further from each other are distinct
 
 Many = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 Known = tuple[int, np.ndarray]
@@ -55,7 +59,7 @@ class Rule(Protocol):
     def bounds(self, domain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and the largest value of each indicator that leaves it in its domain."""
 
-    def domains_of(self, z: np.ndarray, before: np.ndarray, opened: np.ndarray | None = None) -> np.ndarray:
+    def domains_of(self, z: np.ndarray, before: np.ndarray) -> np.ndarray:
         """Return the domains at values of the indicators, from those before."""
 
     def domains_at(self, z: np.ndarray, before: np.ndarray) -> np.ndarray:
@@ -67,7 +71,16 @@ class Rule(Protocol):
     def take(self, now: np.ndarray) -> None:
         """Take over domains that fire nothing."""
 
-    def look_at(self, size: np.ndarray, scatter: np.ndarray) -> None:
+    def strict_bounds(self, domain: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return `bounds` without slack for rounding errors; None if an indicator is on the border."""
+
+    def pass_by(self, size: np.ndarray, later: np.ndarray) -> bool:
+        """Take over a step in which nothing happened; see `Domains.pass_by`."""
+
+    def clear(self, z: np.ndarray, distance: np.ndarray, size: np.ndarray) -> np.ndarray | None:
+        """Return what `outside` does if rounding errors make no difference, else None; see `Domains.clear`."""
+
+    def look_at(self, size: np.ndarray, scatter: np.ndarray | None) -> None:
         """Note the largest values of the indicators in a step that is searched, and how they scatter at its start."""
 
     def outside(self, z: np.ndarray, domain: np.ndarray) -> np.ndarray:
@@ -89,16 +102,28 @@ class EventSearch:
 
     def __init__(self, domains: Rule, many: Many, spacing: float):
         self._rule, self._many, self._spacing = domains, many, spacing
+        self._scan = many.scan if isinstance(many, ManyInstants) and many.scans else None
         self._finest = 2e-16 * spacing
+        self._rough: Callable[[float], np.ndarray] | None = None
+        self._parts: dict[tuple[int, bool], np.ndarray] = {}
         self.fresh = True
         """Whether an event has fired since the last step without one: others may follow closely."""
 
     def first_event(self, step: AcceptedStep) -> Found | None:
         """Return the first instant in (t_old, t] at which events fire; if none does, None: domains are those at t."""
         instants = self._instants(step.t_old, step.t)
-        first, width = 1, _FEW
+        first, width, scan = 1, _FEW, None
+        bounds = None if self._scan is None else self._rule.strict_bounds(self._rule.domain)
+        if self._scan is not None and bounds is not None:
+            width = SIZES[-1] - first
+            scan = self._scan(step, instants[: first + width], bounds)
+            quiet = scan is not None and scan.trouble == 0.0 and len(instants) <= first + width
+            if quiet and scan is not None and self._rule.pass_by(scan.size, scan.later):
+                self.fresh = False
+                return None
         while first < len(instants):
-            found = self._first_among(step, instants[max(0, first - 2) : first + width], min(first, 2))
+            found = self._first_among(step, instants[max(0, first - 2) : first + width], min(first, 2), scan)
+            scan = None
             if found is not None:
                 return found
             first, width = first + width, min(2 * width, _MOST)
@@ -108,37 +133,52 @@ class EventSearch:
     def _instants(self, a: float, b: float) -> np.ndarray:
         n = max(_SAMPLES, math.ceil((b - a) / self._spacing))
         h = (b - a) / n
-        if self.fresh:  # an indicator may be back across zero within a small part of the step
-            close = a + h * _PARTS
-            close = close[(close > a) & (close < a + h)]
-        else:
-            close = np.array([a + _CLOSE * h])  # these two tell which way it goes at the ends
-        inner = a + h * np.arange(1, n)
-        found = np.concatenate(([a], close, inner, [b - _CLOSE * h, b]))
-        return found[np.concatenate(([True], found[1:] > found[:-1]))]
+        key = n, self.fresh
+        parts = self._parts.get(key)
+        if parts is None:
+            if len(self._parts) > _KEPT:
+                self._parts.clear()
+            # after an event an indicator may be back across zero within a small part of the step; else the two close to
+            # the ends tell which way it goes there
+            close = _PARTS if self.fresh else [_CLOSE]
+            parts = self._parts[key] = np.concatenate(([0.0], close, np.arange(1.0, n), [n - _CLOSE, n]))
+        found: np.ndarray = h * parts
+        found += a
+        found[-2:] = b - _CLOSE * h, b
+        if parts[1] * h > _APART * max(abs(a), abs(b)):
+            return found
+        return found[np.concatenate(([True], found[1:] > np.maximum.accumulate(found[:-1])))]
 
-    def _first_among(self, step: AcceptedStep, times: np.ndarray, k: int) -> Found | None:
+    def _first_among(self, step: AcceptedStep, times: np.ndarray, k: int, scan: Scan | None) -> Found | None:
         """Look at instants from number ``k`` on; the domains known are those of the one before."""
         rule = self._rule
-        z, opened = self._many(times, step.interpolate_many(times))
-        bad = np.flatnonzero(np.any(~np.isfinite(z) & (opened > 0.5), axis=1))
-        end = int(bad[0]) if bad.size else len(times)
-        closed = None if np.all(opened > 0.5) else opened <= 0.5
-        size = np.abs(z[:end]).max(axis=0)
-        rule.look_at(size, _scatter(times, z) if self.fresh and k == 1 else np.zeros_like(size))
-        dips = self._find_dips(times[:end], z[:end])
+        self._rough = None if scan is None else scan.value
+        z, opened = self._many(times, step.interpolate_many(times)) if scan is None else scan[:2]
+        closed = None if opened.min() > 0.5 else opened <= 0.5
+        size, end = np.abs(z), len(times)
+        largest = size.max(axis=0) if scan is None or math.isnan(scan.trouble) else scan.size
+        if not math.isfinite(sum(largest.tolist())):
+            bad = np.flatnonzero(np.any(~np.isfinite(z) & (opened > 0.5), axis=1))
+            if bad.size:
+                end = int(bad[0])
+                largest = size[:end].max(axis=0)
+        out = rule.clear(z[k:end], size[k:end], largest) if self.fresh and k == 1 and k < end else None
+        if out is None:
+            rule.look_at(largest, _scatter(times, z) if self.fresh and k == 1 else None)
+        dips = self._find_dips(times[:end], z[:end], size[:end])
         known = [(0, rule.domain)]  # the instants from which on the domains were others, and these
         while k < end:
             now = known[-1][1]
-            out = rule.outside(z[k:end], now)
+            out = rule.outside(z[k:end], now) if out is None else out
             if closed is not None:
                 out &= ~closed[k:end]
-            rows = out.any(axis=1)
-            stop = k + int(rows.argmax()) if rows.any() else end
-            for dip in (d for d in dips if k <= d < stop):
-                ends = self._follow_dips(step, times, z, dip, dips[dip], known)
+            first = int(out.argmax())  # in rows one after the other
+            stop = k + first // out.shape[1] if out.flat[first] else end
+            out = None
+            for dip in dips:
+                ends = self._follow_dips(step, times, z, dip, dips[dip], known) if k <= dip < stop else []
                 if ends:
-                    return self._earliest(step, times, dip, ends, known)
+                    return self._earliest(step, times, z, dip, ends, known)
             if stop == end:
                 break
             b = float(times[stop])
@@ -149,10 +189,10 @@ class EventSearch:
             if stop in dips:
                 ends += self._follow_dips(step, times, z, stop, dips[stop], known)
             if ends:
-                return self._earliest(step, times, stop, ends, known)
+                return self._earliest(step, times, z, stop, ends, known)
             k = stop + 1
         rule.take(known[-1][1])
-        if bad.size:
+        if end < len(times):
             t = float(times[end])
             rule.g(t, step.interpolate(t))  # raises
         return None
@@ -161,47 +201,55 @@ class EventSearch:
         self,
         step: AcceptedStep,
         times: np.ndarray,
+        z: np.ndarray,
         last: int,
         ends: list[tuple[int, float, float]],
         known: list[Known],
     ) -> Found:
-        """Return the first of the events that lie between the given ends, before instant number ``last``."""
+        """Return the first of the events that lie between the given ends, before instant number ``last``.
+
+        There the indicators z are those of the run, to the last bit, if the last domains are known from there on.
+        """
         found, values = math.inf, np.zeros(len(self._rule.domain))
+        rough = self._rough
+        exact = float(times[last]) if known[-1][0] == last else None
         for i, low, high in ends:
-            start = _domains_at(known, int(np.searchsorted(times, low, side="right")) - 1)
-            t, values[i] = self._find_root(i, low, high, step, start)
+            start = _domains_at(known, int(times.searchsorted(low, side="right")) - 1)
+            seen = {high: float(z[last, i])} if high == exact else {}
+            t, values[i] = self._find_root(i, low, high, step, start, seen, rough)
             found = min(found, t)
-        at = min(int(np.searchsorted(times, found, side="right")) - 1, last - 1)
+        at = min(int(times.searchsorted(found, side="right")) - 1, last - 1)
         before = _domains_at(known, at)
         now = self._rule.domains_at(self._rule.g(found, step.interpolate(found)), before)
         return Found(found, before, now, values)
 
     # --- excursions --------------------------------------------------------------------------------------------------
 
-    def _find_dips(self, times: np.ndarray, z: np.ndarray) -> dict[int, np.ndarray]:
+    def _find_dips(self, times: np.ndarray, z: np.ndarray, size: np.ndarray) -> dict[int, np.ndarray]:
         """Return the indicators that may have been in the other domain between three instants, by the last of these.
 
         Where the middle one is closest to zero, the parabola through the three tells how close it may come in between.
         """
         if len(times) < 3:
             return {}
-        size = np.abs(z)
         near = (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:])
+        if not near.any():
+            return {}
         up = z > 0.0
         near &= ((up[1:-1] == up[:-2]) & (up[1:-1] == up[2:])) | self._rule.has_hysteresis
-        dips = {}
-        for k in np.flatnonzero(near.any(axis=1)).tolist():
-            h0, h1 = float(times[k + 1] - times[k]), float(times[k + 2] - times[k + 1])
-            slope0, slope1 = (z[k + 1] - z[k]) / h0, (z[k + 2] - z[k + 1]) / h1
-            bend = (slope1 - slope0) / (h0 + h1)
-            tangent = slope0 + bend * h0
-            with np.errstate(all="ignore"):
-                lowest = z[k + 1] - tangent * tangent / (4.0 * bend)
-            far = ((lowest > 0.0) == (z[k + 1] > 0.0)) & (np.abs(lowest) > 0.3 * np.maximum(size[k], size[k + 2]))
-            which = np.flatnonzero(near[k] & np.isfinite(bend) & (bend != 0.0) & ~far)
-            if which.size:
-                dips[k + 2] = which
-        return dips
+        k = np.flatnonzero((near & (z[1:-1] != z[:-2]) | near & (z[1:-1] != z[2:])).any(axis=1))
+        if not k.size:
+            return {}
+        h0, h1 = (times[k + 1] - times[k])[:, None], (times[k + 2] - times[k + 1])[:, None]
+        middle = z[k + 1]
+        slope0, slope1 = (middle - z[k]) / h0, (z[k + 2] - middle) / h1
+        bend = (slope1 - slope0) / (h0 + h1)
+        tangent = slope0 + bend * h0
+        with np.errstate(all="ignore"):
+            lowest = middle - tangent * tangent / (4.0 * bend)
+        far = ((lowest > 0.0) == (middle > 0.0)) & (np.abs(lowest) > 0.3 * np.maximum(size[k], size[k + 2]))
+        which = near[k] & np.isfinite(bend) & (bend != 0.0) & ~far
+        return {int(row) + 2: np.flatnonzero(of) for row, of in zip(k, which, strict=True) if of.any()}
 
     def _follow_dips(
         self, step: AcceptedStep, times: np.ndarray, z: np.ndarray, k: int, which: np.ndarray, known: list[Known]
@@ -231,19 +279,32 @@ class EventSearch:
 
     # --- location ----------------------------------------------------------------------------------------------------
 
-    def _find_root(self, i: int, a: float, b: float, step: AcceptedStep, before: np.ndarray) -> tuple[float, float]:
+    def _find_root(
+        self,
+        i: int,
+        a: float,
+        b: float,
+        step: AcceptedStep,
+        before: np.ndarray,
+        values: dict[float, float],
+        rough: Callable[[float], np.ndarray] | None,
+    ) -> tuple[float, float]:
         """Return the time at which indicator ``i`` has just left its domain, between a and b, where it has.
 
-        Also the larger one of its distances from there on both sides.
+        Also the larger one of its distances from there on both sides. ``values`` are those that are known.
         """
-        g = self._rule.g
+        g, interpolate = self._rule.g, step.interpolate
         low, high = (float(bound[i]) for bound in self._rule.bounds(before))
-        values: dict[float, float] = {}
 
         def value(t: float) -> float:
-            if t not in values:
-                values[t] = float(g(t, step.interpolate(t))[i])
-            return values[t]
+            found = values.get(t)
+            if found is None:
+                found = values[t] = float(g(t, interpolate(t))[i])
+            return found
+
+        def near(t: float) -> float:
+            found = math.nan if rough is None else float(rough(t)[i])  # it costs a fifth
+            return found if math.isfinite(found) else value(t)
 
         def is_changed(t: float) -> bool:
             return not low <= value(t) <= high
@@ -252,16 +313,14 @@ class EventSearch:
             return a, 0.0
         level = high if value(b) > high else low
         za, zb = value(a) - level, value(b) - level
+        resolution = max(4 * math.ulp(max(abs(a), abs(b))), self._finest)
         if za == 0.0 or not za * zb < 0.0:
             t = b
             while t - a > max(4 * math.ulp(t), self._finest):
                 middle = 0.5 * (a + t)
                 a, t = (a, middle) if is_changed(middle) else (middle, t)
         else:
-            from scipy.optimize import brentq
-
-            resolution = max(4 * math.ulp(max(abs(a), abs(b))), self._finest)
-            t = float(brentq(lambda t: value(t) - level, a, b, xtol=resolution, rtol=1e-15, maxiter=200))
+            t = find_root(lambda t: near(t) - level, a, za, b, zb, resolution)
             ahead = max(math.ulp(t), self._finest)
             while t < b and not is_changed(t):
                 t, ahead = min(b, t + ahead), 2 * ahead
@@ -269,28 +328,13 @@ class EventSearch:
         return t, max(abs(value(t) - level), abs(value(below) - level))
 
 
-def evaluate_many(
-    g: Callable[[float, np.ndarray], np.ndarray], opened: np.ndarray, times: np.ndarray, states: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return indicators at several times, one row each, NaN beyond a failure, and what ``g`` writes into ``opened``."""
-    n = len(opened)
-    z, open_then = np.full((len(times), n), math.nan), np.ones((len(times), n))
-    try:
-        for k, t in enumerate(times.tolist()):
-            z[k] = g(t, states[k])
-            open_then[k] = opened
-    except SimulationError:  # a loop without a solution: whoever needs that instant evaluates it again
-        z[k:], open_then[k:] = math.nan, 1.0
-    return z, open_then
-
-
 def _scatter(times: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Return how far values of the indicators are from straight lines, where a step begins: rounding errors."""
     m = _HALVINGS // 3
     if len(times) <= m + 1:
         return np.zeros(z.shape[1])
-    line = np.outer((times[1:m] - times[0]) / (times[m] - times[0]), z[m] - z[0])
-    return np.asarray(np.max(np.abs(z[1:m] - z[0] - line), axis=0))
+    part = (times[1:m] - times[0]) / (times[m] - times[0])
+    return np.asarray(np.abs(z[1:m] - z[0] - part[:, None] * (z[m] - z[0])).max(axis=0))
 
 
 def _domains_at(known: list[Known], k: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from .functions import indicators_of
 from .layout import FlatEvent, StateLayout
 from .logic import TRUE, is_true
 from .plant_ticks import own_step, takes_any_step
-from .stages import Bound, Evaluators, Schedule, evaluate_apart
+from .stages import Bound, Evaluators, Schedule, bind_function, evaluate_apart
 from .total_derivative import Derivative
 from .trace_stages import trace_schedule
 from .vectors import join_columns, loop_mismatch, next_x, plant_inputs, rates
@@ -32,6 +32,7 @@ __all__ = [
     "StateLayout",
     "TickPattern",
     "WiredDiagram",
+    "bind_function",
     "evaluate",
     "evaluate_apart",
     "indicators_of",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import OptionError, SimulationError, is_before, left_of
-from ..events import Domains, Sliding
+from ..events import Domains, ManyInstants, Sliding
 from ..exchange import ExchangedBlocks, OutsideEvents
 from ..results import Occurrence
 from ..solvers import AcceptedStep, Problem, make_solver
@@ -97,7 +97,9 @@ class Continuous(Trials):
         self.domains: Domains | None = None
         if flat.events:
             self._indicators, self._opened = workspace.indicators()
-            self.domains = Domains(flat, self._g, self._g_many, self._rate, self._opened, self.time_scale)
+            plain = len(flat.indicators.stages) == 1 and not (self.delays or self._loops or self._opaque)
+            many = ManyInstants(flat, workspace.trial, self._time) if plain else self._g_many
+            self.domains = Domains(flat, self._g, many, self._rate, self._opened, self.time_scale)
         if flat.events or flat.outside:
             self._jump = workspace.bind_jump()
         self.outside: OutsideEvents | None = None

@@ -63,7 +63,7 @@ class Trials:
 
     def _g(self, t: float, x: np.ndarray) -> np.ndarray:
         g = self._indicators(self._time(t), x)
-        if not math.isfinite(g.sum()) and not np.all(np.isfinite(g[self._opened > 0.5])):
+        if not math.isfinite(sum(g.tolist())) and not np.all(np.isfinite(g[self._opened > 0.5])):
             raise self._not_finite(t, x, g)
         return g
 

@@ -1,10 +1,11 @@
 """Solvers of fixed and variable step behind one interface."""
 
-from .base import AcceptedStep, Problem, solver_name
+from .base import AcceptedStep, Polynomial, Problem, solver_name
 from .choose import make_solver
 
 __all__ = [
     "AcceptedStep",
+    "Polynomial",
     "Problem",
     "make_solver",
     "solver_name",

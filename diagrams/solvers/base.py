@@ -31,7 +31,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -77,6 +77,15 @@ class Statistics:
     messages: list[str] = field(default_factory=list)
 
 
+class Polynomial(NamedTuple):
+    """The state over a step as a polynomial: x + Σ cₖ ((time − t)/h)ᵏ, k ≥ 1, with cₖ the columns of coefficients."""
+
+    t: float
+    h: float
+    x: np.ndarray
+    coefficients: np.ndarray
+
+
 class AcceptedStep:
     """One accepted step, from ``t_old`` to ``t``, where the state is ``x``."""
 
@@ -95,13 +104,21 @@ class AcceptedStep:
         return self._dense(t)
 
     def interpolate_many(self, times: np.ndarray) -> np.ndarray:
-        """Return the states at several such times, one row each; to rounding those of `interpolate`."""
+        """Return the states at several such times, which ascend, one row each; to rounding those of `interpolate`."""
         if self._dense is None:
             self._dense = self._prepare()
         many = getattr(self._dense, "many", None)
-        found = np.array([self._dense(float(t)) for t in times]) if many is None else many(times)
-        found[times == self.t] = self.x
-        return np.asarray(found)
+        found: np.ndarray = np.array([self._dense(float(t)) for t in times]) if many is None else many(times)
+        if times[-1] == self.t:
+            found[-1] = self.x
+        return found
+
+    def polynomial(self) -> Polynomial | None:
+        """Return the state as a polynomial, to rounding that of `interpolate`; None if the method has another form."""
+        if self._dense is None:
+            self._dense = self._prepare()
+        of = getattr(self._dense, "polynomial", None)
+        return None if of is None else of()
 
 
 class Solver(ABC):

@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from .base import Polynomial
+
 
 class FromStart:
     """The polynomial x(t₀ + u h) = x₀ + Σ cₖ uᵏ over a step.
@@ -48,6 +50,10 @@ class FromStart:
             change = (change + c) * u
         return np.asarray(self._x + change)
 
+    def polynomial(self) -> Polynomial:
+        """Return it; see `AcceptedStep.polynomial`."""
+        return Polynomial(self._t, self._h, self._x, self._coefficients[::-1].T)
+
 
 class OneStepDense:
     """Dense output of one of SciPy's one-step methods, with less work per call and to the last bit its value."""
@@ -56,17 +62,21 @@ class OneStepDense:
         self._dense, self._powers = dense, method in ("RK23", "RK45", "Radau")
         if self._powers:
             self._scale = 1.0 if method == "Radau" else dense.h
+            self._u = np.empty(dense.order + 1)
 
     def __call__(self, t: float) -> np.ndarray:
         """Return the state at a time within the step."""
         dense = self._dense
         if not self._powers:
             return np.asarray(dense(t))
-        u = (t - dense.t_old) / dense.h
-        powers = [u]
-        for _ in range(dense.order):
-            powers.append(powers[-1] * u)
-        found: np.ndarray = self._scale * np.dot(dense.Q, np.array(powers))
+        u = power = (t - dense.t_old) / dense.h
+        powers = self._u
+        powers[0] = u
+        for k in range(1, len(powers)):
+            power *= u
+            powers[k] = power
+        found: np.ndarray = np.dot(dense.Q, powers)
+        found *= self._scale
         found += dense.y_old
         return found
 
@@ -76,11 +86,15 @@ class OneStepDense:
         if not self._powers:
             return np.asarray(dense(times).T)
         u = (times - dense.t_old) / dense.h
-        powers = np.empty((dense.order + 1, len(times)))
-        powers[0] = u
-        for k in range(dense.order):
-            np.multiply(powers[k], u, out=powers[k + 1])
-        return np.asarray(powers.T @ (self._scale * dense.Q.T) + dense.y_old)
+        powers = np.multiply.accumulate(np.broadcast_to(u, (dense.order + 1, len(u))))
+        found: np.ndarray = powers.T @ (self._scale * dense.Q.T)
+        found += dense.y_old
+        return found
+
+    def polynomial(self) -> Polynomial | None:
+        """Return it, but for DOP853; see `AcceptedStep.polynomial`."""
+        dense = self._dense
+        return Polynomial(dense.t_old, dense.h, dense.y_old, self._scale * dense.Q) if self._powers else None
 
 
 def from_nordsieck(dense: Any, t_old: float, x_old: np.ndarray) -> FromStart:
