@@ -21,6 +21,7 @@ from .admittance import (
     target_admittance,
 )
 from .contract import BlockReport, check_block
+from .coupling import Coupling, CouplingReport
 from .diagram import Diagram
 from .drawing import Drawing
 from .flat import FlatDiagram, Layout
@@ -70,6 +71,8 @@ __all__ = [
     "ContactAdmittance",
     "ContactLimit",
     "ContactMap",
+    "Coupling",
+    "CouplingReport",
     "Diagram",
     "DiskMargin",
     "Drawing",

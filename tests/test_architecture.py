@@ -220,7 +220,7 @@ PUBLIC = {
         mass_spring_damper model_spec read_description scara
     """,
     "diagrams": """
-        AdmittanceLoop BlockReport Channel Comparison Contact ContactAdmittance ContactLimit ContactMap Diagram DiskMargin Drawing Fig3Diagram FlatDiagram
+        AdmittanceLoop BlockReport Channel Comparison Contact ContactAdmittance ContactLimit ContactMap Coupling CouplingReport Diagram DiskMargin Drawing Fig3Diagram FlatDiagram
         FrequencyResponse GainCrossover GangOfFour Interrupted Kink Layout Linearization Margins MeanSlope Number
         NyquistCount Occurrence
         OperatingPoint Passivity PeriodicMargins PhaseCrossover Plot Report Requirements Review Rig Run RunOptions RunState SampledDesign

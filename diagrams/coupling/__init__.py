@@ -1,11 +1,31 @@
 """Plants of a run: loaded, stepped between their communication points, and coupled with one another."""
 
+from .coupled_steps import CoupledSteps, Effort
+from .links import Links
+from .loops import note_loops
+from .options import Coupling, Scheme, refuse_exchanged, to_coupling
 from .plant_steps import PlantSteps
 from .plants import Plant, load_plants, note_fine_steps
+from .report import CoupledConnection, CouplingReport, HeldFrom, LinkKind, report_coupling
+from .search import Search
 
 __all__ = [
+    "CoupledConnection",
+    "CoupledSteps",
+    "Coupling",
+    "CouplingReport",
+    "Effort",
+    "HeldFrom",
+    "LinkKind",
+    "Links",
     "Plant",
     "PlantSteps",
+    "Scheme",
+    "Search",
     "load_plants",
     "note_fine_steps",
+    "note_loops",
+    "refuse_exchanged",
+    "report_coupling",
+    "to_coupling",
 ]

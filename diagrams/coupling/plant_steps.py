@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -49,12 +49,17 @@ class PlantSteps:
     ) -> None:
         self._flat, self._plants, self._time_of = flat, plants, time_of
         self._z, self._w = z, w
-        visited = {EVERY} if every_tick else {*flat.visited}
-        self.regular = all(EVERY in ticks or visited <= {*ticks} for ticks in flat.plant_ticks.values())
+        self._visited = {EVERY} if every_tick else {*flat.visited}
+        self.regular = all(map(self.is_regular, flat.plant_ticks))
         self.inputs = z if self.regular else z.copy()
         self.reached: dict[str, int] = {}
         self._even = {path for path in flat.plant_ticks if not takes_any_step(flat.table.blocks[path])}
         self._own = {path: part_of(flat, flat.plant_inputs, path) for path in flat.plant_ticks}
+
+    def is_regular(self, path: str) -> bool:
+        """Whether a plant steps at every tick that the run visits."""
+        ticks = self._flat.plant_ticks[path]
+        return EVERY in ticks or self._visited <= {*ticks}
 
     def bind(self) -> None:
         """Let the plants read their inputs and write their outputs to w."""
@@ -69,6 +74,13 @@ class PlantSteps:
         """Let every plant stand at tick ``k``, and hold its inputs from there on."""
         self.take_inputs()
         self.reached = dict.fromkeys(self._plants, k)
+
+    def go(self, k: int, following: int, *, last: bool) -> None:
+        """Step the plants from a tick that the run has visited to the next one; see `step_to`."""
+        if self.regular:
+            step_all(self._plants.values(), self._time_of(k), float(self._flat.base * (following - k)))
+        else:
+            self.step_to(following, last=last)
 
     def step_to(self, k: int, *, last: bool) -> None:
         """Step the plants of which a tick is a communication point to it; at the ``last`` tick all that can.
@@ -104,3 +116,17 @@ class PlantSteps:
         if saved is not None and not self.regular:
             self.inputs[:] = saved["inputs"]
             self.reached.update(saved["reached"])
+
+
+def step_all(plants: Iterable[Plant], t: float, h: float) -> None:
+    """Let plants step from t over h, both in s; those in processes of their own step at the same time."""
+    begun = []
+    for plant in plants:
+        start = getattr(plant, "start_step", None)
+        if start is None:
+            plant.step(t, h)
+        else:
+            start(t, h)
+            begun.append(plant)
+    for plant in begun:
+        plant.finish_step()  # type: ignore[attr-defined]

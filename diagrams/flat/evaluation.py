@@ -45,6 +45,7 @@ def evaluate(
     visit: Callable[[Instant, str, dict[str, Any], dict[str, Any]], None] | None = None,
     taps: Mapping[tuple[str, str], Callable[[Any], Any]] | None = None,
     apart: Apart | None = None,
+    kept: Any = None,
 ) -> Instant:
     """Evaluate all blocks at an instant.
 
@@ -71,8 +72,10 @@ def evaluate(
         By port: a function that gives what its consumers get, from what is put out there.
     apart : callable, optional
         Evaluates the blocks of `FlatLayout.apart`; required where there are any.
+    kept : column, optional
+        Outputs at the last tick, as `FlatLayout.log` lays them out: those of blocks that do not act.
     """
-    instant = Instant(layout, functions, acting, t, x, w, p, fired, opened, taps or {}, apart)
+    instant = Instant(layout, functions, acting, t, x, w, p, fired, opened, taps or {}, apart, kept)
     instant.run(layout.order.steps if order is None else order, before, visit)
     return instant
 
@@ -115,10 +118,11 @@ class Instant:
         opened: bool,
         taps: Mapping[tuple[str, str], Callable[[Any], Any]],
         apart: Apart | None,
+        kept: Any = None,
     ):
         self.layout, self.functions, self.acting = layout, functions, acting
         self.t, self.x, self.w, self.p, self.fired = t, x, w, p, fired
-        self.opened, self.taps, self.apart = opened, taps, apart
+        self.opened, self.taps, self.apart, self.kept = opened, taps, apart, kept
         self.values: dict[tuple[str, str], Any] = {}
         self.returned: dict[tuple[str, str], Any] = {}
         self.new: dict[str, Any] = {}
@@ -146,6 +150,10 @@ class Instant:
             path, port = layout.ports[name]
             if not acts[path]:
                 self._put((path, port), rows(self.x, where))
+        for name, where in layout.log.slices.items() if self.kept is not None else ():
+            path, port = layout.ports[name]
+            if path in acts and not acts[path] and (path, port) not in self.values:
+                self._put((path, port), rows(self.kept, where))
         torn = {}
         for name, where in layout.loops.slices.items():
             path, port = layout.ports[name]

@@ -103,6 +103,11 @@ class FlatDiagram(FlatLayout):
         """``(t, x, w, p) -> z`` between ticks: the inputs of transport delays, and of FMUs."""
         return functions.trace_driven(self, self.blocks)
 
+    @cached_property
+    def exchange(self) -> Schedule:
+        """``(t, x, w, p, log) -> z`` between ticks: the inputs of plants, with outputs of sampled blocks from log."""
+        return functions.trace_exchange(self, self.blocks)
+
     def output(self, port: tuple[str, str]) -> Schedule:
         """Return ``(t, x, w, p) -> y``: an output between ticks, without entries where nothing evaluates it then."""
         return functions.trace_output(self, self.blocks, port)

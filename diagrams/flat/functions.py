@@ -61,6 +61,17 @@ def trace_driven(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
     )
 
 
+def trace_exchange(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
+    """Return ``(t, x, w, p, log) -> z`` between ticks; sampled blocks put out what they did at the last tick."""
+    symbols = {**make_symbols(layout), "log": ca.MX.sym("log", layout.log.total)}
+
+    def results(apart: Apart) -> Mapping[str, Any]:
+        instants = {name: symbol for name, symbol in symbols.items() if name != "log"}
+        return {"z": plant_inputs(evaluate(layout, functions, NONE, **instants, apart=apart, kept=symbols["log"]))}
+
+    return trace_schedule("exchange", symbols, results)
+
+
 def trace_output(layout: FlatLayout, functions: BlockFunctions, port: tuple[str, str]) -> Schedule:
     """Return ``(t, x, w, p) -> y``: an output between ticks, without entries where nothing evaluates it then."""
     symbols = make_symbols(layout)

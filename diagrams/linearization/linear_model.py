@@ -307,6 +307,8 @@ def _linearize(
             block=diagram.name,
             port="step",
         )
+    if step is not None and not at.asked:
+        at = replace(at, asked=True)
     names = [_as_list(n) for n in (inputs, outputs, openings)]
     flat = diagram.flatten_like(at)
     at.check_fits(flat, diagram.name)

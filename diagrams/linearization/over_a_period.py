@@ -19,6 +19,7 @@ from ...blocks.core import Finding, Layout
 from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
+from .coupled_plants import check_coupling
 from .derivatives import LocalDerivatives, Numbers, Tap
 from .findings import EventWithinPeriod, MemoryActs, UnusualStart
 from .flow_model import EQUILIBRIUM, differentiate_flow
@@ -118,6 +119,7 @@ class Chain:
         frozen: frozenset[TickPattern] = NONE,
     ):
         check_way(way)
+        check_coupling(flat, at)
         self.flat, self.local, self.way, self.frozen = flat, local, way, frozen
         self.first = self.here = at
         self.ticks = list(ticks_of_period(flat, at.tick, count))

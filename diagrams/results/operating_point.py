@@ -112,6 +112,8 @@ class OperatingPoint:
 
     asked: bool = False
     """Whether ``base`` was asked for, as a ``step``: FMUs step at every tick then."""
+    coupling: str = ""
+    """Coupling of the FMUs in the run that has reached it, where it is not the default."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """Parameters that a trim has found with it, by path, as `Diagram.replace` takes them."""
     free: tuple[FreeDirection, ...] = ()

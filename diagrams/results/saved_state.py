@@ -53,6 +53,7 @@ class RunState:
     continuous: Mapping[str, Any] | None = field(default=None, repr=False)
     fmus: Mapping[str, bytes] = field(default_factory=dict, repr=False)
     plant_steps: Mapping[str, Any] | None = field(default=None, repr=False)
+    proposed_step: float | None = field(default=None, repr=False)
     stopped: Stopped | None = None
     version: int = VERSION
     made_by: str = field(default_factory=own_version)

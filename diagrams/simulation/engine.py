@@ -9,12 +9,13 @@ from types import MappingProxyType
 import numpy as np
 
 from ...blocks.core import Block, SimulationError, UnknownNameError, near
-from ..coupling import Plant, PlantSteps, load_plants
+from ..coupling import CoupledSteps, Plant, PlantSteps, load_plants, refuse_exchanged, to_coupling
 from ..exchange import ExchangedBlock, ExchangedBlocks
 from ..flat import FlatDiagram
 from ..results import Occurrence, OperatingPoint, TextSignal
 from ..solvers import solver_name
 from .continuous import Continuous
+from .continuous_part import ContinuousPart
 from .diagnosis import opaque_failure
 from .initialize import initialize
 from .run_options import RunOptions
@@ -76,6 +77,9 @@ class Engine:
         elif options.solver != "auto":
             solver_name(options.solver)  # an unknown one is an error here, too
         self.every_tick = every_tick or (self.continuous is not None and self.continuous.fixed)
+        self.coupling = to_coupling(options.coupling, block=name)
+        self.coupled: CoupledSteps | None = None
+        """Steps of the plants by another scheme than the default."""
         self.steps = PlantSteps(
             flat,
             self.plants,
@@ -84,6 +88,20 @@ class Engine:
             self.position.time_of,
             every_tick=self.every_tick,
         )
+        if not self.coupling.is_plain and flat.plant_ticks:
+            refuse_exchanged(self.coupling, self.exchanged.evaluators)
+            self._part = ContinuousPart(self.workspace, self.continuous)
+            self.coupled = CoupledSteps(
+                flat,
+                name,
+                self.plants,
+                self.coupling,
+                self.steps,
+                self.workspace.z,
+                self.workspace.here.w,
+                self.workspace.bind_exchange(),
+                self._part,
+            )
 
     def load(self, stack: ExitStack, start_time: float) -> None:
         """Load the plants for a run from a time in s on; ``stack`` unloads them."""
@@ -142,12 +160,12 @@ class Engine:
         try:
             if self.continuous is None:
                 run_ticks(
-                    workspace, plants, self.steps, position.tick, last,
+                    workspace, plants, self.steps, self.coupled, position.tick, last,
                     every=self.every_tick, row=row, arrived=self._arrive, progress=progress,
                 )  # fmt: skip
                 return
             ended = run_hybrid(
-                workspace, self.continuous, plants, self.steps, position, last,
+                workspace, self.continuous, plants, self.steps, self.coupled, position, last,
                 every=self.every_tick, row=row, arrived=self._arrive, progress=progress,
             )  # fmt: skip
             if ended is not None:
@@ -160,7 +178,9 @@ class Engine:
         """Go on from a tick to the end of the run, before the next tick, and record it; see `go`."""
         position = self.position
         try:
-            ended = end_between_ticks(self.workspace, self.continuous, self.plants, self.steps, position, end, row)
+            ended = end_between_ticks(
+                self.workspace, self.continuous, self.plants, self.steps, self.coupled, position, end, row
+            )
             position.end = end
             if ended is not None:
                 position.stopped = self._stops.met_at(ended)

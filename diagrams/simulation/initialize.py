@@ -9,7 +9,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError, NonFiniteError, SimulationError
 from ...blocks.tracing import bundle, initial_state
-from ..coupling import Plant
+from ..coupling import Links, Plant, Search
 from ..exchange import ExchangedBlocks
 from ..flat import NONE, FlatDiagram, Instant, evaluate, evaluate_apart, is_true
 from .diagnosis import inputs_text, shaped_inputs
@@ -18,6 +18,8 @@ from .transport_delays import Delays
 from .workspace import Workspace
 
 _MAX_PASSES = 100  # over inputs and outputs of the FMUs at the start
+_PLAIN_PASSES = 10
+"""Passes before the outputs of the FMUs are sought from those before."""
 _SETTLED = 1e-13  # relative change of an input between two passes, a few hundred ulps
 
 
@@ -31,7 +33,8 @@ def initialize(
     """Find values of everything at t = 0.
 
     In Initialization Mode an FMU's outputs follow its inputs at once (FMI 3.0, 2.3.3). Outputs are passed on
-    until inputs change by no more than rounding.
+    until inputs change by no more than rounding; after some passes the next outputs are sought from those before, which
+    finds them where they would run away, too.
 
     Initial states that are computed from inputs are those of the instant before: a source that jumps at t = 0 has its
     value from the left there, so that a derivative sees the jump, as it sees one at any later time.
@@ -51,7 +54,9 @@ def initialize(
             jump(nothing)
 
     most = _MAX_PASSES * (10 if workspace.looped else 1)
+    search = Search(Links(flat).smooth_outputs, np.ones(flat.plant_outputs.total))
     while True:
+        assumed = workspace.here.w.copy()
         _set_initial_states(workspace)
         _hold_first_outputs(workspace)
         workspace.evaluate(acting)
@@ -79,6 +84,8 @@ def initialize(
             break
         if passes == most:
             raise _unsettled(workspace, before) if found else _unsolved_start(workspace, last)
+        if plants and passes >= _PLAIN_PASSES:
+            workspace.here.w[:] = search.next(assumed, workspace.here.w)
         last = workspace.here.x.copy()
 
 

@@ -9,6 +9,7 @@ from fractions import Fraction
 from typing import Any, Self, TypedDict
 
 from ...blocks.core import OptionError, near
+from ..coupling import Coupling
 from ..results import OperatingPoint, RunState
 
 
@@ -26,6 +27,7 @@ class RunKeywords(TypedDict, total=False):
     to: str | os.PathLike[str] | None
     overwrite: bool
     start: RunState | OperatingPoint | None
+    coupling: str | Coupling
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,10 @@ class RunOptions:
     start : RunState or OperatingPoint, optional
         State to go on from: ``run.final_state``, that of `Simulation.save`, or an operating point, such as
         `trim` finds one, with the parameters that belong to it.
+    coupling : str or Coupling
+        Exchange of values between FMUs in a communication step: "jacobi", all step at once with the inputs of its
+        beginning; "gauss_seidel", one after the other; "iterated", until they agree; or a `Coupling` with its options,
+        such as adaptive communication steps. See docs/coupling.md.
     """
 
     step: float | Fraction | None = None
@@ -73,6 +79,7 @@ class RunOptions:
     to: str | os.PathLike[str] | None = None
     overwrite: bool = False
     start: RunState | OperatingPoint | None = None
+    coupling: str | Coupling = "jacobi"
 
     @classmethod
     def of(cls, options: Mapping[str, Any], *, block: str) -> Self:
@@ -104,4 +111,5 @@ class RunOptions:
     def recipe(self) -> dict[str, Any]:
         """The options that a later run to an instant of this one is made with, those that are given."""
         names = ("step", "solver", "rtol", "atol", "max_step", "start")
-        return {name: value for name in names if (value := getattr(self, name)) is not None}
+        found = {name: value for name in names if (value := getattr(self, name)) is not None}
+        return found if self.coupling == "jacobi" else {**found, "coupling": self.coupling}

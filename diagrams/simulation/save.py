@@ -32,6 +32,7 @@ def save_state(engine: Engine) -> RunState:
         layout=layout_of(engine.flat),
         continuous=None if engine.continuous is None else engine.continuous.save(),
         plant_steps=engine.steps.save(),
+        proposed_step=None if engine.coupled is None else engine.coupled.proposed,
         fmus={path: plant.serialize() for path, plant in engine.loaded.items()},
         stopped=position.stopped,
     )
@@ -48,3 +49,5 @@ def restore_state(engine: Engine, state: RunState) -> None:
         engine.continuous.restore(state.continuous)
     engine.position.restore(state.tick, state.stopped)
     engine.steps.restore(state.plant_steps, state.tick)
+    if engine.coupled is not None:
+        engine.coupled.proposed = state.proposed_step

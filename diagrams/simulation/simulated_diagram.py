@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
 from typing import Unpack
 
+from ..coupling import Coupling, CouplingReport, report_coupling, to_coupling
 from ..flat import WiredDiagram
 from ..results import Run
 from .run_options import RunKeywords, RunOptions
@@ -27,7 +29,8 @@ class SimulatedDiagram(WiredDiagram):
             Show a progress bar; by default on a terminal, and in a notebook where ipywidgets is installed.
         **options
             Options of the run by name: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step``, ``record``, ``every``,
-            ``states``, ``to``, ``overwrite``, ``start``. `RunOptions` says what each means, and its default.
+            ``states``, ``to``, ``overwrite``, ``start``, ``coupling``. `RunOptions` says what each
+            means, and its default.
 
         Returns
         -------
@@ -44,6 +47,30 @@ class SimulatedDiagram(WiredDiagram):
             range.
         """
         return simulate(self, duration, RunOptions.of(options, block=self.name), progress=progress)
+
+    def report_coupling(
+        self, coupling: str | Coupling = "jacobi", *, step: float | Fraction | None = None
+    ) -> CouplingReport:
+        """List the delay of every connection from and to an FMU; see docs/coupling.md.
+
+        Parameters
+        ----------
+        coupling : str or Coupling
+            As of `simulate`.
+        step : float or Fraction, optional
+            As of `simulate`; required where no subsystem has a sample time.
+
+        Returns
+        -------
+        CouplingReport
+            ``print`` shows it as a table.
+
+        Raises
+        ------
+        OptionError, SampleTimeError
+            An unknown coupling; no step where one is needed.
+        """
+        return report_coupling(self.flatten(step), to_coupling(coupling, block=self.name))
 
     def simulation(self, **options: Unpack[RunKeywords]) -> Simulation:
         """Return a run in the making, to go on step by step, to save and to restore; see `Simulation`.

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import Block, OptionError, SimulationError
-from ..coupling import note_fine_steps
+from ..coupling import note_fine_steps, note_loops
 from ..flat import EVERY, FlatDiagram, WiredDiagram
 from ..results import (
     Occurrence,
@@ -84,7 +84,6 @@ class Simulation:
         self._stack = ExitStack()
         self._start_state = saved
         every_tick = base is not None or EVERY in self.flat.visited
-        self._notes = note_fine_steps(self.flat) if base is None else ()
         self._last: int | None = None
         if duration is not None:
             count, rest = ticks_in(duration, self.flat.base, diagram.name)
@@ -94,6 +93,8 @@ class Simulation:
             self._last = count + (0 if start is None else start.tick)
             self._recording.check_memory(count, every_tick=every_tick)
         self._engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=self._on_event)
+        fine = note_fine_steps(self.flat) if base is None else ()
+        self._notes = (*fine, *note_loops(self.flat, self._engine.coupling))
         self._elapsed, self._begun = 0.0, False
         self._open: bool | None = None  # until it begins; False once it has ended
         self._recorder = self._new_recorder()
@@ -157,6 +158,12 @@ class Simulation:
     def t(self) -> float:
         """Time that the run has reached in s."""
         return self._engine.position.t
+
+    @property
+    def coupling(self) -> str:
+        """Coupling of the FMUs in words; empty for the default, and where nothing is coupled."""
+        coupled = self._engine.coupled
+        return "" if coupled is None else str(coupled.coupling)
 
     @property
     def stopped(self) -> Stopped | None:
@@ -314,7 +321,8 @@ class Simulation:
     @property
     def _messages(self) -> tuple[str, ...]:
         plants = self._engine.loaded.values()
-        return (*self._notes, *self._engine.workspace.messages, *(m for p in plants for m in p.messages))
+        coupled = () if self._engine.coupled is None else self._engine.coupled.messages
+        return (*self._notes, *self._engine.workspace.messages, *coupled, *(m for p in plants for m in p.messages))
 
     @property
     def can_save(self) -> bool:

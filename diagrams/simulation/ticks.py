@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import SimulationError
-from ..coupling import Plant, PlantSteps
+from ..coupling import CoupledSteps, Plant, PlantSteps
 from ..flat import EVERY, NONE, TickPattern
 from .continuous import Continuous
 from .view import Position
@@ -24,6 +24,7 @@ def run_ticks(
     workspace: Workspace,
     plants: Mapping[str, Plant],
     steps: PlantSteps,
+    coupled: CoupledSteps | None,
     k: int,
     last: int,
     *,
@@ -47,7 +48,7 @@ def run_ticks(
     """
     flat = workspace.flat
     t, log = workspace.here.t, workspace.log
-    each = [plant.step for plant in plants.values()] if steps.regular else []
+    each = [plant.step for plant in plants.values()] if steps.regular and coupled is None else []
     only = each[0] if len(each) == 1 else None
     n, d, h = flat.base.numerator, flat.base.denominator, float(flat.base)
     always = workspace.bind_tick(flat.acting(0)) if all(c == EVERY for c in flat.distinct) else None
@@ -60,6 +61,8 @@ def run_ticks(
         try:
             if only is not None:
                 only(now, h)
+            elif coupled is not None:
+                coupled.go(now, k * n / d, h)
             elif steps.regular:
                 for step in each:
                     step(now, h)
@@ -89,6 +92,7 @@ def run_hybrid(
     continuous: Continuous,
     plants: Mapping[str, Plant],
     steps: PlantSteps,
+    coupled: CoupledSteps | None,
     position: Position,
     last: int,
     *,
@@ -126,15 +130,15 @@ def run_hybrid(
         lands = continuous.fixed or (plants and sampled) or (continuous.lands and sampled)
         following = k + 1 if lands else min([*(c.after(k) for c in clocks), last])
         between = range(k + 1, following) if sampled else range(0)
-        now = time_of(k)
-        ended = continuous.advance(now, time_of(following), map(time_of, between), sample)
+        now, h = time_of(k), float(flat.base * (following - k))
+        if coupled is None:
+            ended = continuous.advance(now, time_of(following), map(time_of, between), sample)
+        else:
+            ended = coupled.go(now, time_of(following), h, sample)
         if ended is not None:
             return ended
-        if steps.regular:
-            for plant in plants.values():
-                plant.step(now, float(flat.base * (following - k)))
-        else:
-            steps.step_to(following, last=following == last)
+        if coupled is None:
+            steps.go(k, following, last=following == last)
         take_tick(workspace, continuous, plants, time_of(following), flat.acting(following))
         if not steps.regular:
             steps.hold(following)
@@ -153,6 +157,7 @@ def end_between_ticks(
     continuous: Continuous | None,
     plants: Mapping[str, Plant],
     steps: PlantSteps,
+    coupled: CoupledSteps | None,
     position: Position,
     end: float,
     row: Row,
@@ -164,16 +169,20 @@ def end_between_ticks(
     float or None
         Time in s at which a stop condition has ended the run before.
     """
-    if continuous is not None:
 
-        def sample(t: float) -> bool:
-            row(t, workspace.log)
-            return continuous.is_stopped()
+    def sample(t: float) -> bool:
+        row(t, workspace.log)
+        return continuous is not None and continuous.is_stopped()
 
-        ended = continuous.advance(position.t, end, (), sample)
-        if ended is not None:
-            return ended
-    steps.end_at(end, position.tick)
+    now, ended = position.t, None
+    if coupled is not None:
+        ended = coupled.go(now, end, end - now, sample)
+    elif continuous is not None:
+        ended = continuous.advance(now, end, (), sample)
+    if ended is not None:
+        return ended
+    if coupled is None:
+        steps.end_at(end, position.tick)
     if continuous is not None:
         take_tick(workspace, continuous, plants, end, NONE)
     else:  # everything is held but for what has been stepped

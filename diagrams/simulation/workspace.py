@@ -219,6 +219,22 @@ class Workspace:
         solve = self.loop_solver(NONE, vectors)
         return call if solve is None else _one_after_the_other(solve, call)
 
+    def bind_exchange(self) -> Callable[[float], np.ndarray]:
+        """Return ``z(t)`` at ``here`` between ticks, with the outputs that sampled blocks had at the last tick."""
+        log = self.log[: self.flat.log.total]
+        bound = self._bind(self.flat.exchange, self.here, None, log)
+        solve = self.loop_solver(NONE, self.here)
+        t, found, call = self.here.t, bound.outputs[0], bound.call
+
+        def exchange(time: float) -> np.ndarray:
+            t[0] = time
+            if solve is not None:
+                solve()
+            call()
+            return found
+
+        return exchange
+
     # --- algebraic loops ---------------------------------------------------------------------------------------------
 
     def loop_solver(self, acting: frozenset[TickPattern], vectors: Vectors) -> Callable[[], None] | None:

@@ -16,6 +16,7 @@ from ...blocks.core import FmuFileError, Layout
 from .binaries import find_binary
 from .exchange import ExchangeInfo, read_exchange
 from .faults import FmuFault, FmuFinding
+from .feedthrough import Feedthrough, feeds_through, read_feedthrough
 from .gathering import Elements, gather
 from .limits import ArchiveLimits
 from .model import read_model
@@ -73,6 +74,8 @@ class FmuDescription:
     fixed_internal_step: float | None = None
     """Fixed step of the FMU's own integrator in s (fixedInternalStepSize of FMI 3.0), or None; steps must be multiples
     of it."""
+    dependencies: Feedthrough = field(default_factory=dict)
+    """Variables that each output depends on, as the model structure says."""
     states: dict[str, str] = field(default_factory=dict)
     """Continuous states that are variables, with their derivatives' names, in the order of the model structure."""
     state_order: tuple[int, ...] = ()
@@ -105,6 +108,10 @@ class FmuDescription:
             If the FMU has no such variable with numbers as values.
         """
         return self.element(name) if name in self.elements and name not in self.variables else self.variables[name]
+
+    def feeds_through(self, source: FmuVariable, output: FmuVariable) -> bool:
+        """Return whether an output may follow an input at once; it may where the model structure doesn't say."""
+        return feeds_through(self.dependencies, source, output)
 
     @property
     def names(self) -> set[str]:
@@ -265,6 +272,7 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
         "variables": variables,
         "other": other,
         "elements": elements,
+        "dependencies": read_feedthrough(model),
         "states": states,
         "state_order": order,
         "unit_complaints": tuple(units.complaints),

@@ -68,12 +68,18 @@ def test_inputs_that_hang_on_outputs_at_the_start_settle(through):
 
 def test_inputs_that_never_settle_at_the_start_are_told(through):
     plant = Fmu(through, name="plant")
-    diagram = Diagram("d", plant(u=-1.0 * plant.y + Constant(value=3.0, unit="N")))  # y = 2 u: grows twofold each pass
+    diagram = Diagram("d", plant(u=0.5 * plant.y + Constant(value=3.0, unit="N")))  # y = 2 u = y + 6
     with pytest.raises(
         SimulationError, match=r"plant\.u, t = 0 s: its value at the start depends on the FMU's own"
     ) as e:
         diagram.simulate(0.2, step=0.1, progress=False)
     assert len(e.value.run.t) == 0
+
+
+def test_inputs_that_grow_twofold_with_each_pass_are_found_at_the_start(through):
+    plant = Fmu(through, name="plant")
+    run = Diagram("d", plant(u=-1.0 * plant.y + Constant(value=3.0, unit="N"))).simulate(0.2, step=0.1, progress=False)
+    assert run["plant.y"][0] == pytest.approx(2.0, rel=1e-12)  # y = 2 u, u = 3 - y
 
 
 def test_a_start_that_is_no_number_names_its_block(through):

@@ -1,0 +1,32 @@
+"""The blocks in continuous time, as the plants of a communication step see them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+Sample = Callable[[float], bool]
+
+
+def never(t: float) -> bool:
+    """Return that no stop condition ends the run at a time."""
+    return False
+
+
+class Rest(Protocol):
+    """The blocks in continuous time between two ticks; they take part in a communication step."""
+
+    sample: Sample
+    """Records the instant at which a stop condition ends the run."""
+
+    def advance(self, t: float, end: float) -> float | None:
+        """Go from t to the end, with the plants' outputs as they stand in w; return where a stop condition ended it."""
+
+    def save(self) -> Any:
+        """Return the present state, for `restore`."""
+
+    def restore(self, saved: Any) -> None:
+        """Go back to a state."""
+
+    def accept(self) -> None:
+        """Keep the events that have happened since the last call."""

@@ -1,0 +1,76 @@
+"""The blocks in continuous time as a part of a communication step that may be gone back over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..results import Occurrence
+from .continuous import Continuous
+from .workspace import Workspace
+
+
+@dataclass
+class _Saved:
+    t: float
+    x: np.ndarray
+    continuous: Any
+    messages: tuple[str, ...]
+    events: int
+
+
+class ContinuousPart:
+    """The blocks in continuous time between two ticks: advanced, saved and restored; see `Rest`.
+
+    Events are told when they are accepted: those of a pass that is gone back over have not happened.
+
+    Parameters
+    ----------
+    workspace : Workspace
+        The run's numbers.
+    continuous : Continuous or None
+        The solver with its events; None where nothing happens between ticks.
+    """
+
+    def __init__(self, workspace: Workspace, continuous: Continuous | None):
+        self._workspace, self._continuous = workspace, continuous
+        self._events: list[Occurrence] = []
+        self.sample: Callable[[float], bool] = lambda t: False
+        """Records the instant at which a stop condition ends the run."""
+        if continuous is not None:
+            self._tell = continuous.on_event
+            continuous.on_event = self._events.append
+
+    def advance(self, t: float, end: float) -> float | None:
+        """Go from t to the end, both in s; return the time at which a stop condition has ended the run."""
+        if self._continuous is None:
+            return None
+        self._continuous.enter(t)
+        if self._continuous.delays is not None:
+            self._continuous.delays.note_edge(t)  # the outputs of the plants have jumped
+        return self._continuous.advance(t, end, (), self.sample)
+
+    def save(self) -> _Saved:
+        """Return the present state."""
+        here, workspace = self._workspace.here, self._workspace
+        continuous = None if self._continuous is None else self._continuous.save()
+        return _Saved(float(here.t[0]), here.x.copy(), continuous, workspace.messages, len(self._events))
+
+    def restore(self, saved: _Saved) -> None:
+        """Go back to a state."""
+        here, workspace = self._workspace.here, self._workspace
+        here.t[0], here.x[:] = saved.t, saved.x
+        workspace.messages = saved.messages
+        del self._events[saved.events :]
+        if self._continuous is not None:
+            self._continuous.restore(saved.continuous)
+
+    def accept(self) -> None:
+        """Tell the events that have happened."""
+        if self._events:
+            for event in self._events:
+                self._tell(event)
+            self._events.clear()

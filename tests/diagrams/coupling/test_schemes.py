@@ -1,0 +1,193 @@
+"""Orders of the coupling schemes against closed forms, loops of direct feedthrough, adaptive steps."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import OptionError, SimulationError
+from loopwright.diagrams import Coupling
+from loopwright.fmus import Fmu
+from support.oscillators import (
+    coupled_by_inertia,
+    coupled_by_inertia_exactly,
+    mass_and_filter,
+    mass_and_filter_exactly,
+    two_masses,
+    two_masses_exactly,
+)
+
+ORDERS = [("jacobi", 1), ("gauss_seidel", 1), ("iterated", 2)]
+STEPS = (1 / 50, 1 / 100, 1 / 200)
+
+
+def order_of(errors):
+    """Return the orders that successive errors show where the step is halved."""
+    return np.log2(np.array(errors[:-1]) / errors[1:])
+
+
+def largest_error(diagram, exactly, signals, **options):
+    run = diagram.simulate(0.5, progress=False, **options)
+    return float(np.abs(np.column_stack([run[name] for name in signals]) - exactly(run.t)).max()), run
+
+
+@pytest.mark.parametrize(("scheme", "order"), ORDERS)
+def test_two_masses_converge_with_the_order_of_the_scheme(cache, scheme, order):
+    errors = [
+        largest_error(two_masses(), two_masses_exactly, ("a.position", "b.position"), step=h, coupling=scheme)[0]
+        for h in STEPS
+    ]
+    assert order_of(errors) == pytest.approx([order, order], abs=0.2)
+
+
+@pytest.mark.parametrize(("scheme", "order"), ORDERS)
+def test_blocks_in_continuous_time_take_part(cache, scheme, order):
+    signals = ("a.position", "filter.y")
+    errors = [
+        largest_error(mass_and_filter(), mass_and_filter_exactly, signals, step=h, coupling=scheme)[0] for h in STEPS
+    ]
+    assert order_of(errors) == pytest.approx([order, order], abs=0.25)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9, 1.5])  # plain repetition diverges from 1 on
+def test_iteration_solves_a_loop_of_direct_feedthrough_between_two_fmus(cache, share):
+    signals = ("a.position", "b.position", "a.acceleration", "b.acceleration")
+    errors = [
+        largest_error(
+            coupled_by_inertia(share),
+            lambda t: coupled_by_inertia_exactly(share, t),
+            signals,
+            step=h,
+            coupling="iterated",
+        )[0]
+        for h in (1 / 400, 1 / 800)
+    ]
+    assert order_of(errors) == pytest.approx([2.0], abs=0.25)
+    assert errors[0] < 0.05 * np.abs(coupled_by_inertia_exactly(share, np.linspace(0, 0.5, 50))).max()
+
+
+def test_a_loop_of_direct_feedthrough_is_told_where_it_is_not_solved(cache):
+    run = coupled_by_inertia(0.5).simulate(0.01, step=1e-3, progress=False)
+    (message,) = run.messages
+    assert "a.acceleration, b.acceleration" in message
+    assert "coupling='iterated'" in message
+    assert not two_masses().simulate(0.01, step=1e-3, progress=False).messages
+
+
+@pytest.mark.parametrize("scheme", ["jacobi", "gauss_seidel", "iterated"])
+def test_adaptive_steps_follow_the_allowed_error(cache, scheme):
+    found = []
+    for error in (1e-3, 1e-4):
+        off, run = largest_error(
+            two_masses(), two_masses_exactly, ("a.position", "b.position"), step=0.05,
+            coupling=Coupling(scheme=scheme, error=error),
+        )  # fmt: skip
+        steps = int(run.messages[0].split(": ")[1].split()[0])
+        found.append((off, steps))
+        assert len(run.t) == 11  # samples stay where they are
+    order = dict(ORDERS)[scheme]
+    (coarse, few), (fine, many) = found
+    assert fine < coarse * 10 ** (-order / (order + 1)) * 2.0  # the error of a step goes with h^(order + 1)
+    assert many == pytest.approx(few * 10 ** (1 / (order + 1)), rel=0.5)
+    assert fine < 100 * 1e-4
+
+
+def test_fmus_that_nothing_couples_take_the_longest_adaptive_steps(cache):
+    from loopwright.diagrams import Diagram
+    from support.oscillators import mass
+
+    run = Diagram("alone", mass("a", 0.1)(force=0.0)).simulate(
+        0.5, step=0.1, progress=False, coupling=Coupling(error=1e-6)
+    )
+    assert run.messages == (
+        "coupling jacobi: 10 communication steps, 0 more repeated with a shorter one, the shortest of 0.05 s.",
+    )
+
+
+def test_the_default_is_jacobi_to_the_last_bit(cache):
+    runs = [two_masses().simulate(0.2, step=0.01, progress=False, **o) for o in ({}, {"coupling": "jacobi"})]
+    assert np.array_equal(runs[0]["a.position"], runs[1]["a.position"])
+
+
+@pytest.mark.parametrize("coupling", ["gauss_seidel", "iterated", Coupling(scheme="iterated", error=1e-4)], ids=str)
+def test_a_run_goes_on_from_a_saved_state(cache, coupling):
+    with mass_and_filter().simulation(step=0.02, coupling=coupling) as simulation:
+        simulation.advance(0.2)
+        half = simulation.save()
+        simulation.advance(0.2)
+        straight = simulation.run()
+    again = mass_and_filter().simulate(0.2, step=0.02, start=half, progress=False, coupling=coupling)
+    assert again["a.position"].tolist() == straight["a.position"][10:].tolist()
+    assert again["filter.y"].tolist() == straight["filter.y"][10:].tolist()
+
+
+def test_the_order_of_gauss_seidel_is_that_of_feedthrough_or_the_one_that_is_given(cache):
+    first = two_masses().simulate(
+        0.1, step=0.01, progress=False, coupling=Coupling(scheme="gauss_seidel", order=("a", "b"))
+    )
+    other = two_masses().simulate(
+        0.1, step=0.01, progress=False, coupling=Coupling(scheme="gauss_seidel", order=("b", "a"))
+    )
+    default = two_masses().simulate(0.1, step=0.01, progress=False, coupling="gauss_seidel")
+    assert default["a.position"].tolist() == first["a.position"].tolist() != other["a.position"].tolist()
+
+
+@pytest.mark.parametrize(
+    ("text", "coupling"),
+    [
+        (r"two\.coupling: .*found scheme='gauss'\. Did you mean 'gauss_seidel'", "gauss"),
+        ("found 3; expected 'jacobi', 'gauss_seidel', 'iterated' or a Coupling", 3),
+        (r"found order=\('a', 'c'\)", Coupling(scheme="gauss_seidel", order=("a", "c"))),
+        (r"found order=\('a',\); expected each of a, b once", Coupling(scheme="gauss_seidel", order=("a",))),
+    ],
+)
+def test_a_coupling_that_does_not_fit_is_refused(cache, text, coupling):
+    with pytest.raises(OptionError, match=text):
+        two_masses().simulate(0.1, step=0.01, progress=False, coupling=coupling)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"scheme": "seidel"}, {"tolerance": 0.0}, {"error": -1.0}, {"passes": 1}, {"order": ("a",)}, {"shortest": np.nan}],
+    ids=lambda o: next(iter(o)),
+)
+def test_options_of_a_coupling_are_checked(options):
+    with pytest.raises(OptionError, match=next(iter(options))):
+        Coupling(**options)
+
+
+def test_an_fmu_that_can_not_go_back_is_named(cache, monkeypatch):
+    monkeypatch.setattr(Fmu, "can_save", property(lambda self: False))
+    with pytest.raises(OptionError, match=r"^a\.coupling: found coupling 'iterated', .*canGetAndSetFMUState"):
+        two_masses().simulate(0.1, step=0.01, progress=False, coupling="iterated")
+    two_masses().simulate(0.1, step=0.01, progress=False, coupling="gauss_seidel")
+    monkeypatch.undo()
+    monkeypatch.setattr(Fmu, "variable_step", property(lambda self: False))
+    with pytest.raises(OptionError, match=r"adaptive communication steps.*canHandleVariableCommunicationStepSize"):
+        two_masses().simulate(0.1, step=0.01, progress=False, coupling=Coupling(error=1e-3))
+
+
+def test_an_iteration_that_does_not_converge_says_where_and_by_how_much(cache):
+    coupling = Coupling(scheme="iterated", passes=2, tolerance=1e-12)
+    with pytest.raises(
+        SimulationError, match=r"does not converge: after 2 passes .* still changes by .* of its size"
+    ) as e:
+        two_masses().simulate(0.1, step=0.02, progress=False, coupling=coupling)
+    assert (e.value.block, e.value.port, e.value.t) == ("a", "position", 0.0)
+    assert e.value.run is not None
+
+
+def test_a_step_that_gets_too_short_says_so(cache):
+    with pytest.raises(SimulationError, match=r"the step would be .* s; expected at least 0\.01 s \(shortest\)") as e:
+        two_masses().simulate(0.1, step=0.02, progress=False, coupling=Coupling(error=1e-9, shortest=0.01))
+    assert e.value.t == 0.0
+
+
+def test_a_linear_model_over_steps_of_another_coupling_is_refused(cache):
+    diagram = two_masses()
+    run = diagram.simulate(0.1, step=0.01, progress=False, coupling="gauss_seidel")
+    for point in (run.at(0.05), diagram.operating_point(0.05, step=0.01, coupling="gauss_seidel")):
+        with pytest.raises(
+            OptionError, match=r"^a\.coupling: found an operating point of a run with coupling 'gauss_s"
+        ):
+            diagram.linearize(point, step=0.01)
+    free = diagram.linearize(run.at(0.05))  # in continuous time: no coupling acts
+    assert len(free.poles) == 4
