@@ -39,6 +39,10 @@ class ExchangedBlock(Protocol):
         """Time in s of its next event that is known beforehand; infinite without one."""
 
     @property
+    def ends_run(self) -> bool:
+        """Whether it asks for the end of the run, at the instant that is reached."""
+
+    @property
     def nominals(self) -> np.ndarray:
         """Nominal values of its states."""
 

@@ -45,7 +45,7 @@ class OutsideEvents:
         self._nothing = np.zeros(len(self.flat.events))
 
     def complete_step(self) -> bool:
-        """Tell the blocks that the solver has accepted a step; return whether one wants an event where it ends."""
+        """Tell the blocks that the solver has accepted a step; return whether one wants an event, or the end, there."""
         for e in self._evaluators.values():
             e.look = Look.STEP
         try:
@@ -53,7 +53,7 @@ class OutsideEvents:
         finally:
             for e in self._evaluators.values():
                 e.look = Look.EVENTS
-        return any(e.wants_event for e in self._evaluators.values())
+        return any(e.wants_event or e.block.ends_run for e in self._evaluators.values())
 
     def fire(self, t: float, fired: np.ndarray) -> bool:
         """Let events act, those of indicators that fire and the blocks' own; return whether any block had one."""

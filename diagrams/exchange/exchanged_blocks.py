@@ -82,6 +82,10 @@ class ExchangedBlocks:
             x[self.flat.states.slices[path]] = e.block.begin_exchange()
             e.look = Look.EVENTS
 
+    def ends_run(self) -> str:
+        """Return the path of a block that asks for the end of the run; empty if none does."""
+        return next((path for path, e in self.evaluators.items() if e.is_loaded and e.block.ends_run), "")
+
     def nominals(self) -> np.ndarray:
         """Return the nominal value of each entry of x, 1 for those of other blocks."""
         found = np.ones(self.flat.width)

@@ -59,7 +59,8 @@ class Engine:
         self.plants: dict[str, Plant] = {}
         self.view = SimulationView.of(self.workspace, MappingProxyType(self.plants), self.position)
         self.continuous: Continuous | None = None
-        self._stops = StopConditions(flat, self.workspace.log)
+        asking = self.exchanged.ends_run if self.exchanged else None
+        self._stops = StopConditions(flat, self.workspace.log, asking)
         self._can_stop = self._stops.exist
         self._tell = on_event
         if flat.hybrid:

@@ -1,6 +1,8 @@
-"""Stop conditions: outputs of blocks that end a run."""
+"""Stop conditions: outputs of blocks that end a run, and blocks that ask for its end."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -18,10 +20,12 @@ class StopConditions:
         The diagram.
     log : ndarray
         The outputs of all blocks: the run's own vector, which it evaluates into.
+    asking : callable, optional
+        Returns the path of a block that asks for the end of the run; empty if none does.
     """
 
-    def __init__(self, flat: FlatDiagram, log: np.ndarray):
-        self._log = log
+    def __init__(self, flat: FlatDiagram, log: np.ndarray, asking: Callable[[], str] | None = None):
+        self._log, self._asking = log, asking
         self._entries: list[tuple[int, str]] = []
         for path in sorted(flat.checked.traced):
             port = flat.table.blocks[path].stops
@@ -31,12 +35,14 @@ class StopConditions:
     @property
     def exist(self) -> bool:
         """Whether the diagram has any."""
-        return bool(self._entries)
+        return bool(self._entries) or self._asking is not None
 
     def is_met(self) -> bool:
         """Whether any is true."""
-        return any(self._log[i] > TRUE for i, _ in self._entries)
+        met = any(self._log[i] > TRUE for i, _ in self._entries)
+        return met or (self._asking is not None and bool(self._asking()))
 
     def met_at(self, t: float) -> Stopped:
         """Return the first one that is true, by path, with the time in s at which it was met."""
-        return Stopped(t, next(path for i, path in self._entries if self._log[i] > TRUE))
+        path = next((path for i, path in self._entries if self._log[i] > TRUE), None)
+        return Stopped(t, path if path is not None else self._asking() if self._asking is not None else "")

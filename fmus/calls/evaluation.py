@@ -57,9 +57,10 @@ class Evaluation:
         at += _vector_call(fmi, states, "setting the continuous states")
         more = [(group.function, group.arguments, "setting the inputs") for group in inputs.groups]
         more += [(group.function, group.arguments, "reading the outputs") for group in outputs.groups]
+        starting = [*more]  # derivatives and indicators can't be computed yet (FMI 2.0, 3.2.3)
         more += _vector_call(fmi, rates, "computing the derivatives of its states")
         more += _vector_call(fmi, indicators, "computing the event indicators")
-        self._running, self._starting = (_bind(fmi, calls) for calls in ([*at, *more], more))
+        self._running, self._starting = (_bind(fmi, calls) for calls in ([*at, *more], starting))
 
     def run(self, t: float, u: np.ndarray, *, running: bool) -> tuple[int, str]:
         """Evaluate it; return the first status that is no success, and the name of that call.

@@ -55,6 +55,8 @@ class ExchangeInstance(LoadedFmu):
         self._indicators = self._allocate(len(self.about.indicators))
         self.next_time, self.nominals = math.inf, np.ones(n)
         self._evaluations: dict[Any, Evaluation] = {}
+        self.ends_run = False
+        """Whether the FMU has asked to end the simulation (terminateSimulation)."""
         self._all_inputs: Transfer | None = None
         self._final = True
         self._discarded = ""
@@ -243,7 +245,7 @@ class ExchangeInstance(LoadedFmu):
             made = self.call("the event iteration", self.fmi.update_events)
             nominals |= made.nominals_changed
             if made.terminate:
-                raise self._termination(t, "in Event Mode")
+                self._note_end(t, "in Event Mode")
             if not made.again:
                 break
         else:
@@ -275,16 +277,16 @@ class ExchangeInstance(LoadedFmu):
         self.evaluation((), rates=True)(t, x, u)
         wants, terminate = self.call("completing a step", self.fmi.complete_step, self._final)
         if terminate:
-            raise self._termination(t, "after a step of the solver")
+            self._note_end(t, "after a step of the solver")
         return wants or changed
 
-    def _termination(self, t: float, place: str) -> FmuRuntimeError:
-        return FmuRuntimeError(
-            f"the FMU asks to end the simulation (terminateSimulation) {place} at t = {t:.9g} s"
-            f"{self._quote_messages()} End the run there, or look up the reason in the FMU's documentation.",
-            block=self.block.label,
-            t=t,
-        )
+    def _note_end(self, t: float, place: str) -> None:
+        """Note that the FMU asks for the end of the run; it is told once."""
+        if not self.ends_run:
+            self.ends_run = True
+            self.messages.append(
+                f"{self.block.label}: it asks to end the simulation at t = {t:.9g} s, {place} (terminateSimulation)"
+            )
 
     # ---- failures ----
 
