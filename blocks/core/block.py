@@ -215,7 +215,8 @@ class Block(Value, Wireable):
         Returns
         -------
         mapping of str to ndarray of bool
-            By input, and by ``"x"`` for all states: which entries of the equation depend on which of these.
+            By input, and by ``"t"`` and ``"x"`` for time and all states: which entries of the equation depend on which
+            of these.
         """
         return {}
 

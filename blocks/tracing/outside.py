@@ -44,17 +44,17 @@ def describe_outside(block: Block, shapes: Mapping[str, Shape], *, sampled: bool
     sizes = {**{name: size(s) for name, s in outputs.items()}, NEXT: sum(map(size, states.values())), GUARDS: 0}
     t, x, p = ca.MX.sym("t"), ca.MX.sym("x", sizes[NEXT]), ca.MX.sym("p", 1)
     u = [ca.MX.sym(f"u{i}", size(s)) for i, s in enumerate(shapes.values())]
-    known = {"x": x, **dict(zip(shapes, u, strict=True))}
+    known = {"t": t, "x": x, **dict(zip(shapes, u, strict=True))}
     results, depends = [], {}
     for name, rows in sizes.items():
         patterns = {} if name == GUARDS else block.dependence(name)
-        column = ca.MX.zeros(rows) if not rows else ca.MX.ones(rows) * t * np.nan
+        column = ca.MX.zeros(rows) if not rows else ca.MX.ones(rows) * np.nan
         for of, symbol in known.items():
             pattern = np.asarray(patterns.get(of, np.zeros((rows, symbol.numel()), dtype=bool)))
             if pattern.any():
                 column += ca.MX(ca.DM(_sparse(pattern))) @ symbol
         results.append(column)
-        depends[name] = frozenset(["t"] if rows else []) | {of for of, pattern in patterns.items() if np.any(pattern)}
+        depends[name] = frozenset(of for of, pattern in patterns.items() if np.any(pattern))
     function = ca.Function("outside", [t, x, *u, p], results)
     n = len(block.events)
     fired = ca.MX.sym("fired", n)

@@ -131,11 +131,6 @@ class ExchangeEvaluator:
             raise no_evaluator(self.path)
         return self._loaded
 
-    @property
-    def is_loaded(self) -> bool:
-        """Whether it is loaded."""
-        return self._loaded is not None
-
     def load(self, block: ExchangedBlock) -> None:
         """Take the block of a run."""
         self._loaded = block

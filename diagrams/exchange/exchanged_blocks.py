@@ -27,6 +27,8 @@ class ExchangedBlocks:
     def __init__(self, flat: FlatDiagram):
         self.flat = flat
         self.evaluators = {path: ExchangeEvaluator(flat, path) for path in flat.outside}
+        self.blocks: dict[str, ExchangedBlock] = {}
+        """The blocks that are loaded, by path."""
 
     def __bool__(self) -> bool:
         return bool(self.evaluators)
@@ -38,18 +40,14 @@ class ExchangedBlocks:
             block: Exchangeable = made
             try:
                 wired = [port for port in made.inputs if (path, port) in self.flat.table.wires]
-                evaluator.load(stack.enter_context(block.exchange(wired, start_time=start_time)))
+                self.blocks[path] = stack.enter_context(block.exchange(wired, start_time=start_time))
+                evaluator.load(self.blocks[path])
             except SimulationError as error:
                 error.at(block=path, t=start_time)
                 raise
             except LoopwrightError as error:
                 error.at(block=path)
                 raise
-
-    @property
-    def loaded(self) -> dict[str, ExchangedBlock]:
-        """The blocks that are loaded, by path."""
-        return {path: e.block for path, e in self.evaluators.items() if e.is_loaded}
 
     # --- the start ---------------------------------------------------------------------------------------------------
 
@@ -84,7 +82,7 @@ class ExchangedBlocks:
 
     def ends_run(self) -> str:
         """Return the path of a block that asks for the end of the run; empty if none does."""
-        return next((path for path, e in self.evaluators.items() if e.is_loaded and e.block.ends_run), "")
+        return next((path for path, block in self.blocks.items() if block.ends_run), "")
 
     def nominals(self) -> np.ndarray:
         """Return the nominal value of each entry of x, 1 for those of other blocks."""

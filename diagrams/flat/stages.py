@@ -121,6 +121,8 @@ class OpaqueStage:
         Which part of c it makes.
     has_parameters : bool
         Whether the block has numbers of its own among the diagram's parameters.
+    by_time : bool
+        Whether it may depend on time by itself.
     """
 
     path: str
@@ -129,6 +131,7 @@ class OpaqueStage:
     inputs: slice
     makes: slice
     has_parameters: bool
+    by_time: bool = True
 
     def evaluator(self, evaluators: Evaluators) -> Evaluator:
         """Return what evaluates it.
@@ -252,7 +255,7 @@ class Schedule:
         for stage in self.stages:
             if isinstance(stage, OpaqueStage):
                 through = np.any(of_c[[*_range(stage.states), *_range(stage.inputs)]], axis=0)
-                of_c[stage.makes] = through | (argument == "t")
+                of_c[stage.makes] = through | (argument == "t" and stage.by_time)
             elif stage is not self.last:
                 of_c[stage.makes] = _depends(stage, 0, k, of_c)
         return _depends(self.last, i, k, of_c)

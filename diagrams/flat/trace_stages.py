@@ -55,6 +55,7 @@ class _Cut:
     has_parameters: bool
     carried: list[tuple[Any, Any]]
     outputs: list[Any]
+    by_time: bool
 
 
 class _Cuts:
@@ -81,9 +82,18 @@ class _Cuts:
         columns = [ca.MX(ca.DM(u)) if not isinstance(u, ca.MX) else u for u in inputs]
         instant.replace_columns(carry)
         self.made.append(
-            _Cut(path, names, states, join_columns(columns), own.stop > own.start + 1, [*carried.values()], outputs)
+            _Cut(
+                path, names, states, join_columns(columns), own.stop > own.start + 1, [*carried.values()], outputs,
+                _varies(instant, path, names),
+            )  # fmt: skip
         )
         return outputs
+
+
+def _varies(instant: Instant, path: str, names: tuple[str, ...]) -> bool:
+    """Whether equations of a block that is evaluated from outside may depend on time, as far as the block says."""
+    depends = instant.functions.traced[path].depends
+    return path not in instant.layout.outside or any("t" in depends.get(name, "t") for name in names)
 
 
 def _in_stages(
@@ -106,7 +116,7 @@ def _in_stages(
         states, inputs = place(cut.states.numel()), place(cut.inputs.numel())
         end = width
         places += [(symbol, place(symbol.numel())) for symbol in cut.outputs]
-        opaque = OpaqueStage(cut.path, cut.names, states, inputs, slice(end, width), cut.has_parameters)
+        opaque = OpaqueStage(cut.path, cut.names, states, inputs, slice(end, width), cut.has_parameters, cut.by_time)
         parts.append(([*(e for _, e in cut.carried), cut.states, cut.inputs], slice(first, end), opaque))
     c = ca.MX.sym("c", width)
     known = [symbol for symbol, where in places if where.stop > where.start]

@@ -30,6 +30,7 @@ from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
 from .block_slopes import BlockSlopes, slopes_of
+from .exchanged import evaluators_at
 from .findings import Kink, StepsOnly, ZeroSlope
 from .operating_points import operating_point
 from .plant_models import plant_paths
@@ -56,7 +57,7 @@ def find_kinks(flat: FlatDiagram, at: OperatingPoint) -> tuple[Finding, ...]:
     """Return the findings about all blocks at an operating point, by path."""
     found: list[Finding] = []
     log: np.ndarray | None = None
-    for path in sorted(flat.checked.traced):
+    for path in sorted(set(flat.checked.traced).difference(flat.outside)):
         slopes = slopes_of(flat.checked.traced[path])
         wired = {f"u {port}" for port in slopes.inputs if (path, port) in flat.table.wires}
         if slopes.is_simple or not slopes.columns.total or not slopes.rows.total:
@@ -69,7 +70,7 @@ def find_kinks(flat: FlatDiagram, at: OperatingPoint) -> tuple[Finding, ...]:
 
 def _find_steps_of_plants(flat: FlatDiagram) -> Iterator[StepsOnly]:
     """Yield the ways through FMUs from or to a port of integers, which has no derivatives."""
-    for path in plant_paths(flat):
+    for path in (*plant_paths(flat), *flat.outside):
         block = flat.table.blocks[path]
         if not isinstance(block, Fmu):
             continue
@@ -94,7 +95,8 @@ def find_kinks_between(
 
 def read_log(flat: FlatDiagram, at: OperatingPoint) -> np.ndarray:
     """Return all outputs at an operating point, as if every clock ticked."""
-    return flat.at_tick(frozenset(flat.clocks.values()))(at.t, at.x, at.w, flat.p)[2]
+    tick = flat.at_tick(frozenset(flat.clocks.values()))
+    return tick(at.t, at.x, at.w, flat.p, evaluators=evaluators_at(flat, at))[2]
 
 
 def read_arguments(

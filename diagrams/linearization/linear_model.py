@@ -25,6 +25,7 @@ from .checks import check_loop, check_opening, refuse_transport_delays, replace_
 from .consumers import find_cut_findings, split_consumers
 from .continuous_model import model_continuous
 from .derivatives import LocalDerivatives, find_signal
+from .exchanged import derivations_at, evaluators_at
 from .findings import EntryTaken
 from .flow_model import EQUILIBRIUM
 from .input_ports import name_inputs, split_inputs
@@ -317,7 +318,8 @@ def _linearize(
     for signal in found[2]:
         check_opening(flat, signal)
     means = replace_stairs(diagram, flat, at, stairs)
-    local, channels = LocalDerivatives(flat, found[0], found[1], found[2], stairs=means), list[str]()
+    channels = list[str]()
+    local = LocalDerivatives(flat, found[0], found[1], found[2], evaluators_at(flat, at), means)
     if diagram.has_clock or (diagram.has_fmu and step is not None):
         if loop:
             check_loop(flat, local, at)
@@ -339,6 +341,7 @@ def _linearize(
     if loop:
         carried += find_cut_findings(flat, at, [s.port for s in found[2]], carried)
     opaque = {p: Derivation(DerivativeMethod.BLOCK_DIFFERENCES) for p, b in flat.table.blocks.items() if b.opaque}
+    outside, error = derivations_at(flat, at)
     return Linearization(
         diagram,
         A,
@@ -351,8 +354,8 @@ def _linearize(
         outputs=outs,
         point=at,
         affine=model.affine,
-        derivations={**opaque, **model.derivations},
-        uncertainty=model.uncertainty,
+        derivations={**opaque, **outside, **model.derivations},
+        uncertainty=max(model.uncertainty, error),
         memory=model.memory,
         openings=tuple(names[2]),
         findings=tuple(dict.fromkeys((*every, *carried))),

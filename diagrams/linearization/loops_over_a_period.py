@@ -21,6 +21,7 @@ from ...blocks.core import ConfirmationError, OptionError, PeriodicLoopError
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
 from .derivatives import LocalDerivatives, Tap
+from .exchanged import evaluators_at
 from .over_a_period import Chain, Model, find_needed, own_states, period_of
 
 SAME_ROWS = 1e-12
@@ -108,7 +109,7 @@ def advance_point(flat: FlatDiagram, at: OperatingPoint, way: str | None, count:
     """Return the operating point ``count`` ticks later."""
     if not count:
         return at
-    chain = Chain(flat, LocalDerivatives(flat, (), (), ()), at, way, count)
+    chain = Chain(flat, LocalDerivatives(flat, (), (), (), evaluators_at(flat, at)), at, way, count)
     chain.go_on()
     return chain.here
 

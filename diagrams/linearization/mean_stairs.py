@@ -64,7 +64,7 @@ class Stairs:
     def of(cls, flat: FlatDiagram, at: OperatingPoint) -> Stairs:
         """Return the stairs of all blocks, with their mean slopes at an operating point."""
         found = []
-        for path in sorted(flat.checked.traced):
+        for path in sorted(set(flat.checked.traced).difference(flat.outside)):
             slopes = slopes_of(flat.checked.traced[path])
             if slopes.has_stairs:
                 z, p = read_arguments(flat, at, path, slopes)

@@ -44,18 +44,21 @@ def capture(simulation: Simulation, how: PointOrigin = PointOrigin.RUN) -> Opera
         layout=layout_of(flat),
         asked=flat.asked,
         coupling=simulation.coupling,
+        exchanged={path: block.operating_point() for path, block in view.exchanged.items()},
     )
     return with_residual(flat, point, view.x_next)
 
 
 def with_residual(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) -> OperatingPoint:
     """Return an operating point with its residual, the largest relative change of a state, and that state's name."""
+    from .exchanged import evaluators_at, pass_on
     from .plant_models import plant_changes
 
     x, found, who = point.x, 0.0, ""
     rates = np.zeros(flat.width)
     if flat.continuous.size:
-        rates[flat.continuous] = flat.flow(point.t, x, point.w, flat.p)[0]
+        evaluators = evaluators_at(flat, point)
+        rates[flat.continuous] = flat.flow(point.t, x, point.w, flat.p, evaluators=evaluators)[0]
     changes = {
         path: np.maximum(np.abs(x_next[where] - x[where]), np.abs(rates[where])) / (1.0 + np.abs(x[where]))
         for path, where in flat.states.slices.items()
@@ -66,7 +69,7 @@ def with_residual(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) 
             found, who = worst, name
         if np.isnan(found):
             break
-    return replace(point, residual=found, largest=who)
+    return pass_on(point, replace(point, residual=found, largest=who))
 
 
 def check_options(diagram: WiredDiagram, options: Mapping[str, Any], caller: str) -> None:

@@ -243,8 +243,10 @@ class Chain:
         flat, here = self.flat, self.here
         if not flat.events:
             return
+        evaluators = self.local.evaluators
         (g0, _), (g1, opened) = (
-            flat.indicators(t, x, here.w, flat.p) for t, x in ((here.t, here.x), (here.t + h, x_end))
+            flat.indicators(t, x, here.w, flat.p, evaluators=evaluators)
+            for t, x in ((here.t, here.x), (here.t + h, x_end))
         )
         for event, a, b, now in zip(flat.events, g0 > 0, g1 > 0, opened > 0.5, strict=True):
             if a != b and now:

@@ -12,6 +12,7 @@ from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
 from .derivatives import LocalDerivatives, Tap, find_signal
+from .exchanged import evaluators_at, linearize_exchanged
 from .over_a_period import find_moving, is_moving
 from .plant_models import linearize_equations
 
@@ -57,11 +58,22 @@ def linearize_plant(diagram: WiredDiagram, at: OperatingPoint, path: str) -> Pla
     """
     flat, block = diagram.flatten_like(at), diagram.blocks[path]
     inputs, outputs = (_lay_out(block, kind) for kind in ("inputs", "outputs"))
+    if block.evaluated_outside:
+        return _model_exchanged(flat, at, path, inputs, outputs)
     if block.stepped:
         m = linearize_equations(flat, at, path, at.z)
         names = tuple(f"{path}.{name}" for name in m.states)
         return PlantEquations(m.A, m.B, m.C, m.D, m.f, m.x0, names, inputs, outputs, m.derivation, m.uncertainty)
     return _differentiate(diagram, flat, at, path, inputs, outputs)
+
+
+def _model_exchanged(
+    flat: FlatDiagram, at: OperatingPoint, path: str, inputs: Layout, outputs: Layout
+) -> PlantEquations:
+    """Return the model of an FMU in model exchange."""
+    m = linearize_exchanged(flat, at, path)
+    names = tuple(f"{path}.{name}" for name in m.states)
+    return PlantEquations(m.A, m.B, m.C, m.D, m.f, m.x0, names, inputs, outputs, m.derivation, m.uncertainty)
 
 
 def _lay_out(block: Block, kind: str) -> Layout:
@@ -111,7 +123,7 @@ def moves_between_ticks(diagram: WiredDiagram, at: OperatingPoint, outputs: list
     """
     flat = diagram.flatten_like(at)
     signals = [find_signal(flat, name) for name in outputs]
-    local = LocalDerivatives(flat, signals, [], signals)
+    local = LocalDerivatives(flat, signals, [], signals, evaluators_at(flat, at))
     sources: list[Tap] = [find_signal(flat, name) for name in inputs]
     names = [*find_moving(flat, local, at), *(s.name for s in sources if is_moving(flat, s))]
     return names[0] if names else ""

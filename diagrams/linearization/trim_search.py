@@ -31,6 +31,7 @@ from ..flat import (
     trace_schedule,
 )
 from ..results import FreeDirection, OperatingPoint, PointOrigin
+from .exchanged import evaluators_at
 from .operating_points import PointLike, operating_point, with_residual
 from .trim_plants import Plants
 from .trim_request import Free, Target, free_parameters, index_states, read_targets, set_states
@@ -53,6 +54,7 @@ class _Equations:
     def __init__(self, diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, free: list[Free], target: Target):
         self.diagram, self.flat, self.at, self.parameters, self.target = diagram, flat, at, free, target
         self.plants = Plants(flat, at, diagram)
+        self.evaluators = evaluators_at(flat, at)
         traced = flat.checked.traced
         self.sampled = flat.states.entries(p for p in flat.states.slices if traced[p].advance != "derivative")
         loops = flat.loops.entries(flat.loops.slices)
@@ -167,7 +169,7 @@ class _Equations:
             if f.where is not None:
                 p[f.where] = f.pack_value(value)
                 by_q[f.where, columns] = f.slope(value)
-        numbers = self.function(self.at.t, x, w, p)
+        numbers = self.function(self.at.t, x, w, p, evaluators=self.evaluators)
         values, rest = numbers[:5], numbers[5:]
         many, where = 3 if self.parameters else 2, self.unknowns.slices
 
@@ -377,7 +379,7 @@ def _complete_point(
     """Return the operating point with all its signals; subsystems hold their outputs."""
     flat = diagram.flatten_like(guess)
     at_tick = flat.at_tick(frozenset(flat.clocks.values()))
-    x_next, z, log, _ = at_tick(guess.t, x, w, flat.p)
+    x_next, z, log, _ = at_tick(guess.t, x, w, flat.p, evaluators=evaluators_at(flat, guess))
     values = {name: log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
     x = x.copy()
     for name, where in flat.held.slices.items():

@@ -57,7 +57,9 @@ class Engine:
         self.workspace = Workspace(flat, self.exchanged.evaluators)
         self.position = Position(flat.base)
         self.plants: dict[str, Plant] = {}
-        self.view = SimulationView.of(self.workspace, MappingProxyType(self.plants), self.position)
+        self.view = SimulationView.of(
+            self.workspace, MappingProxyType(self.plants), MappingProxyType(self.exchanged.blocks), self.position
+        )
         self.continuous: Continuous | None = None
         asking = self.exchanged.ends_run if self.exchanged else None
         self._stops = StopConditions(flat, self.workspace.log, asking)
@@ -113,7 +115,7 @@ class Engine:
     @property
     def loaded(self) -> dict[str, Plant | ExchangedBlock]:
         """All that is loaded for the run, by path."""
-        return {**self.plants, **self.exchanged.loaded}
+        return {**self.plants, **self.exchanged.blocks}
 
     @property
     def has_plants(self) -> bool:

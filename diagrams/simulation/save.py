@@ -42,7 +42,7 @@ def restore_state(engine: Engine, state: RunState) -> None:
     """Put a run into a state that fits it."""
     for path, plant in engine.plants.items():
         plant.restore(plant.deserialize(state.fmus[path]))
-    for path, block in engine.exchanged.loaded.items():
+    for path, block in engine.exchanged.blocks.items():
         block.restore_bytes(state.fmus[path])
     engine.workspace.restore(t=state.t, x=state.x, w=state.w, z=state.z, log=state.log)
     if engine.continuous is not None and state.continuous is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ def apply_point(diagram: WiredDiagram, point: OperatingPoint) -> WiredDiagram:
     changes: dict[str, Any] = dict(point.parameters)
     variant = diagram.replace(changes) if changes else diagram
     blocks: dict[str, Any] = {}
-    for path, known in point.plants.items():
+    for path, known in (*point.plants.items(), *_settable(variant, point)):
         block: Any = variant.blocks[path]
         try:
             blocks[path] = block.replace(start={**block.start, **known["state"]})
@@ -37,6 +38,17 @@ def apply_point(diagram: WiredDiagram, point: OperatingPoint) -> WiredDiagram:
                 block=path,
             ) from error
     return variant.replace(blocks) if blocks else variant
+
+
+def _settable(diagram: WiredDiagram, point: OperatingPoint) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the FMUs in model exchange, with those states at a point that they take as start values.
+
+    Their continuous states stand in x, so that a run begins with these in any case.
+    """
+    for path, known in point.exchanged.items():
+        block: Any = diagram.blocks[path]
+        exact = {n: v for n, v in known["state"].items() if block.description.find(n).initial == "exact"}
+        yield path, {"state": exact}
 
 
 def copy_states(values: np.ndarray, old: FlatDiagram, new: FlatDiagram, into: np.ndarray) -> None:

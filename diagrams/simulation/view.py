@@ -9,6 +9,7 @@ from fractions import Fraction
 import numpy as np
 
 from ..coupling import Plant
+from ..exchange import ExchangedBlock
 from ..results import Occurrence, Stopped
 from .workspace import Workspace
 
@@ -71,6 +72,8 @@ class SimulationView:
         Every output, as ``FlatDiagram.log`` lays them out, in the ports' units.
     plants : mapping of str to Plant
         The plants that are loaded, by path.
+    exchanged : mapping of str to ExchangedBlock
+        The blocks that are evaluated from outside, by path, in a run that has begun.
     """
 
     x: np.ndarray
@@ -79,10 +82,17 @@ class SimulationView:
     z: np.ndarray
     log: np.ndarray
     plants: Mapping[str, Plant]
+    exchanged: Mapping[str, ExchangedBlock]
     _position: Position = field(repr=False)
 
     @classmethod
-    def of(cls, workspace: Workspace, plants: Mapping[str, Plant], position: Position) -> SimulationView:
+    def of(
+        cls,
+        workspace: Workspace,
+        plants: Mapping[str, Plant],
+        exchanged: Mapping[str, ExchangedBlock],
+        position: Position,
+    ) -> SimulationView:
         """Return the view of a run's numbers, plants and position."""
         n, width = workspace.flat.log.total, workspace.flat.width
         return cls(
@@ -92,6 +102,7 @@ class SimulationView:
             z=_read_only(workspace.z),
             log=_read_only(workspace.log[:n]),
             plants=plants,
+            exchanged=exchanged,
             _position=position,
         )
 

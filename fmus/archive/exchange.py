@@ -40,6 +40,14 @@ class ExchangeInfo:
     """For each output and derivative of a state, the variables that it depends on; None: all. They stand by type and
     value reference."""
 
+    time: Key | None = None
+    """Type and value reference of the independent variable, if there is one."""
+
+    def varies(self, unknown: FmuVariable) -> bool:
+        """Whether an output or a derivative may depend on time by itself; one that is not listed may."""
+        found = [self.dependencies.get(key) for key in _keys(unknown)]
+        return self.time is None or any(of is None or self.time in of for of in found)
+
     def pattern(self, unknown: FmuVariable, known: FmuVariable) -> np.ndarray:
         """Return which elements of an output or a derivative may depend on which of an input or a state.
 
@@ -96,6 +104,7 @@ def read_exchange(root: ET.Element, model: Any, binary: str) -> ExchangeInfo:
         completes_steps=completes,
         state_count=int(model.numberOfContinuousStates),
         indicators=_indicators(model),
+        time=next((_key(v) for v in model.modelVariables if v.causality == "independent"), None),
         dependencies={
             _key(unknown.variable): None if unknown.dependencies is None else frozenset(map(_key, unknown.dependencies))
             for unknown in (*model.outputs, *model.derivatives)

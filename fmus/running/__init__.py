@@ -1,6 +1,7 @@
 """The block `Fmu` and its linear model."""
 
 from .derivation import Derivation, DerivativeMethod
+from .exchange import find_exchange_slopes
 from .fmu import Fmu
 from .linearization import FmuLinearization
 
@@ -9,4 +10,5 @@ __all__ = [
     "DerivativeMethod",
     "Fmu",
     "FmuLinearization",
+    "find_exchange_slopes",
 ]

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import Array, Block, Event, FmuError, FmuFileError, ParameterError, State
+from ...blocks.core import Array, Block, Event, FmuError, FmuFileError, Layout, ParameterError, State
 from ...blocks.tracing import NEXT
 from ..archive import FmuDescription, FmuVariable
 from ..calls import ExchangeInstance, is_smooth
 from ..isolation import open_fmu
+from .differences import Column, differentiate
 
 INTERFACES = ("co_simulation", "model_exchange")
 """Interfaces of an FMU, as the parameter ``interface`` names them."""
+EQUATIONS = 1e-5
+"""Relative distance of differences of equations."""
 UNNAMED = "continuous_states"
 """Name of the state of an FMU whose continuous states are no variables."""
 
@@ -156,9 +159,54 @@ def dependence(block: ExchangeMembers, equation: str, rates: str) -> dict[str, n
         if is_smooth(v):
             found[port] = _stack([exchange.pattern(of, v) for of in unknown], rows, v.size)
     by_states = [_stack([exchange.pattern(of, v) for of in unknown], rows, v.size) for v in states]
+    found["t"] = np.full((rows, 1), not unknown or any(map(exchange.varies, unknown)))
     found["x"] = np.hstack(by_states) if states else np.ones((rows, n), dtype=bool)
     return found
 
 
 def _stack(parts: list[np.ndarray], rows: int, columns: int) -> np.ndarray:
     return np.vstack(parts) if parts else np.ones((rows, columns), dtype=bool)
+
+
+def find_exchange_slopes(
+    block: ExchangeMembers,
+    wired: Sequence[str],
+    values: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    x: np.ndarray,
+    u: np.ndarray,
+) -> tuple[np.ndarray, float]:
+    """Return the derivative of values by (x, u) of model exchange, by differences, and its largest estimated error.
+
+    Parameters
+    ----------
+    wired : sequence of str
+        Inputs that are moved; others, and those without derivatives, have zero columns.
+    values : callable
+        ``values(x, u)``: flat, at states and inputs.
+    """
+    about, places = block.description, Layout.of({p: v.shape for p, v in block.input_variables.items()}).slices
+    moved = {port: v for port, v in block.input_variables.items() if port in wired and is_smooth(v)}
+    parts = [(v, x, where) for v, where in _states_in(block)]
+    parts += [(v, u, places[port]) for port, v in moved.items()]
+    base = values(x, u)
+    J, worst = np.zeros((base.size, x.size + u.size)), 0.0
+    for variable, vector, where in parts:
+        column = Column(about, [variable.name], vector[where], EQUATIONS)
+
+        def evaluate(name: str, moved: np.ndarray, vector: np.ndarray = vector, where: slice = where) -> np.ndarray:
+            changed = vector.copy()
+            changed[where] = moved
+            return values(changed, u) if vector is x else values(x, changed)
+
+        found, error = differentiate(column, base, evaluate)
+        first = where.start if vector is x else x.size + where.start
+        J[:, first : first + variable.size] = found
+        worst = max(worst, float(np.max(error, initial=0.0)))
+    return J, worst
+
+
+def _states_in(block: ExchangeMembers) -> Iterator[tuple[FmuVariable, slice]]:
+    """Yield the variables of the continuous states, and where they stand among these."""
+    about = block.description
+    layout = about.layout(about.states).slices
+    yield from ((about.find(name), layout[name]) for name in about.states)

@@ -1,0 +1,144 @@
+"""FMUs in model exchange at an operating point: instances of their own, for linear models and trims."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Mapping
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Any, cast
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from ...blocks.core import FmuError, Layout
+from ...blocks.tracing import GUARDS, NEXT
+from ...fmus.running import Derivation, DerivativeMethod, FmuLinearization, find_exchange_slopes
+from ..exchange import ExchangeEvaluator
+from ..flat import Evaluators, FlatDiagram
+from ..results import OperatingPoint
+from ..wiring import join
+
+if TYPE_CHECKING:
+    from ...fmus.running import Fmu
+
+
+class PointEvaluator(ExchangeEvaluator):
+    """Evaluator of one FMU at an operating point; it notes how its derivatives are computed."""
+
+    def __init__(self, flat: FlatDiagram, path: str):
+        super().__init__(flat, path)
+        self._fmu = cast("Fmu", flat.table.blocks[path])
+        self._inputs = Layout.of(dict(flat.checked.traced[path].inputs))
+        self._wired = [port for port in self._inputs.slices if (path, port) in flat.table.wires]
+        self.error = 0.0
+        """Largest estimated error of a derivative so far; 0 where the FMU computes them."""
+
+    @property
+    def derivation(self) -> Derivation:
+        """Method by which the derivatives are computed."""
+        exchange = self._fmu.description.exchange
+        directional = exchange is not None and exchange.has_derivatives
+        method = DerivativeMethod.DIRECTIONAL if directional else DerivativeMethod.DIFFERENCES
+        return Derivation(method, "model_exchange")
+
+    def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
+        """Return the derivative of `evaluate` by (t, x, u), NaN by t: that of the FMU, else by differences."""
+        J = super().differentiate(names, t, x, u)
+        if J is None and {NEXT, GUARDS, *self._fmu.outputs}.issuperset(names):
+            found, error = find_exchange_slopes(
+                self._fmu, self._wired, lambda x, u: self.evaluate(names, t, x, u).copy(), x, u
+            )
+            self.error = max(self.error, error)
+            J = np.hstack([np.full((len(found), 1), np.nan), found])
+        return J
+
+
+_KNOWN: WeakKeyDictionary[OperatingPoint, tuple[FlatDiagram, Mapping[str, PointEvaluator]]] = WeakKeyDictionary()
+
+
+class _Held(dict[str, PointEvaluator]):
+    """Evaluators whose instances are freed when nothing refers to them any more."""
+
+
+def evaluators_at(flat: FlatDiagram, at: OperatingPoint) -> Evaluators | None:
+    """Return the evaluators of the FMUs in model exchange at an operating point; None without such FMUs.
+
+    Each point has instances of its own, with the discrete states there.
+
+    Raises
+    ------
+    FmuError
+        If an FMU can't be loaded, or doesn't accept the states of the point.
+    """
+    if not flat.outside:
+        return None
+    known = _KNOWN.get(at)
+    if known is None or known[0] is not flat:
+        known = _KNOWN[at] = (flat, _load(flat, at))
+    return known[1]
+
+
+def pass_on(at: OperatingPoint, variant: OperatingPoint) -> OperatingPoint:
+    """Let a variant of a point, with the same states, use its instances; return the variant."""
+    if at in _KNOWN:
+        _KNOWN[variant] = _KNOWN[at]
+    return variant
+
+
+def derivations_at(flat: FlatDiagram, at: OperatingPoint) -> tuple[dict[str, Derivation], float]:
+    """Return how the FMUs in model exchange were differentiated at a point, and the largest estimated error."""
+    found = cast("Mapping[str, PointEvaluator]", evaluators_at(flat, at) or {})
+    return {path: e.derivation for path, e in found.items()}, max((e.error for e in found.values()), default=0.0)
+
+
+def _load(flat: FlatDiagram, at: OperatingPoint) -> Mapping[str, PointEvaluator]:
+    held, stack = _Held(), ExitStack()
+    weakref.finalize(held, stack.close)
+    for path in flat.outside:
+        block = cast("Fmu", flat.table.blocks[path])
+        evaluator = held[path] = PointEvaluator(flat, path)
+        try:
+            made = block.replace(start={**block.start, **settable(block, states_at(flat, at, path))})
+            instance = stack.enter_context(made.exchange(evaluator._wired, start_time=at.t))
+            instance.exchange(_inputs_at(flat, at, path))
+            instance.begin_exchange()
+        except FmuError as error:
+            error.at(block=path)
+            raise
+        evaluator.load(instance)
+    return held
+
+
+def linearize_exchanged(flat: FlatDiagram, at: OperatingPoint, path: str) -> FmuLinearization:
+    """Return the linear model of the equations of an FMU in model exchange at a point."""
+    block = cast("Fmu", flat.table.blocks[path])
+    shapes = Layout.of(dict(flat.checked.traced[path].inputs))
+    inputs = shapes.split(_inputs_at(flat, at, path))
+    return block.linear_model(t=at.t, state=states_at(flat, at, path), inputs=inputs, interface="model_exchange")
+
+
+def states_at(flat: FlatDiagram, at: OperatingPoint, path: str) -> dict[str, np.ndarray]:
+    """Return the states of an FMU in model exchange at a point, by its names: continuous ones from x, then others."""
+    known = dict(at.exchanged.get(path, {}).get("state", {}))
+    return {**known, **flat.states.of_block[path].split(at.x)}
+
+
+def settable(block: Fmu, states: Mapping[str, Any]) -> dict[str, Any]:
+    """Return those states that an FMU takes as start values; the others are set when it runs."""
+    about = block.description
+    return {n: v for n, v in states.items() if n in about.names and about.find(n).initial == "exact"}
+
+
+def _inputs_at(flat: FlatDiagram, at: OperatingPoint, path: str) -> np.ndarray:
+    """Return all inputs of an FMU at a point, flat."""
+    known = at.exchanged.get(path, {}).get("inputs", {})
+    parts = []
+    for port, shape in flat.checked.traced[path].inputs.items():
+        wire = flat.table.wires.get((path, port))
+        value = known.get(port)
+        if wire is not None:
+            signal = np.asarray(at.values.get(join(wire.block, wire.port), np.nan), dtype=float)
+            if np.all(np.isfinite(signal)):
+                value = signal if wire.index is None else signal[wire.index]
+        parts.append(np.broadcast_to(np.asarray(0.0 if value is None else value, dtype=float), shape).ravel())
+    return np.concatenate([np.zeros(0), *parts])
