@@ -83,9 +83,15 @@ class _Cuts:
         instant.replace_columns(carry)
         self.made.append(
             _Cut(
-                path, names, states, join_columns(columns), own.stop > own.start + 1, [*carried.values()], outputs,
+                path,
+                names,
+                states,
+                join_columns(columns),
+                own.stop > own.start + 1,
+                [*carried.values()],
+                outputs,
                 _varies(instant, path, names),
-            )  # fmt: skip
+            )
         )
         return outputs
 
