@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .fmi_calls import EventUpdate, FmiCalls, Log, StepCall, TypeCalls
+from .fmi_calls import MOST_ROUNDS, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
 
 _INTEGERS = {f"{sign}Int{bits}": getattr(ctypes, f"c_{sign.lower()}int{bits}")
              for sign in ("", "U") for bits in (8, 16, 32, 64)}  # fmt: skip
@@ -98,9 +98,19 @@ class Fmi3Calls(FmiCalls):
         return status, False
 
     def do_step(self, t: float, h: float, final: bool) -> bool:
-        """Take a step; return whether it ended early or asks to end the simulation."""
-        _, terminate, early, _ = self.fmu.doStep(t, h, final)
-        return bool(terminate or early)
+        """Take a step with its events; return whether it ended early or asks to end the simulation."""
+        end = t + h
+        for _ in range(MOST_ROUNDS):
+            event, terminate, early, reached = self.fmu.doStep(t, h, final)
+            if event and self.event_mode_used and not terminate:
+                self.enter_event_mode()
+                self.settle_events()
+            if terminate or not early or not self.early_return_allowed:
+                return bool(terminate or early)
+            t, h = reached, end - reached
+            if h <= 1e-9 * (end - t + h):
+                return False
+        return True
 
     def directional_derivative(
         self, unknowns: Sequence[int], knowns: Sequence[int], seed: Sequence[float], size: int

@@ -15,6 +15,8 @@ import numpy as np
 STATUS = ("OK", "warning", "discard", "error", "fatal", "pending")
 WARNING, DISCARD, ERROR, FATAL, PENDING = range(1, 6)
 
+MOST_ROUNDS = 100
+"""Rounds of an event iteration before an error."""
 Log = Callable[[int, str], None]
 """Takes the status and the text of a message."""
 Call = tuple[Callable[..., int], tuple[Any, ...]]
@@ -301,6 +303,20 @@ class FmiCalls(ABC):
     def enter_step_mode(self) -> None:
         """Go back from Event Mode to Step Mode (FMI 3.0, 4.2.1)."""
         self.fmu.enterStepMode()
+
+    def settle_events(self) -> None:
+        """Go through the event iteration of an FMU in Event Mode, and back to Step Mode.
+
+        Raises
+        ------
+        RuntimeError
+            If it does not end.
+        """
+        for _ in range(MOST_ROUNDS):
+            if not self.update_discrete_states():
+                self.enter_step_mode()
+                return
+        raise RuntimeError(f"the events don't settle in {MOST_ROUNDS} rounds")
 
     def activate_clocks(self, references: Sequence[int]) -> None:
         """Let input clocks tick, in Event Mode (FMI 3.0, 2.2.9)."""

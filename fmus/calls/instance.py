@@ -90,10 +90,14 @@ class FmuInstance(StepFailures):
         """Leave Initialization Mode and read the outputs at the start of the run."""
         super().begin()
         self._now.value, self._width.value = self._began, 0.0
-        if self._careful is not None:
-            self._careful.begin(self._began)
         self._read(self._began)
         self._begin_texts()
+
+    def _settle_start(self) -> None:
+        if self._careful is None:
+            super()._settle_start()
+        else:
+            self._careful.begin(self._began)
 
     def bind(self, inputs: np.ndarray, outputs: np.ndarray) -> None:
         """Bind the vectors of the inputs to set and of the outputs to get, and get the outputs once."""

@@ -227,6 +227,12 @@ class LoadedFmu:
         except Exception as error:
             raise self._initialization_error(error) from error
         self._running = True
+        if self.fmi.event_mode_used:
+            self._settle_start()
+
+    def _settle_start(self) -> None:
+        """Settle the events at the start, where the FMU is in Event Mode now."""
+        self.call("the events at the start", self.fmi.settle_events)
 
     # ---- calls that are not made at each step ----
 

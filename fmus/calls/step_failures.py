@@ -25,7 +25,7 @@ class StepFailures(LoadedFmu):
     _now: ctypes.c_double
     _width: ctypes.c_double
     _call: StepCall | None = None
-    _has_retried = _has_been_short = False
+    _has_retried = _has_been_off = False
 
     def set_span(self, t: float, h: float) -> None:
         """Set start and length of the next step in s."""
@@ -106,8 +106,9 @@ class StepFailures(LoadedFmu):
                 block=self.block.label,
                 t=t,
             )
-        reached, off = call.reached.value, h * NEAR + 1e-12 * abs(t)
-        if reached > t + h + off:
+        reached, near = call.reached.value, h * NEAR + 1e-12 * abs(t)
+        own = self.description.fixed_internal_step
+        if reached > t + h + max(near, 1.001 * (own or 0.0)):
             raise FmuRuntimeError(
                 f"the step from t = {t:.9g} s by {h:g} s ended at {reached:.9g} s (lastSuccessfulTime); expected "
                 f"{t + h:.9g} s{self._quote_messages()} Its outputs belong to another time than the diagram's: report "
@@ -115,12 +116,15 @@ class StepFailures(LoadedFmu):
                 block=self.block.label,
                 t=t,
             )
-        if reached < t + h - off and not self._has_been_short:
-            self._has_been_short = True
-            where = "before it began" if reached < t - off else "short of its end"
+        if abs(reached - t - h) > near and not self._has_been_off:
+            self._has_been_off = True
+            where = (
+                "before it began" if reached < t - near else "short of its end" if reached < t + h else "beyond its end"
+            )
+            advice = f"Take steps that are multiples of its own, {own:g} s" if own else "Report it to its makers"
             self.add_note(
                 f"t = {t:.9g} s: the FMU says that a step of {h:g} s ended at {reached:.9g} s (lastSuccessfulTime), "
-                f"{where}; its outputs are taken as those of {t + h:.9g} s. Check its steps, or report it to its makers"
+                f"{where}; its outputs are taken as those of {t + h:.9g} s. {advice}"
             )
 
     def note_retry(self, t: float, h: float, count: int) -> None:

@@ -15,15 +15,13 @@ import numpy as np
 
 from ...blocks.core import FmuRuntimeError, Layout
 from ..archive import FmuDescription, FmuVariable, OtherVariable
-from .fmi_calls import DISCARD, FmiCalls, StepCall
+from .fmi_calls import DISCARD, MOST_ROUNDS, FmiCalls, StepCall
 from .fmu_block import FmuBlock
 from .step_options import StepOptions, StepTime, allows_early_return, uses_event_mode
 from .transfer import Transfer, UnfitError
 
 _ROUNDED = 1e-9
 """Part of a step within which two times are one."""
-_MOST_ROUNDS = 100
-"""Rounds of an event iteration, and steps that end where they began, before an error."""
 R = TypeVar("R")
 _CHANGED = 2
 """Qualifier of an interval that the FMU has set anew (fmi3IntervalChanged)."""
@@ -174,11 +172,12 @@ class CarefulSteps:
     # ---- the start ----
 
     def begin(self, t: float) -> None:
-        """Settle the events at the start, where the FMU is in Event Mode after its initialization."""
+        """Settle the events at the start, where the FMU is in Event Mode after its initialization.
+
+        It is called only if Event Mode is used.
+        """
         self._last, self._added, self._fresh = None, None, True
         self.next_event = math.inf
-        if not self.has_events:
-            return
         for clock in self.clocks:
             if clock.variable.is_periodic and clock.variable.interval is not None:
                 clock.start(t, clock.variable.interval, clock.variable.shift)
@@ -227,7 +226,7 @@ class CarefulSteps:
             target = end if end - target < _ROUNDED * h else target
             reached, event = self._take(now, (end if target == end else target) - now)
             still = still + 1 if reached - now <= _ROUNDED * h else 0
-            if still > _MOST_ROUNDS:
+            if still > MOST_ROUNDS:
                 raise FmuRuntimeError(
                     f"its steps returned early at {reached:.9g} s {still} times in a row; expected that it goes on. "
                     "Report it to its makers, or leave early_return out of stepping=.",
@@ -259,10 +258,8 @@ class CarefulSteps:
         if (status := call.function(*call.arguments)) > 1:
             instance.end_step(status, t, h)
             return t + h, False
-        event, _, early, _ = call.flags
-        if early and allows_early_return(self.about, self.options):
-            call.flags[2] = False
-            instance.check_flags(call, t, h)
+        event, ends, early, _ = call.flags
+        if early and not ends and allows_early_return(self.about, self.options):
             return min(max(call.reached.value, t), t + h), bool(event)
         instance.check_flags(call, t, h)
         return t + h, bool(event)
@@ -321,7 +318,7 @@ class CarefulSteps:
     def _settle(self, t: float) -> None:
         """Update the discrete states until nothing changes, and go back to Step Mode."""
         instance = self.instance
-        for _ in range(_MOST_ROUNDS):
+        for _ in range(MOST_ROUNDS):
             found = instance.call("updating its discrete states", self.fmi.update_events)
             if found.terminate:
                 raise instance.termination(t, 0.0)
@@ -330,7 +327,7 @@ class CarefulSteps:
                 break
         else:
             raise FmuRuntimeError(
-                f"the events don't settle in {_MOST_ROUNDS} rounds (discreteStatesNeedUpdate); expected that they end. "
+                f"the events don't settle in {MOST_ROUNDS} rounds (discreteStatesNeedUpdate); expected that they end. "
                 "Report it to its makers.",
                 block=instance.block.label,
                 t=t,
