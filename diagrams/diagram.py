@@ -66,7 +66,8 @@ class Diagram(SimulatedDiagram):
             Values of states of blocks and FMUs that are given, by path: ``{"plant.position": 0.2}``. Signals, and the
             FMUs' outputs, are then what follows from them.
         **options
-            Of the run there: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step`` and ``start`` of `simulate`.
+            Of the run there: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step``, ``start``, and
+            ``start_exchange`` of `simulate`.
 
         Raises
         ------

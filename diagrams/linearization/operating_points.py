@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 PointLike: TypeAlias = OperatingPoint | Snapshot | float | None
 """Values that give an operating point: one, a recorded instant, a time in s, or None for the start."""
-OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start", "coupling")
+OPTIONS = ("step", "solver", "rtol", "atol", "max_step", "start", "coupling", "start_exchange")
 """Options of a run to an operating point."""
 AGAIN = 1e-3
 """Largest deviation of a repeated run, whose solver takes other steps, relative to 1 + the size of a state."""

@@ -18,7 +18,7 @@ from .continuous import Continuous
 from .continuous_part import ContinuousPart
 from .diagnosis import opaque_failure
 from .initialize import initialize
-from .run_options import RunOptions
+from .run_options import RunOptions, check_start_exchange
 from .start_at_point import start_at, take_over
 from .stops import StopConditions
 from .ticks import Progress, Row, end_between_ticks, run_hybrid, run_ticks, take_tick
@@ -63,6 +63,7 @@ class Engine:
         self.continuous: Continuous | None = None
         asking = self.exchanged.ends_run if self.exchanged else None
         self._stops = StopConditions(flat, self.workspace.log, asking)
+        self._passes_on = check_start_exchange(options.start_exchange)
         self._can_stop = self._stops.exist
         self._tell = on_event
         if flat.hybrid:
@@ -126,7 +127,7 @@ class Engine:
         """Find values of everything at t = 0; the plants are then ready to be stepped."""
         self.steps.bind()
         delays = None if self.continuous is None else self.continuous.delays
-        initialize(self.workspace, self.plants, delays, self.steps.take_inputs, self.exchanged)
+        initialize(self.workspace, self.plants, delays, self.steps.take_inputs, self.exchanged, self._passes_on)
         for plant in self.plants.values():
             plant.begin()
         self.exchanged.begin(self.workspace.here.x)

@@ -29,6 +29,7 @@ def initialize(
     delays: Delays | None,
     take_inputs: Callable[[], None],
     exchanged: ExchangedBlocks,
+    passes_on: str = "agree",
 ) -> None:
     """Find values of everything at t = 0.
 
@@ -39,7 +40,8 @@ def initialize(
     Initial states that are computed from inputs are those of the instant before: a source that jumps at t = 0 has its
     value from the left there, so that a derivative sees the jump, as it sees one at any later time.
 
-    ``take_inputs`` lets the plants see the inputs z.
+    ``take_inputs`` lets the plants see the inputs z. ``passes_on`` is the exchange of values with them: "agree" until
+    their inputs stay, "once", or "none", where the inputs of FMUs keep their start values.
     """
     flat = workspace.flat
     acting = flat.acting(0)
@@ -62,9 +64,10 @@ def initialize(
         workspace.evaluate(acting)
         workspace.check(acting)
         before = workspace.z.copy()
-        take_inputs()
-        for plant in plants.values():
-            plant.exchange()
+        if passes_on != "none":
+            take_inputs()
+            for plant in plants.values():
+                plant.exchange()
         if delays is not None:
             delays.begin(workspace.z, workspace.here.w)
         moved = exchanged.exchange(workspace.here.x, look) if exchanged else ""
@@ -80,7 +83,8 @@ def initialize(
                 t=0.0,
             )
         found = not workspace.looped or np.allclose(last, workspace.here.x, rtol=_SETTLED, atol=_SETTLED)
-        if found and np.allclose(before, workspace.z, rtol=_SETTLED, atol=0.0, equal_nan=True):
+        agreed = passes_on != "agree" or np.allclose(before, workspace.z, rtol=_SETTLED, atol=0.0, equal_nan=True)
+        if found and agreed:
             break
         if passes == most:
             raise _unsettled(workspace, before) if found else _unsolved_start(workspace, last)

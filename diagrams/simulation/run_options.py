@@ -12,6 +12,24 @@ from ...blocks.core import OptionError, near
 from ..coupling import Coupling
 from ..results import OperatingPoint, RunState
 
+START_EXCHANGES = ("agree", "once", "none")
+"""Exchanges of values with FMUs while they initialize; the first one is the default."""
+
+
+def check_start_exchange(value: str) -> str:
+    """Return a way of exchanging values at the start.
+
+    Raises
+    ------
+    OptionError
+        For an unknown one.
+    """
+    if value not in START_EXCHANGES:
+        raise OptionError(
+            f"found {value!r}; expected {', '.join(map(repr, START_EXCHANGES))}. Give one.", port="start_exchange"
+        )
+    return value
+
 
 class RunKeywords(TypedDict, total=False):
     """The options of a run as keywords, for type checkers; `RunOptions` says what they mean."""
@@ -28,6 +46,7 @@ class RunKeywords(TypedDict, total=False):
     overwrite: bool
     start: RunState | OperatingPoint | None
     coupling: str | Coupling
+    start_exchange: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +85,9 @@ class RunOptions:
         Exchange of values between FMUs in a communication step: "jacobi", all step at once with the inputs of its
         beginning; "gauss_seidel", one after the other; "iterated", until they agree; or a `Coupling` with its options,
         such as adaptive communication steps. See docs/coupling.md.
+    start_exchange : {"agree", "once", "none"}
+        Exchange of values with FMUs while they initialize: until inputs and outputs agree, one pass, or none, where
+        inputs keep their start values until the first step. Tools differ in this.
     """
 
     step: float | Fraction | None = None
@@ -80,6 +102,7 @@ class RunOptions:
     overwrite: bool = False
     start: RunState | OperatingPoint | None = None
     coupling: str | Coupling = "jacobi"
+    start_exchange: str = START_EXCHANGES[0]
 
     @classmethod
     def of(cls, options: Mapping[str, Any], *, block: str) -> Self:

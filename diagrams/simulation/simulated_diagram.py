@@ -29,7 +29,7 @@ class SimulatedDiagram(WiredDiagram):
             Show a progress bar; by default on a terminal, and in a notebook where ipywidgets is installed.
         **options
             Options of the run by name: ``step``, ``solver``, ``rtol``, ``atol``, ``max_step``, ``record``, ``every``,
-            ``states``, ``to``, ``overwrite``, ``start``, ``coupling``. `RunOptions` says what each
+            ``states``, ``to``, ``overwrite``, ``start``, ``coupling``, ``start_exchange``. `RunOptions` says what each
             means, and its default.
 
         Returns

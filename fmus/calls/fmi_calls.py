@@ -6,14 +6,16 @@ import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
-STATUS = ("OK", "warning", "discard", "error", "fatal", "pending")
-WARNING, DISCARD, ERROR, FATAL, PENDING = range(1, 6)
+from .missing_functions import allow_missing
+from .status import DISCARD, ERROR, FATAL, PENDING, STATUS, WARNING
+
+__all__ = ["DISCARD", "ERROR", "FATAL", "PENDING", "STATUS", "WARNING", "FmiCalls"]
+
 
 MOST_ROUNDS = 100
 """Rounds of an event iteration before an error."""
@@ -57,34 +59,6 @@ class EventUpdate(NamedTuple):
     states_changed: bool
     next_time: float
     """Time of the next time event in s, infinite without one."""
-
-
-@cache
-def allow_missing(kind: Any, prefix: str, required: tuple[str, ...]) -> Any:
-    """Return a class of FMPy's that loads a library without some functions too; their calls return an error.
-
-    Tools leave out functions of capabilities that their FMUs don't have, though the standard asks for all of them.
-
-    Parameters
-    ----------
-    kind : type
-        Class of FMPy's.
-    prefix : str
-        Prefix of the functions' names.
-    required : tuple of str
-        Ends of the names of functions without which an FMU can't run.
-    """
-    needed = {f"{prefix}{name}" for name in required}
-
-    def load(fmu: Any) -> None:
-        fmu.missing_functions = set()
-        for name in dir(fmu):
-            if name.startswith(prefix) and name not in needed and not hasattr(fmu.dll, name):
-                fmu.missing_functions.add(name)
-                setattr(fmu.dll, name, ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR))
-        kind._loadFunctions(fmu)
-
-    return type(kind.__name__, (kind,), {"_loadFunctions": load})  # FMPy reads the version from the class's name
 
 
 class BoundCalls:

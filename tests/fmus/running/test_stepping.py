@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Constant, FmuRuntimeError, Output, ParameterError, Sine
+from loopwright.blocks import Block, Constant, FmuRuntimeError, OptionError, Output, ParameterError, Sine
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, StepOptions
 from support.small_fmus import small_fmu, values
@@ -294,6 +294,32 @@ def test_the_tolerance_is_told(events):
     assert simulate(Fmu(events, name="plant"), level=Constant(value=0.0))["plant.tolerance"][-1] == -1.0
     told = Fmu(events, name="plant", stepping=StepOptions(tolerance=1e-7))
     assert simulate(told, level=Constant(value=0.0))["plant.tolerance"][-1] == 1e-7
+
+
+THROUGH = (
+    """
+typedef struct { double u, y; int running; } instance;
+int fmi2ExitInitializationMode(void *p) { ((instance *)p)->running = 1; return 0; }
+int fmi2DoStep(void *p, double t, double h, int f) { instance *c = p; c->y = c->u; return 0; }
+"""
+    + values("fmi2", "Get", "Real", "double", {1: "c->running ? c->y : c->u"})
+    + values("fmi2", "Set", "Real", "double", {2: "if (!c->running) c->y = v[i]; c->u"})
+)
+
+
+@pytest.mark.parametrize(("way", "first"), [("agree", 2.0), ("once", 1.0), ("none", 0.0)])
+def test_values_are_exchanged_at_the_start_as_chosen(folder, way, first):
+    """The FMU passes its input on at the start, and after a step; u = 1 + y / 2 has the solution 2."""
+    file = small_fmu(folder, "fmi2", THROUGH, INTEGRATOR_MODEL.format(more=""), name="through")
+    plant = Fmu(file, name="plant")
+    diagram = Diagram("d", plant(u=1.0 + 0.5 * plant.x))
+    run = diagram.simulate(0.3, step=0.1, progress=False, start_exchange=way)
+    want = [first]
+    for _ in range(3):
+        want.append(1.0 + 0.5 * want[-1])
+    assert run["plant.x"] == pytest.approx(want, rel=1e-12)
+    with pytest.raises(OptionError, match="start_exchange: found 'twice'; expected 'agree', 'once', 'none'"):
+        diagram.simulate(0.3, step=0.1, progress=False, start_exchange="twice")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,37 @@
+"""Libraries that don't export all functions of the standard."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from typing import Any
+
+from .status import ERROR
+
+
+@cache
+def allow_missing(kind: Any, prefix: str, required: tuple[str, ...]) -> Any:
+    """Return a class of FMPy's that loads a library without some functions too; their calls return an error.
+
+    Tools leave out functions of capabilities that their FMUs don't have, though the standard asks for all of them.
+
+    Parameters
+    ----------
+    kind : type
+        Class of FMPy's.
+    prefix : str
+        Prefix of the functions' names.
+    required : tuple of str
+        Ends of the names of functions without which an FMU can't run.
+    """
+    needed = {f"{prefix}{name}" for name in required}
+
+    def load(fmu: Any) -> None:
+        fmu.missing_functions = set()
+        for name in dir(fmu):
+            if name.startswith(prefix) and name not in needed and not hasattr(fmu.dll, name):
+                fmu.missing_functions.add(name)
+                setattr(fmu.dll, name, ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR))
+        kind._loadFunctions(fmu)
+
+    return type(kind.__name__, (kind,), {"_loadFunctions": load})  # FMPy reads the version from the class's name
