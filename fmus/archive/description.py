@@ -260,7 +260,7 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
     dropped, units = _dropped_attributes(root), FmuUnits({u.name: u for u in model.unitDefinitions})
     scalars, other = {}, {}
     for v in model.modelVariables:
-        if v.causality == "independent":
+        if v.causality == "independent" or v.name in scalars or v.name in other:  # a local of a name that is taken
             continue
         if fmi3_type(v.type) in WIRE_TYPES:
             scalars[v.name] = read_variable(v, dropped.get(v.name, {}), units)

@@ -63,8 +63,8 @@ def read_model(path: Path, text: bytes, root: Any, limits: ArchiveLimits | None 
             if not repaired:
                 raise
             model = _read_model(etree.tostring(root))
-        check_variables(path, root, model, limits or ArchiveLimits())
-        complaints = repaired or schema or validate_model_description(model)
+        doubles = check_variables(path, root, model, limits or ArchiveLimits())
+        complaints = doubles or repaired or schema or validate_model_description(model)
     except FmuFileError:
         raise
     except Exception as error:

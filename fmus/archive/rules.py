@@ -36,8 +36,8 @@ def _schema(major: str) -> Any:
     return etree.XMLSchema(file=str(folder / f"fmi{major}" / f"{name}.xsd"))
 
 
-def check_variables(path: Path, root: Any, model: Any, limits: ArchiveLimits) -> None:
-    """Refuse variables that can't be told apart, or have no possible type or shape.
+def check_variables(path: Path, root: Any, model: Any, limits: ArchiveLimits) -> list[str]:
+    """Refuse variables that can't be told apart, or have no possible type or shape; return complaints about others.
 
     Parameters
     ----------
@@ -53,9 +53,9 @@ def check_variables(path: Path, root: Any, model: Any, limits: ArchiveLimits) ->
     Raises
     ------
     FmuFileError
-        If two variables have one name, or one value reference with different types or shapes; if a reference is no
-        unsigned integer of 32 bits, a variable of FMI 1.0 or 2.0 has no type, or a variable has a negative size or too
-        many elements.
+        If two variables have one name, unless the second is a local that is no state; if two have one value reference
+        with different types or shapes; if a reference is no unsigned integer of 32 bits, a variable of FMI 1.0 or 2.0
+        has no type, or a variable has a negative size or too many elements.
     """
 
     def refuse(fault: FmuFault, name: str, text: str) -> FmuFileError:
@@ -67,14 +67,21 @@ def check_variables(path: Path, root: Any, model: Any, limits: ArchiveLimits) ->
             text = f"has no type; expected one of {', '.join(_TYPES2)}. Export it again."
             raise refuse(FmuFault.DESCRIPTION, element.get("name"), text)
     check_dimensions(path, model, limits)
+    complaints: list[str] = []
+    derived = [u.variable for u in model.derivatives]
+    states = {v.name for u in derived for v in (u, u.derivative) if v is not None}
     names: set[str] = set()
     by_reference: dict[int, Any] = {}
     for v in model.modelVariables:
         if v.name in names:
-            raise FmuFileError(
-                f"{str(path)!r} has two variables {v.name!r}; expected different names. Export it again.",
-                fault=FmuFault.DUPLICATE_NAME,
-                subject=v.name,
+            if v.causality != "local" or v.name in states:
+                raise FmuFileError(
+                    f"{str(path)!r} has two variables {v.name!r}; expected different names. Export it again.",
+                    fault=FmuFault.DUPLICATE_NAME,
+                    subject=v.name,
+                )
+            complaints.append(
+                f"Two variables have the name {v.name!r} (the second in line {v.sourceline}); the first is read by it."
             )
         names.add(v.name)
         if not 0 <= v.valueReference < 2**32:
@@ -89,6 +96,7 @@ def check_variables(path: Path, root: Any, model: Any, limits: ArchiveLimits) ->
                 "reference of its own. Export it again."
             )
             raise refuse(FmuFault.DUPLICATE_REFERENCE, v.name, text)
+    return complaints
 
 
 _TYPES2 = ("Real", "Integer", "Boolean", "String", "Enumeration")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 import posixpath
+import re
 import signal
 import subprocess
 import sys
@@ -97,7 +98,7 @@ def validate(file: Path, *, run: bool = True, limits: ArchiveLimits | None = Non
     if not (fmi in ("1.0", "2.0") or fmi.startswith("3.")):
         problem = FmuProblem(f"fmiVersion is {fmi!r}; expected 1.0, 2.0 or 3.0.", again)
         return ValidationReport((problem,), (), ("everything else: the version isn't known",))
-    problems = [*_archive(archive), *_description(archive, again)]
+    problems = [*_archive(archive), *_description(archive, root, again)]
     done = [f"description against FMI {fmi}'s schema and rules"]
     left: list[str] = []
     if fmi != "1.0":
@@ -140,12 +141,41 @@ def _archive(archive: FmuArchive) -> Iterator[FmuProblem]:
             yield FmuProblem(found, "Copy or export it again.", FmuFault.DAMAGED, name)
 
 
-def _description(archive: FmuArchive, again: str) -> Iterator[FmuProblem]:
-    """Yield the faults that FMPy finds: schema, names, start values, units, model structure."""
-    from fmpy.validation import validate_fmu
+def _description(archive: FmuArchive, root: Any, again: str) -> Iterator[FmuProblem]:
+    """Yield the faults that FMPy finds (schema, start values, units, model structure), and illegal names."""
+    import fmpy
+    from fmpy.model_description import ValidationError
 
-    for found in validate_fmu(archive.for_fmpy()):
+    problems = list(_names(root))
+    try:
+        fmpy.read_model_description(archive.for_fmpy(), validate=True, validate_model_structure=True)
+    except ValidationError as error:
+        problems += error.problems
+    except Exception as error:  # FMPy raises bare exceptions
+        problems.append(str(error))
+    for found in problems:
         yield FmuProblem(_end_sentence(found), _next_step(found, again))
+
+
+_IDENTIFIER = r"(?:[_a-zA-Z]\w*|'(?:[\w!#$%&()*+,\-./:;<>=?@\[\]^{}| ~]|\\['\"?\\abfnrtv])+')(?:\[\d+(?:,\d+)*\])?"
+_STRUCTURED = re.compile(
+    rf"{_IDENTIFIER}(?:\.{_IDENTIFIER})*|der\({_IDENTIFIER}(?:\.{_IDENTIFIER})*(?:,\d+)?\)", re.ASCII
+)
+"""Names by the convention "structured" (FMI 2.0, 2.2.9; FMI 3.0, 2.4.7.5.1); its grammar is regular."""
+
+
+def _names(root: Any) -> Iterator[str]:
+    """Yield variables' names that break the naming convention, which is "flat" if none is said."""
+    structured = root.get("variableNamingConvention") == "structured"
+    for variable in root.iterfind("ModelVariables/*"):
+        name = variable.get("name", "")
+        if structured and _STRUCTURED.fullmatch(name) is None:
+            yield (
+                f'The variable "{name}" (line {variable.sourceline}) breaks the naming convention "structured"; '
+                "expected a name such as a.b[1] or der(a.b)"
+            )
+        elif re.search(r"[\r\n\t]", name):
+            yield f"The variable {name!r} (line {variable.sourceline}) has a line break or a tab in its name."
 
 
 def _next_step(found: str, again: str) -> str:

@@ -256,6 +256,12 @@ DESCRIPTIONS = {
         described((r'name="velocity" valueReference="\d+"', 'name="position" valueReference="77"')),
         FmuFault.DUPLICATE_NAME,
     ),
+    "a name twice among locals": Case(
+        described(
+            (r"</ModelVariables>", r'<Float64 name="v" valueReference="77"/><Float64 name="v" valueReference="78"/>\g<0>')
+        ),
+        None,
+    ),
     "a reference of another type": Case(
         described(
             (r"</ModelVariables>", r'<Int32 name="n" valueReference="0" causality="local" variability="discrete"/>\g<0>')
