@@ -2,6 +2,7 @@ from .archive import ArchiveLimits, FmuDescription, FmuFault, FmuFinding, FmuSev
 from .calls import FmuInstance, FmuState, StepOptions, StepTime
 from .checks import FmuDiagnosis, FmuTrial, FmuVerdict, doctor
 from .export import ModelSpec, Variable, build, build_fmu, build_python, clear_cache, model_spec
+from .isolation import Isolation
 from .models import (
     bouncing_ball,
     dc_motor,
@@ -28,6 +29,7 @@ __all__ = [
     "FmuTrial",
     "FmuVariable",
     "FmuVerdict",
+    "Isolation",
     "ModelSpec",
     "StepOptions",
     "StepTime",

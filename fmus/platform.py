@@ -6,6 +6,7 @@ import os
 import platform
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 import platformdirs
@@ -25,6 +26,26 @@ def cache_folder() -> Path:
     """Return the folder of files that can be built again: LOOPWRIGHT_CACHE, else the user's cache folder."""
     given = os.environ.get("LOOPWRIGHT_CACHE")
     return Path(given).expanduser() if given else Path(platformdirs.user_cache_dir("loopwright", appauthor=False))
+
+
+def record_build(digest: str) -> None:
+    """Note in the cache that Loopwright has built a file with this SHA-256 digest, for `is_built_here`."""
+    folder = cache_folder() / "built"
+    with suppress(OSError):  # a cache that can't be written: the FMU counts as foreign
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        (folder / digest).touch(mode=0o600)
+
+
+def is_built_here(digest: str) -> bool:
+    """Return whether Loopwright has built a file with this digest, by a note that only this user can have written."""
+    folder = cache_folder() / "built"
+    try:
+        stats = [(folder / digest).stat(), folder.stat(), folder.parent.stat()]
+    except OSError:
+        return False
+    if os.name != "posix":
+        return True
+    return all(s.st_uid == os.getuid() and not s.st_mode & 0o022 for s in stats)
 
 
 def check_cache() -> Path:

@@ -203,7 +203,7 @@ PUBLIC = {
         Compare CompilerError ConfirmationError Constant Counter CubicSpline DeadZone DefinitionError Delay
         DiscreteIntegrator DiscreteStateSpace DiscreteTransferFunction DiscreteZeroPoleGain DoubleDriveError
         DuplicateNameError EdgeDetector Ellipse Encoder ErrorDynamics Event FIR FeedbackLinearization
-        FilteredDerivative FmuError FmuFileError FmuRuntimeError ForceProjection ForceSensor Frame Function Gain
+        FilteredDerivative FmuEnd FmuError FmuFileError FmuProcessError FmuRuntimeError ForceProjection ForceSensor Frame Function Gain
         GuardError HandForce HandProfile Hold IIR Input Integrator Latch LimitedIntegrator Line Lookup1D
         Lookup2D LoopwrightError Maximum Minimum MovingAverage NonFiniteError Not OptionError Or Output PID
         PadeDelay ParameterError Path PathDomainError PathProjection PathSpring PathTracking PeriodicLoopError PiecewiseLinear
@@ -215,7 +215,7 @@ PUBLIC = {
     """,
     "fmus": """
         ArchiveLimits Fmu FmuDescription FmuDiagnosis FmuFault FmuFinding FmuInstance FmuLinearization FmuSeverity FmuState
-        FmuTrial FmuVariable FmuVerdict ModelSpec StepOptions StepTime Variable bouncing_ball
+        FmuTrial FmuVariable FmuVerdict Isolation ModelSpec StepOptions StepTime Variable bouncing_ball
         build build_fmu build_python clear_cache dc_motor doctor gantry gantry_contact gantry_elastic gantry_stiction
         mass_spring_damper model_spec read_description scara
     """,

@@ -21,6 +21,7 @@
     │   ├── GuardError
     │   │   └── PathDomainError           a position outside the domain of a path's coordinates
     │   └── FmuRuntimeError               an FMU's function returned an error
+    │       └── FmuProcessError           the process of an isolated FMU ended, or had to be ended
     ├── FmuError (RuntimeError)           an FMU that can't be read, built or loaded
     │   ├── FmuFileError
     │   └── CompilerError
@@ -34,6 +35,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from enum import Enum
 from typing import Any, Self
 
 
@@ -212,6 +214,41 @@ class PathDomainError(GuardError):
 
 class FmuRuntimeError(SimulationError):
     """A function of an FMU returned an error; its own log lines are in the message."""
+
+
+class FmuEnd(Enum):
+    """Reason for which the process of an isolated FMU has ended."""
+
+    CRASH = "crash"
+    """A signal, such as that of a segmentation fault."""
+    EXIT = "exit"
+    """The FMU has ended its process itself."""
+    TIMEOUT = "timeout"
+    """A call took longer than it may."""
+    MEMORY = "memory"
+    """The process took more memory than it may."""
+    OUTPUT = "output"
+    """The FMU wrote more output than it may."""
+    LOST = "lost"
+    """The process does not answer, as the FMU has closed its pipes, say, or was ended before."""
+
+
+class FmuProcessError(FmuRuntimeError):
+    """The process of an isolated FMU has ended in a call, or was ended; this process and other FMUs go on.
+
+    Attributes
+    ----------
+    cause : FmuEnd
+        Reason.
+    call : str
+        Function of the FMU, such as ``"fmi3DoStep"``, or a step of its loading.
+    printed : str
+        Last lines of its standard output.
+    """
+
+    def __init__(self, message: str, *, cause: FmuEnd, call: str, printed: str = "", **where: Any):
+        super().__init__(message, **where)
+        self.cause, self.call, self.printed = cause, call, printed
 
 
 class FmuError(LoopwrightError, RuntimeError):

@@ -1,20 +1,21 @@
 """FMI calls into a library that is loaded in this process."""
 
+from .bound_calls import BoundCalls, Call
 from .exchange_instance import ExchangeInstance, is_smooth
-from .fmi2 import Fmi2Calls
-from .fmi3 import Fmi3Calls
-from .fmi_calls import BoundCalls, Call, FmiCalls, Log
+from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
-from .instance import FmuInstance, FmuState
-from .loaded_library import LoadedFmu, MakeCalls
+from .instance import FmuInstance
+from .loaded_library import CALLS, LoadedFmu, MakeCalls
+from .saved_state import FmuState
 from .step_options import StepOptions, StepTime, check_offered
 
 __all__ = [
+    "CALLS",
+    "ERROR",
+    "WARNING",
     "BoundCalls",
     "Call",
     "ExchangeInstance",
-    "Fmi2Calls",
-    "Fmi3Calls",
     "FmiCalls",
     "FmuBlock",
     "FmuInstance",

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from .fmi_calls import WARNING, BoundCalls, FmiCalls
+from .bound_calls import BoundCalls
+from .fmi_calls import WARNING, FmiCalls
 from .transfer import Transfer
 
 

@@ -11,6 +11,8 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
+from ...blocks.core import FmuProcessError
+from .bound_calls import BoundCalls, Call
 from .missing_functions import allow_missing
 from .status import DISCARD, ERROR, FATAL, PENDING, STATUS, WARNING
 
@@ -21,8 +23,6 @@ MOST_ROUNDS = 100
 """Rounds of an event iteration before an error."""
 Log = Callable[[int, str], None]
 """Takes the status and the text of a message."""
-Call = tuple[Callable[..., int], tuple[Any, ...]]
-"""A C function, and its arguments."""
 C = TypeVar("C")
 
 
@@ -61,41 +61,6 @@ class EventUpdate(NamedTuple):
     """Time of the next time event in s, infinite without one."""
 
 
-class BoundCalls:
-    """C functions with their arguments, bound once and called one after the other.
-
-    Parameters
-    ----------
-    calls : sequence of (function, arguments)
-        Functions of the library, with arguments that are C values; their memory is that of `FmiCalls.allocate` and
-        `FmiCalls.variable`, or doesn't change.
-    """
-
-    failed = 0
-    """Place of the call that has failed last."""
-
-    def __init__(self, calls: Sequence[Call]):
-        self._calls = tuple(calls)
-
-    def run(self) -> int:
-        """Call the functions up to the first that fails; return its status, else 1 after a warning, else 0."""
-        worst = 0
-        for place, (function, arguments) in enumerate(self._calls):
-            status = function(*arguments)
-            if not 0 <= status <= WARNING:
-                self.failed = place
-                return status
-            worst |= status
-        return worst
-
-    def start(self) -> None:
-        """Begin to run, if that can go on by itself; `finish` ends it."""
-
-    def finish(self) -> int:
-        """Return the status of what `start` has begun."""
-        return self.run()
-
-
 class FmiCalls(ABC):
     """Functions of an FMU's library for one instance.
 
@@ -123,6 +88,8 @@ class FmiCalls(ABC):
 
     # ---- memory and calls that are bound once ----
 
+    lose: Callable[[FmuProcessError], FmuProcessError] = staticmethod(lambda error: error)
+    """Completes the error of a process that has ended, for bound calls."""
     in_process: ClassVar[bool] = True
     """Whether the library reads and writes this process's memory; else `allocate` and `variable` alone."""
 
@@ -239,9 +206,12 @@ class FmiCalls(ABC):
         """Return the arguments of a `value_function`: a C array of references, and the address of the values."""
 
     def _function(self, name: str) -> Callable[..., int]:
-        """Return a C function without declared arguments, which takes those that are made for it."""
+        """Return a C function without declared arguments, which takes those that are made for it.
+
+        Its status is unsigned, so that a negative one, which the standard doesn't have, is no success.
+        """
         function = self.fmu.dll[name]
-        function.restype = ctypes.c_int
+        function.restype = ctypes.c_uint
         return function  # type: ignore[no-any-return]
 
     # ---- steps ----
@@ -384,4 +354,6 @@ class FmiCalls(ABC):
 
     def status_name(self, code: int) -> str:
         """Return the name of a status (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3), such as ``fmi3Discard``."""
-        return f"{self.prefix}{STATUS[code].capitalize()}" if 0 <= code < len(STATUS) else f"status {code}"
+        known = STATUS if self.prefix == "fmi2" else STATUS[:PENDING]
+        code = ctypes.c_int(code).value
+        return f"{self.prefix}{known[code].capitalize()}" if 0 <= code < len(known) else f"status {code}"

@@ -21,6 +21,10 @@ class FmuBlock(Protocol):
         """The FMU's description, read and checked."""
 
     @property
+    def isolate(self) -> object:
+        """Whether it is loaded in a process of its own, or the limits of that process; None to decide by its origin."""
+
+    @property
     def start(self) -> Mapping[str, Any]:
         """Start values by the FMU's names."""
 

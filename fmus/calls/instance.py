@@ -3,57 +3,29 @@
 from __future__ import annotations
 
 import ctypes
-import struct
-import weakref
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuError
+from ...blocks.core import FmuError, FmuProcessError
 from ..archive import FmuVariable
-from ..platform import native_platform
 from .fmi_calls import StepCall
 from .fmu_block import FmuBlock
 from .loaded_library import MakeCalls
+from .saved_state import FmuState, pack_state, unpack_state
+from .shared_steps import SharedSteps
 from .step_failures import NEAR, StepFailures
 from .stepping import CarefulSteps, needs_care
 from .texts import Text, TextRecord
 from .transfer import Transfer, UnfitError
 
-_HEADER = struct.Struct("<8s32s24sd?")  # of a serialized state: magic, FMU's digest, platform, time, running
-_MAGIC = b"lw-fmu-1"
 _Bound = tuple[Callable[[float, float], None], Callable[[], None], Callable[[float], None]]
 
 
 def _succeed() -> int:
     return 0
-
-
-class FmuState:
-    """Saved state of an `FmuInstance`: all of its memory at one time, and that time.
-
-    It belongs to the instance that made it, and is freed with it, or when nothing refers to it any more.
-    """
-
-    def __init__(self, instance: FmuInstance, handle: Any, t: float, running: bool):
-        self.instance, self.t, self.running = instance, t, running
-        self._handle = handle
-        self._free = weakref.finalize(self, instance._release, handle)
-        self._free.atexit = False  # the end of the process frees the memory anyway
-
-    @property
-    def is_free(self) -> bool:
-        """Whether the state has been freed, so that it can't be restored any more."""
-        return not self._free.alive
-
-    def free(self) -> None:
-        """Free the state's memory in the FMU."""
-        self._free()
-
-    def __repr__(self) -> str:
-        return f"FmuState({self.instance.block.label}, t={self.t:.9g}{', freed' if self.is_free else ''})"
 
 
 class FmuInstance(StepFailures):
@@ -64,6 +36,11 @@ class FmuInstance(StepFailures):
 
     step: Callable[[float, float], None]
     """Set the inputs, take a step from a time over a length, both in s, and get the outputs (after `bind`)."""
+    is_stepping = False
+    start_step: Callable[[float, float], None]
+    """Begin a step, as `step`; one in another process goes on by itself until `finish_step` (after `bind`)."""
+    finish_step: Callable[[], None]
+    """End the step that `start_step` has begun, and get the outputs."""
     exchange: Callable[[], None]
     """In Initialization Mode: set the inputs and get the outputs (after `bind`)."""
 
@@ -76,6 +53,8 @@ class FmuInstance(StepFailures):
         self._now, self._width = self.fmi.variable(ctypes.c_double), self.fmi.variable(ctypes.c_double)
         self._final = self.fmi.final  # noSetFMUStatePriorToCurrentPoint, until a state has been saved
         self._vector = np.zeros(0)
+        self._asked = (0.0, 0.0)
+        self.start_step, self.finish_step = self._ask, self._take
         self._handles: dict[int, Any] = {}
         self._read: Callable[[float], None] = lambda t: None
         self._texts = TextRecord(self.fmi, block.text_variables)
@@ -105,14 +84,27 @@ class FmuInstance(StepFailures):
         ins, outs = Transfer(self.fmi, "Set", self._inputs, inputs), Transfer(self.fmi, "Get", self._outputs, outputs)
         call = self.fmi.step_call(self._now, self._width, self._final)
         plain = ins.is_plain and outs.is_plain
-        self.step, self.exchange, self._read = (self._bind_plain if plain else self._bind_typed)(ins, outs, call)
+        if self.fmi.in_process:
+            self.step, self.exchange, self._read = (self._bind_plain if plain else self._bind_typed)(ins, outs, call)
+        else:
+            shared = SharedSteps(self, ins, outs, call)
+            self.step, self.exchange, self._read = shared.step, shared.exchange, shared.read
+            self.start_step, self.finish_step = shared.start, shared.finish
         self._call = call
         if needs_care(self.description, self.block.stepping):
             self._careful = CarefulSteps(self, self._inputs, inputs, outs, call)
-            self.step = self._careful.step
+            self.step = partial(self._step_marked, self._careful.step)
         if self._texts.variables:
             self.step = partial(self._step_and_note, self.step)
+        if isinstance(self.step, partial):
+            self.start_step, self.finish_step = self._ask, self._take
         self._read(self._began)
+
+    def _ask(self, t: float, h: float) -> None:
+        self._asked = t, h
+
+    def _take(self) -> None:
+        self.step(*self._asked)
 
     def _begin_texts(self) -> None:
         """Let the record of texts begin anew, at the present time."""
@@ -122,6 +114,11 @@ class FmuInstance(StepFailures):
     def _step_and_note(self, step: Callable[[float, float], None], t: float, h: float) -> None:
         step(t, h)
         self.call("reading its texts", self._texts.note, t + h)
+
+    def _step_marked(self, step: Callable[[float, float], None], t: float, h: float) -> None:
+        self.is_stepping = True
+        step(t, h)
+        self.is_stepping = False
 
     @property
     def texts(self) -> Mapping[str, list[tuple[float, Text]]]:
@@ -191,6 +188,12 @@ class FmuInstance(StepFailures):
             read(self._began)
 
         return step, exchange, read
+
+    def lose(self, error: FmuProcessError) -> FmuProcessError:
+        """Note that the process of the FMU has ended, in a step at its start."""
+        if self.is_stepping:
+            self._width.value = 0.0
+        return super().lose(error)
 
     def operating_point(self) -> dict[str, Any]:
         """Return the present ``t``, ``state`` and ``inputs``, for `Fmu.linear_model` and `Fmu.step_difference`."""
@@ -269,7 +272,7 @@ class FmuInstance(StepFailures):
             state = self.save()
         self._check_state(state)
         data = self.call("serializing its state", self.fmi.serialize_state, state._handle)
-        return _HEADER.pack(_MAGIC, *self._identity(), state.t, state.running) + bytes(data)
+        return pack_state(self.description.digest, state.t, state.running, bytes(data))
 
     def deserialize(self, data: bytes) -> FmuState:
         """Return a state of this instance, made from bytes; `restore` it after `begin`.
@@ -282,33 +285,16 @@ class FmuInstance(StepFailures):
             If the FMU's function fails.
         """
         self._check_can(self.description.state_flags[1], "made from bytes", self.can_serialize)
-        head, rest = data[: _HEADER.size], data[_HEADER.size :]
-        if len(head) < _HEADER.size or not head.startswith(_MAGIC):
-            raise FmuError(
-                f"found {len(data)} bytes that are no state of an FMU; expected those of serialize(). Give these.",
-                block=self.block.label,
-            )
-        _, digest, platform, t, running = _HEADER.unpack(head)
-        if (digest, platform) != self._identity():
-            here = bytes.fromhex(self.description.digest)
-            found, expected = (d.hex()[:12] for d in (digest, here))
-            raise FmuError(
-                f"found the state of another FMU: SHA-256 {found}… on "
-                f"{platform.rstrip(bytes(1)).decode()}, expected {expected}… on {native_platform()}. Run the FMU that "
-                "was saved.",
-                block=self.block.label,
-            )
+        t, running, rest = unpack_state(data, self.description.digest, self.block.label)
         return self._keep(self.call("reading a serialized state", self.fmi.deserialize_state, rest), t, running)
-
-    def _identity(self) -> tuple[bytes, bytes]:
-        return bytes.fromhex(self.description.digest), native_platform().encode().ljust(24, b"\0")
 
     def _keep(self, handle: Any, t: float, running: bool) -> FmuState:
         self._final.value = False  # the FMU may be set back from now on
         self._handles[id(handle)] = handle
         return FmuState(self, handle, t, running)
 
-    def _release(self, handle: Any) -> None:
+    def release(self, handle: Any) -> None:
+        """Free the saved state of a handle, once."""
         if self._handles.pop(id(handle), None) is not None:
             self.free_state(handle)
 
@@ -340,5 +326,5 @@ class FmuInstance(StepFailures):
         """Free the saved states, then terminate and free the instance."""
         if self._open:
             for handle in list(self._handles.values()):
-                self._release(handle)
+                self.release(handle)
         super().close()

@@ -12,16 +12,17 @@ from weakref import WeakSet
 
 import numpy as np
 
-from ...blocks.core import FmuError, FmuFileError, FmuRuntimeError, UnknownNameError, near
+from ...blocks.core import FmuError, FmuFileError, FmuProcessError, FmuRuntimeError, UnknownNameError, near
 from ..archive import FmuVariable, inexact, unpack
 from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
 from .fmi_calls import FATAL, STATUS, FmiCalls
 from .fmu_block import FmuBlock
+from .process_ends import describe_end
 from .step_options import allows_early_return, uses_event_mode
 from .texts import is_readable, read_text, write_text
 
-_CALLS: dict[str, type[FmiCalls]] = {"2": Fmi2Calls, "3": Fmi3Calls}
+CALLS: dict[str, type[FmiCalls]] = {"2": Fmi2Calls, "3": Fmi3Calls}
 """Functions by the major version of FMI."""
 MakeCalls = Callable[..., FmiCalls]
 R = TypeVar("R")
@@ -45,7 +46,7 @@ class LoadedFmu:
         description, folder = self.description, Path.cwd()
         if make_calls is None:
             self._refuse_second()
-        make = make_calls or _CALLS[description.fmi[0]]
+        make = make_calls or CALLS[description.fmi[0]]
         try:
             files = unpack(description)
         except FmuError as error:
@@ -59,13 +60,18 @@ class LoadedFmu:
                 library=files / (description.model_exchange_binary if model_exchange else description.binary),
                 model_exchange=model_exchange,
             )
-            self._fmu = self.fmi.fmu
+            self._fmu, self.fmi.lose = self.fmi.fmu, self.lose
             self._check_version()
             self._choose_modes()
             self.fmi.instantiate(self._log)
-        except FmuFileError:
+        except FmuProcessError as error:
+            raise self.lose(error) from None
+        except FmuError as error:
+            self._end_calls()
+            error.at(block=block.label)
             raise
         except Exception as error:
+            self._end_calls()
             raise FmuFileError(
                 f"the FMU {str(description.file)!r} can't be loaded: {error}{self._quote_messages()} Check it with "
                 f"'fmpy validate {description.file}'.",
@@ -83,6 +89,19 @@ class LoadedFmu:
             options = self.block.stepping
             self.fmi.event_mode_used = uses_event_mode(self.description, options)
             self.fmi.early_return_allowed = allows_early_return(self.description, options)
+
+    def _end_calls(self) -> None:
+        """Give up the calls after an error in the course of loading."""
+        if (calls := getattr(self, "fmi", None)) is not None:
+            calls.end()
+
+    def lose(self, error: FmuProcessError) -> FmuProcessError:
+        """Note that the process of the FMU has ended, and return the error with place, time and messages."""
+        if not self.fatal:
+            self.failed = self.fatal = True
+            self._end_calls()
+            error.add(describe_end(error, self._quote_messages()))
+        return error.at(block=self.block.label, t=self.t)
 
     def _refuse_second(self) -> None:
         """Refuse a second instance in this process where the FMU can have one only."""
@@ -208,6 +227,8 @@ class LoadedFmu:
         return lost
 
     def _initialization_error(self, error: Exception) -> FmuRuntimeError:
+        if isinstance(error, FmuProcessError):
+            return self.lose(error)
         self._note(error)
         return FmuRuntimeError(
             f"initialization failed ({error}){self._quote_messages()} Check its start values.",
@@ -246,6 +267,8 @@ class LoadedFmu:
         """
         try:
             return function(*arguments)
+        except FmuProcessError as error:
+            raise self.lose(error) from None
         except Exception as error:
             self._note(error)
             raise FmuRuntimeError(

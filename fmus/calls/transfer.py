@@ -10,6 +10,7 @@ import numpy as np
 
 from ...blocks.core import Layout
 from ..archive import FmuVariable, inexact
+from .bound_calls import Call
 from .fmi_calls import FmiCalls
 
 
@@ -44,6 +45,33 @@ class Transfer:
         """The one call of a plain transfer; None without ports."""
         return (self.groups[0].function, self.groups[0].arguments) if self.groups else None
 
+    @property
+    def calls(self) -> list[Call]:
+        """The calls, one for each type."""
+        return [(group.function, group.arguments) for group in self.groups]
+
+    def fill(self) -> None:
+        """Copy the values of the vector to where the calls read them.
+
+        Raises
+        ------
+        UnfitError
+            If a value is none of its port's type.
+        """
+        for group in self.groups:
+            group.check_and_fill(self.vector)
+
+    def spread(self) -> None:
+        """Copy the values that the calls have read into the vector.
+
+        Raises
+        ------
+        UnfitError
+            If a value is an integer that the vector can't hold.
+        """
+        for group in self.groups:
+            group.spread(self.vector)
+
     def set(self) -> int:
         """Set the values of the vector, and return the first status that is no success.
 
@@ -52,8 +80,7 @@ class Transfer:
         UnfitError
             If a value is none of its port's type; nothing of this type has been set then.
         """
-        for group in self.groups:
-            group.check_and_fill(self.vector)
+        self.fill()
         for group in self.groups:
             if (status := group.function(*group.arguments)) > 1:
                 return status
@@ -97,21 +124,24 @@ class TypeGroup:
         self.ports, self.places = ports, places
         references = [r for v in ports.values() for r in v.references]
         self.size = sum(v.size for v in ports.values())
-        self.direct = type_ == "Float64" and self.size == vector.size
+        self.is_whole = type_ == "Float64" and self.size == vector.size
+        self.direct = self.is_whole and fmi.in_process
         self.is_integer = any(v.is_integer for v in ports.values())
         self.index = np.concatenate([np.arange(s.start, s.stop) for s in places.values()])
         kept = (ctypes.c_uint * max(1, len(references)))(*references)
         if self.direct:
             self.buffer: np.ndarray = vector
         else:
-            self.buffer = np.zeros(max(1, self.size), dtype=fmi.types[type_].ctype)
+            self.buffer = fmi.allocate(self.size, fmi.types[type_].ctype)
         self._kept = kept  # as long as its address is in the arguments
         self.function = fmi.value_function(verb, type_)
         self.arguments = fmi.value_arguments(kept, len(references), self.buffer.ctypes.data, self.size)
 
     def check_and_fill(self, vector: np.ndarray) -> None:
         """Copy the values of the vector into the buffer."""
-        if self.direct:
+        if self.is_whole:
+            if not self.direct:
+                self.buffer[:] = vector
             return
         for port, where in self.places.items():
             if reason := self.ports[port].complaint(vector[where]):
@@ -120,7 +150,9 @@ class TypeGroup:
 
     def spread(self, vector: np.ndarray) -> None:
         """Copy the values of the buffer into the vector."""
-        if self.direct:
+        if self.is_whole:
+            if not self.direct:
+                vector[:] = self.buffer
             return
         if self.is_integer and self.buffer.itemsize == 8 and inexact(self.buffer):
             port, value = next(

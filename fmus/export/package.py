@@ -24,7 +24,7 @@ import casadi as ca
 import numpy as np
 
 from ...blocks.core import FmuError
-from ..platform import cache_folder, native_platform
+from ..platform import cache_folder, native_platform, record_build
 from .c_code import generate, runtime
 from .compiler import SUFFIXES, TARGETS, Compiler, check_platform, compile_shared, find_compiler, flags
 from .html_page import index_html
@@ -228,11 +228,13 @@ def build_fmu(
     cached = cache_folder() / "fmus" / build_key(spec, options, compiler)[:32] / f"{spec.name}.fmu"
     if not cached.is_file():
         write_atomically(cached, _archive(spec, options, compiler, notify or (lambda message: None)))
+    data = cached.read_bytes()
+    record_build(hashlib.sha256(data).hexdigest())
     if out is None:
         return cached
     out = Path(out)
     target = out / cached.name if out.is_dir() else out
-    write_atomically(target, cached.read_bytes())
+    write_atomically(target, data)
     return target
 
 

@@ -27,6 +27,7 @@ import numpy as np
 
 from ...blocks.core import Block, DefinitionError, FmuError, Port
 from ...blocks.tracing import bundle, traced_parameters
+from ..platform import record_build
 from .html_page import block_text
 from .model import check_file_name
 from .package import _zip, write_atomically
@@ -130,6 +131,7 @@ def build_python(
     target = Path.cwd() if out is None else Path(out)
     target = target / f"{name}.fmu" if target.is_dir() else target
     write_atomically(target, data)
+    record_build(hashlib.sha256(data).hexdigest())
     return target
 
 

@@ -1,7 +1,14 @@
 """FMUs in processes of their own: the face of `fmus/calls`, with the library in a child."""
 
-from .opening import open_fmu
+from .limits import Isolation, check_isolation
+from .opening import find_limits, open_fmu
+from .pool import count_processes, end_idle
 
 __all__ = [
+    "Isolation",
+    "check_isolation",
+    "count_processes",
+    "end_idle",
+    "find_limits",
     "open_fmu",
 ]

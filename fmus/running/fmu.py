@@ -25,7 +25,7 @@ from ...blocks.core import (
 )
 from ..archive import FmuDescription, FmuVariable, OtherVariable, read_description
 from ..calls import FmuInstance, StepOptions, check_offered
-from ..isolation import open_fmu
+from ..isolation import Isolation, check_isolation, open_fmu
 from .exchange import ExchangeMembers, choose_interface
 from .linearization import STEP, FmuLinearization, linear_model, step_difference
 from .ports import FmuPorts, choose_ports
@@ -47,9 +47,8 @@ class Fmu(ExchangeMembers):
     A wire carries numbers: integers and enumerations as such, a Boolean as 0 or 1. An input of one of these types
     refuses other numbers in a run. Texts, binaries and clocks are no ports (`left_out`); ``start`` takes texts.
 
-    The file is checked when the block is made, and loaded only for the duration of a run. The SHA-256 digest of its
-    content belongs to the block: two blocks are equal only if the contents were equal, and a file that has changed
-    since is an error.
+    The file is checked when the block is made, and loaded only for a run. The SHA-256 digest of its content belongs to
+    the block: blocks are equal only if the contents were equal, and a file that has changed since is an error.
     """
 
     opaque = True
@@ -58,21 +57,22 @@ class Fmu(ExchangeMembers):
         default={}, description="start values of parameters, states and inputs, by the FMU's names"
     )
     rename: Mapping[str, str] = parameter(default={}, description="FMU's name → name of the port")
+    isolate: bool | Isolation | None = parameter(
+        default=None, description="a process of its own: True, its limits, False; None for all but own builds"
+    )
     ports: Sequence[str] | None = parameter(
         default=None,
         description="FMU's names of the variables that are ports: inputs, outputs, local variables, tunable "
         "parameters as inputs; None for all inputs and outputs",
     )
     convert_units: bool = parameter(
-        default=False,
-        description="convert wires to and from other units of a port's dimension, which else are refused",
+        default=False, description="convert wires to and from other units of a port's dimension, else refused"
     )
     stepping: StepOptions = parameter(
         default=StepOptions(), description="options of its co-simulation: Event Mode, retries, tolerance and more"
     )
     interface: str | None = parameter(
-        default=None,
-        description="'co_simulation' or 'model_exchange'; None for co-simulation where the FMU offers it",
+        default=None, description="'co_simulation' or 'model_exchange'; None for co-simulation where it is offered"
     )
 
     def check(self) -> None:
@@ -86,6 +86,7 @@ class Fmu(ExchangeMembers):
             raise ParameterError(
                 f"found {self.ports!r}; expected a list of names of variables.", block=who, port="ports"
             )
+        check_isolation(self.isolate, who)
         for old, new in self.rename.items():
             if not isinstance(old, str) or not isinstance(new, str):
                 raise ParameterError(f"found {old!r}: {new!r}; expected two names.", block=who, port="rename")

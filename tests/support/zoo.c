@@ -33,6 +33,7 @@ typedef void (*logger)(void *, int, const char *, const char *);
 typedef struct { double u, y, p, t; bool running; logger log; void *environment; } instance;
 static volatile char setting[128] = "@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@";
 static instance *last;
+static void *volatile sink; /* else the compiler leaves allocations out */
 
 static void nap(double s) { struct timespec w = {(time_t)s, (long)(fmod(s, 1.0) * 1e9)}; nanosleep(&w, NULL); }
 static int deeper(volatile char *above) { volatile char frame[4096]; frame[0] = above[0]; return deeper(frame) + frame[0]; }
@@ -68,8 +69,9 @@ static int act(const char *here, instance *c, double t) {
     if (IS("spin")) for (volatile int i = 0;; i++) {}
     if (IS("deaf_hang")) { signal(SIGTERM, SIG_IGN); signal(SIGINT, SIG_IGN); for (;;) pause(); }
     if (IS("slow")) nap(0.02);
-    if (IS("memory")) for (;;) memset(malloc(1 << 24), 1, 1 << 24);
-    if (IS("leak")) memset(malloc(1 << 20), 1, 1 << 20);
+    if (IS("log_hang")) { log_a_little(c); for (;;) pause(); }
+    if (IS("memory")) for (;;) sink = memset(malloc(1 << 24), 1, 1 << 24);
+    if (IS("leak")) sink = memset(malloc(1 << 20), 1, 1 << 20);
     if (IS("handles")) open("/dev/null", O_RDONLY);
     if (IS("fork") && !fork()) { for (;;) pause(); }
     if (IS("fork_on")) fork();

@@ -38,7 +38,7 @@ class Loop:
     def __init__(self, name, file, **start):
         self.T = 2e-2 if name == "bouncing_ball" else T
         start = {"position": (0.8, 0.6399), "velocity": (0.2, 0.05)} | start if name == "gantry_contact" else start
-        self.plant = Fmu(file, name="plant", start=start)
+        self.plant = Fmu(file, name="plant", start=start, isolate=False)
 
     def open(self, stop_time=None, start_time=0.0):
         return Opened(self, stop_time, start_time)

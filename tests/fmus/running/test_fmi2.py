@@ -308,7 +308,7 @@ def test_a_wrong_guid_is_quoted(msd, tmp_path):
 
 def test_an_fmu_of_which_a_process_can_have_one_instance_is_refused_a_second(msd, tmp_path):
     flag = 'canBeInstantiatedOnlyOncePerProcess="true" canGetAndSetFMUstate'
-    one = Fmu(edited(msd, tmp_path, lambda text: text.replace("canGetAndSetFMUstate", flag)), name="one")
+    one = Fmu(edited(msd, tmp_path, lambda text: text.replace("canGetAndSetFMUstate", flag)), name="one", isolate=False)
     with one.instantiate([], None):
         with pytest.raises(FmuError, match=r"^two: its FMU .*canBeInstantiatedOnlyOncePerProcess\), and one is one"):
             one.replace(name="two").instantiate([], None).__enter__()

@@ -1,0 +1,84 @@
+"""A saved state of an instance."""
+
+from __future__ import annotations
+
+import struct
+import weakref
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from ...blocks.core import FmuError
+from ..platform import native_platform
+
+_HEADER = struct.Struct("<8s32s24sd?")  # of a serialized state: magic, FMU's digest, platform, time, running
+_MAGIC = b"lw-fmu-1"
+
+
+class Saver(Protocol):
+    """Instance that a saved state belongs to."""
+
+    @property
+    def block(self) -> Any:
+        """The block."""
+
+    @property
+    def release(self) -> Callable[[Any], None]:
+        """Frees the state of a handle."""
+
+
+class FmuState:
+    """Saved state of an `FmuInstance`: all of its memory at one time, and that time.
+
+    It belongs to the instance that made it, and is freed with it, or when nothing refers to it any more.
+    """
+
+    def __init__(self, instance: Saver, handle: Any, t: float, running: bool):
+        self.instance, self.t, self.running = instance, t, running
+        self._handle = handle
+        self._free = weakref.finalize(self, instance.release, handle)
+        self._free.atexit = False  # the end of the process frees the memory anyway
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the state has been freed, so that it can't be restored any more."""
+        return not self._free.alive
+
+    def free(self) -> None:
+        """Free the state's memory in the FMU."""
+        self._free()
+
+    def __repr__(self) -> str:
+        return f"FmuState({self.instance.block.label}, t={self.t:.9g}{', freed' if self.is_free else ''})"
+
+
+def pack_state(digest: str, t: float, running: bool, data: bytes) -> bytes:
+    """Return the bytes of a state of an FMU, with the FMU's digest, this platform and its time in s before them."""
+    return _HEADER.pack(_MAGIC, *_identify(digest), t, running) + data
+
+
+def unpack_state(data: bytes, digest: str, label: str) -> tuple[float, bool, bytes]:
+    """Return the time in s of a state, whether it ran, and the FMU's bytes of it.
+
+    Raises
+    ------
+    FmuError
+        If the bytes are no state of the FMU with this digest on this platform; ``label`` names its block.
+    """
+    head, rest = data[: _HEADER.size], data[_HEADER.size :]
+    if len(head) < _HEADER.size or not head.startswith(_MAGIC):
+        raise FmuError(
+            f"found {len(data)} bytes that are no state of an FMU; expected those of serialize(). Give these.",
+            block=label,
+        )
+    _, found, platform, t, running = _HEADER.unpack(head)
+    if (found, platform) != _identify(digest):
+        raise FmuError(
+            f"found the state of another FMU: SHA-256 {found.hex()[:12]}… on {platform.rstrip(bytes(1)).decode()}, "
+            f"expected {digest[:12]}… on {native_platform()}. Run the FMU that was saved.",
+            block=label,
+        )
+    return t, running, rest
+
+
+def _identify(digest: str) -> tuple[bytes, bytes]:
+    return bytes.fromhex(digest), native_platform().encode().ljust(24, b"\0")

@@ -1,0 +1,110 @@
+"""Steps of an instance whose library stands in another process: one round trip each, through shared memory."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from .bound_calls import BoundCalls
+from .fmi_calls import StepCall
+from .stepping import SteppedInstance as Judge
+from .transfer import Transfer, UnfitError
+
+_NEAR = 1e-6  # distance from the end of a step, in steps, within which a time is that end
+
+
+class SteppedInstance(Judge, Protocol):
+    """Instance that takes the steps, and words their errors."""
+
+    is_stepping: bool
+    """Whether a step is under way."""
+
+    @property
+    def t(self) -> float:
+        """Time in s."""
+
+
+class SharedSteps:
+    """Setting the inputs, a step, and getting the outputs, bound as one sequence of calls.
+
+    Parameters
+    ----------
+    instance : SteppedInstance
+        The instance, which words the errors.
+    ins, outs : Transfer
+        Inputs to set and outputs to get.
+    call : StepCall
+        The step.
+    """
+
+    def __init__(self, instance: SteppedInstance, ins: Transfer, outs: Transfer, call: StepCall):
+        self.instance, self.ins, self.outs, self.call = instance, ins, outs, call
+        bind, self._t, self._h = instance.fmi.bind, 0.0, 0.0
+        self._n_in = len(ins.calls)
+        self._step = bind([*ins.calls, (call.function, call.arguments), *outs.calls])
+        self._exchange = bind([*ins.calls, *outs.calls])
+        self._read = bind(outs.calls)
+
+    def start(self, t: float, h: float) -> None:
+        """Set the inputs, and begin a step from a time over a length, both in s."""
+        instance = self.instance
+        self._fill(t)
+        instance.set_span(t, h)
+        self._t, self._h = t, h
+        instance.is_stepping = True
+        self._step.start()
+
+    def finish(self) -> None:
+        """Wait for the end of the step, and get the outputs."""
+        instance, t, h, call = self.instance, self._t, self._h, self.call
+        status = self._step.finish()
+        if status > 1:
+            place = self._step.failed
+            if place < self._n_in:
+                raise instance.report("setting the inputs", status, t)
+            if place > self._n_in:
+                raise instance.report("reading the outputs", status, t)
+            instance.end_step(status, t, h)
+            self._finish_reading(t)
+        instance.is_stepping = False
+        if call.any_flag.value or abs(call.reached.value - t - h) > h * _NEAR:
+            instance.check_flags(call, t, h)
+        self._spread(t + h)
+
+    def step(self, t: float, h: float) -> None:
+        """Set the inputs, take a step from a time over a length, both in s, and get the outputs."""
+        self.start(t, h)
+        self.finish()
+
+    def exchange(self) -> None:
+        """Set the inputs and get the outputs."""
+        t = self.instance.t
+        self._fill(t)
+        self._run(self._exchange, t, self._n_in)
+
+    def read(self, t: float) -> None:
+        """Get the outputs."""
+        self._run(self._read, t, 0)
+
+    def _finish_reading(self, t: float) -> None:
+        if (status := self._read.run()) > 1:
+            raise self.instance.report("reading the outputs", status, t)
+
+    def _run(self, bound: BoundCalls, t: float, n_in: int) -> None:
+        status = bound.run()
+        if status > 1:
+            raise self.instance.report(
+                "setting the inputs" if bound.failed < n_in else "reading the outputs", status, t
+            )
+        self._spread(t)
+
+    def _fill(self, t: float) -> None:
+        try:
+            self.ins.fill()
+        except UnfitError as error:
+            raise self.instance.refuse_input(error, t) from None
+
+    def _spread(self, t: float) -> None:
+        try:
+            self.outs.spread()
+        except UnfitError as error:
+            raise self.instance.refuse_output(error, t) from None

@@ -1,0 +1,337 @@
+"""The child: calls functions of an FMU's library, as it is told.
+
+It imports the standard library only, to start quickly. It reads frames from its command pipe, and numbers of bound
+sequences from the shared words (`wire`). All that the FMU writes to its standard output goes to a file, and its log
+messages to another one, so that they are there after a crash.
+"""
+
+from __future__ import annotations
+
+import _ctypes
+import ctypes
+import importlib
+import json
+import mmap
+import os
+import select
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from . import wire
+from .surroundings import kill_group, limit, look_around, move, print_to, resident
+from .wire import (
+    CAUSE,
+    CHILD_SLEEPS,
+    MAIL,
+    MEMORY,
+    MESSAGES,
+    OUTPUT,
+    PARENT_SLEEPS,
+    PLACE,
+    REPLY,
+    REQUEST,
+    SEQUENCE,
+    STATUS,
+    WAKE,
+)
+
+_TYPES: dict[str, Any] = {
+    t._type_: t
+    for t in (
+        *(ctypes.c_bool, ctypes.c_byte, ctypes.c_ubyte, ctypes.c_short, ctypes.c_ushort, ctypes.c_int, ctypes.c_uint),
+        *(ctypes.c_long, ctypes.c_ulong, ctypes.c_longlong, ctypes.c_ulonglong, ctypes.c_float, ctypes.c_double),
+        *(ctypes.c_char, ctypes.c_char_p, ctypes.c_void_p),
+    )
+}
+_LOOKS = 4000
+_PERIOD = 0.25  # s between two looks at memory, output and parent
+_KEPT_OUTPUT = 16 << 20  # bytes of output at which its file begins again
+
+
+class Child:
+    """The process: its pipes, its shared memory, its library."""
+
+    def __init__(self, commands: int, replies: int, about: dict[str, Any]):
+        self.commands, self.replies, self.about = commands, replies, about
+        self.parent, self.me = about["parent"], os.getpid()
+        with open(about["shared"], "r+b") as file:
+            self.memory = mmap.mmap(file.fileno(), about["size"])
+        with suppress(AttributeError, OSError):  # a copy of the process has no part in it
+            self.memory.madvise(mmap.MADV_DONTFORK)
+        self.base = ctypes.addressof(ctypes.c_char.from_buffer(self.memory))
+        self.words = memoryview(self.memory).cast("Q")
+        self.log = os.open(about["log"], os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        self.library: Any = None
+        self.kept: list[Any] = []  # as long as the library may use it
+        self.sequences: list[tuple[tuple[Callable[..., int], tuple[Any, ...]], ...]] = []
+        self.printf = importlib.import_module(".printf", __package__)
+        self.before: list[Any] = []
+        self._logging = threading.Lock()
+
+    # ---- requests ----
+
+    def serve(self) -> None:
+        """Answer requests until the parent is gone."""
+        words, get, last, patience = (
+            self.words,
+            self.words.__getitem__,
+            0,
+            wire.Patience(_LOOKS, may=self.about["watches"]),
+        )
+        while True:
+            for _ in range(patience.looks):
+                if get(REQUEST) != last:
+                    patience.watched()
+                    break
+            else:
+                patience.slept()
+                while get(REQUEST) == last:
+                    self._sleep(last)
+            last = get(REQUEST)
+            if get(SEQUENCE) == MAIL:
+                self._answer()
+            else:
+                self._run(get(SEQUENCE))
+            words[REPLY] = last
+            wire.order_memory()
+            if words[PARENT_SLEEPS] or not wire.ORDERED:
+                os.write(self.replies, WAKE)
+
+    def _sleep(self, last: int) -> None:
+        """Sleep until there is a request, or a byte of an earlier one."""
+        words = self.words
+        words[CHILD_SLEEPS] = 1
+        wire.order_memory()
+        if words[REQUEST] == last and not os.read(self.commands, 4096):
+            self.leave()
+        words[CHILD_SLEEPS] = 0
+
+    def _run(self, sequence: int) -> None:
+        """Run a bound sequence."""
+        words, status, worst = self.words, 0, 0
+        for place, (function, arguments) in enumerate(self.sequences[sequence]):
+            words[PLACE] = place
+            status = function(*arguments)
+            if not 0 <= status <= 1:
+                break
+            worst |= status
+        else:
+            status = worst
+        self._leave_copy()
+        words[STATUS] = status & 0xFFFFFFFF
+
+    def _leave_copy(self) -> None:
+        """End this process if the FMU has made it from the child: the child itself goes on."""
+        if os.getpid() != self.me:
+            os._exit(0)
+
+    def _answer(self) -> None:
+        """Do what the message in the mailbox says, and put the result there."""
+        memory, words, file = self.memory, self.words, self.about["mail"]
+        (operation, *arguments), blobs = wire.read_message(memory, words, file)
+        try:
+            result, data = getattr(self, f"do_{operation}")(*arguments, blobs=blobs)
+        except Exception as error:
+            succeeded, result, data = False, f"{error}", []
+        else:
+            succeeded = True
+        self._leave_copy()
+        wire.write_message(memory, words, file, [succeeded, result], data)
+
+    # ---- operations ----
+
+    def do_load(self, path: str, names: list[str], blobs: list[bytes]) -> tuple[Any, list[bytes]]:
+        """Load the library, and return which of some functions it exports."""
+        if not self.before:
+            self.before = look_around(self.about["files"])
+        here = os.getcwd()
+        os.chdir(os.path.dirname(path))
+        try:
+            self.library = ctypes.CDLL(path)
+        finally:
+            os.chdir(here)
+        return [name for name in names if hasattr(self.library, name)], []
+
+    def do_has(self, name: str, blobs: list[bytes]) -> tuple[bool, list[bytes]]:
+        """Return whether the library exports a function."""
+        return hasattr(self.library, name), []
+
+    def do_call(
+        self, name: str, result: str, arguments: list[Any], blobs: list[bytes]
+    ) -> tuple[tuple[Any, list[Any]], list[bytes]]:
+        """Call a function; return its result, texts that it has left, and the bytes of the buffers."""
+        function = self.library[name]
+        function.restype = _TYPES[result] if result else None
+        data, buffers, texts = iter(blobs), [], []
+        made: list[Any] = []
+        for kind, value in arguments:
+            if kind == "buffer":
+                raw = next(data)
+                buffer = (ctypes.c_char * max(1, len(raw))).from_buffer_copy(raw or b"\0")
+                buffers.append((buffer, len(raw)))
+                made.append(buffer)
+            elif kind == "texts":
+                array = (ctypes.c_char_p * max(1, len(value)))(*(None if v is None else _bytes(v) for v in value))
+                texts.append((array, len(value)))
+                made.append(array)
+            elif kind == "shared":
+                made.append(ctypes.c_void_p(self.base + value))
+            elif kind == "callbacks":
+                made.append(self._callbacks(value))
+            else:
+                made.append(_TYPES[kind](_bytes(value) if kind in "zc" and value is not None else value))
+        found = function(*made)
+        found = found.decode("latin-1") if isinstance(found, bytes) else found
+        if "nstantiate" in name:  # FMUs of FMI 1.0 and 2.0 may keep its texts and callbacks
+            self.kept.append(made)
+        left = [[None if v is None else v.decode("latin-1") for v in array[:n]] for array, n in texts]
+        return (found, left), [bytes(buffer)[:n] for buffer, n in buffers]
+
+    def do_bytes(self, pieces: list[tuple[int, int]], blobs: list[bytes]) -> tuple[None, list[bytes]]:
+        """Return the bytes at addresses that the FMU has given."""
+        return None, [ctypes.string_at(address, n) if address and n else b"" for address, n in pieces]
+
+    def do_set_bytes(self, name: str, arguments: list[Any], blobs: list[bytes]) -> tuple[Any, list[bytes]]:
+        """Call a function that takes pointers to pieces of bytes."""
+        component, references, sizes = arguments
+        pieces = [ctypes.create_string_buffer(b, max(1, len(b))) for b in blobs]
+        n = len(references)
+        pointers = (ctypes.c_void_p * max(1, len(pieces)))(*(ctypes.addressof(p) for p in pieces))
+        status = self.library[name](
+            *(ctypes.c_void_p(component), (ctypes.c_uint * max(1, n))(*references), ctypes.c_size_t(n)),
+            *((ctypes.c_size_t * max(1, len(sizes)))(*sizes), pointers, ctypes.c_size_t(len(pieces))),
+        )
+        return status, []
+
+    def do_bind(self, calls: list[Any], blobs: list[bytes]) -> tuple[int, list[bytes]]:
+        """Bind functions to arguments in the shared memory, and return the number of the sequence."""
+        data, bound = iter(blobs), []
+        for name, arguments in calls:
+            made: list[Any] = []
+            for kind, value in arguments:
+                if kind == "shared":
+                    made.append(ctypes.c_void_p(self.base + value))
+                elif kind == "constant":
+                    raw = next(data)
+                    buffer = ctypes.create_string_buffer(raw, max(1, len(raw)))
+                    self.kept.append(buffer)
+                    made.append(buffer)
+                elif kind == "live":
+                    made.append(_TYPES[value[0]].from_buffer(self.memory, value[1]))
+                else:
+                    made.append(_TYPES[kind](value))
+            function = self.library[name]
+            function.restype = ctypes.c_int
+            bound.append((function, tuple(made)))
+        self.sequences.append(tuple(bound))
+        return len(self.sequences) - 1, []
+
+    def do_unload(self, blobs: list[bytes]) -> tuple[list[str], list[bytes]]:
+        """Unload the library, and return traces of the FMU in this process: with any, it is used no more."""
+        self.sequences.clear()
+        handle, self.library = self.library._handle, None
+        self.kept.clear()
+        if sys.platform == "win32":
+            _ctypes.FreeLibrary(handle)
+        else:
+            _ctypes.dlclose(handle)
+        after = look_around(self.about["files"])
+        return [name for (name, old), (_, new) in zip(self.before, after, strict=True) if old != new], []
+
+    # ---- log messages ----
+
+    def _keep_message(self, status: int, text: str) -> None:
+        if not status:
+            return
+        with self._logging:
+            if self.words[MESSAGES] < wire.MOST_MESSAGES:
+                data = text.encode(errors="replace")[: wire.LONGEST_MESSAGE]
+                os.write(self.log, wire.LOG_HEAD.pack(status, len(data)) + data)
+                self.words[MESSAGES] += 1
+
+    def _callbacks(self, version: int) -> Any:
+        """Return the callbacks of a version of FMI: the logger alone, and the C library's memory."""
+        if version == 3:
+
+            def message3(environment: Any, status: int, category: bytes | None, text: bytes | None) -> None:
+                self._keep_message(status, (text or b"").decode(errors="replace"))
+
+            kind = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_char_p)
+            return self._keep(kind(message3))
+
+        def message(environment: Any, name: Any, status: int, category: Any, text: bytes | None, *more: Any) -> None:
+            if status:
+                self._keep_message(status, self.printf.format_message(text or b"", more))
+
+        c_library = ctypes.CDLL(None) if sys.platform != "win32" else ctypes.cdll.msvcrt
+        calloc, free = (ctypes.cast(getattr(c_library, n), ctypes.c_void_p).value for n in ("calloc", "free"))
+        logger = self._keep(self.printf.Logger(message))
+        address = ctypes.cast(logger, ctypes.c_void_p).value
+        callbacks = self._keep((ctypes.c_void_p * 5)(address, calloc, free, None, None))
+        if version == 1:
+
+            class Callbacks(ctypes.Structure):
+                _fields_ = (("pointers", ctypes.c_void_p * 4),)
+
+            return self._keep(Callbacks.from_buffer_copy(callbacks))
+        return callbacks
+
+    def _keep(self, value: Any) -> Any:
+        self.kept.append(value)
+        return value
+
+    # ---- the end ----
+
+    def watch_over(self) -> None:
+        """End the process when its parent is gone, when it has too much memory, or when it writes too much."""
+        poll = select.poll() if hasattr(select, "poll") else None
+        if poll is not None:
+            poll.register(self.commands, 0)
+        most, written = self.about["memory"], 0
+        while True:
+            if poll is None:
+                time.sleep(_PERIOD)
+            elif poll.poll(_PERIOD * 1000):
+                self.leave()
+            if self.parent != os.getppid() and os.name == "posix":
+                self.leave()
+            if resident() > most:
+                self._end(MEMORY)
+            with suppress(OSError):
+                size = os.fstat(1).st_size
+                if written + size > self.about["output"]:
+                    self._end(OUTPUT)
+                if size > _KEPT_OUTPUT:
+                    os.truncate(self.about["printed"], 0)
+                    written += size
+
+    def _end(self, cause: int) -> None:
+        self.words[CAUSE] = cause
+        kill_group()
+
+    def leave(self) -> None:
+        """End the process, as its parent is gone, and remove its folder."""
+        with suppress(OSError):
+            os.chdir("/" if os.name == "posix" else os.path.dirname(self.about["folder"]))
+        shutil.rmtree(self.about["folder"], ignore_errors=True)
+        kill_group()
+
+
+def _bytes(text: str) -> bytes:
+    return text.encode("latin-1")
+
+
+def main() -> None:
+    """Serve; the last argument says where the shared memory is."""
+    about = json.loads(sys.argv[-1])
+    commands, replies = move(0), move(1)
+    print_to(about["printed"])
+    limit(about["memory"])
+    child = Child(commands, replies, about)
+    threading.Thread(target=child.watch_over, daemon=True).start()
+    child.serve()

@@ -1,0 +1,50 @@
+"""Begin and end of a child: the copy of its files, the cores for it, the reason of its end."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from pathlib import Path
+
+from ...blocks.core import FmuEnd
+from .wire import MEMORY, OUTPUT
+
+_BY_US = -int(getattr(signal, "SIGKILL", signal.SIGTERM))
+_NEARLY = 0.8  # part of the memory that counts as all of it
+SKIPPED = {"sources", "documentation"}
+
+
+def read_end(
+    status: int | None, noted: int, error: Exception | None, peak: int, memory: int, output: int
+) -> tuple[FmuEnd, str]:
+    """Return cause and text for the way in which the process has ended."""
+    if noted == MEMORY:
+        return FmuEnd.MEMORY, f"it took more memory than {memory / 1e6:.6g} MB; its process was ended"
+    if noted == OUTPUT:
+        return FmuEnd.OUTPUT, f"it wrote more than {output / 1e6:.6g} MB; its process was ended"
+    if status is None or (status == _BY_US and error is not None):
+        return FmuEnd.LOST, f"its process does not answer any more ({error or 'its pipe is closed'})"
+    if status < 0:
+        try:
+            name = signal.Signals(-status).name
+        except ValueError:
+            name = f"signal {-status}"
+        more = f": {text}" if (text := signal.strsignal(-status)) else ""
+        if peak > _NEARLY * memory:  # the system gave it no more, which few libraries bear
+            used = f"{peak / 1e6:.6g} of {memory / 1e6:.6g} MB"
+            return FmuEnd.MEMORY, f"its process crashed ({name}{more}) when its memory was used up ({used})"
+        return FmuEnd.CRASH, f"its process crashed ({name}{more})"
+    if os.name == "nt" and status >= 0xC0000000:
+        return FmuEnd.CRASH, f"its process crashed (0x{status:08X})"
+    return FmuEnd.EXIT, f"it ended its process with exit status {status}"
+
+
+def count_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def copy_files(source: Path, target: Path) -> None:
+    """Copy the files of an FMU that its library may read or write: sources and documentation are left out."""
+    shutil.copytree(source, target, ignore=lambda where, names: SKIPPED & set(names) if where == str(source) else ())

@@ -1,0 +1,399 @@
+"""A child process that holds an FMU's library, seen from this process: requests, watchdog, end."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import mmap
+import os
+import select
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from ...blocks.core import FmuEnd, FmuError, FmuProcessError
+from ..calls import printf
+from . import wire
+from .endings import copy_files, count_cores, read_end
+from .wire import (
+    CAUSE,
+    CHILD_SLEEPS,
+    DATA,
+    MAIL,
+    MESSAGES,
+    PARENT_SLEEPS,
+    PLACE,
+    REPLY,
+    REQUEST,
+    SEQUENCE,
+    STATUS,
+    WAKE,
+)
+
+_START = (
+    "import sys, types; sys.path[:] = [p for p in sys.path if p]; m = types.ModuleType('loopwright_child'); "
+    "m.__path__ = sys.argv[1:3]; sys.modules[m.__name__] = m; from loopwright_child.child import main; main()"
+)
+_LOOKS = 2000
+_LOOK = 0.05  # s between two looks at a process that does not answer
+_LAST_LINES = 5
+
+
+class ChildProcess:
+    """A child process: it answers one request at a time.
+
+    It gets a copy of the ``files`` of the unpacked FMU, and shares ``size`` bytes of memory. ``memory`` and ``output``
+    are its limits in bytes; see `Isolation`.
+
+    Attributes
+    ----------
+    folder : Path
+        Private folder; its ``fmu`` is the copy of the files, its ``work`` the working folder.
+    told : callable
+        Takes status and text of the FMU's log messages.
+    used : bool
+        Whether it can't be used again, since a call has failed or was interrupted.
+    """
+
+    def __init__(self, name: str, files: Path, size: int, memory: float, output: float):
+        self.name, self.size, self.memory_limit, self.output_limit = name, size, int(memory), int(output)
+        self.told: Callable[[int, str], None] = lambda status, text: None
+        self.lose: Callable[[FmuProcessError], FmuProcessError] = lambda error: error
+        self.used, self.alive = False, False
+        self.folder = Path(tempfile.mkdtemp(prefix="loopwright-fmu-"))
+        self._peak = 0
+        self._log_position, self._number, self._allotted = 0, 0, DATA
+        self._watches = wire.ORDERED and count_cores() > 1
+        self._patience = wire.Patience(_LOOKS, may=self._watches)
+        self._names: list[list[str]] = []
+        self._call = ""
+        self._process: subprocess.Popen[bytes] | None = None
+        try:
+            self._spawn(files)
+        except OSError as error:
+            self.end()
+            raise FmuError(
+                f"the process for the FMU {name!r} can't be started: {error}. Make room in {tempfile.gettempdir()!r}, "
+                "or load it in this process: isolate=False."
+            ) from error
+        except BaseException:
+            self.end()
+            raise
+
+    def _spawn(self, files: Path) -> None:
+        copy_files(files, self.folder / "fmu")
+        (self.folder / "work").mkdir()
+        shared = self.folder / "shared"
+        with shared.open("wb") as file:
+            file.truncate(self.size)
+        with shared.open("r+b") as file:
+            self._memory = mmap.mmap(file.fileno(), self.size)
+        self._base = ctypes.addressof(ctypes.c_char.from_buffer(self._memory))
+        self._words = memoryview(self._memory).cast("Q")
+        about = {
+            "size": self.size,
+            "parent": os.getpid(),
+            "memory": self.memory_limit,
+            "output": self.output_limit,
+            "watches": self._watches,
+            "folder": str(self.folder),
+            "files": str(self.folder / "fmu"),
+            **{name: str(self.folder / name) for name in ("shared", "log", "printed", "mail")},
+        }
+        here = [str(Path(__file__).parent), str(Path(printf.__file__).parent), json.dumps(about)]
+        group: dict[str, Any] = {"start_new_session": True} if os.name == "posix" else {"creationflags": 0x200}
+        with open(self.folder / "printed", "wb") as printed:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _START, *here],
+                cwd=self.folder / "work",
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=printed,
+                bufsize=0,
+                **group,
+            )
+        commands, replies = self._process.stdin, self._process.stdout
+        self._in, self._out = (pipe.fileno() for pipe in (commands, replies) if pipe is not None)
+        self._poll = select.poll() if hasattr(select, "poll") else None
+        if self._poll is not None:
+            self._poll.register(self._out, select.POLLIN)
+        self.alive = True
+
+    # ---- memory ----
+
+    def place(self, n: int) -> int:
+        """Return the place of n more bytes of shared memory, for the present instance."""
+        start = self._allotted
+        if start + n > self.size:
+            raise FmuError(
+                f"{n} bytes don't fit into the {self.size} bytes of memory that are shared with the FMU's process. "
+                "Take fewer ports, or isolate=False."
+            )
+        self._allotted = start + (n + 63) // 64 * 64
+        return start
+
+    def array(self, n: int, ctype: Any) -> np.ndarray:
+        """Return an array (n,) in the shared memory."""
+        dtype = np.dtype(ctype)
+        found = np.frombuffer(self._memory, dtype=dtype, count=n, offset=self.place(max(1, n) * dtype.itemsize))
+        found[:] = 0
+        return found
+
+    def value(self, ctype: Any) -> Any:
+        """Return a C value in the shared memory, zero at first."""
+        n = ctypes.sizeof(ctype)
+        at = self.place(n)
+        self._memory[at : at + n] = bytes(n)
+        return ctype.from_buffer(self._memory, at)
+
+    def find(self, address: int) -> int | None:
+        """Return the place of an address in the shared memory; None if it isn't there."""
+        return place if 0 <= (place := address - self._base) < self.size else None
+
+    # ---- requests ----
+
+    def request(
+        self, operation: str, *arguments: Any, blobs: Sequence[bytes] = (), call: str, seconds: float
+    ) -> tuple[Any, list[bytes]]:
+        """Let the child do something, and return its result.
+
+        Parameters
+        ----------
+        operation : str
+            Method ``do_…`` of the child.
+        *arguments
+            Numbers, texts, lists.
+        blobs : sequence of bytes
+            Bytes that go with them.
+        call : str
+            Call of the FMU, for an error.
+        seconds : float
+            Time after which the process is ended.
+
+        Raises
+        ------
+        FmuProcessError
+            If the process ends, or is ended.
+        RuntimeError
+            With the text of the child's exception.
+        """
+        self._call = call
+        self._check_alive(call)
+        memory, words, file = self._memory, self._words, str(self.folder / "mail")
+        wire.write_message(memory, words, file, [operation, *arguments], blobs)
+        self.post(MAIL)
+        self.finish(MAIL, seconds)
+        try:
+            (succeeded, result), data = wire.read_message(memory, words, file)
+        except (OSError, ValueError, struct.error) as error:  # the FMU has written over it
+            self._fail(call, error=error)
+        if not succeeded:
+            self.used = True
+            raise RuntimeError(result)
+        return result, data
+
+    def bind(self, calls: list[Any], blobs: list[bytes], seconds: float) -> int:
+        """Bind a sequence in the child, and return its number."""
+        number = int(self.request("bind", calls, blobs=blobs, call="binding its calls", seconds=seconds)[0])
+        self._names[number:] = [[name for name, _ in calls]]
+        return number
+
+    def post(self, sequence: int) -> None:
+        """Begin to run a bound sequence, or to read the mailbox."""
+        words = self._words
+        if not self.alive:
+            self._check_alive(self._place_name(sequence))
+        words[SEQUENCE] = sequence
+        self._number += 1
+        words[REQUEST] = self._number
+        wire.order_memory()
+        if words[CHILD_SLEEPS] or not wire.ORDERED:
+            try:
+                os.write(self._in, WAKE)
+            except OSError as error:
+                self._fail(self._place_name(sequence), error=error)
+
+    def finish(self, sequence: int, seconds: float) -> int:
+        """Return the status of a sequence that was posted; see `failed_place`."""
+        words, number, get = self._words, self._number, self._words.__getitem__
+        for _ in range(self._patience.looks):
+            if get(REPLY) == number:
+                self._patience.watched()
+                break
+        else:
+            self._patience.slept()
+            self._sleep(sequence, number, seconds)
+        if words[MESSAGES]:
+            self.fetch_messages()
+        return words[STATUS]
+
+    def _sleep(self, sequence: int, number: int, seconds: float) -> None:
+        """Sleep until the reply is there."""
+        words = self._words
+        deadline = time.monotonic() + seconds
+        try:
+            words[PARENT_SLEEPS] = 1
+            wire.order_memory()
+            while words[REPLY] != number:
+                if self._is_readable(_LOOK):
+                    if not os.read(self._out, 4096) and words[REPLY] != number:
+                        self._fail(self._place_name(sequence))
+                elif words[REPLY] != number:
+                    if self.has_ended():
+                        self._fail(self._place_name(sequence))
+                    if time.monotonic() >= deadline:
+                        self._fail(self._place_name(sequence), FmuEnd.TIMEOUT, seconds=seconds)
+            words[PARENT_SLEEPS] = 0
+        except FmuProcessError:
+            raise
+        except BaseException:  # an interrupt: the reply is still to come
+            self.used = True
+            self.end()
+            raise
+
+    def _is_readable(self, seconds: float) -> bool:
+        if self._poll is not None:
+            return bool(self._poll.poll(seconds * 1000))
+        import _winapi  # not tried
+        import msvcrt
+
+        handle, end = msvcrt.get_osfhandle(self._out), time.monotonic() + seconds  # type: ignore[attr-defined]
+        while True:
+            try:
+                if _winapi.PeekNamedPipe(handle, 0)[0]:  # type: ignore[attr-defined]
+                    return True
+            except OSError:
+                return True  # closed: reading says so
+            if time.monotonic() >= end:
+                return False
+            time.sleep(0.0005)
+
+    @property
+    def failed_place(self) -> int:
+        """Place of the call at which the last sequence ended."""
+        return int(self._words[PLACE])
+
+    def _place_name(self, sequence: int) -> str:
+        if sequence == MAIL:
+            return self._call
+        names = self._names[sequence]
+        return names[min(self.failed_place, len(names) - 1)]
+
+    # ---- messages ----
+
+    def fetch_messages(self) -> None:
+        """Give the FMU's log messages to `told`."""
+        self._words[MESSAGES] = 0
+        with suppress(OSError), open(self.folder / "log", "rb") as file:
+            file.seek(self._log_position)
+            data = file.read()
+            at, head = 0, wire.LOG_HEAD
+            while at + head.size <= len(data):
+                status, n = head.unpack_from(data, at)
+                if at + head.size + n > len(data):
+                    break
+                self.told(status, data[at + head.size : at + head.size + n].decode(errors="replace"))
+                at += head.size + n
+            self._log_position += at
+
+    def read_printed(self) -> list[str]:
+        """Return the last lines that the FMU has written to its standard output."""
+        with suppress(OSError), open(self.folder / "printed", "rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - 4096))
+            lines = file.read().decode(errors="replace").splitlines()
+            return [line.strip() for line in lines if line.strip()][-_LAST_LINES:]
+        return []
+
+    # ---- the end ----
+
+    def _check_alive(self, call: str) -> None:
+        if not self.alive:
+            text = f"the process of the FMU {self.name!r} has ended before {call}. Run it again."
+            raise self.lose(FmuProcessError(text, call=call, cause=FmuEnd.LOST))
+
+    def has_ended(self) -> bool:
+        """Return whether the process has ended; it isn't reaped, so that its group keeps its number."""
+        process = self._process
+        if process is None or process.returncode is not None:
+            return True
+        if hasattr(os, "waitid"):
+            with suppress(ChildProcessError):
+                return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+        return process.poll() is not None
+
+    def _fail(
+        self, call: str, cause: FmuEnd | None = None, *, seconds: float = 0.0, error: Exception | None = None
+    ) -> NoReturn:
+        """End the process, and raise the error that says why."""
+        for _ in range(100):  # the pipe closes before the process has ended
+            if cause is not None or self.has_ended():
+                break
+            time.sleep(0.01)
+        self.fetch_messages()
+        printed = self.read_printed()
+        noted = int(self._words[CAUSE])
+        status = self._finish_process()
+        if cause is None:
+            cause, text = read_end(status, noted, error, self._peak, self.memory_limit, self.output_limit)
+        else:
+            text = f"{call} has not ended after {seconds:g} s; its process was ended"
+        said = f" It wrote: {' / '.join(printed)}." if printed else ""
+        found = FmuProcessError(
+            f"{text}{'' if cause is FmuEnd.TIMEOUT else f' in {call}'} (FMU {self.name!r}, in a process of its own).",
+            call=call,
+            cause=cause,
+            printed=said,
+        )
+        self.used = True
+        self.end()
+        raise self.lose(found) from None
+
+    def _finish_process(self) -> int | None:
+        """End the process and its group; return the status with which it ended by itself, None if it had not."""
+        process = self._process
+        if process is None:
+            return None
+        ended = self.has_ended()
+        if os.name == "posix":
+            with suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL)
+        if not ended:
+            with suppress(OSError):
+                process.kill()
+        if ended and process.returncode is None and hasattr(os, "wait4"):
+            with suppress(ChildProcessError):
+                _, code, usage = os.wait4(process.pid, 0)
+                process.returncode = os.waitstatus_to_exitcode(code)
+                self._peak = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(10.0)
+        return process.returncode if ended else None
+
+    def end(self) -> None:
+        """End the process with all that the FMU has started in it, and remove its folder."""
+        self.alive = False
+        self._finish_process()
+        if self._process is not None:
+            for pipe in (self._process.stdin, self._process.stdout):
+                if pipe is not None:
+                    with suppress(OSError):
+                        pipe.close()
+            self._process = None
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def begin_again(self) -> None:
+        """Prepare for another instance: forget memory, sequences and messages."""
+        self._allotted = DATA
+        self._names.clear()
+        self.told, self.lose = lambda status, text: None, lambda error: error
+        self._words[MESSAGES] = 0

@@ -1,0 +1,167 @@
+"""Calls of FMI with the library in a child process."""
+
+from __future__ import annotations
+
+import ctypes
+from collections import deque
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import FmuError
+from ..calls import CALLS, ERROR, WARNING, BoundCalls, Call, FmiCalls, Log
+from .library import RemoteLibrary, describe_call, seconds_for
+from .limits import Isolation
+from .pool import give_back
+from .process import ChildProcess
+
+
+class RemoteBoundCalls(BoundCalls):
+    """C functions in a child with their arguments in shared memory: one round trip runs them all."""
+
+    def __init__(self, process: ChildProcess, calls: Sequence[Call], limits: Isolation):
+        super().__init__(calls)
+        described, blobs, names = [], [], [function.name for function, _ in calls]  # type: ignore[attr-defined]
+        for name, (_, arguments) in zip(names, calls, strict=True):
+            call, constants = describe_call(process, name, arguments)
+            described.append(call)
+            blobs += constants
+        self._process = process
+        self._seconds = sum(seconds_for(name, limits) for name in dict.fromkeys(names) if "DoStep" in name) or (
+            max((seconds_for(name, limits) for name in names), default=limits.step_time)
+        )
+        self._sequence = process.bind(described, blobs, limits.step_time)
+
+    def run(self) -> int:
+        """Run them and return the status; see `BoundCalls`."""
+        self.start()
+        return self.finish()
+
+    def start(self) -> None:
+        """Let the child begin."""
+        self._process.post(self._sequence)
+
+    def finish(self) -> int:
+        """Wait for the child, and return the status."""
+        status = self._process.finish(self._sequence, self._seconds)
+        if status > 1:
+            if status >= ERROR:
+                self._process.used = True
+            self.failed = self._process.failed_place
+        return status
+
+
+class RemoteCalls(FmiCalls):
+    """Part of the calls that differs where the library is in a child; the other base is a version's calls."""
+
+    in_process = False
+    process: ChildProcess
+    limits: Isolation
+
+    def _open(self, kind: Any, required: tuple[str, ...], **arguments: Any) -> Any:
+        """Return an object of FMPy's class whose library is in the child."""
+        process, limits, path, prefix = self.process, self.limits, self._path, self.prefix
+        needed = {f"{prefix}{name}" for name in required}
+
+        def initialize(fmu: Any, **given: Any) -> None:
+            fmu.guid, fmu.modelIdentifier = given["guid"], given["modelIdentifier"]
+            fmu.unzipDirectory, fmu.instanceName = given["unzipDirectory"], given["instanceName"]
+            fmu.fmiCallLogger, fmu.requireFunctions, fmu._functions = None, True, {}
+            names = [name for name in dir(fmu) if name.startswith(prefix)]
+            shown = [_exported(name, prefix, given["modelIdentifier"]) for name in names]
+            fmu.dll = RemoteLibrary(process, path, shown, limits)
+            fmu.missing_functions = set()
+            for name, export in zip(names, shown, strict=True):
+                if name not in needed and not hasattr(fmu.dll, export):
+                    fmu.missing_functions.add(name)
+                    setattr(fmu.dll, export, ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR))
+            fmu._loadFunctions()
+            fmu.component = fmu.callbacks = None
+
+        def unload(fmu: Any) -> None:
+            process.used = process.used or bool(fmu.dll.unload())
+            self._unloaded = True
+
+        return type(kind.__name__, (kind,), {"__init__": initialize, "freeLibrary": unload})(**arguments)
+
+    def _function(self, name: str) -> Callable[..., int]:
+        return self.fmu.dll[name]  # type: ignore[no-any-return]
+
+    def instantiate(self, log: Log) -> None:
+        """Make the instance; its messages go to ``log``."""
+        self.process.told, self.process.lose = log, self.lose
+        super().instantiate(log)  # type: ignore[safe-super]
+        if self.process.find(self.fmu.component) is not None:  # an address there that is shared memory here
+            raise FmuError("its instance has an address that can't be told from shared memory; run it again.")
+
+    def allocate(self, n: int, ctype: type[Any]) -> np.ndarray:
+        """Return an array (n,) of zeros of a C type in the shared memory."""
+        return self.process.array(n, ctype)
+
+    def variable(self, ctype: type[Any]) -> Any:
+        """Return a C value, array or structure in the shared memory."""
+        return self.process.value(ctype)
+
+    def bind(self, calls: Sequence[Call]) -> BoundCalls:
+        """Bind functions of the library to their arguments: one round trip runs them all."""
+        return RemoteBoundCalls(self.process, calls, self.limits)
+
+    def free_state(self, handle: Any) -> None:
+        """Free a saved state before the next one is saved; Python may ask for it at any time, in a step too."""
+        self._freed.append(handle)
+
+    def save_state(self) -> Any:
+        """Return the handle of a copy of the instance's memory, in the child."""
+        while self._freed:
+            super().free_state(self._freed.popleft())
+        return super().save_state()
+
+    def get_binaries(self, references: Sequence[int], size: int) -> list[bytes]:
+        """Return binary data, which the child reads at the addresses that the FMU gives."""
+        sizes, addresses = (ctypes.c_size_t * size)(), (ctypes.c_void_p * size)()
+        kept = (ctypes.c_uint * len(references))(*references)
+        self.fmu.fmi3GetBinary(self.fmu.component, kept, len(references), sizes, addresses, size)
+        pieces = [(address or 0, n) for address, n in zip(addresses, sizes, strict=True)]
+        return self.process.request("bytes", pieces, call="fmi3GetBinary", seconds=self.limits.step_time)[1]
+
+    def set_binaries(self, references: Sequence[int], values: Sequence[bytes]) -> None:
+        """Set binary data, from memory of the child."""
+        from fmpy.fmi1 import FMICallException
+
+        arguments = [self.fmu.component, list(references), [len(v) for v in values]]
+        status = self.process.request(
+            "set_bytes", "fmi3SetBinary", arguments, blobs=list(values), call="fmi3SetBinary",
+            seconds=self.limits.step_time,
+        )[0]  # fmt: skip
+        if status > WARNING:
+            raise FMICallException("fmi3SetBinary", status)
+
+    def end(self) -> None:
+        """Keep the process for another instance, or end it."""
+        give_back(self.process, self._unloaded)
+
+    def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
+        self._path, self._unloaded = library, False
+        self._freed: deque[Any] = deque()
+        super().__init__(name=name, token=token, folder=folder, library=library, model_exchange=model_exchange)  # type: ignore[safe-super]
+
+
+def _exported(name: str, prefix: str, identifier: str) -> str:
+    """Return the name of a function in the library; those of FMI 1.0 begin with the model identifier."""
+    return f"{identifier}_{name.replace('fmi1', 'fmi', 1)}" if prefix == "fmi1" else name
+
+
+def make_remote_calls(version: str, process: ChildProcess, limits: Isolation, **arguments: Any) -> FmiCalls:
+    """Make the calls of a major version of FMI with the library in a child, which is given back if that fails."""
+    base = CALLS[version]
+    kind = type(f"Remote{base.__name__}", (RemoteCalls, base), {"process": process, "limits": limits})
+    source, folder = Path(arguments["folder"]), process.folder / "fmu"
+    library = folder / Path(arguments["library"]).relative_to(source)
+    try:
+        calls: FmiCalls = kind(**{**arguments, "folder": folder, "library": library})
+    except BaseException:
+        give_back(process, False)
+        raise
+    return calls

@@ -1,0 +1,265 @@
+"""FMUs in processes of their own: equal numbers, and faults that end the run alone. The FMU of the zoo is y' = u."""
+
+import os
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import FmuEnd, FmuProcessError, ParameterError
+from loopwright.diagrams import Diagram
+from loopwright.fmus import Fmu, Isolation
+from loopwright.fmus.isolation import count_processes, end_idle, find_limits
+from support.exported import mass_spring_damper
+from support.zoo import zoo_fmu
+
+SHORT = Isolation(step_time=0.5, start_time=0.5)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("zoo")
+
+
+@pytest.fixture(autouse=True)
+def nothing_left():
+    """No test leaves a process or a folder behind."""
+    yield
+    end_idle()
+    assert count_processes() == (0, 0)
+
+
+def simulate(file, isolate=SHORT, duration=0.1, **options):
+    return Diagram("d", Fmu(file, name="plant", isolate=isolate)(u=1.0)).simulate(
+        duration, step=0.01, progress=False, **options
+    )
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_sound_fmu_gives_the_integral_of_its_input(folder, fmi):
+    run = simulate(zoo_fmu(folder, fmi))
+    assert np.allclose(run["plant.y"], run.t, atol=1e-12)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_numbers_are_bit_for_bit_those_in_process(msd, fmi):
+    from loopwright.fmus import build_fmu
+
+    file = msd if fmi == 3 else build_fmu(mass_spring_damper(), fmi=2)
+    one, two = (
+        Diagram("d", Fmu(file, name="plant", isolate=isolate)(force=1.0)).simulate(0.05, step=0.001, progress=False)
+        for isolate in (True, False)
+    )
+    for port in Fmu(file).outputs:
+        assert np.array_equal(one[f"plant.{port}"], two[f"plant.{port}"]), port
+
+
+FAULTS = [
+    ("load segfault", FmuEnd.CRASH, "loading its library", "SIGSEGV"),
+    ("instantiate abort", FmuEnd.CRASH, "nstantiate", "SIGABRT"),
+    ("enter exit", FmuEnd.EXIT, "EnterInitializationMode", "exit status 3"),
+    ("step segfault 0.05", FmuEnd.CRASH, "DoStep", "SIGSEGV"),
+    ("step divide_trapped 0.05", FmuEnd.CRASH, "DoStep", "SIGFPE"),
+    ("step exit0 0.05", FmuEnd.EXIT, "DoStep", "exit status 0"),
+    ("step deaf_hang 0.05", FmuEnd.TIMEOUT, "DoStep", "has not ended after 0.5 s"),
+    ("get segfault 0.05", FmuEnd.CRASH, "Get", "SIGSEGV"),
+]
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize(("fault", "cause", "call", "text"), FAULTS, ids=[f[0].replace(" ", "_") for f in FAULTS])
+@pytest.mark.drawn
+def test_a_fault_ends_the_run_and_says_where_when_and_why(folder, fmi, fault, cause, call, text):
+    with pytest.raises(FmuProcessError) as caught:
+        simulate(zoo_fmu(folder, fmi, fault))
+    error = caught.value
+    assert error.cause is cause
+    assert call in error.call
+    assert text in str(error)
+    assert error.call in str(error)
+    assert error.block == "plant"
+    late = "0.05" in fault
+    assert error.t == pytest.approx((0.04 if call == "Get" else 0.05) if late else 0.0, abs=1e-9)
+    if late:  # the samples until then are kept, and right
+        assert len(error.run.t) >= 4
+        assert np.allclose(error.run["plant.y"], error.run.t, atol=1e-12)
+
+
+def test_too_much_memory_ends_the_run(folder):
+    limits = Isolation(memory=200e6, step_time=30.0)
+    with pytest.raises(FmuProcessError) as caught:
+        simulate(zoo_fmu(folder, 3, "step memory 0.05"), limits)
+    assert caught.value.cause is FmuEnd.MEMORY
+    assert "200 MB" in str(caught.value)
+
+
+def test_a_flood_of_output_ends_the_run(folder):
+    limits = Isolation(output=1e6, step_time=30.0)
+    with pytest.raises(FmuProcessError, match="wrote more than 1 MB") as caught:
+        simulate(zoo_fmu(folder, 3, "step flood_stdout 0.05"), limits)
+    assert caught.value.cause is FmuEnd.OUTPUT
+    assert "out out out" in str(caught.value)  # its last lines
+
+
+def test_the_log_before_the_end_is_quoted(folder):
+    with pytest.raises(FmuProcessError, match="The FMU says: plant: warning: from a thread") as caught:
+        simulate(zoo_fmu(folder, 3, "step log_hang 0.05"))
+    assert caught.value.cause is FmuEnd.TIMEOUT
+
+
+@pytest.mark.parametrize("fault", ["chdir", "rounding", "traps", "sigmask", "sigint", "umask", "environment", "limits"])
+def test_what_an_fmu_changes_stays_in_its_process(folder, fault):
+    here, mask = Path.cwd(), os.umask(0o022)
+    os.umask(mask)
+    environment = dict(os.environ)
+    third = 1.0 / 3.0 + 1e-17
+    run = simulate(zoo_fmu(folder, 3, f"step {fault}"))
+    assert np.allclose(run["plant.y"], run.t, atol=1e-12)
+    assert Path.cwd() == here
+    assert dict(os.environ) == environment
+    assert third == 1.0 / 3.0 + 1e-17
+    assert os.umask(mask) == mask
+    assert count_processes() == (0, 0)  # such a process is not used again
+
+
+def processes_of(folder):
+    """Return the numbers of processes whose command line names a folder."""
+    found = []
+    for file in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if str(folder).encode() in file.read_bytes():
+                found.append(int(file.parent.name))
+        except OSError:  # it has ended
+            continue
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/cmdline").exists(), reason="looks at /proc")
+def test_what_an_fmu_forks_ends_with_its_process(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    plant = Fmu(zoo_fmu(folder, 3, "step fork"), name="plant", isolate=True)
+    with plant.instantiate(["u"], None) as one:
+        one.bind(np.ones(1), np.zeros(1))
+        one.begin()
+        one.step(0.0, 0.01)
+        assert len(processes_of(tmp_path)) == 2
+    end_idle()
+    assert processes_of(tmp_path) == []
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_fork_that_comes_back_is_no_second_fmu(folder):
+    run = simulate(zoo_fmu(folder, 3, "step fork_on 0.05"))
+    assert np.allclose(run["plant.y"], run.t, atol=1e-12)
+
+
+def test_the_process_is_kept_for_the_next_run_with_a_fresh_instance(folder):
+    file = zoo_fmu(folder, 3)
+    first = simulate(file)
+    assert count_processes() == (1, 1)
+    second = simulate(file)
+    assert count_processes() == (1, 1)
+    assert np.array_equal(first["plant.y"], second["plant.y"])
+
+
+def test_an_fmu_that_a_process_can_have_once_may_be_there_twice(folder, tmp_path):
+    import zipfile
+
+    once = tmp_path / "once.fmu"
+    with zipfile.ZipFile(zoo_fmu(folder, 3)) as old, zipfile.ZipFile(once, "w") as new:
+        for item in old.infolist():
+            data = old.read(item)
+            if item.filename == "modelDescription.xml":
+                flag = b'canBeInstantiatedOnlyOncePerProcess="true" canGetAndSetFMUState'
+                data = data.replace(b"canGetAndSetFMUState", flag)
+            new.writestr(item, data)
+    a, b = (Fmu(once, name=name, isolate=True) for name in "ab")
+    run = Diagram("d", a(u=1.0), b(u=2.0)).simulate(0.1, step=0.01, progress=False)
+    assert np.allclose(run["b.y"], 2.0 * run.t, atol=1e-12)
+
+
+def test_two_fmus_step_at_the_same_time(folder):
+    """Each step takes 20 ms of sleep: two one after the other take 40 ms, side by side little more than 20 ms."""
+    file = zoo_fmu(folder, 3, "step slow")
+    blocks = [Fmu(file, name=name, isolate=True) for name in "ab"]
+    with blocks[0].instantiate(["u"], None) as a, blocks[1].instantiate(["u"], None) as b:
+        for one in (a, b):
+            one.bind(np.ones(1), np.zeros(1))
+            one.begin()
+        began = time.perf_counter()
+        for k in range(5):
+            a.start_step(0.01 * k, 0.01)
+            b.start_step(0.01 * k, 0.01)
+            a.finish_step()
+            b.finish_step()
+        assert time.perf_counter() - began < 0.17  # of 0.2 one after the other
+
+
+def test_saved_states_go_across_the_process(folder):
+    plant = Fmu(zoo_fmu(folder, 3), name="plant", isolate=True)
+    with plant.instantiate(["u"], None) as one:
+        u, y = np.ones(1), np.zeros(1)
+        one.bind(u, y)
+        one.begin()
+        one.step(0.0, 0.5)
+        state = one.save()
+        one.step(0.5, 0.5)
+        assert y[0] == pytest.approx(1.0)
+        one.restore(state)
+        assert y[0] == pytest.approx(0.5)
+        assert one.t == 0.5
+        del state  # its memory is freed with the next one that is saved
+        one.save()
+
+
+def test_foreign_fmus_are_isolated_and_own_builds_are_not(folder, msd, tmp_path):
+    assert find_limits(Fmu(zoo_fmu(folder, 3))) == Isolation()
+    assert find_limits(Fmu(msd)) is None
+    copy = tmp_path / "copy.fmu"
+    copy.write_bytes(msd.read_bytes())
+    assert find_limits(Fmu(copy)) is None  # its content counts
+    assert find_limits(Fmu(msd, isolate=True)) == Isolation()
+    assert find_limits(Fmu(zoo_fmu(folder, 3), isolate=False)) is None
+
+
+def test_a_cache_that_others_can_write_proves_nothing(msd, cache):
+    noted = cache / "built"
+    mode = noted.stat().st_mode
+    noted.chmod(0o777)
+    try:
+        assert find_limits(Fmu(msd)) is not None
+    finally:
+        noted.chmod(mode)
+    assert find_limits(Fmu(msd)) is None
+
+
+def test_a_wrong_limit_is_refused(msd):
+    with pytest.raises(ParameterError, match=r"isolate.step_time: found -1; expected a positive number"):
+        Isolation(step_time=-1)
+    with pytest.raises(ParameterError, match="found 'yes'; expected True, False, None or an Isolation"):
+        Fmu(msd, isolate="yes")
+
+
+def test_an_interrupt_ends_the_process_of_a_step(folder):
+    """Ctrl-C while the FMU works: the run ends at once, and the process with it."""
+    import signal
+
+    plant = Fmu(zoo_fmu(folder, 3, "step deaf_hang 0.02"), name="plant", isolate=True)
+    timer = threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT))
+    with plant.instantiate(["u"], None) as one:
+        one.bind(np.ones(1), np.zeros(1))
+        one.begin()
+
+        def go():
+            for k in range(5):
+                one.step(0.01 * k, 0.01)
+
+        timer.start()
+        began = time.perf_counter()
+        with pytest.raises(KeyboardInterrupt):
+            go()
+        assert time.perf_counter() - began < 5.0
+    assert count_processes() == (0, 0)
