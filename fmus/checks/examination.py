@@ -74,8 +74,8 @@ def doctor(
         archive = FmuArchive.open(path, limits)
         summary = summarize(path, limits=limits)
     except FmuFileError as error:
-        finding = _as_error(error, path)
-        return FmuDiagnosis(str(path), _decide([finding], [], []), (finding,))
+        reason = _as_error(error, path)
+        return FmuDiagnosis(str(path), _decide([reason], [], []), (reason,))
     counts = Counter(v["causality"] for v in summary.pop("variables"))
     found = [*_judge_platform(archive, summary), *_judge_content(summary)]
     found += _judge_rules(path, archive, found)
