@@ -93,6 +93,13 @@ def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_pat
     assert f"here {scope['sign'].frequency:.3f} rad/s" in text
 
 
+def test_the_page_on_coupling_runs(cache, tmp_path):
+    scope = {}
+    with chdir(tmp_path):
+        for snippet in blocks_of_code((ROOT / "docs" / "coupling.md").read_text(encoding="utf-8")):
+            exec(snippet, scope)
+
+
 @pytest.mark.slow
 def test_the_page_on_export_runs(tmp_path):
     text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")

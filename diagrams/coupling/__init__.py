@@ -4,7 +4,7 @@ from .coupled_steps import CoupledSteps, Effort
 from .links import Links
 from .loops import note_loops
 from .options import Coupling, Scheme, refuse_exchanged, to_coupling
-from .plant_steps import PlantSteps
+from .plant_steps import PlantSteps, step_all
 from .plants import Plant, load_plants, note_fine_steps
 from .report import CoupledConnection, CouplingReport, HeldFrom, LinkKind, report_coupling
 from .search import Search
@@ -27,5 +27,6 @@ __all__ = [
     "note_loops",
     "refuse_exchanged",
     "report_coupling",
+    "step_all",
     "to_coupling",
 ]

@@ -102,7 +102,7 @@ class CoupledSteps:
             raise OptionError(
                 f"found coupling {coupling.scheme!r}, while {few} has communication points of its own, fewer than the "
                 "run has ticks; expected FMUs that all step at every tick. Give simulate(…, step=…), which asks for "
-                "that, leave out communication_step=, or take coupling='jacobi'.",
+                "that, leave out its communication_step, or take coupling='jacobi'.",
                 block=self._name,
                 port="coupling",
             )
@@ -240,7 +240,7 @@ class CoupledSteps:
             step_all([self._plants[path] for path in self._straight], t, h)
             for path, rows in self._straight.items():
                 made[path] = self._w[links.outputs[path]][rows].copy()
-                self._plants[path].restore(start.plants[path])
+                self._restore_plant(path, start)
         self._z[:] = np.where(links.moving & links.smooth_inputs, 0.5 * (inputs + last), inputs)
         step_all(self._plants.values(), t, h)
         for path, rows in self._straight.items():
@@ -315,13 +315,21 @@ class CoupledSteps:
 
     def _save(self) -> _Saved:
         plants = {path: save_plant(plant) for path, plant in self._plants.items()}
-        return _Saved(self._rest.save(), plants, self._w.copy(), self._z.copy())
+        texts = {path: {port: list(v) for port, v in _texts(plant).items()} for path, plant in self._plants.items()}
+        return _Saved(self._rest.save(), plants, texts, self._w.copy(), self._z.copy())
 
     def _restore(self, saved: _Saved) -> None:
-        for path, plant in self._plants.items():
-            plant.restore(saved.plants[path])
+        for path in self._plants:
+            self._restore_plant(path, saved)
         self._rest.restore(saved.rest)
         self._w[:], self._z[:] = saved.w, saved.z
+
+    def _restore_plant(self, path: str, saved: _Saved) -> None:
+        """Let a plant go back; its texts, whose record would begin anew, stay as they were there."""
+        plant = self._plants[path]
+        plant.restore(saved.plants[path])
+        for port, changes in _texts(plant).items():
+            changes[:] = saved.texts[path][port]
 
     @property
     def messages(self) -> tuple[str, ...]:
@@ -343,6 +351,7 @@ class _Saved:
 
     rest: Any
     plants: dict[str, Any]
+    texts: dict[str, dict[str, list[Any]]]
     w: np.ndarray
     z: np.ndarray
 
@@ -351,6 +360,12 @@ def save_plant(plant: Plant) -> Any:
     """Return the state of a plant, for its ``restore``."""
     save = getattr(plant, "save", None)
     return plant.deserialize(plant.serialize()) if save is None else save()
+
+
+def _texts(plant: Plant) -> Mapping[str, list[Any]]:
+    """Return the record of a plant's texts by port."""
+    found: Mapping[str, list[Any]] = getattr(plant, "texts", {})
+    return found
 
 
 def _can_save(block: Any) -> bool:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ...blocks.core import SimulationError
 from ..flat import EVERY, FlatDiagram, takes_any_step
 from .plants import Plant, bind, part_of
 
@@ -78,9 +79,22 @@ class PlantSteps:
     def go(self, k: int, following: int, *, last: bool) -> None:
         """Step the plants from a tick that the run has visited to the next one; see `step_to`."""
         if self.regular:
-            step_all(self._plants.values(), self._time_of(k), float(self._flat.base * (following - k)))
+            self.step_together(self._time_of(k), float(self._flat.base * (following - k)))
         else:
             self.step_to(following, last=last)
+
+    @property
+    def apart(self) -> bool:
+        """Whether several plants step, one of them in a process of its own."""
+        return len(self._plants) > 1 and any(map(runs_apart, self._plants.values()))
+
+    def step_together(self, t: float, h: float) -> None:
+        """Step all plants from t over h, both in s."""
+        if self.apart:
+            step_all(self._plants.values(), t, h)
+        else:
+            for plant in self._plants.values():
+                plant.step(t, h)
 
     def step_to(self, k: int, *, last: bool) -> None:
         """Step the plants of which a tick is a communication point to it; at the ``last`` tick all that can.
@@ -118,15 +132,33 @@ class PlantSteps:
             self.reached.update(saved["reached"])
 
 
+def runs_apart(plant: Any) -> bool:
+    """Whether a plant runs in a process of its own, so that its steps can go on beside others."""
+    return not getattr(getattr(plant, "fmi", None), "in_process", True)
+
+
 def step_all(plants: Iterable[Plant], t: float, h: float) -> None:
-    """Let plants step from t over h, both in s; those in processes of their own step at the same time."""
-    begun = []
+    """Let plants step from t over h, both in s; those in processes of their own step at the same time.
+
+    Every step that has begun is ended, also where one fails; then the first error is raised.
+    """
+    begun: list[Any] = []
+    failure: SimulationError | None = None
     for plant in plants:
-        start = getattr(plant, "start_step", None)
-        if start is None:
-            plant.step(t, h)
-        else:
-            start(t, h)
-            begun.append(plant)
+        apart: Any = plant
+        try:
+            if hasattr(plant, "start_step"):
+                apart.start_step(t, h)
+                begun.append(apart)
+            else:
+                plant.step(t, h)
+        except SimulationError as error:
+            failure = error
+            break
     for plant in begun:
-        plant.finish_step()  # type: ignore[attr-defined]
+        try:
+            plant.finish_step()
+        except SimulationError as error:
+            failure = failure or error
+    if failure is not None:
+        raise failure from failure.__cause__

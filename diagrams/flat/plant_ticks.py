@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from fractions import Fraction
 
 from ...blocks.core import Block
-from ..wiring import Structure, stepped_blocks
+from ..wiring import Structure, exact_time, stepped_blocks
 from .clocks import EVERY, TickPattern, in_order
 
 
@@ -23,9 +23,8 @@ def takes_any_step(plant: Block) -> bool:
 
 def own_step(plant: Block) -> Fraction | None:
     """Return the communication step in s that a plant asks for; None where its wires decide."""
-    found = getattr(plant, "communication_step", None)
-    assert found is None or isinstance(found, Fraction)
-    return found
+    found = getattr(getattr(plant, "stepping", None), "communication_step", None)
+    return None if found is None else exact_time(found, block=plant.label)
 
 
 def find_plant_ticks(

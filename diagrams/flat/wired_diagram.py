@@ -5,9 +5,10 @@ from __future__ import annotations
 from fractions import Fraction
 from typing import Protocol
 
-from ..wiring import CheckedDiagram, Structure, exact_time
+from ..wiring import CheckedDiagram, Structure, exact_time, stepped_blocks
 from .flat_diagram import FlatDiagram
 from .flatten import flatten
+from .plant_ticks import own_step
 
 
 class HasBase(Protocol):
@@ -40,6 +41,11 @@ class WiredDiagram(CheckedDiagram):
             Seconds between two ticks, where no subsystem has a sample time (or to look between samples).
         """
         return self.flattened(None if step is None else exact_time(step, block=self.name))
+
+    @property
+    def has_base(self) -> bool:
+        """Whether the time between two ticks follows from sample times, or from communication steps of FMUs."""
+        return self.has_clock or any(own_step(plant) is not None for plant in stepped_blocks(self.structure).values())
 
     def flatten_like(self, other: HasBase) -> FlatDiagram:
         """Return the diagram with the ticks of an operating point, or of another flat diagram."""

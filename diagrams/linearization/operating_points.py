@@ -161,7 +161,7 @@ def run_to(diagram: WiredDiagram, t: float, options: Mapping[str, Any]) -> Opera
             block=diagram.name,
             port="operating point",
         )
-    if not diagram.has_clock:
+    if not diagram.has_base:
         if start is not None:
             options.setdefault("step", start.base)
         elif not _keeps_step(options, t, diagram.has_fmu):

@@ -69,7 +69,7 @@ class Simulation:
         self._point = start if isinstance(start, OperatingPoint) else None
         if self._point is not None:
             diagram = apply_point(diagram, self._point)
-            if not diagram.is_continuous and not diagram.has_clock:
+            if not diagram.is_continuous and not diagram.has_base:
                 step = step or self._point.base
         self.diagram = diagram
         saved = None if isinstance(start, OperatingPoint) else start
@@ -213,7 +213,7 @@ class Simulation:
         try:
             if self.stopped is None:
                 if count:
-                    self._engine.go(last, self._recorder, tell)
+                    self._engine.go(last, self._recorder.row, tell)
                 if end is not None and self.stopped is None:
                     self._engine.end_between_ticks(end, self._recorder.row, tell)
         except SimulationError as error:
@@ -320,10 +320,9 @@ class Simulation:
 
     @property
     def _messages(self) -> tuple[str, ...]:
-        engine = self._engine
-        coupled = () if engine.coupled is None else engine.coupled.messages
-        told = (m for p in engine.loaded.values() for m in p.messages)
-        return (*self._notes, *engine.messages, *engine.workspace.messages, *coupled, *told)
+        plants = self._engine.loaded.values()
+        coupled = () if self._engine.coupled is None else self._engine.coupled.messages
+        return (*self._notes, *self._engine.workspace.messages, *coupled, *(m for p in plants for m in p.messages))
 
     @property
     def can_save(self) -> bool:

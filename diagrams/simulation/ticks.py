@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import SimulationError
-from ..coupling import CoupledSteps, Plant, PlantSteps
+from ..coupling import CoupledSteps, Plant, PlantSteps, step_all
 from ..flat import EVERY, NONE, TickPattern
 from .continuous import Continuous
 from .view import Position
@@ -50,6 +50,7 @@ def run_ticks(
     t, log = workspace.here.t, workspace.log
     each = [plant.step for plant in plants.values()] if steps.regular and coupled is None else []
     only = each[0] if len(each) == 1 else None
+    together = steps.regular and steps.apart
     n, d, h = flat.base.numerator, flat.base.denominator, float(flat.base)
     always = workspace.bind_tick(flat.acting(0)) if all(c == EVERY for c in flat.distinct) else None
     count, now, before, width = 0, k * n / d, k, 1
@@ -63,6 +64,8 @@ def run_ticks(
                 only(now, h)
             elif coupled is not None:
                 coupled.go(now, k * n / d, h)
+            elif together:
+                step_all(plants.values(), now, h)
             elif steps.regular:
                 for step in each:
                     step(now, h)

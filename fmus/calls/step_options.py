@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import Enum
+from fractions import Fraction
 
 from ...blocks.core import ParameterError
 from ..archive import FmuDescription
@@ -40,6 +41,9 @@ class StepOptions:
         step before. This helps where inputs are smooth; where they are held or jump, it overshoots.
     time : StepTime or {"multiplied", "added"}
         Arithmetic by which the FMU is told the time.
+    communication_step : float or Fraction, optional
+        Seconds between two communication points of the FMU, a multiple of the run's base. None: at the ticks of the
+        subsystems that it is wired to, or at those of the run's ``step``.
 
     Raises
     ------
@@ -53,6 +57,7 @@ class StepOptions:
     retries: int = 10
     input_derivatives: bool = False
     time: StepTime | str = StepTime.MULTIPLIED
+    communication_step: float | Fraction | None = None
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -62,6 +67,14 @@ class StepOptions:
             raise ParameterError(
                 f"found {self.tolerance!r}; expected a positive number, or None. Give one such as 1e-6.",
                 port="stepping.tolerance",
+            )
+        step = self.communication_step
+        if step is not None and (
+            isinstance(step, bool) or not isinstance(step, float | int | Fraction) or not 0 < step < math.inf
+        ):
+            raise ParameterError(
+                f"found {step!r}; expected seconds, positive, or None. Give a multiple of the ticks, such as 0.01.",
+                port="stepping.communication_step",
             )
         if isinstance(self.retries, bool) or not isinstance(self.retries, int) or not 0 <= self.retries <= 50:
             raise ParameterError(

@@ -1,12 +1,14 @@
 """Ticks to which FMUs step: those of the subsystems that they are wired to, in a run and in its linear model."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Clock, Gain, Integrator, Sine
+from loopwright.blocks import Clock, Gain, Integrator, OptionError, ParameterError, SampleTimeError, Sine
 from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu, mass_spring_damper
+from loopwright.fmus import Fmu, StepOptions, mass_spring_damper
 
 P = mass_spring_damper.MassSpringDamper()
 A = np.array([[0.0, 1.0], [-P.stiffness / P.mass, -P.damping / P.mass]])
@@ -148,3 +150,64 @@ def test_an_fmu_of_one_step_length_goes_by_its_own_base_and_says_so(cache, steps
     run = Diagram("d", mass(force=0.0), sampled(0.004, "a")(mass.position), *others).simulate(0.024, progress=False)
     assert [h for _, h in steps] == [0.002] * 12
     assert not run.messages  # the fastest subsystem acts more often
+
+
+# --- communication steps of their own -----------------------------------------------------------------------------------
+
+
+def own(h):
+    return plant(stepping=StepOptions(communication_step=h))
+
+
+def integral_control(stepped, *more):
+    """A mass that a fast controller pulls to zero, by the integral of the position that it sees."""
+
+    @subsystem(sample_time=1e-3)
+    def controller(position):
+        return Gain(gain=-200.0, name="gain")(Integrator(name="integral")(position))
+
+    return Diagram("d", stepped(force=controller(stepped.position)), *more)
+
+
+@pytest.mark.parametrize("between", [False, True], ids=["ticks", "solver"])
+def test_an_fmu_has_a_communication_step_of_its_own(cache, steps, between):
+    """Over its 4 ms the controller adds up the held position four times; the force is that of the FMU's own ticks."""
+    more = [Integrator(name="aside")(Clock())] if between else []
+    diagram = integral_control(own(4e-3), *more)
+    run = diagram.simulate(0.04, progress=False)
+    assert [round(t / 4e-3) for t, _ in steps] == list(range(10))
+    big = np.zeros((3, 3))
+    big[:2, :2], big[:2, 2] = A, B
+    whole = expm(big * 4e-3)
+    M = np.eye(3)
+    M[:2, :2], M[:2, 2], M[2, 0] = whole[:2, :2], -200.0 * whole[:2, 2], 4e-3
+    expected = [np.linalg.matrix_power(M, k) @ [*START, 0.0] for k in range(11)]
+    assert run["plant.position"] == pytest.approx([expected[k // 4][0] for k in range(41)], rel=1e-9, abs=1e-10)
+    if not between:
+        model = diagram.linearize()
+        assert model.dt == pytest.approx(4e-3)
+        found = [z for z in model.poles if abs(z) > 1e-9]
+        assert np.sort_complex(found) == pytest.approx(np.sort_complex(np.linalg.eigvals(M)), abs=1e-9)
+        seen = diagram.linearize(inputs="plant.force", outputs="controller.integral.y")
+        assert [z for z in seen.poles if abs(z) > 1e-9] == pytest.approx(found, abs=1e-9)
+
+
+def test_an_own_communication_step_is_a_clock_and_must_fit_the_others(cache, steps):
+    alone = own(0.01)
+    run = Diagram("d", alone(force=0.0)).simulate(0.1, progress=False)
+    assert len(run.t) == 11
+    assert len(steps) == 10
+    two = Diagram("d", own(0.02).replace(name="a")(force=0.0), own(0.03).replace(name="b")(force=0.0))
+    assert two.flatten().base == Fraction(1, 100)
+    with pytest.raises(SampleTimeError, match=r"a: its communication step 0\.02 s is no multiple of the step 0\.015 s"):
+        two.flatten(0.015)
+    with pytest.raises(ParameterError, match="expected seconds, positive"):
+        StepOptions(communication_step=-1.0)
+    with pytest.raises(OptionError, match="a has communication points of its own, fewer than the run has ticks"):
+        two.simulate(0.1, progress=False, coupling="gauss_seidel")
+
+
+def test_delays_of_an_fmu_with_a_longer_communication_step(cache):
+    found = {c.target: c for c in integral_control(own(4e-3)).report_coupling().connections}
+    assert found["plant.force"].step == found["controller.integral.u"].step == 4e-3
+    assert found["plant.force"].delay == found["controller.integral.u"].delay == pytest.approx(1.5e-3)  # 0, 1, 2, 3 ms

@@ -5,6 +5,7 @@ import pytest
 
 from loopwright.blocks import OptionError, SimulationError
 from loopwright.diagrams import Coupling
+from loopwright.diagrams.coupling import step_all
 from loopwright.fmus import Fmu
 from support.oscillators import (
     coupled_by_inertia,
@@ -191,3 +192,56 @@ def test_a_linear_model_over_steps_of_another_coupling_is_refused(cache):
             diagram.linearize(point, step=0.01)
     free = diagram.linearize(run.at(0.05))  # in continuous time: no coupling acts
     assert len(free.poles) == 4
+
+
+# --- FMUs in processes of their own ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("coupling", ["jacobi", "gauss_seidel", "iterated"])
+def test_fmus_in_processes_of_their_own_give_the_bits_of_those_in_this_one(cache, coupling):
+    apart = two_masses().replace(
+        {"a": two_masses()["a"].replace(isolate=True), "b": two_masses()["b"].replace(isolate=True)}
+    )
+    here, there = (d.simulate(0.1, step=0.01, progress=False, coupling=coupling) for d in (two_masses(), apart))
+    assert here["a.position"].tolist() == there["a.position"].tolist()
+    assert here["b.velocity"].tolist() == there["b.velocity"].tolist()
+
+
+class Apart:
+    """A plant in a process of its own, as its calls look from here."""
+
+    class fmi:  # noqa: N801
+        in_process = False
+
+    def __init__(self, name, calls, fails=""):
+        self.name, self.calls, self.fails = name, calls, fails
+
+    def start_step(self, t, h):
+        self.calls.append(f"start {self.name}")
+        if self.fails == "start":
+            raise SimulationError("no", block=self.name)
+
+    def finish_step(self):
+        self.calls.append(f"finish {self.name}")
+        if self.fails == "finish":
+            raise SimulationError("no", block=self.name)
+
+
+def test_all_steps_begin_before_one_is_waited_for():
+    calls = []
+    step_all([Apart("a", calls), Apart("b", calls)], 0.0, 0.1)
+    assert calls == ["start a", "start b", "finish a", "finish b"]
+
+
+@pytest.mark.parametrize(
+    ("fails", "calls_made"),
+    [
+        (("finish", ""), ["start a", "start b", "finish a", "finish b"]),
+        (("", "start"), ["start a", "start b", "finish a"]),
+    ],
+)
+def test_a_step_that_has_begun_is_ended_where_another_one_fails(fails, calls_made):
+    calls = []
+    with pytest.raises(SimulationError, match="no"):
+        step_all([Apart("a", calls, fails[0]), Apart("b", calls, fails[1])], 0.0, 0.1)
+    assert calls == calls_made
