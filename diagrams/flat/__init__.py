@@ -11,7 +11,7 @@ from .plant_ticks import own_step, takes_any_step
 from .stages import Bound, Evaluators, Schedule, bind_function, evaluate_apart
 from .total_derivative import Derivative
 from .trace_stages import trace_schedule
-from .vectors import join_columns, loop_mismatch, next_x, plant_inputs, rates
+from .vectors import Vectors, join_columns, loop_mismatch, next_x, plant_inputs, rates
 from .wired_diagram import WiredDiagram
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "Schedule",
     "StateLayout",
     "TickPattern",
+    "Vectors",
     "WiredDiagram",
     "bind_function",
     "evaluate",

@@ -1,4 +1,4 @@
-"""The vectors of the whole diagram at an instant that was evaluated with symbols."""
+"""The vectors of the whole diagram: those of an instant that was evaluated with symbols, and memory for numbers."""
 
 from __future__ import annotations
 
@@ -10,6 +10,29 @@ import numpy as np
 
 from ...blocks.core import Layout
 from .evaluation import Instant, rows
+from .layout import FlatLayout
+
+
+class Vectors:
+    """An instant, in memory that functions are bound to.
+
+    Attributes
+    ----------
+    t : ndarray
+        Time in s, shape (1,).
+    x : ndarray
+        States, held outputs, gates, reset states and loop values, shape (`FlatLayout.width`,).
+    w : ndarray
+        Outputs of plants and of transport delays.
+    p : ndarray
+        Parameters; one vector may serve several instants of a run.
+    """
+
+    def __init__(self, layout: FlatLayout, p: np.ndarray):
+        self.t = np.zeros(1)
+        self.x = layout.x0.copy()
+        self.w = np.zeros(layout.plant_outputs.total)
+        self.p = p
 
 
 def next_x(instant: Instant) -> Any:

@@ -129,6 +129,37 @@ class Recorder:
             self._skip = self.every - 1
             self._keep(t, vector)
 
+    @property
+    def entries(self) -> np.ndarray | None:
+        """Entries of the vector that a row keeps, ascending; None for all."""
+        return self._pick
+
+    @property
+    def skip(self) -> int:
+        """Calls of `row` to come until the next one that is kept."""
+        return self._skip
+
+    def room(self, t: float) -> np.ndarray:
+        """Return rows to be written from outside, shape (n, 1 + entries), n > 0: time, then values; see `took`.
+
+        Parameters
+        ----------
+        t : float
+            Time that the run has reached in s, for an error.
+        """
+        if self._k == self._limit or (self.to is not None and monotonic() >= self._due):
+            if self.to is None:
+                self._grow(t)
+            else:
+                self._start()
+                self.flush()
+        return self._chunk[self._k :]
+
+    def took(self, rows: int, skip: int) -> None:
+        """Take over rows that were written into `room`, and how many samples are to be skipped next."""
+        self._k += rows
+        self._skip = skip
+
     def last(self, t: float, vector: np.ndarray) -> None:
         """Append the final sample, whatever ``every`` is, unless `row` has just kept it."""
         newest = self._chunk[self._k - 1] if self._k else self._tail

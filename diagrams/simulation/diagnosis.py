@@ -8,8 +8,7 @@ import numpy as np
 
 from ...blocks.core import NonFiniteError, SimulationError
 from ...blocks.tracing import GUARDS, NEXT, bundle, raise_failure
-from ..flat import Evaluators, FlatDiagram, Instant, TickPattern, evaluate, evaluate_apart
-from .vectors import Vectors
+from ..flat import Evaluators, FlatDiagram, Instant, TickPattern, Vectors, evaluate, evaluate_apart
 
 
 def failure(

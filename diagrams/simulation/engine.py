@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from ...blocks.core import Block, SimulationError, UnknownNameError, near
 from ..coupling import CoupledSteps, Plant, PlantSteps, load_plants, refuse_exchanged, to_coupling
 from ..exchange import ExchangedBlock, ExchangedBlocks
 from ..flat import FlatDiagram
-from ..results import Occurrence, OperatingPoint, TextSignal
+from ..results import Occurrence, OperatingPoint, Recorder, TextSignal
 from ..solvers import solver_name
 from .continuous import Continuous
 from .continuous_part import ContinuousPart
@@ -24,6 +25,9 @@ from .stops import StopConditions
 from .ticks import Progress, Row, end_between_ticks, run_hybrid, run_ticks, take_tick
 from .view import Position, SimulationView
 from .workspace import Workspace
+
+if TYPE_CHECKING:
+    from .compiled_ticks import CompiledTicks
 
 
 class Engine:
@@ -64,6 +68,9 @@ class Engine:
         asking = self.exchanged.ends_run if self.exchanged else None
         self._stops = StopConditions(flat, self.workspace.log, asking)
         self._passes_on = check_start_exchange(options.start_exchange)
+        self._compile = options.compile
+        self._compiled: CompiledTicks | None = None
+        self.messages: tuple[str, ...] = ()
         self._can_stop = self._stops.exist
         self._tell = on_event
         if flat.hybrid:
@@ -132,6 +139,19 @@ class Engine:
             plant.begin()
         self.exchanged.begin(self.workspace.here.x)
         self.workspace.begun = True
+        if self._compile:
+            self._compiled = self._make_compiled()
+
+    def _make_compiled(self) -> CompiledTicks | None:
+        """Return the ticks in C; None, with a message, where they can't be had."""
+        from .compiled_ticks import make_compiled
+
+        regular = self.steps.regular and self.coupled is None
+        found, message = make_compiled(
+            self.workspace, self.plants, self._stops.entries, every=self.every_tick, regular=regular
+        )
+        self.messages += message
+        return found
 
     def take_first_tick(self, point: OperatingPoint | None, row: Row) -> None:
         """Go through the tick with which the run begins, tick 0 or that of an operating point, and record it."""
@@ -145,13 +165,13 @@ class Engine:
         row(now, self.workspace.log)
         self._arrive(first)
 
-    def go(self, last: int, row: Row, progress: Progress) -> None:
+    def go(self, last: int, recorder: Recorder, progress: Progress) -> None:
         """Go on to a tick, or to where a stop condition ends the run.
 
         Parameters
         ----------
-        row : callable
-            Records a sample.
+        recorder : Recorder
+            Records the samples.
         progress : callable
             Told the time now and then, and at the end.
 
@@ -160,8 +180,11 @@ class Engine:
         SimulationError
             With the block that is to blame.
         """
-        workspace, plants, position = self.workspace, self.plants, self.position
+        workspace, plants, position, row = self.workspace, self.plants, self.position, recorder.row
         try:
+            if self._compiled is not None and self._compiled.reaches(last):
+                self._compiled.run(position.tick, last, recorder, arrived=self._arrive, progress=progress)
+                return
             if self.continuous is None:
                 run_ticks(
                     workspace, plants, self.steps, self.coupled, position.tick, last,

@@ -47,6 +47,7 @@ class RunKeywords(TypedDict, total=False):
     start: RunState | OperatingPoint | None
     coupling: str | Coupling
     start_exchange: str
+    compile: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +89,10 @@ class RunOptions:
     start_exchange : {"agree", "once", "none"}
         Exchange of values with FMUs while they initialize: until inputs and outputs agree, one pass, or none, where
         inputs keep their start values until the first step. Tools differ in this.
+    compile : bool
+        Go from tick to tick in C, with the same results to the last bit: it needs a compiler (the extra ``build``), and
+        a diagram of sampled subsystems and FMUs in this process, without continuous states, algebraic loops and blocks
+        of Python. Where one of these fails, the run is interpreted, and ``run.messages`` says why.
     """
 
     step: float | Fraction | None = None
@@ -103,6 +108,7 @@ class RunOptions:
     start: RunState | OperatingPoint | None = None
     coupling: str | Coupling = "jacobi"
     start_exchange: str = START_EXCHANGES[0]
+    compile: bool = False
 
     @classmethod
     def of(cls, options: Mapping[str, Any], *, block: str) -> Self:

@@ -213,7 +213,7 @@ class Simulation:
         try:
             if self.stopped is None:
                 if count:
-                    self._engine.go(last, self._recorder.row, tell)
+                    self._engine.go(last, self._recorder, tell)
                 if end is not None and self.stopped is None:
                     self._engine.end_between_ticks(end, self._recorder.row, tell)
         except SimulationError as error:
@@ -320,9 +320,10 @@ class Simulation:
 
     @property
     def _messages(self) -> tuple[str, ...]:
-        plants = self._engine.loaded.values()
-        coupled = () if self._engine.coupled is None else self._engine.coupled.messages
-        return (*self._notes, *self._engine.workspace.messages, *coupled, *(m for p in plants for m in p.messages))
+        engine = self._engine
+        coupled = () if engine.coupled is None else engine.coupled.messages
+        told = (m for p in engine.loaded.values() for m in p.messages)
+        return (*self._notes, *engine.messages, *engine.workspace.messages, *coupled, *told)
 
     @property
     def can_save(self) -> bool:

@@ -37,6 +37,11 @@ class StopConditions:
         """Whether the diagram has any."""
         return bool(self._entries) or self._asking is not None
 
+    @property
+    def entries(self) -> list[int]:
+        """Entries of the outputs that end the run where they are true."""
+        return [entry for entry, _ in self._entries]
+
     def is_met(self) -> bool:
         """Whether any is true."""
         met = any(self._log[i] > TRUE for i, _ in self._entries)

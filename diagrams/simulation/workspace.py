@@ -9,10 +9,9 @@ import numpy as np
 
 from ...blocks.core import Block, ParameterError
 from ...blocks.tracing import is_traced_by
-from ..flat import NONE, Bound, Derivative, Evaluators, FlatDiagram, Schedule, TickPattern
+from ..flat import NONE, Bound, Derivative, Evaluators, FlatDiagram, Schedule, TickPattern, Vectors
 from .algebraic_loops import LoopSolver
 from .diagnosis import failure
-from .vectors import Vectors
 
 
 class Workspace:

@@ -6,12 +6,15 @@ from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance
 from .loaded_library import CALLS, LoadedFmu, MakeCalls
+from .native_step import NativeStep
 from .saved_state import FmuState
+from .step_failures import NEAR
 from .step_options import StepOptions, StepTime, check_offered
 
 __all__ = [
     "CALLS",
     "ERROR",
+    "NEAR",
     "WARNING",
     "BoundCalls",
     "Call",
@@ -23,6 +26,7 @@ __all__ = [
     "LoadedFmu",
     "Log",
     "MakeCalls",
+    "NativeStep",
     "StepOptions",
     "StepTime",
     "check_offered",

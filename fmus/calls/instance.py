@@ -14,6 +14,7 @@ from ..archive import FmuVariable
 from .fmi_calls import StepCall
 from .fmu_block import FmuBlock
 from .loaded_library import MakeCalls
+from .native_step import NativeStep, native_step
 from .saved_state import FmuState, pack_state, unpack_state
 from .shared_steps import SharedSteps
 from .step_failures import NEAR, StepFailures
@@ -44,6 +45,9 @@ class FmuInstance(StepFailures):
     exchange: Callable[[], None]
     """In Initialization Mode: set the inputs and get the outputs (after `bind`)."""
 
+    read: Callable[[float], None]
+    """Get the outputs at a time in s (after `bind`)."""
+
     def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
         super().__init__(block, make_calls=make_calls)
         self._has_retried = False
@@ -56,9 +60,10 @@ class FmuInstance(StepFailures):
         self._asked = (0.0, 0.0)
         self.start_step, self.finish_step = self._ask, self._take
         self._handles: dict[int, Any] = {}
-        self._read: Callable[[float], None] = lambda t: None
+        self.read = lambda t: None
         self._texts = TextRecord(self.fmi, block.text_variables)
         self._careful: CarefulSteps | None = None
+        self._native: tuple[StepCall, Transfer, Transfer] | None = None
 
     @property
     def t(self) -> float:
@@ -69,7 +74,7 @@ class FmuInstance(StepFailures):
         """Leave Initialization Mode and read the outputs at the start of the run."""
         super().begin()
         self._now.value, self._width.value = self._began, 0.0
-        self._read(self._began)
+        self.read(self._began)
         self._begin_texts()
 
     def _settle_start(self) -> None:
@@ -85,20 +90,30 @@ class FmuInstance(StepFailures):
         call = self.fmi.step_call(self._now, self._width, self._final)
         plain = ins.is_plain and outs.is_plain
         if self.fmi.in_process:
-            self.step, self.exchange, self._read = (self._bind_plain if plain else self._bind_typed)(ins, outs, call)
+            self.step, self.exchange, self.read = (self._bind_plain if plain else self._bind_typed)(ins, outs, call)
         else:
             shared = SharedSteps(self, ins, outs, call)
-            self.step, self.exchange, self._read = shared.step, shared.exchange, shared.read
+            self.step, self.exchange, self.read = shared.step, shared.exchange, shared.read
             self.start_step, self.finish_step = shared.start, shared.finish
         self._call = call
-        if needs_care(self.description, self.block.stepping):
+        careful = needs_care(self.description, self.block.stepping)
+        plain = plain and self.fmi.in_process and not careful and not self._texts.variables
+        self._native = (call, ins, outs) if plain else None
+        if careful:
             self._careful = CarefulSteps(self, self._inputs, inputs, outs, call)
             self.step = partial(self._step_marked, self._careful.step)
         if self._texts.variables:
             self.step = partial(self._step_and_note, self.step)
         if isinstance(self.step, partial):
             self.start_step, self.finish_step = self._ask, self._take
-        self._read(self._began)
+        self.read(self._began)
+
+    @property
+    def native(self) -> NativeStep | None:
+        """Its step as addresses; None in another process, and where a step is more than three calls."""
+        if self._native is None:
+            return None
+        return native_step(self.description.fmi, self._now, self._width, self._final, *self._native)
 
     def _ask(self, t: float, h: float) -> None:
         self._asked = t, h
@@ -252,7 +267,7 @@ class FmuInstance(StepFailures):
         self._now.value, self._width.value = state.t, 0.0
         if self._careful is not None:
             self._careful.return_to(state.t)
-        self._read(state.t)
+        self.read(state.t)
         self._begin_texts()
 
     def serialize(self, state: FmuState | None = None) -> bytes:

@@ -127,6 +127,23 @@ class StepFailures(LoadedFmu):
                 f"{where}; its outputs are taken as those of {t + h:.9g} s. {advice}"
             )
 
+    def judge_native(self, stage: int, status: int, t: float, h: float) -> None:
+        """Judge a step in C from t over h, both in s, that was out of the ordinary: raise its error, or accept it.
+
+        Parameters
+        ----------
+        stage : {0, 1, 2}
+            What was done last: setting the inputs, the step, reading the outputs.
+        status : int
+            Status of that.
+        """
+        assert self._call is not None
+        if stage != 1 and status > 1:
+            raise self.report("setting the inputs" if stage == 0 else "reading the outputs", status, t)
+        if status > 1:
+            self.end_step(status, t, h)
+        self.check_flags(self._call, t, h)
+
     def note_retry(self, t: float, h: float, count: int) -> None:
         """Keep the message of the first step that was discarded."""
         if not self._has_retried:

@@ -1,7 +1,7 @@
 """Inspection, validation, examination and trial runs of FMUs."""
 
 from .diagnosis import FmuDiagnosis, FmuTrial, FmuVerdict
-from .doctor import doctor
+from .examination import doctor
 from .summary import INTERFACES, summarize
 from .validation import validate
 

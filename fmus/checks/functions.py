@@ -41,19 +41,18 @@ def missing_promises(library: SharedLibrary, place: str, summary: Mapping[str, A
     if library.symbols is None or major not in _PROMISES:
         return
     promised: set[str] = set()
-    for attributes in summary["interfaces"].values():
-        for flag, names in _PROMISES[major].items():
-            if attributes.get(flag) not in (True, 1):
-                continue
-            lost = [name for name in names if name not in library.symbols]
-            promised.update(lost)
-            if lost:
-                yield FmuFinding(
-                    FmuFault.MISSING_SYMBOL,
-                    lost[0],
-                    f"it declares {flag}, but {place} lacks {', '.join(lost)}; expected them.",
-                    "Don't rely on this capability. Report it to its makers.",
-                )
+    for flag, names in _PROMISES[major].items():
+        if not any(attributes.get(flag) in (True, 1) for attributes in summary["interfaces"].values()):
+            continue
+        lost = [name for name in names if name not in library.symbols]
+        promised.update(lost)
+        if lost:
+            yield FmuFinding(
+                FmuFault.MISSING_SYMBOL,
+                lost[0],
+                f"it declares {flag}, but {place} lacks {', '.join(lost)}; expected them.",
+                "Don't rely on this capability. Report it to its makers.",
+            )
     others = sorted(_standard(major, summary["interfaces"]) - library.symbols - promised)
     if others:
         shown = ", ".join(others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")

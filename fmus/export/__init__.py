@@ -1,6 +1,6 @@
 """Export of a block as an FMU: equations, C code, model description, binaries."""
 
-from .compiler import SUFFIXES, TARGETS
+from .compiler import SUFFIXES, TARGETS, compile_shared, describe_compiler
 from .from_block import build, model_spec
 from .model import Integrator, ModelSpec, Variable
 from .package import build_fmu, clear_cache
@@ -16,5 +16,7 @@ __all__ = [
     "build_fmu",
     "build_python",
     "clear_cache",
+    "compile_shared",
+    "describe_compiler",
     "model_spec",
 ]

@@ -106,6 +106,18 @@ def flags(compiler: Compiler, platform: str) -> tuple[str, ...]:
     return (*target, *FLAGS, *(() if windows else ("-fPIC",)))
 
 
+def describe_compiler(platform: str) -> tuple[str, ...]:
+    """Return the compiler's name, version and flags for a platform, for keys of caches.
+
+    Raises
+    ------
+    CompilerError
+        If there is none.
+    """
+    compiler = find_compiler()
+    return (compiler.identity, *flags(compiler, platform))
+
+
 def check_platform(compiler: Compiler, platform: str) -> None:
     """Refuse a platform for which this compiler can't build."""
     if platform not in TARGETS and (compiler.zig or platform != native_platform()):

@@ -24,7 +24,8 @@ from loopwright.blocks import (
     parameter,
 )
 from loopwright.diagrams import Diagram, experiments, subsystem
-from loopwright.diagrams.flat.layout import NONE, FlatLayout
+from loopwright.diagrams.flat.clocks import NONE
+from loopwright.diagrams.flat.layout import FlatLayout
 from loopwright.diagrams.flat.stages import OpaqueStage, TracedStage
 from loopwright.diagrams.flat.total_derivative import Derivative
 from loopwright.diagrams.linearization.derivatives import LocalDerivatives, find_signal

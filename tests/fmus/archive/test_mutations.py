@@ -21,11 +21,11 @@ def good(cache):
 
 
 def mutate(data, rng):
-    """Change an archive at one to four places: bytes, numbers, parts that are cut out, doubled or moved."""
+    """Change an archive at one or two places: bytes, numbers, parts that are cut out, doubled or moved."""
     data = bytearray(data)
     end = data.rindex(b"PK\5\6")
     directory = int.from_bytes(data[end + 16 : end + 20], "little")
-    for _ in range(rng.randint(1, 4)):
+    for _ in range(rng.randint(1, 2)):
         if not data:
             break
         at = rng.randrange(directory, end + 22) if rng.random() < 0.6 else rng.randrange(len(data))
@@ -76,7 +76,7 @@ def test_mutated_archives_are_unpacked_whole_or_refused(good, tmp_path, monkeypa
             assert str(path) in str(told)
         path.unlink()
     assert {path.name for path in tmp_path.iterdir()} <= {"cache"}
-    assert min(found.values()) > count // 50
+    assert min(found.values()) > count // 100
 
 
 @pytest.mark.parametrize("count", [30, pytest.param(1000, marks=pytest.mark.slow)])

@@ -74,7 +74,8 @@ def doctor(
         archive = FmuArchive.open(path, limits)
         summary = summarize(path, limits=limits)
     except FmuFileError as error:
-        return FmuDiagnosis(str(path), FmuVerdict.REFUSED, (_as_error(error, path),))
+        reason = _as_error(error, path)
+        return FmuDiagnosis(str(path), _decide([reason], [], []), (reason,))
     counts = Counter(v["causality"] for v in summary.pop("variables"))
     found = [*_judge_platform(archive, summary), *_judge_content(summary)]
     found += _judge_rules(path, archive, found)
@@ -127,8 +128,9 @@ def _judge_platform(archive: FmuArchive, summary: Mapping[str, Any]) -> Iterator
     identifiers = [str(attributes.get("modelIdentifier")) for attributes in summary["interfaces"].values()]
     found = native_libraries(native, binaries, identifiers)
     if found is None:
-        yield _absent(native, binaries, summary)
-        return
+        if not any(tuple_of(folder) == native and names for folder, names in binaries.items()):
+            yield _absent(native, binaries, summary)
+        return  # of several libraries with other names, the description's reading tells
     folder, names = found
     for name in names:
         place = f"binaries/{folder}/{name}"

@@ -1,0 +1,221 @@
+"""The compiled loop: a diagram's ticks and the FMUs between them, gone through in C."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from ...fmus.calls import NEAR, NativeStep
+from ..flat import TRUE, TickPattern
+from .code import TickCode, master
+
+
+class Reason(IntEnum):
+    """Reasons for which the loop returns: the end of its ticks, or the first tick that Python must look at."""
+
+    DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED = range(6)
+
+
+class _Outcome(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_int64) for name in ("ticks", "rows", "reason", "plant", "stage", "status")]
+
+
+class _Tick(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_void_p) for name in ("evaluate", "arguments", "results", "iw", "w")]
+
+
+class _Transfer(ctypes.Structure):
+    _fields_ = [
+        ("function", ctypes.c_void_p),
+        ("references", ctypes.c_void_p),
+        ("count", ctypes.c_size_t),
+        ("values", ctypes.c_void_p),
+        ("size", ctypes.c_size_t),
+    ]
+
+
+class _Plant(ctypes.Structure):
+    _fields_ = [
+        ("version", ctypes.c_int32),
+        ("instance", ctypes.c_void_p),
+        ("step", ctypes.c_void_p),
+        ("inputs", _Transfer),
+        ("outputs", _Transfer),
+        *((name, ctypes.c_void_p) for name in ("now", "width", "final", "flags", "reached")),
+    ]
+
+
+class _Loop(ctypes.Structure):
+    _fields_ = [
+        *((name, ctypes.c_int64) for name in ("kinds", "plants", "states", "row", "stops", "every")),
+        *((name, ctypes.c_void_p) for name in ("ticks", "fmus", "t", "x", "x_next", "log", "ok", "columns", "stop")),
+        ("truth", ctypes.c_double),
+        ("near", ctypes.c_double),
+        ("skip", ctypes.c_int64),
+        ("halt", ctypes.c_int32),
+    ]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where and why the loop has returned.
+
+    Attributes
+    ----------
+    ticks, rows : int
+        Ticks that were gone through, and samples that were written.
+    reason : Reason
+        The reason.
+    plant : int
+        The FMU that it is about, by its place.
+    stage : {0, 1, 2}
+        What failed: setting the inputs, the step, reading the outputs.
+    status : int
+        Status of that call.
+    """
+
+    ticks: int
+    rows: int
+    reason: Reason
+    plant: int
+    stage: int
+    status: int
+
+
+class CompiledLoop:
+    """The loop over ticks, bound to the numbers of a run.
+
+    Parameters
+    ----------
+    code : TickCode
+        The ticks.
+    arguments, results : sequence of ndarray
+        The vectors (t, x, w, p) and (x_next, z, log, ok) of the run.
+    plants : sequence of NativeStep
+        The steps of the FMUs.
+    columns : ndarray or None
+        Entries of the log that a sample keeps; None for the first ``width``.
+    width : int
+        Number of entries of a sample.
+    every : int
+        One of so many samples is kept.
+    stops : sequence of int
+        Entries of the log that end the run where they are true.
+    """
+
+    def __init__(
+        self,
+        code: TickCode,
+        arguments: Sequence[np.ndarray],
+        results: Sequence[np.ndarray],
+        plants: Sequence[NativeStep],
+        *,
+        columns: np.ndarray | None,
+        width: int,
+        every: int,
+        stops: Sequence[int],
+    ):
+        self._kept: list[Any] = [code, arguments, results, plants, columns]
+        t, x, _, _ = arguments
+        x_next, _, log, ok = results
+        self.kinds = {clocks: i for i, clocks in enumerate(code.functions)}
+        self._loop = _Loop(
+            kinds=len(code.functions),
+            plants=len(plants),
+            states=x.size,
+            row=width,
+            stops=len(stops),
+            every=every,
+            ticks=self._address([self._tick(code, clocks, arguments, results) for clocks in code.functions], _Tick),
+            fmus=self._address([self._plant(plant) for plant in plants], _Plant),
+            t=_at(t),
+            x=_at(x),
+            x_next=_at(x_next),
+            log=_at(log),
+            ok=_at(ok),
+            columns=None if columns is None else self._array(np.ascontiguousarray(columns, dtype=np.int64)),
+            stop=self._array(np.array(stops, dtype=np.int64)),
+            truth=TRUE,
+            near=NEAR,
+        )
+        self._outcome, self._run = _Outcome(), master()
+
+    def _array(self, values: np.ndarray) -> int | None:
+        self._kept.append(values)
+        return _at(values)
+
+    def _address(self, structures: Sequence[ctypes.Structure], kind: type[ctypes.Structure]) -> int | None:
+        if not structures:
+            return None
+        array = (kind * len(structures))(*structures)
+        self._kept.append(array)
+        return ctypes.addressof(array)
+
+    def _tick(
+        self,
+        code: TickCode,
+        clocks: frozenset[TickPattern],
+        arguments: Sequence[np.ndarray],
+        results: Sequence[np.ndarray],
+    ) -> ctypes.Structure:
+        function = code.functions[clocks]
+        given, made = (ctypes.c_void_p * function.sz_arg())(), (ctypes.c_void_p * function.sz_res())()
+        for into, vectors in ((given, arguments), (made, results)):
+            for i, vector in enumerate(vectors):
+                into[i] = _at(vector)
+        iw, w = np.zeros(function.sz_iw() + 1, dtype=np.int64), np.zeros(function.sz_w() + 1)
+        self._kept += [given, made]
+        return _Tick(
+            code.addresses[clocks], ctypes.addressof(given), ctypes.addressof(made), self._array(iw), self._array(w)
+        )
+
+    def _plant(self, step: NativeStep) -> ctypes.Structure:
+        inputs, outputs = (
+            _Transfer()
+            if call is None
+            else _Transfer(call.function, call.references, call.count, call.values, call.size)
+            for call in (step.inputs, step.outputs)
+        )
+        return _Plant(
+            step.version, step.instance, step.step, inputs, outputs, step.now, step.width, step.final, step.flags,
+            step.reached,
+        )  # fmt: skip
+
+    @property
+    def skip(self) -> int:
+        """Samples to leave out before the next one that is kept."""
+        return int(self._loop.skip)
+
+    @skip.setter
+    def skip(self, count: int) -> None:
+        self._loop.skip = count
+
+    def run(self, times: np.ndarray, widths: np.ndarray, kinds: np.ndarray, rows: np.ndarray) -> Outcome:
+        """Go through ticks, at most as many as there are rows to be written.
+
+        Parameters
+        ----------
+        times : ndarray, shape (n + 1,)
+            Time of the tick before them, and of each of them, in s.
+        widths : ndarray, shape (n,)
+            Length of each tick, in s.
+        kinds : ndarray, shape (n,), of int32
+            Clocks that act at each of them, as places in `kinds`.
+        rows : ndarray, shape (m, 1 + width)
+            Samples: their time in s, then their values.
+        """
+        self._run(
+            ctypes.byref(self._loop), ctypes.c_int64(len(widths)), *(ctypes.c_void_p(_at(a)) for a in (times, widths)),
+            ctypes.c_void_p(_at(kinds)), ctypes.c_void_p(_at(rows)), ctypes.byref(self._outcome),
+        )  # fmt: skip
+        found = self._outcome
+        return Outcome(found.ticks, found.rows, Reason(found.reason), found.plant, found.stage, found.status)
+
+
+def _at(vector: np.ndarray) -> int | None:
+    return vector.ctypes.data if vector.size else None

@@ -1,0 +1,157 @@
+/* The loop over ticks: FMUs step, the diagram's tick is evaluated, its states are taken over, a sample is recorded.
+
+   It knows no diagram: a tick is a function pointer with the addresses of its arguments and results. On anything out of
+   the ordinary it returns at that tick; Python, which has the same numbers before it, says what has happened. */
+
+#include <math.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+
+#ifdef _WIN32
+#define VISIBLE __declspec(dllexport)
+#else
+#define VISIBLE __attribute__((visibility("default")))
+#endif
+
+typedef int (*tick_function)(const double **arguments, double **results, long long *iw, double *w, int memory);
+
+/* A tick at which some clocks act. */
+typedef struct {
+    tick_function evaluate;
+    const double **arguments;
+    double **results;
+    long long *iw;
+    double *w;
+} tick;
+
+typedef int (*set_or_get2)(void *instance, const uint32_t *references, size_t count, double *values);
+typedef int (*set_or_get3)(void *instance, const uint32_t *references, size_t count, double *values, size_t size);
+typedef int (*do_step2)(void *instance, double now, double width, int final);
+typedef int (*do_step3)(void *instance, double now, double width, bool final, bool *event, bool *terminate, bool *early,
+                        double *reached);
+
+typedef struct {
+    void *function; /* NULL: no such ports */
+    const uint32_t *references;
+    size_t count;
+    double *values;
+    size_t size;
+} transfer;
+
+/* An FMU in this process; flags are event, terminate, early return, and one that is never set. */
+typedef struct {
+    int32_t version;
+    void *instance;
+    void *step;
+    transfer inputs, outputs;
+    double *now, *width;
+    const void *final;
+    bool *flags;
+    double *reached;
+} plant;
+
+typedef struct {
+    int64_t kinds, plants, states, row, stops, every;
+    const tick *ticks;
+    const plant *fmus;
+    double *t, *x;
+    const double *x_next, *log, *ok;
+    const int64_t *columns; /* entries of the log that are recorded; NULL: the first ones */
+    const int64_t *stop;    /* entries of the log that end the run where they are true */
+    double truth;           /* a condition is true above it */
+    double near;            /* distance from the end of a step, in steps, within which a time is that end */
+    int64_t skip;           /* samples to leave out before the next one that is kept */
+    volatile int32_t halt;  /* not 0: return before the next tick */
+} loop;
+
+enum { DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED };
+enum { INPUTS, STEP, OUTPUTS };
+
+typedef struct {
+    int64_t ticks, rows; /* that were gone through, and recorded */
+    int64_t reason, plant, stage, status;
+} outcome;
+
+static int move(const plant *p, const transfer *of) {
+    if (p->version == 2)
+        return ((set_or_get2)of->function)(p->instance, of->references, of->count, of->values);
+    return ((set_or_get3)of->function)(p->instance, of->references, of->count, of->values, of->size);
+}
+
+static int step(const plant *p) {
+    if (p->version == 2) return ((do_step2)p->step)(p->instance, *p->now, *p->width, *(const int *)p->final);
+    return ((do_step3)p->step)(p->instance, *p->now, *p->width, *(const bool *)p->final, p->flags, p->flags + 1,
+                               p->flags + 2, p->reached);
+}
+
+/* Step one FMU; return DONE, or why it can't go on. */
+static int64_t step_plant(const plant *p, double now, double width, outcome *out) {
+    unsigned status; /* a negative one is no success */
+    out->stage = INPUTS;
+    if (p->inputs.function && (status = (unsigned)move(p, &p->inputs)) > 1) return out->status = (int)status, FMU_FAILED;
+    *p->now = now;
+    *p->width = width;
+    out->stage = STEP;
+    if ((status = (unsigned)step(p)) > 1) return out->status = (int)status, FMU_FAILED;
+    return p->flags[1] | p->flags[2] ? FMU_FLAGS : DONE; /* a flag for an event is for event mode alone */
+}
+
+static int64_t read_plant(const plant *p, double now, double width, double near, outcome *out) {
+    unsigned status; /* a negative one is no success */
+    if (fabs(*p->reached - now - width) > width * near) return FMU_FLAGS;
+    out->stage = OUTPUTS;
+    if (p->outputs.function && (status = (unsigned)move(p, &p->outputs)) > 1) return out->status = (int)status, FMU_FAILED;
+    return DONE;
+}
+
+/* Go through ticks, one after the other; times[i] is where tick i begins, times[i + 1] where it ends. */
+VISIBLE void loopwright_run(loop *l, int64_t count, const double *times,
+                                                           const double *widths, const int32_t *kinds, double *rows,
+                                                           outcome *out) {
+    int64_t i;
+    out->rows = 0;
+    out->reason = DONE;
+    for (i = 0; i < count; i++) {
+        if (l->halt) {
+            out->reason = HALTED;
+            break;
+        }
+        for (int64_t j = 0; j < l->plants; j++) {
+            const plant *p = l->fmus + j;
+            out->plant = j;
+            if ((out->reason = step_plant(p, times[i], widths[i], out)) != DONE ||
+                (out->reason = read_plant(p, times[i], widths[i], l->near, out)) != DONE) {
+                out->ticks = i;
+                return;
+            }
+        }
+        *l->t = times[i + 1];
+        const tick *now = l->ticks + kinds[i];
+        if (now->evaluate(now->arguments, now->results, now->iw, now->w, 0) || l->ok[0] == 0.0) {
+            out->ticks = i;
+            out->reason = NOT_OK;
+            return;
+        }
+        memcpy(l->x, l->x_next, (size_t)l->states * sizeof(double));
+        if (l->skip) {
+            l->skip--;
+        } else {
+            l->skip = l->every - 1;
+            double *row = rows + out->rows++ * (l->row + 1);
+            row[0] = times[i + 1];
+            if (l->columns)
+                for (int64_t j = 0; j < l->row; j++) row[1 + j] = l->log[l->columns[j]];
+            else
+                memcpy(row + 1, l->log, (size_t)l->row * sizeof(double));
+        }
+        for (int64_t j = 0; j < l->stops; j++)
+            if (l->log[l->stop[j]] > l->truth) {
+                out->ticks = i + 1;
+                out->reason = STOPPED;
+                return;
+            }
+    }
+    out->ticks = i;
+}

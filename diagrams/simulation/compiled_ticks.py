@@ -1,0 +1,222 @@
+"""From tick to tick in C, and by Python where something is out of the ordinary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import CompilerError, SimulationError
+from ...fmus.calls import FmuInstance, NativeStep
+from ..compiled import CompiledLoop, Outcome, Reason, compile_ticks, find_obstacle
+from ..coupling import Plant
+from ..flat import FlatDiagram, TickPattern
+from ..results import Recorder
+from .workspace import Workspace
+
+_FIRST, _LARGEST = 1000, 2**20  # ticks of a chunk
+_WISHED = 0.05  # s that a chunk takes at least; Ctrl-C and the progress bar have their turn after it
+_EXACT = 2**53  # up to which every integer is a float64
+_CLOCKS = 16  # up to which sets of clocks are numbered by their bits
+_SIGNS = (
+    "Compiled: it has tables or large matrix products, in which signs of zeros may differ from those of an interpreted "
+    "run."
+)
+
+
+class CompiledTicks:
+    """The ticks of a run, gone through in C.
+
+    Parameters
+    ----------
+    workspace : Workspace
+        The run's numbers.
+    plants : mapping of str to FmuInstance
+        The plants by path, bound, in this process.
+    stops : sequence of int
+        Entries of the log that end the run where they are true.
+    every : bool
+        Visit every tick, not only those at which a subsystem acts.
+
+    Raises
+    ------
+    CompilerError
+        If there is no compiler, or it fails.
+    """
+
+    def __init__(self, workspace: Workspace, plants: Mapping[str, FmuInstance], stops: Sequence[int], *, every: bool):
+        flat = self._flat = workspace.flat
+        self._workspace, self._plants, self._every, self._stops = workspace, [*plants.values()], every, stops
+        self._code = compile_ticks(flat, kinds_of(flat, every=every))
+        self._loop: CompiledLoop | None = None
+        self._recorder: Recorder | None = None
+        self._kind_of = np.full(1 << len(flat.distinct), -1, dtype=np.int32)
+        for kind, clocks in enumerate(self._code.functions):
+            self._kind_of[sum(1 << i for i, clock in enumerate(flat.distinct) if clock in clocks)] = kind
+        self._chunk = _FIRST
+
+    @property
+    def exact(self) -> bool:
+        """Whether every bit is that of an interpreted run."""
+        return self._code.exact
+
+    def reaches(self, last: int) -> bool:
+        """Whether times up to a tick are quotients of integers that a float64 holds."""
+        base = self._flat.base
+        return max(base.denominator, last * base.numerator) < _EXACT
+
+    def run(
+        self,
+        k: int,
+        last: int,
+        recorder: Recorder,
+        *,
+        arrived: Callable[[int], bool],
+        progress: Callable[[float], Any],
+    ) -> None:
+        """Run the ticks after tick ``k`` up to ``last`` and record them.
+
+        Parameters
+        ----------
+        arrived : callable
+            Told the ticks at which the loop has returned; returns whether the run ends there.
+        progress : callable
+            Told the time after each chunk.
+        """
+        loop, base = self._bind(recorder), self._flat.base
+        n, d = base.numerator, base.denominator
+        visited, rest = self._flat.ticks(k, last, every=self._every), np.zeros(0, dtype=np.int64)
+        while rest.size or (rest := np.fromiter(islice(visited, self._chunk), dtype=np.int64)).size:
+            rows = recorder.room(k * n / d)
+            loop.skip = recorder.skip
+            ticks = rest[: recorder.skip + (len(rows) - 1) * recorder.every + 1]
+            kinds = self._kinds(ticks)
+            if (kinds < 0).any():
+                ticks = ticks[: int(np.argmax(kinds < 0))]
+            started = perf_counter()
+            ends = np.concatenate([[k], ticks])
+            found = loop.run(ends * n / d, np.diff(ends) * n / d, kinds[: len(ticks)], rows)
+            recorder.took(found.rows, loop.skip)
+            rest = rest[found.ticks :]
+            if found.ticks:
+                k = int(ticks[found.ticks - 1])
+                if arrived(k):
+                    return
+            if found.ticks < len(ticks) or not len(ticks):  # Python looks at this tick
+                following = int(rest[0])
+                self._take_tick(k, following, found, recorder)
+                k, rest = following, rest[1:]
+                if arrived(k):
+                    return
+            elif perf_counter() - started < _WISHED:
+                self._chunk = min(2 * self._chunk, _LARGEST)
+            progress(k * n / d)
+
+    def _bind(self, recorder: Recorder) -> CompiledLoop:
+        if self._loop is None or recorder is not self._recorder:
+            workspace, entries, steps = self._workspace, recorder.entries, list[NativeStep]()
+            here = workspace.here
+            for plant in self._plants:
+                native = plant.native
+                assert native is not None
+                steps.append(native)
+            self._recorder = recorder
+            self._loop = CompiledLoop(
+                self._code,
+                [here.t, here.x, here.w, here.p],
+                [workspace.x_next, workspace.z, workspace.log, workspace.ok],
+                steps,
+                columns=entries,
+                width=workspace.log.size if entries is None else len(entries),
+                every=recorder.every,
+                stops=self._stops,
+            )
+        return self._loop
+
+    def _kinds(self, ticks: np.ndarray) -> np.ndarray:
+        """Return the clocks that act at ticks, as places among the compiled functions; −1 where none is."""
+        bits = np.zeros(len(ticks), dtype=np.int64)
+        for i, clock in enumerate(self._flat.distinct):
+            bits |= _acts(clock, ticks).astype(np.int64) << i
+        found: np.ndarray = self._kind_of[bits]
+        return found
+
+    def _take_tick(self, before: int, k: int, found: Outcome, recorder: Recorder) -> None:
+        """Go through a tick at which the loop has returned: from the call on that it could not go beyond."""
+        workspace, base = self._workspace, self._flat.base
+        now, h = before * base.numerator / base.denominator, float(base * (k - before))
+        t, first = k * base.numerator / base.denominator, 0
+        try:
+            if found.reason is Reason.NOT_OK:
+                first = len(self._plants)
+            elif found.reason in (Reason.FMU_FAILED, Reason.FMU_FLAGS):
+                status = found.status if found.reason is Reason.FMU_FAILED else 0
+                plant = self._plants[found.plant]
+                plant.judge_native(found.stage, status, now, h)
+                plant.read(t)
+                first = found.plant + 1
+            for other in self._plants[first:]:
+                other.step(now, h)
+        except SimulationError as error:
+            raise error.at(t=t) from error.__cause__
+        workspace.here.t[0] = t
+        workspace.tick(self._flat.acting(k))
+        recorder.row(t, workspace.log)
+
+
+def _acts(clock: TickPattern, ticks: np.ndarray) -> np.ndarray:
+    return np.asarray((ticks >= clock.offset) & ((ticks - clock.offset) % clock.every == 0))
+
+
+def kinds_of(flat: FlatDiagram, *, every: bool) -> list[frozenset[TickPattern]]:
+    """Return the sets of clocks that act together at some tick, as far as they are found in the first million."""
+    clocks = flat.distinct
+    period = int(np.lcm.reduce([1, *(clock.every for clock in clocks)]))
+    ticks = np.arange(min(max((clock.offset for clock in clocks), default=0) + period + 1, _LARGEST))
+    bits = np.zeros(len(ticks), dtype=np.int64)
+    for i, clock in enumerate(clocks):
+        bits |= _acts(clock, ticks).astype(np.int64) << i
+    found = [frozenset(c for i, c in enumerate(clocks) if mask >> i & 1) for mask in np.unique(bits).tolist()]
+    return [acting for acting in found if acting or every or not clocks]
+
+
+def make_compiled(
+    workspace: Workspace, plants: Mapping[str, Plant], stops: Sequence[int], *, every: bool, regular: bool
+) -> tuple[CompiledTicks | None, tuple[str, ...]]:
+    """Return the ticks of a run in C, None where they can't be had, and messages about them.
+
+    Parameters
+    ----------
+    regular : bool
+        Whether every plant steps once from each tick to the next.
+    """
+    native = {
+        path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance) and plant.native is not None
+    }
+    reason = _find_run_obstacle(workspace.flat, plants, native, regular=regular)
+    if reason is None:
+        try:
+            found = CompiledTicks(workspace, native, stops, every=every)
+        except CompilerError as error:
+            reason = str(error)
+        else:
+            return found, () if found.exact else (_SIGNS,)
+    return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)
+
+
+def _find_run_obstacle(
+    flat: FlatDiagram, plants: Mapping[str, Plant], native: Mapping[str, FmuInstance], *, regular: bool
+) -> str | None:
+    if (found := find_obstacle(flat)) is not None:
+        return found
+    if len(flat.distinct) > _CLOCKS:
+        return f"it has {len(flat.distinct)} different clocks, and at most {_CLOCKS} are compiled"
+    if not regular:
+        return "an FMU takes longer steps than from one tick to the next, or a coupling is asked for that iterates"
+    for path in plants:
+        if path not in native:
+            return f"the FMU {path!r} runs in a process of its own, or has ports that are no Float64, or options"
+    return None

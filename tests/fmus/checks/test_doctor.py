@@ -1,0 +1,229 @@
+"""The doctor: verdicts, findings with next steps, trial runs that may crash, JSON; for good, broken and hostile FMUs."""
+
+import json
+import re
+import sys
+
+import pytest
+
+from loopwright.diagrams.cli import main
+from loopwright.fmus import FmuFault, FmuSeverity, FmuVerdict, doctor, mass_spring_damper
+from loopwright.fmus.platform import native_platform
+from support.hostile import CASES, XML, binaries, described, good_files, library, packed, without_library
+from support.zoo import zoo_fmu
+
+LINUX = pytest.mark.skipif(native_platform() != "x86_64-linux", reason="its libraries are for x86_64-linux")
+NOT_HERE = {FmuFault.NO_BINARY, FmuFault.OTHER_PLATFORM, FmuFault.INTERFACE, FmuFault.VERSION}
+
+
+@pytest.fixture(scope="module")
+def good(cache):
+    return good_files(mass_spring_damper.build())
+
+
+@pytest.fixture
+def examine(good, tmp_path, monkeypatch):
+    """examine(maker, **options) -> the diagnosis of what a maker of `support.hostile` makes; no process looks for libraries."""
+
+    def run(make, **options):
+        path = tmp_path / "plant.fmu"
+        path.write_bytes(make(good))
+        return doctor(path, **{"run": False, **options})
+
+    monkeypatch.setattr("loopwright.fmus.checks.libraries.find_missing", lambda *_: ([], []))
+    return run
+
+
+def findings(diagnosis, fault):
+    return [f for f in diagnosis.findings if f.fault == fault]
+
+
+@pytest.mark.parametrize("name", [n for n in CASES if n != "archive: bomb"])
+def test_a_bad_file_gets_the_verdict_and_the_finding_of_its_fault(examine, name):
+    case = CASES[name]
+    diagnosis = examine(case.make, limits=case.limits)
+    if case.fault is None:
+        assert diagnosis.verdict == FmuVerdict.EXPECTED
+        assert not diagnosis.of(FmuSeverity.ERROR)
+        assert diagnosis.findings  # it runs, and what is wrong is told
+        assert case.finding is None or findings(diagnosis, case.finding)
+    else:
+        assert diagnosis.verdict == (FmuVerdict.NOT_HERE if case.fault in NOT_HERE else FmuVerdict.REFUSED)
+        first = diagnosis.findings[0]
+        assert (first.fault, first.severity) == (case.fault, FmuSeverity.ERROR)
+        assert first.found.endswith(".")
+        assert first.step.endswith(".")
+        assert len(findings(diagnosis, case.fault)) == 1
+    assert all(f.found and f.step for f in diagnosis.findings)
+    assert "\n" not in diagnosis.headline
+    assert json.loads(json.dumps(diagnosis.as_dict()))["runs"] == (case.fault is None)
+
+
+def test_a_good_file_has_nothing_wrong(examine):
+    diagnosis = examine(packed)
+    assert diagnosis.verdict == FmuVerdict.EXPECTED
+    assert diagnosis.findings == ()
+    assert diagnosis.headline == "should run here, but was not tried; nothing is wrong with it"
+    assert dict(diagnosis.counts)["input"] == 1
+    text = str(diagnosis)
+    assert f"this machine  {native_platform()}" in text
+    assert "not tried     co-simulation: as asked for" in text
+
+
+@LINUX
+@pytest.mark.parametrize(
+    ("folder", "says"),
+    [
+        ("x86_64-windows/mass_spring_damper.dll", "Run it on Windows of 64 bits, or Wine"),
+        ("x86-linux/mass_spring_damper.so", "Run it on a Python of 32 bits on Linux"),
+        ("aarch64-darwin/mass_spring_damper.dylib", "Run it on macOS on Apple silicon"),
+    ],
+)
+def test_it_says_what_would_run_an_fmu_for_another_platform(examine, folder, says):
+    diagnosis = examine(lambda files: packed(without_library(files), (f"binaries/{folder}", b"x")))
+    (found,) = findings(diagnosis, FmuFault.NO_BINARY)
+    assert folder.split("/")[0] in found.found
+    assert says in found.step
+    assert "from its sources (fmpy compile)" in found.step
+    assert diagnosis.headline.startswith("does not run here: it has no library for this machine, x86_64-linux")
+
+
+@pytest.mark.parametrize(
+    ("attributes", "found"),
+    [
+        ('startTime="NaN"', "has the start time NaN; expected a finite number"),
+        ('stopTime="INF"', "has the stop time INF; expected a finite number"),
+        ('startTime="5" stopTime="1"', "stops at 1 s, before its start at 5 s; expected a later"),
+        ('stepSize="0"', "has the step size 0; expected a positive number"),
+        ('stepSize="-0.1"', "has the step size -0.1; expected a positive number"),
+        ('stepSize="soon"', "has the step size soon; expected a positive number"),
+        ('startTime="0" stopTime="10" stepSize="0.1"', None),
+    ],
+)
+def test_an_impossible_default_experiment_is_told(examine, attributes, found):
+    change = (r"(?s)<DefaultExperiment[^>]*/>", f"<DefaultExperiment {attributes}/>")
+    diagnosis = examine(described(change))
+    assert diagnosis.runs
+    told = findings(diagnosis, FmuFault.EXPERIMENT)
+    assert len(told) == (found is not None)
+    if found:
+        assert found in told[0].found
+
+
+@LINUX
+def test_a_capability_without_its_function_is_told(examine):
+    """The name in the library's table is changed by one letter."""
+    change = library(lambda data: data.replace(b"fmi3SerializeFMUState\0", b"fmi3serializeFMUState\0"))
+    (found,) = findings(examine(change), FmuFault.MISSING_SYMBOL)
+    assert found.found.startswith("it declares canSerializeFMUState, but binaries/")
+    assert found.found.endswith("lacks fmi3SerializeFMUState; expected them.")
+    other = library(lambda data: data.replace(b"fmi3SetDebugLogging\0", b"fmi3setDebugLogging\0"))
+    (found,) = findings(examine(other), FmuFault.MISSING_SYMBOL)
+    assert "lacks fmi3SetDebugLogging, which the standard asks for" in found.found
+
+
+def test_an_fmu_that_needs_another_program_is_tried_if_asked_only(examine, monkeypatch):
+    tried = []
+    monkeypatch.setattr("loopwright.fmus.checks.examination.try_out", lambda path, kind: tried.append(kind))
+    needs = described((r"<CoSimulation ", '<CoSimulation needsExecutionTool="true" '))
+    diagnosis = examine(needs, run=None)
+    assert tried == ["ModelExchange"]
+    (note,) = findings(diagnosis, FmuFault.TOOL)
+    assert note.severity == FmuSeverity.NOTE
+    assert "--run tries it" in str(diagnosis)
+    examine(needs, run=True)
+    assert tried == ["ModelExchange", "CoSimulation", "ModelExchange"] or set(tried[1:]) == {
+        "CoSimulation",
+        "ModelExchange",
+    }
+    examine(needs, run=False)
+    assert len(tried) == 3
+
+
+def test_an_fmu_of_many_variables_is_examined_in_time(examine):
+    """A parser of the names' grammar took 8 ms for each name."""
+    rows = "".join(f'<Float64 name="part{k}.x[{k % 7 + 1}]" valueReference="{k + 100}"/>' for k in range(3000))
+    convention = (r'variableNamingConvention="[^"]*"', 'variableNamingConvention="structured"')
+    diagnosis = examine(described(convention, (r"</ModelVariables>", rows + r"\g<0>")))
+    assert diagnosis.findings == ()
+    assert sum(diagnosis.counts.values()) > 3000
+    row = '<Float64 name="a b" valueReference="100"/>'
+    bad = described(convention, (r"</ModelVariables>", row + r"\g<0>"))
+    (found,) = findings(examine(bad), FmuFault.STANDARD)
+    assert found.found.startswith('The variable "a b" (line')
+
+
+# --- trials -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "step crash 0",
+        *(pytest.param(fault, marks=pytest.mark.slow) for fault in ("", "instantiate exit 0", "initialize abort 0")),
+    ],
+)
+def test_a_trial_run_may_crash(tmp_path, fault):
+    file = zoo_fmu(tmp_path, 3, fault)
+    diagnosis = doctor(file)
+    (trial,) = diagnosis.trials
+    assert trial.ran == (not fault)
+    assert trial.seconds > 0.0
+    if fault:
+        assert diagnosis.verdict == FmuVerdict.FAILS
+        assert diagnosis.findings[0].fault == FmuFault.TRIAL
+        assert diagnosis.findings[0].severity == FmuSeverity.ERROR
+    else:
+        assert diagnosis.verdict == FmuVerdict.RUNS
+
+
+def test_one_of_two_interfaces_may_fail(examine, monkeypatch):
+    from loopwright.fmus.checks.validation import FmuProblem
+
+    def run(path, kind):
+        return FmuProblem("its first step crashed.", "Report it.") if kind == "CoSimulation" else None
+
+    monkeypatch.setattr("loopwright.fmus.checks.examination.try_out", run)
+    diagnosis = examine(packed, run=True)
+    assert diagnosis.verdict == FmuVerdict.RUNS
+    assert diagnosis.headline == "runs here by model exchange only: its first step crashed"
+
+
+# --- the command --------------------------------------------------------------------------------------------------------
+
+
+def test_the_command(good, tmp_path, capsys):
+    path = tmp_path / "plant.fmu"
+    path.write_bytes(packed(good))
+    assert main(["doctor", str(path), "--no-run"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith(f"{path}: should run here, but was not tried; nothing is wrong with it\n")
+    assert main(["doctor", str(path), "--no-run", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["verdict"], told["findings"]) == ("expected", [])
+    assert told["summary"]["native"]["missing_libraries"] == []
+
+    path.write_bytes(packed(without_library(good)))
+    assert main(["doctor", str(path), "--json"]) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert (told["verdict"], told["findings"][0]["fault"]) == ("not_here", "no_binary")
+    path.write_bytes(packed(good)[:-50])
+    assert main(["doctor", str(path)]) == 1
+    assert ": is refused: it is no FMU" in capsys.readouterr().out
+    assert main(["doctor", str(path), "--max-size", "-1"]) == 2
+    assert main(["doctor", str(tmp_path / "absent.fmu")]) == 2
+
+
+def test_texts_of_an_fmu_do_not_control_the_terminal(examine):
+    """XML has no escape characters; C1 controls and texts of a trial may hold some."""
+    diagnosis = examine(described((r'modelName="[^"]*"', 'modelName="a&#x9b;2Jb"')))
+    assert not re.search(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]", str(diagnosis))
+
+
+def test_the_library_is_not_loaded_in_this_process(examine, good):
+    name = binaries(good)[0].rpartition("/")[2]
+    examine(packed)
+    if sys.platform == "linux":
+        with open("/proc/self/maps", encoding="utf-8") as maps:
+            assert f"/{XML}" not in (text := maps.read())
+            assert f"binaries/x86_64-linux/{name}" not in re.sub(r"unpacked/\S+", "", text)
