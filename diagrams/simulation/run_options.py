@@ -141,4 +141,5 @@ class RunOptions:
         """The options that a later run to an instant of this one is made with, those that are given."""
         names = ("step", "solver", "rtol", "atol", "max_step", "start")
         found = {name: value for name in names if (value := getattr(self, name)) is not None}
-        return found if self.coupling == "jacobi" else {**found, "coupling": self.coupling}
+        chosen = {"coupling": (self.coupling, "jacobi"), "start_exchange": (self.start_exchange, START_EXCHANGES[0])}
+        return found | {name: value for name, (value, default) in chosen.items() if value != default}

@@ -364,6 +364,7 @@ class Simulation:
             raise not_open_error(self._open, self.diagram.name)
         check_fits(state, self.flat, self.diagram.name)
         restore_state(self._engine, state)
+        self._engine.take_texts()
         self._elapsed, self._begun = 0.0, True
         if self._recorder.is_open:
             self._recorder.finish()

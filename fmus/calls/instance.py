@@ -15,7 +15,7 @@ from .fmi_calls import StepCall
 from .fmu_block import FmuBlock
 from .loaded_library import MakeCalls
 from .native_step import NativeStep, native_step
-from .saved_state import FmuState, pack_state, unpack_state
+from .saved_state import FmuState, StepMemory, pack_state, unpack_state
 from .shared_steps import SharedSteps
 from .step_failures import NEAR, StepFailures
 from .stepping import CarefulSteps, needs_care
@@ -122,8 +122,8 @@ class FmuInstance(StepFailures):
         self.step(*self._asked)
 
     def _begin_texts(self) -> None:
-        """Let the record of texts begin anew, at the present time."""
-        for text in self.call("reading its texts", self._texts.begin_anew, self.t):
+        """Let the record of texts go on from the present time."""
+        for text in self.call("reading its texts", self._texts.go_back, self.t):
             self.add_note(text)
 
     def _step_and_note(self, step: Callable[[float, float], None], t: float, h: float) -> None:
@@ -249,7 +249,8 @@ class FmuInstance(StepFailures):
             If the FMU's function fails.
         """
         self._check_can(self.description.state_flags[0], "saved", self.can_save)
-        return self._keep(self.call("saving its state", self.fmi.save_state), self.t, self._running)
+        steps = None if self._careful is None else self._careful.memory()
+        return self._keep(self.call("saving its state", self.fmi.save_state), self.t, self._running, steps)
 
     def restore(self, state: FmuState) -> None:
         """Restore a saved state, earlier or later, and get the outputs there; this is allowed after an error, too.
@@ -266,7 +267,7 @@ class FmuInstance(StepFailures):
         self.failed, self._running = False, state.running
         self._now.value, self._width.value = state.t, 0.0
         if self._careful is not None:
-            self._careful.return_to(state.t)
+            self._careful.return_to(state.t, state.steps)
         self.read(state.t)
         self._begin_texts()
 
@@ -303,10 +304,10 @@ class FmuInstance(StepFailures):
         t, running, rest = unpack_state(data, self.description.digest, self.block.label)
         return self._keep(self.call("reading a serialized state", self.fmi.deserialize_state, rest), t, running)
 
-    def _keep(self, handle: Any, t: float, running: bool) -> FmuState:
+    def _keep(self, handle: Any, t: float, running: bool, steps: StepMemory | None = None) -> FmuState:
         self._final.value = False  # the FMU may be set back from now on
         self._handles[id(handle)] = handle
-        return FmuState(self, handle, t, running)
+        return FmuState(self, handle, t, running, steps)
 
     def release(self, handle: Any) -> None:
         """Free the saved state of a handle, once."""

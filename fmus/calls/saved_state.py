@@ -5,7 +5,10 @@ from __future__ import annotations
 import struct
 import weakref
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Protocol
+
+import numpy as np
 
 from ...blocks.core import FmuError
 from ..platform import native_platform
@@ -26,14 +29,26 @@ class Saver(Protocol):
         """Frees the state of a handle."""
 
 
+@dataclass(frozen=True)
+class StepMemory:
+    """Memory of the steps beside the FMU's own state: next events, the inputs of the step before, clocks."""
+
+    next_event: float
+    last: tuple[float, np.ndarray] | None
+    added: float | None
+    fresh: bool
+    clocks: tuple[tuple[float, float, int, float], ...]
+    jumping: np.ndarray
+
+
 class FmuState:
     """Saved state of an `FmuInstance`: all of its memory at one time, and that time.
 
     It belongs to the instance that made it, and is freed with it, or when nothing refers to it any more.
     """
 
-    def __init__(self, instance: Saver, handle: Any, t: float, running: bool):
-        self.instance, self.t, self.running = instance, t, running
+    def __init__(self, instance: Saver, handle: Any, t: float, running: bool, steps: StepMemory | None = None):
+        self.instance, self.t, self.running, self.steps = instance, t, running, steps
         self._handle = handle
         self._free = weakref.finalize(self, instance.release, handle)
         self._free.atexit = False  # the end of the process frees the memory anyway

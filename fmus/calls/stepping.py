@@ -7,17 +7,18 @@ options need that.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from ...blocks.core import FmuRuntimeError, Layout
 from ..archive import FmuDescription, FmuVariable, OtherVariable
-from .fmi_calls import DISCARD, MOST_ROUNDS, FmiCalls, StepCall
-from .fmu_block import FmuBlock
+from .fmi_calls import DISCARD, MOST_ROUNDS, StepCall
+from .saved_state import StepMemory
 from .step_options import StepOptions, StepTime, allows_early_return, uses_event_mode
+from .stepped_instance import SteppedInstance
 from .transfer import Transfer, UnfitError
 
 _ROUNDED = 1e-9
@@ -35,48 +36,6 @@ def needs_care(about: FmuDescription, options: StepOptions) -> bool:
         or options.input_derivatives
         or options.time is StepTime.ADDED
     )
-
-
-class SteppedInstance(Protocol):
-    """Members of an instance that its steps need."""
-
-    fmi: FmiCalls
-    messages: list[str]
-
-    @property
-    def block(self) -> FmuBlock:
-        """Its block."""
-
-    @property
-    def description(self) -> FmuDescription:
-        """The FMU's description."""
-
-    def call(self, purpose: str, function: Callable[..., R], *arguments: Any) -> R:
-        """Call a method of ``fmi``; an error begins with the purpose."""
-
-    def set_span(self, t: float, h: float) -> None:
-        """Set start and length of the next step in s."""
-
-    def end_step(self, status: int, t: float, h: float) -> None:
-        """Wait for a step that is pending, and raise the error of one that has failed."""
-
-    def check_flags(self, call: StepCall, t: float, h: float) -> None:
-        """Raise the error of a step that has ended early, elsewhere, or asks for the end."""
-
-    def report(self, action: str, status: int, t: float, advice: str = "") -> FmuRuntimeError:
-        """Return the error of an action that has failed."""
-
-    def termination(self, t: float, h: float) -> FmuRuntimeError:
-        """Return the error of an FMU that asks to end the simulation."""
-
-    def refuse_input(self, error: UnfitError, t: float) -> FmuRuntimeError:
-        """Return the error of an input that doesn't fit."""
-
-    def refuse_output(self, error: UnfitError, t: float) -> FmuRuntimeError:
-        """Return the error of an output that doesn't fit."""
-
-    def note_retry(self, t: float, h: float, count: int) -> None:
-        """Keep the message of a step that was taken in parts."""
 
 
 @dataclass
@@ -185,13 +144,25 @@ class CarefulSteps:
         self._activate([clock for clock in self.clocks if clock.next <= t])
         self._settle(t)
 
-    def return_to(self, t: float) -> None:
-        """Go on from a restored state at a time in s."""
-        self._last, self._added, self._fresh = None, None, True
+    def memory(self) -> StepMemory:
+        """Return what the steps keep beside the FMU's own state."""
+        clocks = tuple((clock.interval, clock.next, clock.count, clock.origin) for clock in self.clocks)
+        return StepMemory(self.next_event, self._last, self._added, self._fresh, clocks, self.jumping.values.copy())
+
+    def return_to(self, t: float, memory: StepMemory | None) -> None:
+        """Go on from a restored state at a time in s; without a memory Event Mode tells the next events anew."""
+        if memory is not None:
+            self.next_event, self._last = memory.next_event, memory.last
+            self._added, self._fresh = memory.added, memory.fresh
+            self.jumping.values[:] = memory.jumping
+            for clock, kept in zip(self.clocks, memory.clocks, strict=True):
+                clock.interval, clock.next, clock.count, clock.origin = kept
+            return
+        self._last, self._added, self._fresh, self.next_event = None, None, True, math.inf
         for clock in self.clocks:
             if clock.variable.is_periodic and math.isfinite(clock.interval):
                 ahead = (t - clock.origin) / clock.interval
-                clock.count = max(0, math.ceil(ahead * (1.0 - _ROUNDED)))
+                clock.count = max(0, math.ceil(ahead - _ROUNDED * max(1.0, ahead)))
                 clock.next = clock.origin + clock.count * clock.interval
 
     # ---- a step ----

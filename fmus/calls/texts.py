@@ -45,14 +45,15 @@ class TextRecord:
             if not kept or kept[-1][1] != value:
                 kept.append((t, value))
 
-    def begin_anew(self, t: float) -> list[str]:
-        """Forget the values, and keep those at a time in s; return texts on variables that can't be read."""
+    def go_back(self, t: float) -> list[str]:
+        """Forget the values from a time in s on, and read those there; return texts on variables that can't be read."""
         lost = []
         for port, variable in [*self.variables.items()]:
-            self.values[port].clear()
-            if is_readable(self.fmi, variable):
-                self.values[port].append((t, read_text(self.fmi, variable)))
-            else:
+            kept = self.values[port]
+            while kept and kept[-1][0] >= t:
+                kept.pop()
+            if not is_readable(self.fmi, variable):
                 del self.variables[port], self.values[port]
                 lost.append(f"{variable} is not recorded: the library has no {self.fmi.prefix}Get{variable.type}")
+        self.note(t)
         return lost

@@ -34,12 +34,17 @@ int fmi3DoStep(void *p, double t, double h, bool f, bool *e, bool *stop, bool *e
     if (c->sign > 0 && c->x + c->u * h > 0.5 && c->mode == 2) { way = (0.5 - c->x) / c->u; *e = true; *early = way < h && c->early; }
     c->x += c->sign * c->u * way; c->t = t + way; *last = c->t; return 0; }
 """
-    + values("fmi3", "Get", "Float64", "double", {1: "c->x", 3: "c->level", 4: "c->tolerance", 5: "c->told"})
+    """
+int fmi3GetFMUState(void *p, void **s) { if (!*s) *s = malloc(sizeof(instance)); memcpy(*s, p, sizeof(instance)); return 0; }
+int fmi3SetFMUState(void *p, void *s) { memcpy(p, s, sizeof(instance)); return 0; }
+int fmi3FreeFMUState(void *p, void **s) { free(*s); *s = 0; return 0; }
+"""
+    + values("fmi3", "Get", "Float64", "double", {1: "c->x", 2: "c->u", 3: "c->level", 4: "c->tolerance", 5: "c->told"})
     + values("fmi3", "Get", "Int32", "int32_t", {6: "c->beats", 7: "c->timed", 9: "c->level"})
     + values("fmi3", "Set", "Float64", "double", {2: "c->u"})
     + values("fmi3", "Set", "Int32", "int32_t", {9: "if (c->mode == 2) return 3; c->level"})
 )
-MODEL = """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="{variable}" hasEventMode="true"/>
+MODEL = """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="{variable}" hasEventMode="true" canGetAndSetFMUState="true"/>
 <ModelVariables>
 <Float64 name="x" valueReference="1" causality="output"/>
 <Float64 name="u" valueReference="2" causality="input" start="0"/>
@@ -127,6 +132,34 @@ def test_events_that_never_settle_are_an_error(folder):
     file = small_fmu(folder, "fmi3", endless, MODEL.format(clock="", outputs=OUTPUTS, variable="true"), name="endless")
     with pytest.raises(FmuRuntimeError, match=r"the events don't settle in 100 rounds \(discreteStatesNeedUpdate\)"):
         simulate(Fmu(file, name="plant", stepping=StepOptions(event_mode=True)))
+
+
+def test_events_and_clocks_are_those_of_a_restored_state(clocked):
+    plant = Fmu(clocked, name="plant", start={"level": 0})
+    u, y = np.ones(1), np.zeros(6)
+    ends = []
+    with plant.instantiate(["u"], None) as one:
+        one.bind(u, y)
+        one.begin()
+        for k in range(10):
+            if k == 2:
+                saved = one.save()  # before the time event, and a tick
+            one.step(k * 0.1, 0.1)
+        ends.append(y.copy())
+        for _ in range(2):
+            one.restore(saved)
+            for k in range(2, 10):
+                one.step(k * 0.1, 0.1)
+            ends.append(y.copy())
+    assert ends[0].tolist() == pytest.approx([0.0, 0.0, -1.0, 0.9, 7.0, 1.0], abs=1e-12)
+    assert np.array_equal(ends[0], ends[1])
+    assert np.array_equal(ends[0], ends[2])
+
+
+def test_a_linear_model_of_a_step_is_that_of_event_mode(clocked):
+    plant = Fmu(clocked, name="plant", start={"level": 0})
+    D = plant.step_difference(0.1, inputs={"u": 1.0}).D
+    assert D[0, 0] == pytest.approx(0.1, rel=1e-9)
 
 
 # --- early return -------------------------------------------------------------------------------------------------------
