@@ -6,7 +6,7 @@ from typing import Protocol
 
 from .bound_calls import BoundCalls
 from .fmi_calls import StepCall
-from .stepping import SteppedInstance as Judge
+from .stepped_instance import SteppedInstance as Judge
 from .transfer import Transfer, UnfitError
 
 _NEAR = 1e-6  # distance from the end of a step, in steps, within which a time is that end
