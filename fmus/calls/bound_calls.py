@@ -1,4 +1,4 @@
-"""C functions that are bound once to their arguments."""
+"""C functions that are bound once to their arguments, and their statuses."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from typing import Any
 
 Call = tuple[Callable[..., int], tuple[Any, ...]]
 """A C function, and its arguments."""
-_WARNING = 1
+STATUS = ("OK", "warning", "discard", "error", "fatal", "pending")
+WARNING, DISCARD, ERROR, FATAL, PENDING = range(1, 6)
+"""Statuses of FMI's functions (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)."""
 
 
 class BoundCalls:
@@ -31,7 +33,7 @@ class BoundCalls:
         worst = 0
         for place, (function, arguments) in enumerate(self._calls):
             status = function(*arguments)
-            if not 0 <= status <= _WARNING:
+            if not 0 <= status <= WARNING:
                 self.failed = place
                 return status
             worst |= status

@@ -12,9 +12,8 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import numpy as np
 
 from ...blocks.core import FmuProcessError
-from .bound_calls import BoundCalls, Call
+from .bound_calls import DISCARD, ERROR, FATAL, PENDING, STATUS, WARNING, BoundCalls, Call
 from .missing_functions import allow_missing
-from .status import DISCARD, ERROR, FATAL, PENDING, STATUS, WARNING
 
 __all__ = ["DISCARD", "ERROR", "FATAL", "PENDING", "STATUS", "WARNING", "FmiCalls"]
 

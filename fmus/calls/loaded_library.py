@@ -20,7 +20,7 @@ from .fmi_calls import FATAL, STATUS, FmiCalls
 from .fmu_block import FmuBlock
 from .process_ends import describe_end
 from .step_options import allows_early_return, uses_event_mode
-from .texts import is_readable, read_text, write_text
+from .texts import is_readable, list_limits, read_text, write_text
 
 CALLS: dict[str, type[FmiCalls]] = {"2": Fmi2Calls, "3": Fmi3Calls}
 """Functions by the major version of FMI."""
@@ -39,7 +39,7 @@ class LoadedFmu:
     def __init__(self, block: FmuBlock, *, model_exchange: bool = False, make_calls: MakeCalls | None = None):
         self.block, self.description = block, block.description
         self.model_exchange, self.failed, self.fatal = model_exchange, False, False
-        self.messages: list[str] = self._list_limits()
+        self.messages: list[str] = list_limits(block.label, self.description)
         self._limits = len(self.messages)
         self._open = self._running = False
         self._began = 0.0
@@ -123,22 +123,6 @@ class LoadedFmu:
                 f"({self.fmi.prefix}GetVersion); expected {expected!r}, as its description says. Export it again.",
                 block=self.block.label,
             )
-
-    def _list_limits(self) -> list[str]:
-        """Return messages on ports that are neither read nor set, and on a description that breaks rules."""
-        label, about = self.block.label, self.description
-        ins, outs = (about.other_ports(causality) for causality in ("input", "output"))
-        outs = [v for v in outs if not v.is_text]
-        parts = [f"the outputs {', '.join(map(str, outs))} are not recorded"] if outs else []
-        parts += [f"the inputs {', '.join(map(str, ins))} keep their start values"] if ins else []
-        found = [f"{label}: no wire carries texts, binaries and clocks: {'; '.join(parts)}"] if parts else []
-        if about.complaints:
-            more = f", and {len(about.complaints) - 1} more" if len(about.complaints) > 1 else ""
-            found.append(
-                f"{label}: its description breaks the standard: {about.complaints[0].rstrip('.')}{more}. "
-                f"'loopwright validate {about.file}' has them all"
-            )
-        return found + [f"{label}: {text}" for text in about.unit_complaints]
 
     def _log(self, status: int, text: str) -> None:
         if status and len(self.messages) < 1000:

@@ -6,7 +6,7 @@ import ctypes
 from functools import cache
 from typing import Any
 
-from .status import ERROR
+from .bound_calls import ERROR
 
 
 @cache

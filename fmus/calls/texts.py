@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from ..archive import OtherVariable
+from ..archive import FmuDescription, OtherVariable
 from .fmi_calls import FmiCalls
 
 Text = str | bytes | tuple[str, ...] | tuple[bytes, ...]
@@ -28,6 +28,22 @@ def write_text(fmi: FmiCalls, variable: OtherVariable, value: Text) -> None:
     elements = list(value) if isinstance(value, tuple) else [value]
     put: Callable[..., None] = fmi.set_texts if variable.type == "String" else fmi.set_binaries
     put([variable.reference], elements)
+
+
+def list_limits(label: str, about: FmuDescription) -> list[str]:
+    """Return messages on ports that are neither read nor set, and on a description that breaks rules."""
+    ins, outs = (about.other_ports(causality) for causality in ("input", "output"))
+    outs = [v for v in outs if not v.is_text]
+    parts = [f"the outputs {', '.join(map(str, outs))} are not recorded"] if outs else []
+    parts += [f"the inputs {', '.join(map(str, ins))} keep their start values"] if ins else []
+    found = [f"{label}: no wire carries texts, binaries and clocks: {'; '.join(parts)}"] if parts else []
+    if about.complaints:
+        more = f", and {len(about.complaints) - 1} more" if len(about.complaints) > 1 else ""
+        found.append(
+            f"{label}: its description breaks the standard: {about.complaints[0].rstrip('.')}{more}. "
+            f"'loopwright validate {about.file}' has them all"
+        )
+    return found + [f"{label}: {text}" for text in about.unit_complaints]
 
 
 class TextRecord:
