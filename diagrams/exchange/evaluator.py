@@ -17,6 +17,7 @@ import numpy as np
 from ...blocks.tracing import GUARDS, NEXT
 from ..flat import INDICATORS, JUMP, FlatDiagram, no_evaluator
 
+_STEP = float(np.cbrt(np.finfo(float).eps))  # of a difference, relative to the nominal value
 Values = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -185,9 +186,28 @@ class ExchangeEvaluator:
         return block.handle_event(t, x, u)
 
     def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
-        """Return the derivative of `evaluate` by (t, x, u), NaN by t; None: by differences."""
+        """Return the derivative of `evaluate` by (t, x, u), NaN by t; None: by differences.
+
+        Differences are by states and inputs alone: time can't go back behind an event.
+        """
         if not {NEXT, GUARDS, *self._outputs}.issuperset(names):
             return None
         ports = [name for name in names if name in self._outputs]
         J = self.block.slopes(ports, rates=NEXT in names, t=t, x=x, u=u)
-        return None if J is None else np.hstack([np.full((len(J), 1), math.nan), J])
+        if J is None:
+            J = self.differences(names, t, x, u)
+        return np.hstack([np.full((len(J), 1), math.nan), J])
+
+    def differences(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Return the derivative of `evaluate` by (x, u), by central differences over parts of the nominal values."""
+        columns = []
+        scales = [*self.block.nominals, *(0.0 for _ in u)]
+        for i, (at, nominal) in enumerate(zip([*x, *u], scales, strict=True)):
+            step = _STEP * max(abs(at), nominal or 1.0)
+            made = []
+            for side in (step, -step):
+                moved = np.concatenate([x, u])
+                moved[i] += side
+                made.append((moved[i], self.evaluate(names, t, moved[: x.size], moved[x.size :]).copy()))
+            columns.append((made[0][1] - made[1][1]) / (made[0][0] - made[1][0]))
+        return np.array(columns).T if columns else np.zeros((self.evaluate(names, t, x, u).size, 0))

@@ -11,7 +11,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ...blocks.core import FmuError, Layout
-from ...blocks.tracing import GUARDS, NEXT
 from ...fmus.running import Derivation, DerivativeMethod, FmuLinearization, find_exchange_slopes
 from ..exchange import ExchangeEvaluator
 from ..flat import Evaluators, FlatDiagram
@@ -41,16 +40,13 @@ class PointEvaluator(ExchangeEvaluator):
         method = DerivativeMethod.DIRECTIONAL if directional else DerivativeMethod.DIFFERENCES
         return Derivation(method, "model_exchange")
 
-    def differentiate(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
-        """Return the derivative of `evaluate` by (t, x, u), NaN by t: that of the FMU, else by differences."""
-        J = super().differentiate(names, t, x, u)
-        if J is None and {NEXT, GUARDS, *self._fmu.outputs}.issuperset(names):
-            found, error = find_exchange_slopes(
-                self._fmu, self._wired, lambda x, u: self.evaluate(names, t, x, u).copy(), x, u
-            )
-            self.error = max(self.error, error)
-            J = np.hstack([np.full((len(found), 1), np.nan), found])
-        return J
+    def differences(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Return the derivative of `evaluate` by (x, u), by differences whose error is estimated."""
+        found, error = find_exchange_slopes(
+            self._fmu, self._wired, lambda x, u: self.evaluate(names, t, x, u).copy(), x, u
+        )
+        self.error = max(self.error, error)
+        return found
 
 
 _KNOWN: WeakKeyDictionary[OperatingPoint, tuple[FlatDiagram, Mapping[str, PointEvaluator]]] = WeakKeyDictionary()

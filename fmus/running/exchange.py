@@ -84,6 +84,12 @@ class ExchangeMembers(Block):
         return self.used_interface == INTERFACES[1]
 
     @property
+    def interface_text(self) -> str:
+        """Text on an interface that was not asked for, and is the only one; else empty."""
+        only = self.interface is None and not self.description.co_simulation
+        return "by model exchange, its only interface" if only else ""
+
+    @property
     def states(self) -> Mapping[str, State]:  # type: ignore[override]
         """The continuous states in model exchange; in co-simulation they are the FMU's own."""
         return states_of(self) if self.evaluated_outside else {}
@@ -111,6 +117,8 @@ class ExchangeMembers(Block):
         instance = open_fmu(ExchangeInstance, self, wired)
         try:
             instance.initialize(None, start_time=start_time)
+            if self.interface_text:
+                instance.messages.append(f"{self.label}: it runs {self.interface_text}: the solver integrates it")
             yield instance
         finally:
             instance.close()

@@ -167,7 +167,7 @@ class Fmu(ExchangeMembers):
             shown = [str(v) for v in self.description.other.values()]
         except FmuError:
             return text
-        more = f" and {len(shown) - 5} more" if len(shown) > 5 else ""
+        more, text = f" and {len(shown) - 5} more" if len(shown) > 5 else "", f"{text} {self.interface_text}".rstrip()
         return f"{text} without ports for {', '.join(shown[:5])}{more}" if shown else text
 
     @property

@@ -1,0 +1,118 @@
+"""Events of FMUs in model exchange: of time, of steps, of inputs, and the end that an FMU asks for."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Constant, Gain, Quantizer, SimulationError, Step, Sum
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.fmus import Fmu
+from support.eventful import eventful_fmu
+
+
+@pytest.fixture(scope="module", params=[2, 3])
+def file(request, cache, tmp_path_factory):
+    return eventful_fmu(tmp_path_factory.mktemp("eventful"), request.param)
+
+
+def named(events, name):
+    return [e.t for e in events if e.event == name]
+
+
+def plant(file, **start):
+    return Fmu(file, name="plant", start=start)
+
+
+def exact(t, u=0.0):
+    """x with ẋ = u + k, k = ⌊4 t⌋."""
+    k = np.floor(4.0 * t)
+    return u * t + 0.25 * k * (k - 1) / 2 + k * (t - 0.25 * k)
+
+
+@pytest.mark.parametrize("solver", ["RK45", "Radau", "BDF", "CVODE_Adams", "rk4", "euler"])
+def test_a_solver_lands_on_time_events(file, solver):
+    diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    run = diagram.simulate(1.1, step=0.1, solver=solver, progress=False)
+    assert named(run.events, "time_event") == [0.25, 0.5, 0.75, 1.0]
+    np.testing.assert_allclose(run["plant.x"], exact(run.t, 0.5), atol=1e-12)  # linear between events: no error
+    np.testing.assert_array_equal(run["plant.k"], np.floor(4.0 * run.t))
+
+
+def test_an_interface_that_is_the_only_one_is_chosen_and_told(file):
+    fmu = plant(file)
+    assert fmu.used_interface == "model_exchange"
+    assert "model exchange" in repr(fmu)
+    run = Diagram("d", fmu(u=Constant(value=0.5), n=Constant(value=0.0))).simulate(0.1, step=0.1, progress=False)
+    assert any("model exchange" in message for message in run.messages)
+
+
+def test_a_discrete_input_is_set_in_event_mode_and_taken_over_at_once(file):
+    step = Step(times=0.333, values=3.0, name="step")
+    run = Diagram("d", plant(file)(u=Constant(value=1.0, name="u"), n=step)).simulate(0.8, step=0.05, progress=False)
+    np.testing.assert_array_equal(run["plant.m"], np.where(run.t >= 0.333, 3.0, 0.0))
+    np.testing.assert_allclose(run["plant.x"], exact(run.t, 1.0), atol=1e-12)
+
+
+def test_a_sampled_integer_output_reaches_the_fmu_at_its_tick(file):
+    @subsystem(sample_time=0.1)
+    def sampler(x):
+        return Quantizer(interval=1.0, name="whole")(Gain(gain=10.0, name="tenfold")(x))
+
+    fmu = plant(file)
+    run = Diagram("d", fmu(u=Constant(value=1.0, name="u"), n=sampler(fmu.x))).simulate(0.5, progress=False)
+    np.testing.assert_array_equal(run["plant.m"], np.rint(10.0 * exact(run.t, 1.0) - 1e-9))
+    np.testing.assert_array_equal(run["plant.m"], run["plant.n"] if "plant.n" in run else run["plant.m"])
+
+
+def test_a_jump_of_a_continuous_input_is_an_event(file):
+    fmu = plant(file)
+    quiet = Diagram("d", fmu(u=Constant(value=1.0, name="u"), n=Constant(value=0.0, name="n")))
+    jumping = quiet.replace(u=Step(times=0.4, values=1.0, initial_value=0.0, name="u"))
+    events = [d.simulate(0.6, step=0.1, progress=False)["plant.events"][-1] for d in (quiet, jumping)]
+    assert events == [3.0, 4.0]  # at the start, at 0.25 and 0.5 s; and at 0.4 s
+
+
+def test_a_step_event_sets_states_and_nominal_values_anew(file):
+    diagram = Diagram("d", plant(file, armed=1)(u=Constant(value=8.0, name="u"), n=Constant(value=0.0, name="n")))
+    with diagram.simulation(step=0.05, solver="rk4") as simulation:
+        simulation.advance(0.2)
+        run = simulation.run()
+    assert named(run.events, "step_event") == [pytest.approx(0.15)]
+    np.testing.assert_allclose(run["plant.x"], [0.0, 0.4, 0.8, 0.0, 0.4], atol=1e-12)
+    with diagram.simulation(step=0.05, solver="RK45", atol=1e-7) as simulation:
+        simulation.advance(0.05)
+        solver = simulation._engine.continuous.solver
+        assert np.ravel(solver.atol) == [1e-7]
+        simulation.advance(0.5)
+        assert np.ravel(solver.atol) == [5e-7]  # the nominal value is 5 after the event
+
+
+def test_every_accepted_step_is_completed_once(file):
+    diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    run = diagram.simulate(0.2, step=0.02, solver="euler", progress=False)
+    np.testing.assert_array_equal(run["plant.steps"], np.arange(11))
+
+
+def test_an_fmu_ends_the_run(file):
+    diagram = Diagram("d", plant(file, last=3)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    run = diagram.simulate(2.0, step=0.1, progress=False)
+    assert (run.stopped.t, run.stopped.block) == (0.75, "plant")
+    assert run.t[-1] == 0.75
+    assert run["plant.k"][-1] == 3.0
+    assert any("terminateSimulation" in message for message in run.messages)
+
+
+def test_two_fmus_pass_an_event_on_at_the_same_instant(file):
+    first, second = plant(file), Fmu(file, name="second")
+    fixed = Constant(value=0.5, name="u")
+    diagram = Diagram("d", first(u=fixed, n=Constant(value=0.0, name="n")), second(u=fixed, n=first.k))
+    run = diagram.simulate(1.0, step=0.05, progress=False)
+    np.testing.assert_array_equal(run["second.m"], run["plant.k"])
+
+
+def test_discrete_signals_that_chase_each_other_end_in_an_error(file):
+    fmu = plant(file)
+    diagram = Diagram(
+        "d", fmu(u=Constant(value=0.5, name="u"), n=Sum(signs="++")(fmu.m, Constant(value=1.0, name="one")))
+    )
+    with pytest.raises(SimulationError, match=r"plant.*(without end|still change)"):
+        diagram.simulate(0.2, step=0.1, progress=False)
