@@ -81,7 +81,7 @@ class Simulation:
         self._recording = Recording(
             self.flat, diagram.name, options.record, options.every, options.states, options.to, options.overwrite
         )
-        self._stack = ExitStack()
+        self._stack, self._loaded = ExitStack(), ExitStack()
         self._start_state = saved
         every_tick = base is not None or EVERY in self.flat.visited
         self._last: int | None = None
@@ -125,7 +125,7 @@ class Simulation:
 
     def _load(self) -> None:
         try:
-            self._engine.load(self._stack, 0.0 if self._point is None else self._point.t)
+            self._engine.load(self._stack.enter_context(self._loaded), 0.0 if self._point is None else self._point.t)
         except SimulationError as error:
             raise self._with_run(error) from error.__cause__
 
@@ -277,19 +277,24 @@ class Simulation:
     def _with_run(self, error: SimulationError) -> SimulationError:
         return error if error.run is not None else error.keep(self.run(final=False))
 
-    def run(self, *, final: bool = True) -> Run:
+    def run(self, *, final: bool = True, last: bool = False) -> Run:
         """Return what was recorded since the start, or since `restore`; afterwards recording begins anew.
 
         Parameters
         ----------
         final : bool
             Whether the complete state at the end is kept with it, as ``run.final_state``, where that can be had.
+        last : bool
+            End the FMUs first, so that the run's messages tell of those that do not end well; nothing runs on.
         """
         recorder = self._recorder
         state = self.save() if final and self.can_save else None
         if final and self._begun:
             recorder.last(self.t, self._engine.workspace.log)
-        messages, texts = self._messages, self._engine.take_texts()
+        texts = self._engine.take_texts()
+        if last:
+            self._loaded.close()
+        messages = self._messages
         written = {name: text.to_json() for name, text in texts.items()}
         t, data = recorder.finish(elapsed=self._elapsed, messages=messages, stopped=self.stopped, texts=written)
         run = Run(
@@ -383,4 +388,4 @@ def simulate(diagram: WiredDiagram, duration: float, options: RunOptions, *, pro
         with progress_bar(diagram.name, first, first + float(duration), progress) as show:
             if simulation.stopped is None:
                 simulation.advance(duration, progress=show)
-        return simulation.run()
+        return simulation.run(last=True)

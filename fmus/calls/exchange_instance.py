@@ -284,9 +284,7 @@ class ExchangeInstance(LoadedFmu):
         """Note that the FMU asks for the end of the run; it is told once."""
         if not self.ends_run:
             self.ends_run = True
-            self.messages.append(
-                f"{self.block.label}: it asks to end the simulation at t = {t:.9g} s, {place} (terminateSimulation)"
-            )
+            self.add_note(f"it asks to end the simulation at t = {t:.9g} s, {place} (terminateSimulation)")
 
     # ---- failures ----
 

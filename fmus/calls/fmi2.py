@@ -108,13 +108,14 @@ class Fmi2Calls(FmiCalls):
     def end_step(self, status: int) -> tuple[int, bool]:
         """Wait for a step that is pending, and look whether a discarded one asks to end the simulation (4.2.2, 4.2.3).
 
-        The FMU gets no function stepFinished, so that it is asked for the status of its step.
+        The FMU gets no function stepFinished, so that it is asked for the status of its step. A step that is pending
+        beyond `patience` stays so.
         """
         from fmpy.fmi1 import FMICallException
         from fmpy.fmi2 import fmi2DoStepStatus, fmi2Terminated
 
-        wait = 1e-5
-        while status == PENDING:
+        wait, end = 1e-5, time.monotonic() + self.patience
+        while status == PENDING and time.monotonic() < end:
             time.sleep(wait)
             wait = min(2 * wait, _LONGEST_WAIT)
             status = self.fmu.getStatus(fmi2DoStepStatus)

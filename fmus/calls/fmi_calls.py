@@ -76,6 +76,8 @@ class FmiCalls(ABC):
     types: ClassVar[dict[str, TypeCalls]]
     """Functions by type, as FMI 3.0 names types."""
     fmu: Any
+    patience: float = 60.0
+    """Longest time in s for which a step may be pending."""
 
     @abstractmethod
     def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
@@ -112,8 +114,9 @@ class FmiCalls(ABC):
     """Whether the FMU is told that it may end a step early; set it before `instantiate`."""
 
     def version(self) -> str:
-        """Return the version of FMI that the library states."""
-        return str(self.fmu.getVersion())
+        """Return the version of FMI that the library states; empty if it states none."""
+        stated = getattr(self.fmu, f"{self.prefix}GetVersion")()
+        return "" if stated is None else bytes(stated).decode(errors="replace")
 
     @abstractmethod
     def instantiate(self, log: Log) -> None:

@@ -16,8 +16,9 @@ from ...blocks.core import FmuError, FmuFileError, FmuProcessError, FmuRuntimeEr
 from ..archive import FmuVariable, inexact, unpack
 from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
-from .fmi_calls import FATAL, STATUS, FmiCalls
+from .fmi_calls import FATAL, FmiCalls
 from .fmu_block import FmuBlock
+from .message_log import MessageLog
 from .process_ends import describe_end
 from .step_options import allows_early_return, uses_event_mode
 from .texts import is_readable, list_limits, read_text, write_text
@@ -39,8 +40,7 @@ class LoadedFmu:
     def __init__(self, block: FmuBlock, *, model_exchange: bool = False, make_calls: MakeCalls | None = None):
         self.block, self.description = block, block.description
         self.model_exchange, self.failed, self.fatal = model_exchange, False, False
-        self.messages: list[str] = list_limits(block.label, self.description)
-        self._limits = len(self.messages)
+        self.log = MessageLog(block.label, list_limits(block.label, self.description))
         self._open = self._running = False
         self._began = 0.0
         description, folder = self.description, Path.cwd()
@@ -63,7 +63,7 @@ class LoadedFmu:
             self._fmu, self.fmi.lose = self.fmi.fmu, self.lose
             self._check_version()
             self._choose_modes()
-            self.fmi.instantiate(self._log)
+            self.fmi.instantiate(self.log.take)
         except FmuProcessError as error:
             raise self.lose(error) from None
         except FmuError as error:
@@ -117,26 +117,24 @@ class LoadedFmu:
     def _check_version(self) -> None:
         """Refuse a library of another version of FMI than the description says (FMI 2.0, 2.1.4; FMI 3.0, 2.3.1)."""
         version, expected = self.fmi.version(), self.description.fmi[:3]
-        if not version.startswith(expected):
+        if not version.startswith(expected) or "-" in version:  # the functions of a beta version take other arguments
             raise FmuFileError(
                 f"the library of {str(self.description.file)!r} says that it is of FMI {version!r} "
                 f"({self.fmi.prefix}GetVersion); expected {expected!r}, as its description says. Export it again.",
                 block=self.block.label,
             )
 
-    def _log(self, status: int, text: str) -> None:
-        if status and len(self.messages) < 1000:
-            kind = STATUS[status] if 0 <= status < len(STATUS) else f"status {status}"
-            self.messages.append(f"{self.block.label}: {kind}: {text}")
+    @property
+    def messages(self) -> list[str]:
+        """Notes on the FMU, and its own messages."""
+        return self.log.texts
 
     def add_note(self, text: str) -> None:
         """Add a message of this library, which is not the FMU's own."""
-        self.messages.insert(self._limits, f"{self.block.label}: {text}")
-        self._limits += 1
+        self.log.note(text)
 
     def _quote_messages(self) -> str:
-        said = self.messages[self._limits :][-5:]
-        return f". The FMU says: {' / '.join(m.rstrip('.') for m in said)}." if said else "."
+        return self.log.quote()
 
     @property
     def t(self) -> float:
@@ -373,7 +371,7 @@ class LoadedFmu:
     # ---- the end ----
 
     def close(self) -> None:
-        """Terminate and free the instance."""
+        """Terminate and free the instance; what fails then is noted, as the run is complete."""
         if not self._open:
             return
         self._open = False
@@ -381,10 +379,16 @@ class LoadedFmu:
         try:
             if self.fatal:  # nothing may be called any more, not even to free it (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)
                 return
-            with suppress(Exception):
-                if self._running and not self.failed:
-                    self.fmi.terminate()
-            with suppress(Exception):
-                self.fmi.free_instance()
+            if self._running and not self.failed:
+                self._end_by(self.fmi.terminate)
+            if not self.fatal:
+                self._end_by(self.fmi.free_instance)
         finally:
             self.fmi.end()
+
+    def _end_by(self, function: Callable[[], None]) -> None:
+        try:
+            function()
+        except Exception as error:
+            self._note(error)
+            self.add_note(f"the run is complete, but the FMU did not end well: {error}")

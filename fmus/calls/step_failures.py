@@ -8,7 +8,7 @@ import numpy as np
 
 from ...blocks.core import FmuRuntimeError
 from ..archive import FmuVariable
-from .fmi_calls import DISCARD, ERROR, FATAL, StepCall
+from .fmi_calls import DISCARD, ERROR, FATAL, PENDING, StepCall
 from .loaded_library import LoadedFmu
 from .stepping import retry_discarded
 from .transfer import UnfitError
@@ -74,6 +74,8 @@ class StepFailures(LoadedFmu):
     def _step_error(self, status: int, t: float, h: float) -> FmuRuntimeError:
         self._width.value = 0.0  # the instance stays where it was
         action = f"the step from t = {t:.9g} s by {h:g} s"
+        if status == PENDING:
+            action = f"{action} was still pending after {self.fmi.patience:g} s: it"
         if status != DISCARD:
             return self.report(action, status, t)
         steps = "" if self.block.variable_step else " from the start: this FMU takes steps of one length only"

@@ -18,7 +18,6 @@ class SteppedInstance(Protocol):
     """Members of an instance that its steps need."""
 
     fmi: FmiCalls
-    messages: list[str]
 
     @property
     def block(self) -> FmuBlock:

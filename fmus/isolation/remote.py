@@ -156,7 +156,11 @@ def _exported(name: str, prefix: str, identifier: str) -> str:
 def make_remote_calls(version: str, process: ChildProcess, limits: Isolation, **arguments: Any) -> FmiCalls:
     """Make the calls of a major version of FMI with the library in a child, which is given back if that fails."""
     base = CALLS[version]
-    kind = type(f"Remote{base.__name__}", (RemoteCalls, base), {"process": process, "limits": limits})
+    kind = type(
+        f"Remote{base.__name__}",
+        (RemoteCalls, base),
+        {"process": process, "limits": limits, "patience": limits.step_time},
+    )
     source, folder = Path(arguments["folder"]), process.folder / "fmu"
     library = folder / Path(arguments["library"]).relative_to(source)
     try:

@@ -1,4 +1,4 @@
-/* A hostile FMU of FMI 2.0 or 3.0 for co-simulation: y follows the integral of u. One fault, at one place, from one
+/* A hostile FMU of FMI 2.0 or 3.0 for co-simulation and model exchange: y is the integral of u. One fault, at one place, from one
    time on, stands in a text of the library that the test writes over: "place fault time". */
 #define _GNU_SOURCE
 #include <fcntl.h>
@@ -30,7 +30,7 @@ typedef void (*logger)(void *, int, const char *, const char *);
 #define LOG(c, status, text) (c)->log((c)->environment, status, "logAll", text)
 #endif
 
-typedef struct { double u, y, p, t; bool running; logger log; void *environment; } instance;
+typedef struct { double u, y, p, t, slope; bool running; logger log; void *environment; } instance;
 static volatile char setting[128] = "@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@";
 static instance *last;
 static void *volatile sink; /* else the compiler leaves allocations out */
@@ -94,7 +94,7 @@ static int act(const char *here, instance *c, double t) {
     if (IS("umask")) umask(0777);
     if (IS("environment")) clearenv();
     if (IS("limits")) { struct rlimit r = {3, 3}; setrlimit(RLIMIT_NOFILE, &r); }
-    if (IS("alarm")) { alarm(1); nap(1.5); }
+    if (IS("alarm")) { ualarm(20000, 0); nap(0.2); nap(0.2); }
     if (IS("file")) { FILE *o = fopen("droppings.txt", "w"); if (o) { fputs("zoo", o); fclose(o); } }
     if (IS("warning")) { LOG(c, 1, "this is a warning"); return 1; }
     if (IS("discard")) { LOG(c, 2, "no solution here"); return 2; }
@@ -124,7 +124,7 @@ static void spoil(instance *c, double v[], size_t n) {
 }
 static double *at(instance *c, unsigned reference) {
     static double none;
-    return reference == 1 ? &c->u : reference == 2 ? &c->y : reference == 3 ? &c->p : &none;
+    return reference == 1 ? &c->u : reference == 2 ? &c->y : reference == 3 ? &c->p : reference == 4 ? (c->slope = c->u, &c->slope) : &none;
 }
 static const char *version(const char *right) {
     static char text[64];
@@ -143,7 +143,28 @@ F(GetFMUState)(void *c, void **s) { *s = malloc(sizeof(instance)); memcpy(*s, c,
 F(SetFMUState)(void *c, void *s) { memcpy(c, s, sizeof(instance)); return act("restore", c, 0.0); }
 F(FreeFMUState)(void *c, void **s) { free(*s); *s = NULL; return act("free_state", c, 0.0); }
 
+/* model exchange: der(y) = u, one indicator that never crosses zero */
+F(SetTime)(void *c, double t) { ((instance *)c)->t = t; return act("time", c, t); }
+F(SetContinuousStates)(void *c, const double x[], size_t n) {
+    ((instance *)c)->y = x[0]; return act("states", c, ((instance *)c)->t); }
+F(GetContinuousStates)(void *c, double x[], size_t n) { x[0] = ((instance *)c)->y; return 0; }
+F(GetNominalsOfContinuousStates)(void *c, double x[], size_t n) { x[0] = 1.0; return act("nominals", c, 0.0); }
+F(GetEventIndicators)(void *c, double z[], size_t n) { z[0] = 1.0; return act("indicators", c, ((instance *)c)->t); }
+F(EnterEventMode)(void *c) { return act("event_mode", c, ((instance *)c)->t); }
+F(EnterContinuousTimeMode)(void *c) { return act("continuous_mode", c, 0.0); }
+static int derivative(instance *c, double d[]) {
+    char f[64]; d[0] = c->u;
+    if (match("slope", c->t, f)) d[0] = IS("nan") ? NAN : INFINITY;
+    return act("derivative", c, c->t); }
+static bool updates(instance *c, const char *fault) { char f[64]; return match("update", c->t, f) && IS(fault); }
+
 #if FMI == 2
+F(GetDerivatives)(void *c, double d[], size_t n) { return derivative(c, d); }
+F(CompletedIntegratorStep)(void *c, int final, int *event, int *terminate) {
+    *event = 0; *terminate = updates(c, "terminate"); return act("completed", c, ((instance *)c)->t); }
+typedef struct { int again, terminate, nominals, values, next; double time; } event_info;
+F(NewDiscreteStates)(void *c, event_info *e) {
+    memset(e, 0, sizeof *e); e->again = updates(c, "endless"); return act("update", c, ((instance *)c)->t); }
 API const char *fmi2GetVersion(void) { return version("2.0"); }
 API const char *fmi2GetTypesPlatform(void) { return "default"; }
 API void *fmi2Instantiate(const char *name, int kind, const char *token, const char *resources, const callbacks *with) {
@@ -165,6 +186,14 @@ F(GetStatus)(void *c, int kind, int *value) { *value = 5; return act("status", c
 F(GetBooleanStatus)(void *c, int kind, int *value) { char f[64]; *value = match("flags", 1e9, f); return 0; }
 F(GetRealStatus)(void *c, int kind, double *value) { *value = ((instance *)c)->t; return 0; }
 #else
+F(GetContinuousStateDerivatives)(void *c, double d[], size_t n) { return derivative(c, d); }
+F(CompletedIntegratorStep)(void *c, bool final, bool *event, bool *terminate) {
+    *event = false; *terminate = updates(c, "terminate"); return act("completed", c, ((instance *)c)->t); }
+F(UpdateDiscreteStates)(void *c, bool *again, bool *terminate, bool *nominals, bool *values, bool *next, double *t) {
+    *again = updates(c, "endless"); *terminate = *nominals = *values = *next = false;
+    return act("update", c, ((instance *)c)->t); }
+API void *fmi3InstantiateModelExchange(const char *name, const char *token, const char *resources, bool visible,
+        bool logging, void *environment, logger log) { return make(log, environment); }
 API const char *fmi3GetVersion(void) { return version("3.0"); }
 API void *fmi3InstantiateCoSimulation(const char *name, const char *token, const char *resources, bool visible, bool logging,
         bool events, bool early, const unsigned required[], size_t n, void *environment, logger log, void *intermediate) {

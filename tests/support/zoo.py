@@ -14,25 +14,39 @@ _STATES = 'canGetAndSetFMUState="true" canHandleVariableCommunicationStepSize="t
 _DESCRIPTIONS = {
     3: f"""<?xml version="1.0" encoding="UTF-8"?>
 <fmiModelDescription fmiVersion="3.0" modelName="zoo" instantiationToken="zoo">
-  <CoSimulation modelIdentifier="zoo" {_STATES.replace("FMUState", "FMUState")}/>
+  <ModelExchange modelIdentifier="zoo"/>
+  <CoSimulation modelIdentifier="zoo" {_STATES}/>
   <ModelVariables>
     <Float64 name="time" valueReference="0" causality="independent" variability="continuous"/>
     <Float64 name="u" valueReference="1" causality="input" start="0"/>
-    <Float64 name="y" valueReference="2" causality="output"/>
+    <Float64 name="y" valueReference="2" causality="output" initial="exact" start="0"/>
     <Float64 name="p" valueReference="3" causality="parameter" variability="fixed" start="1"/>
+    <Float64 name="der(y)" valueReference="4" derivative="2"/>
+    <Float64 name="z" valueReference="5"/>
   </ModelVariables>
-  <ModelStructure><Output valueReference="2"/></ModelStructure>
+  <ModelStructure>
+    <Output valueReference="2"/>
+    <ContinuousStateDerivative valueReference="4"/>
+    <InitialUnknown valueReference="4"/>
+    <EventIndicator valueReference="5"/>
+  </ModelStructure>
 </fmiModelDescription>
 """,
     2: f"""<?xml version="1.0" encoding="UTF-8"?>
-<fmiModelDescription fmiVersion="2.0" modelName="zoo" guid="zoo">
+<fmiModelDescription fmiVersion="2.0" modelName="zoo" guid="zoo" numberOfEventIndicators="1">
+  <ModelExchange modelIdentifier="zoo"/>
   <CoSimulation modelIdentifier="zoo" {_STATES.replace("FMUState", "FMUstate")}/>
   <ModelVariables>
     <ScalarVariable name="u" valueReference="1" causality="input"><Real start="0"/></ScalarVariable>
-    <ScalarVariable name="y" valueReference="2" causality="output"><Real/></ScalarVariable>
+    <ScalarVariable name="y" valueReference="2" causality="output" initial="exact"><Real start="0"/></ScalarVariable>
     <ScalarVariable name="p" valueReference="3" causality="parameter" variability="fixed"><Real start="1"/></ScalarVariable>
+    <ScalarVariable name="der(y)" valueReference="4"><Real derivative="2"/></ScalarVariable>
   </ModelVariables>
-  <ModelStructure><Outputs><Unknown index="2"/></Outputs></ModelStructure>
+  <ModelStructure>
+    <Outputs><Unknown index="2"/></Outputs>
+    <Derivatives><Unknown index="4"/></Derivatives>
+    <InitialUnknowns><Unknown index="4"/></InitialUnknowns>
+  </ModelStructure>
 </fmiModelDescription>
 """,
 }

@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from pathlib import Path
 
 ANSWERS = 700  # a descriptor that no FMU guesses
@@ -108,7 +109,11 @@ def main():
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)
     for line in sys.stdin:
-        answers.write(json.dumps(serve(json.loads(line))) + "\n")
+        try:
+            answer = serve(json.loads(line))
+        except Exception:
+            answer = {"broken": traceback.format_exc()}
+        answers.write(json.dumps(answer) + "\n")
         answers.flush()
 
 

@@ -1,0 +1,68 @@
+"""Log of an instance: messages of the FMU and notes on it, cleaned and within bounds."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+from .fmi_calls import STATUS
+
+_MOST = 1000
+"""Most different messages of an FMU that are kept."""
+_LONGEST = 2000
+"""Most characters of a message that are kept."""
+_QUOTED = 5
+
+
+class MessageLog:
+    """Messages of an FMU, each told once with its count, after notes on the FMU; ``label`` names the block."""
+
+    def __init__(self, label: str, notes: Iterable[str] = ()):
+        self._label, self._notes = label, list(notes)
+        self._said: dict[str, int] = {}
+        self._last: deque[str] = deque(maxlen=_QUOTED)
+        self._left_out = 0
+
+    def note(self, text: str) -> None:
+        """Add a note, which is not the FMU's own."""
+        self._notes.append(f"{self._label}: {text}")
+
+    def take(self, status: int, text: str) -> None:
+        """Take a message of the FMU, of a status that is a warning or worse."""
+        if not status:
+            return
+        kind = STATUS[status] if 0 <= status < len(STATUS) else f"status {status}"
+        message = f"{self._label}: {kind}: {clean_text(text)}"
+        if message not in self._last:
+            self._last.append(message)
+        if message in self._said or len(self._said) < _MOST:
+            self._said[message] = self._said.get(message, 0) + 1
+        else:
+            self._left_out += 1
+
+    @property
+    def texts(self) -> list[str]:
+        """Notes, then the FMU's messages in the order in which each came first."""
+        said = [m if n == 1 else f"{m} (said {n:,} times)" for m, n in self._said.items()]
+        more = [f"{self._label}: {self._left_out:,} further messages are left out"] if self._left_out else []
+        return [*self._notes, *said, *more]
+
+    def quote(self) -> str:
+        """Return the end of a sentence, with the FMU's last words if there are any."""
+        return f". The FMU says: {' / '.join(m.rstrip('.') for m in self._last)}." if self._last else "."
+
+
+def clean_text(text: str) -> str:
+    r"""Return a text of an FMU on one line, without characters that steer a terminal, cut where it is very long.
+
+    Examples
+    --------
+    >>> clean_text("no root\n  at t = 2\x1b[2J")
+    'no root / at t = 2\\x1b[2J'
+    """
+    if len(text) > _LONGEST:
+        text = f"{text[:_LONGEST]} … ({len(text):,} characters)"
+    if text.isprintable():
+        return text
+    line = " / ".join(part.strip() for part in text.splitlines() if part.strip()).replace("\t", " ")
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)
