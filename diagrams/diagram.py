@@ -260,6 +260,7 @@ class Diagram(SimulatedDiagram):
         *,
         pdf: bool = False,
         json: bool = False,
+        paper: str = "A4",
         **options: Any,
     ) -> Report:
         """Analyse the diagram for design, and write the report; see docs/reports.md.
@@ -270,8 +271,8 @@ class Diagram(SimulatedDiagram):
             File to write, ``.html``; without it nothing is written. A notebook shows the report.
         pdf, json : bool
             Write ``.pdf`` (which needs ``pip install 'loopwright[pdf]'``) and ``.json`` beside it, too.
-        **options
-            What `loopwright.diagrams.analyse` takes, such as ``point`` and ``loops``.
+        paper : {"A4", "letter"}
+            Paper of the PDF. ``options`` are those of `analyse`, such as ``requirements``, ``point`` and ``loops``.
 
         Returns
         -------
@@ -286,9 +287,9 @@ class Diagram(SimulatedDiagram):
         from .report import analyse, with_drawing
         from .report_writing import check_files, write_report
 
-        check_files(path, pdf=pdf, json=json)
+        check_files(path, pdf=pdf, json=json, paper=paper)
         made = with_drawing(analyse(self, **options), self)
-        write_report(made, path, pdf=pdf, json=json)
+        write_report(made, path, pdf=pdf, json=json, paper=paper)
         return made
 
     def draw(

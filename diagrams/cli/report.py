@@ -53,6 +53,9 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     report.add_argument("--check", action="store_true", help="say by the exit status whether they are met")
     for name in ABOUT:
         report.add_argument(f"--{name}", metavar="TEXT", help=f"the {name} in the report's heading")
+    report.add_argument("--db", action="store_true", help="draw magnitudes in dB")
+    report.add_argument("--hz", action="store_true", help="draw frequency responses over Hz in place of rad/s")
+    report.add_argument("--paper", choices=["A4", "letter"], default="A4", help="paper of the PDF (default: A4)")
     report.add_argument("--plant", metavar="FILE.fmu", help="another plant in place of the gantry")
     report.add_argument(
         "--stairs", choices=["gain"], help="take stairs, as of quantizers and encoders, as their mean slope"
@@ -89,7 +92,7 @@ def report_command(arguments: argparse.Namespace) -> int:
         about = {name: text for name in ABOUT if (text := getattr(arguments, name)) is not None}
         try:
             with _progress(diagram.name) as tell:
-                report = _analyse(diagram, experiment, arguments.stairs, asked, about, tell)
+                report = _analyse(diagram, experiment, arguments, asked, about, tell)
         except UnknownNameError as error:
             say(f"loopwright: error: {error}", sys.stderr)
             return 1 if asked is None else 2
@@ -101,7 +104,7 @@ def report_command(arguments: argparse.Namespace) -> int:
             return 130
         say(f"{diagram.name}: {len(report.numbers())} numbers in {time.perf_counter() - began:.1f} s", sys.stderr)
         try:
-            files = write_report(report, out, pdf=arguments.pdf, json=arguments.json)
+            files = write_report(report, out, pdf=arguments.pdf, json=arguments.json, paper=arguments.paper)
         except OSError as error:
             say(f"loopwright: error: the report can't be written: {error}. Name another file.", sys.stderr)
             return 1
@@ -128,14 +131,23 @@ def _verdict(reviewed: Review) -> str:
 def _analyse(
     diagram: Diagram,
     experiment: Experiment | None,
-    stairs: str | None,
+    arguments: argparse.Namespace,
     asked: Requirements | None,
     about: Mapping[str, str],
     tell: Callable[[str], None],
 ) -> Report:
     from ..report import analyse, with_drawing
 
-    made = analyse(diagram, experiment=experiment, stairs=stairs, requirements=asked, about=about, progress=tell)
+    made = analyse(
+        diagram,
+        experiment=experiment,
+        stairs=arguments.stairs,
+        requirements=asked,
+        about=about,
+        decibels=arguments.db,
+        hertz=arguments.hz,
+        progress=tell,
+    )
     return with_drawing(made, diagram)
 
 

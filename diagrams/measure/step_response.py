@@ -50,6 +50,8 @@ class StepResponse:
         Their changes.
     before : (K,) ndarray
         Their values before the step.
+    wire_before : float
+        The wire's value before the step.
     moved : float
         Largest change of the wire and of the outputs without the step, relative to 1 + their sizes.
     dt : float
@@ -68,6 +70,7 @@ class StepResponse:
     outputs: tuple[str, ...]
     y: np.ndarray
     before: np.ndarray
+    wire_before: float
     moved: float
     dt: float
     held: bool
@@ -139,7 +142,7 @@ def step_response(
     variant = diagram.replace(point.parameters) if point.parameters else diagram
     sampled = diagram.has_clock or diagram.has_fmu
     base = point.base if sampled else Fraction(max(1, round(length / SAMPLES * 1e9)), 10**9)
-    flat = variant.flatten(base)
+    flat = variant.flatten_like(point) if sampled else variant.flatten(base)
     signal = find_signal(flat, wire)
     if len(signal.entries) != 1:
         raise OptionError(
@@ -202,7 +205,8 @@ def step_response(
     labels = tuple(label for tap in taps for label in tap.labels)
     is_held = bool(held) and steady and not _follows_states(flat, signal.port)
     return StepResponse(
-        wire, float(size), t, d, change[:, 0], labels, change[:, 1:], rest[0, 1:], moved, float(period), is_held,
+        wire, float(size), t, d, change[:, 0], labels, change[:, 1:], rest[0, 1:], float(rest[0, 0]),
+        moved, float(period), is_held,
         prediction,
     )  # fmt: skip
 

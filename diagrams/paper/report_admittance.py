@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -21,13 +21,16 @@ from ..admittance import (
 from ..frequency import Number, with_findings
 from ..report import Implementation
 from ..report_writing import Plot, Section, Table, Texts
-from .reduced_loops import OPTIONS, ReducedLoops, each_implementation
+from .reduced_loops import FRICTION, OPTIONS, ReducedLoops, each_implementation
 from .report_case import Fig3Case
 from .report_contact import DAMPINGS, SPRING, again, contact_sections, find_contacts
 from .report_figures import RULE, TARGET, WITH_FRICTION, draw_admittances, draw_stability
 
 TEXTS = Texts(__package__, "admittance")
 TITLE = "Admittance and coupled stability"
+SAMPLED, DELAYED = Implementation.SAMPLED, Implementation.DELAYED
+ROUGH = SAMPLED + FRICTION
+"""Key of the sampled variant with friction."""
 
 
 def has_admittance(case: Fig3Case) -> bool:
@@ -47,11 +50,12 @@ def admittance(case: Fig3Case) -> Section:
         if contacts is None:
             return Section("admittance", TITLE, not_shown(case))
         try:
-            parts = contact_sections(contacts)
+            parts = contact_sections(contacts, {key: v.title for key, v in case.variants.items()})
         except ConfirmationError as error:  # a limit that is refuted is none; the rest of the report holds
             return Section("admittance", TITLE, (*not_shown(case), str(error)))
         return Section("admittance", TITLE, (*TEXTS.paragraphs("contacts"), str(case.reduced)), sections=parts)
-    parts = tuple(_side(case.reduced, side) for side in SIDES)
+    titles = {key: v.title for key, v in case.variants.items()}
+    parts = tuple(_side(case.reduced, side, titles) for side in SIDES)
     return Section("admittance", TITLE, TEXTS.paragraphs("limits"), sections=parts)
 
 
@@ -60,7 +64,7 @@ def not_shown(case: Fig3Case) -> tuple[str, ...]:
     return (*TEXTS.paragraphs("not_shown"), str(case.reduced))
 
 
-def _side(loops: ReducedLoops, side: str) -> Section:
+def _side(loops: ReducedLoops, side: str, titles: Mapping[str, str]) -> Section:
     loop = loops.plain[side]
     numbers: dict[str, Number] = {}
     a = loop.admittance
@@ -70,14 +74,18 @@ def _side(loops: ReducedLoops, side: str) -> Section:
         ("stiffness", a.stiffness, "N/m"),
     ):
         numbers[f"target.{name}"] = Number(value, unit, 1e-15 * abs(value), "given", given=True)
-    tables = [_passivity(loops, side, numbers), *_limits(loops, side, numbers), *_masses(loops, side, numbers)]
-    plots = (_rendered(loops, side), _map(loops, side))
+    tables = [
+        _passivity(loops, side, numbers, titles),
+        *_limits(loops, side, numbers, titles),
+        *_masses(loops, side, numbers, titles),
+    ]
+    plots = (_rendered(loops, side, titles), _map(loops, side, titles))
     symbol = "along the path, ∥" if side == "par" else "across the path, ⊥"
     text = (*TEXTS.paragraphs("asked", loop=loop), passivity(loop).caveat)
     return Section(side, f"Direction {symbol}", text, tuple(tables), plots, numbers)
 
 
-def _passivity(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Table:
+def _passivity(loops: ReducedLoops, side: str, numbers: dict[str, Number], titles: Mapping[str, str]) -> Table:
     rows = []
     for suffix, loop in loops.suffixed(side).items():
         for name, variant in each_implementation(loop).items():
@@ -93,12 +101,12 @@ def _passivity(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Ta
             error = p.tolerance * p.frequency if math.isfinite(p.frequency) else 0.0
             numbers[path] = Number(p.frequency, "rad/s", error, how, findings=p.findings)
             spans = ", ".join(f"{low:.5g} … {high:.5g}" for low, high in p.intervals) or "none"
-            rows.append((name + suffix, numbers[path], spans, "yes" if p.stable else "no"))
+            rows.append((titles.get(name + suffix, name + suffix), numbers[path], spans, "yes" if p.stable else "no"))
     columns = ("variant", "first Re Y < 0 at", "all of Re Y < 0 [rad/s]", "stable alone")
     return Table("Sign of Re Y(jω)", columns, tuple(rows))
 
 
-def _limits(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Iterator[Table]:
+def _limits(loops: ReducedLoops, side: str, numbers: dict[str, Number], titles: Mapping[str, str]) -> Iterator[Table]:
     for key, kind in loops.kinds(side).items():
         rows = []
         for name in OPTIONS:
@@ -113,12 +121,13 @@ def _limits(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Itera
                 shown = {"ke_limit": found.number, "rule_of_thumb": rule, "ke_frequency": frequency}
                 place = f"{name}.be_{b:g}"
                 numbers |= {f"{kind.key_of(of)}.{place}": n for of, n in shown.items() if n is not None}
-                rows.append((name, f"{b:g} N s/m", *shown.values(), again(found)))
+                title = titles.get(name + kind.suffix, name + kind.suffix)
+                rows.append((title, f"{b:g} N·s/m", *shown.values(), again(found)))
         columns = ("variant", "b_e", "largest k_e", "rule of thumb", "oscillates at", "stable again")
         yield Table(f"Largest stiffness of the environment, {kind.title}", columns, tuple(rows))
 
 
-def _masses(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Iterator[Table]:
+def _masses(loops: ReducedLoops, side: str, numbers: dict[str, Number], titles: Mapping[str, str]) -> Iterator[Table]:
     rows = []
     # without any stiffness the robot drifts, and there is no limit to lose
     moored: dict[str, Any] = {} if loops.plain[side].admittance.stiffness > 0 else {"stiffness": SPRING}
@@ -130,26 +139,26 @@ def _masses(loops: ReducedLoops, side: str, numbers: dict[str, Number]) -> Itera
                 path = f"{key}{suffix}.{name}"
                 numbers[path] = found.number
                 shown += [numbers[path], again(found)]
-            rows.append((name + suffix, *shown))
+            rows.append((titles.get(name + suffix, name + suffix), *shown))
     columns = ("variant", "largest m_e", "stable again", "largest tool mass", "stable again")
     how = f"on a spring of {SPRING:g} N/m" if moored else "without spring and damper"
     yield Table(f"Largest masses, {how}", columns, tuple(rows))
 
 
-def _rendered(loops: ReducedLoops, side: str) -> Plot:
+def _rendered(loops: ReducedLoops, side: str, titles: Mapping[str, str]) -> Plot:
     loop = loops.plain[side]
     a = loop.admittance
     centre = math.sqrt(a.stiffness / a.mass) if a.stiffness > 0 else float(a.effective_damping) / a.mass
     w = np.geomspace(centre / 50, 0.999 * math.pi / loop.sample_time, 500)
     curves: dict[str, tuple[str, np.ndarray]] = {TARGET: ("target", target_admittance(loop, w))}
     for name, variant in each_implementation(loop).items():
-        curves[name] = (name.replace("_", " "), rendered_admittance(variant, w))
+        curves[name] = (titles.get(name, name), rendered_admittance(variant, w))
     if side in loops.rough:
-        curves[WITH_FRICTION] = ("sampled d0, friction slope at rest", rendered_admittance(loops.rough[side], w))
+        curves[WITH_FRICTION] = (titles.get(ROUGH, ROUGH), rendered_admittance(loops.rough[side], w))
     return draw_admittances(f"admittance_{side}", w, curves, along=side == "par")
 
 
-def _map(loops: ReducedLoops, side: str) -> Plot:
+def _map(loops: ReducedLoops, side: str, titles: Mapping[str, str]) -> Plot:
     loop = loops.plain[side]
     k, b = np.geomspace(10.0, 1e6, 120), np.geomspace(0.1, 1e3, 41)
 
@@ -158,13 +167,13 @@ def _map(loops: ReducedLoops, side: str) -> Plot:
 
     shown = growth(loop)
     lines: dict[str, tuple[str, np.ndarray]] = {
-        Implementation.SAMPLED: ("sampled d0", _first(k, shown)),
-        Implementation.DELAYED: ("sampled d1", _first(k, growth(loop.replace(delay=1)))),
+        Implementation.SAMPLED: (titles.get(SAMPLED, SAMPLED), _first(k, shown)),
+        Implementation.DELAYED: (titles.get(DELAYED, DELAYED), _first(k, growth(loop.replace(delay=1)))),
     }
     if side in loops.rough:
-        lines[WITH_FRICTION] = ("sampled d0, friction slope at rest", _first(k, growth(loops.rough[side])))
+        lines[WITH_FRICTION] = (titles.get(ROUGH, ROUGH), _first(k, growth(loops.rough[side])))
     d = float(loop.admittance.effective_damping) / loop.scale
-    lines[RULE] = ("rule of thumb, d0", (d + b) / (0.5 * loop.sample_time))
+    lines[RULE] = ("rule of thumb, no delay", (d + b) / (0.5 * loop.sample_time))
     return draw_stability(f"stability_{side}", k, b, shown, lines, along=side == "par")
 
 

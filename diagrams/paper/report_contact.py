@@ -47,12 +47,12 @@ def find_contacts(case: Fig3Case) -> Contacts | None:
     return None if blind or any(contact.filter is None for contact in every) or not every else found
 
 
-def contact_sections(contacts: Contacts) -> tuple[Section, ...]:
-    """Return the sections of both directions."""
-    return tuple(_side(contacts[side], side) for side in SIDES)
+def contact_sections(contacts: Contacts, titles: Mapping[str, str]) -> tuple[Section, ...]:
+    """Return the sections of both directions; ``titles`` are those of the variants by their keys."""
+    return tuple(_side(contacts[side], side, titles) for side in SIDES)
 
 
-def _side(variants: Mapping[Implementation, Contact], side: str) -> Section:
+def _side(variants: Mapping[Implementation, Contact], side: str, titles: Mapping[str, str]) -> Section:
     one = next(iter(variants.values()))
     numbers: dict[str, Number] = {}
     a = one.filter
@@ -63,13 +63,19 @@ def _side(variants: Mapping[Implementation, Contact], side: str) -> Section:
         ("stiffness", a.stiffness, "N/m"),
     ):
         numbers[f"target.{name}"] = Number(value, unit, 1e-15 * abs(value), "given", given=True)
-    tables = (_passivity(variants, numbers), _limits(variants, numbers), _masses(variants, a.stiffness > 0, numbers))
+    tables = (
+        _passivity(variants, numbers, titles),
+        _limits(variants, numbers, titles),
+        _masses(variants, a.stiffness > 0, numbers, titles),
+    )
     symbol = "along the path, ∥" if side == "par" else "across the path, ⊥"
     text = (*TEXTS.paragraphs("asked_of", filter=a, scale=one.scale), one.passivity().caveat)
-    return Section(side, f"Direction {symbol}", text, tables, (_rendered(variants, side),), numbers)
+    return Section(side, f"Direction {symbol}", text, tables, (_rendered(variants, side, titles),), numbers)
 
 
-def _passivity(variants: Mapping[Implementation, Contact], numbers: dict[str, Number]) -> Table:
+def _passivity(
+    variants: Mapping[Implementation, Contact], numbers: dict[str, Number], titles: Mapping[str, str]
+) -> Table:
     rows = []
     for name, contact in variants.items():
         p = contact.passivity()
@@ -83,24 +89,29 @@ def _passivity(variants: Mapping[Implementation, Contact], numbers: dict[str, Nu
         path = f"first_non_passive.{name}"
         numbers[path] = Number(p.frequency, "rad/s", error, known, findings=p.findings)
         spans = ", ".join(f"{low:.5g} … {high:.5g}" for low, high in p.intervals) or "none"
-        rows.append((name, numbers[path], spans, "yes" if p.stable else "no"))
+        rows.append((titles.get(name, name), numbers[path], spans, "yes" if p.stable else "no"))
     columns = ("variant", "first Re Y < 0 at", "all of Re Y < 0 [rad/s]", "stable alone")
     return Table("Sign of Re Y(jω)", columns, tuple(rows))
 
 
-def _limits(variants: Mapping[Implementation, Contact], numbers: dict[str, Number]) -> Table:
+def _limits(variants: Mapping[Implementation, Contact], numbers: dict[str, Number], titles: Mapping[str, str]) -> Table:
     rows = []
     for name, contact in variants.items():
         for b in DAMPINGS:
             found = contact.stability_limit("stiffness", damping=b)
             place = f"{name}.be_{b:g}"
             shown = _enter(found, "ke_limit", place, "ke_frequency", numbers)
-            rows.append((name, f"{b:g} N s/m", *shown))
+            rows.append((titles.get(name, name), f"{b:g} N·s/m", *shown))
     columns = ("variant", "b_e", "largest k_e", "oscillates at", "moves", "stable again")
     return Table("Largest stiffness of the environment", columns, tuple(rows))
 
 
-def _masses(variants: Mapping[Implementation, Contact], has_spring: bool, numbers: dict[str, Number]) -> Table:
+def _masses(
+    variants: Mapping[Implementation, Contact],
+    has_spring: bool,
+    numbers: dict[str, Number],
+    titles: Mapping[str, str],
+) -> Table:
     rows = []
     # without any stiffness the robot drifts, and there is no limit to lose
     moored: dict[str, Any] = {} if has_spring else {"stiffness": SPRING}
@@ -108,7 +119,7 @@ def _masses(variants: Mapping[Implementation, Contact], has_spring: bool, number
         for vary, key in (("mass", "me_limit"), ("tool_mass", "tool_mass_limit")):
             found = contact.stability_limit(vary, **moored)
             shown = _enter(found, key, str(name), "", numbers)
-            rows.append((name, "m_e" if vary == "mass" else "tool", *shown))
+            rows.append((titles.get(name, name), "m_e" if vary == "mass" else "tool", *shown))
     where = f"on a spring of {SPRING:g} N/m" if moored else "without spring and damper"
     columns = ("variant", "mass", "largest", "oscillates at", "moves", "stable again")
     return Table(f"Largest masses, {where}", columns, tuple(rows))
@@ -129,7 +140,7 @@ def _enter(found: ContactLimit, key: str, place: str, frequency_key: str, number
     yield again(found)
 
 
-def _rendered(variants: Mapping[Implementation, Contact], side: str) -> Plot:
+def _rendered(variants: Mapping[Implementation, Contact], side: str, titles: Mapping[str, str]) -> Plot:
     one = next(iter(variants.values()))
     a = one.filter
     assert a is not None  # find_contacts looks
@@ -139,7 +150,7 @@ def _rendered(variants: Mapping[Implementation, Contact], side: str) -> Plot:
     target = one.admittance(w).target
     assert target is not None  # as there is a filter
     curves: dict[str, tuple[str, np.ndarray]] = {TARGET: ("target", target)}
-    curves |= {n: (n.replace("_", " "), c.admittance(w).rendered) for n, c in variants.items()}
+    curves |= {n: (titles.get(n, n), c.admittance(w).rendered) for n, c in variants.items()}
     return draw_admittances(f"admittance_{side}", w, curves, along=side == "par")
 
 

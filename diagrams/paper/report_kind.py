@@ -77,5 +77,6 @@ FIG3 = ReportKind(
         ReportPart("limits", friction_not_modelled, has_friction),
     ),
     {**DEFINITIONS, **read_definitions(__package__)},
+    {"poles": "Poles asked and got", "inner": "Inner loops"},
 )
 """The report of a diagram of Fig. 3."""

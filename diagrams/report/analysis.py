@@ -13,7 +13,7 @@ from ..frequency import on_one_thread
 from ..linearization import find_signal
 from ..report_writing import DEFINITIONS, Report
 from ..requirements import Requirements, read_requirements
-from .case import Case, ReportedExperiment
+from .case import AxisUnits, Case, ReportedExperiment
 from .content_hash import content_hash
 from .parts import HasReportKind, MakesSections, ReportKind, ReportPart
 from .points import STEP
@@ -55,6 +55,8 @@ def analyse(
     stairs: str | None = None,
     requirements: Requirements | str | os.PathLike[str] | None = None,
     about: Mapping[str, str] | None = None,
+    decibels: bool = False,
+    hertz: bool = False,
     progress: Callable[[str], None] | None = None,
 ) -> Report:
     """Analyse a diagram, and return the content of its report.
@@ -86,6 +88,8 @@ def analyse(
         the JSON tell.
     about : mapping of str to str, optional
         Lines of the heading: ``title``, ``author``, ``project``, ``date``, ``revision``, or any other.
+    decibels, hertz : bool
+        Whether magnitudes are drawn in dB, and over a frequency in Hz; without it plain, over rad/s.
     progress : callable, optional
         Told the key of each section before it is made.
 
@@ -112,7 +116,9 @@ def analyse(
         find_signal(diagram.flatten(None if diagram.has_clock else STEP), wire)
     tell = progress or (lambda key: None)
     asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(requirements)
-    case, sections = kind.sections(diagram, point, experiment, wires, only, tell, stairs, asked)
+    case, sections = kind.sections(
+        diagram, point, experiment, wires, only, tell, stairs, asked, AxisUnits(decibels, hertz)
+    )
     made = Report("", sections).numbers()
     reviewed = None if asked is None else review(case, asked, made)
     if only is None or asked is not None:

@@ -49,6 +49,32 @@ class Basis(NamedTuple):
     is_design: bool = True
 
 
+class AxisUnits(NamedTuple):
+    """Units of the axes of frequency responses: plain or in dB, over rad/s or Hz."""
+
+    decibels: bool = False
+    hertz: bool = False
+
+    def magnitude(self, value: Any) -> np.ndarray:
+        """Return magnitudes in the unit of their axis."""
+        data = np.asarray(value, dtype=float)
+        with np.errstate(divide="ignore"):
+            return np.asarray(20 * np.log10(data)) if self.decibels else data
+
+    def frequency(self, omega: Any) -> np.ndarray:
+        """Return frequencies, which are in rad/s, in the unit of their axis."""
+        return np.asarray(omega, dtype=float) / (2 * np.pi if self.hertz else 1.0)
+
+    @property
+    def frequency_label(self) -> str:
+        """Label of the frequency axis."""
+        return "frequency [Hz]" if self.hertz else "ω [rad/s]"
+
+    def magnitude_label(self, name: str) -> str:
+        """Return the label of a magnitude's axis."""
+        return f"{name} [dB]" if self.decibels else name
+
+
 class InjectionPlan(NamedTuple):
     """A test signal: the variant that it is added to, frequencies in rad/s, and the amplitude."""
 
@@ -86,6 +112,8 @@ class Case:
         Keys of the sections that the report is to have.
     requirements : Requirements, optional
         Requirements on the design.
+    axes : AxisUnits
+        Units of the axes of frequency responses.
     """
 
     inputs: tuple[str, ...] = ()
@@ -106,6 +134,7 @@ class Case:
         self.notes: list[str] = []
         self.keys: tuple[str, ...] = ()
         self.requirements: Requirements | None = None
+        self.axes = AxisUnits()
         self.variants: dict[str, Variant] = {}
         own = self.own_delay()
         for basis in self.bases():

@@ -7,7 +7,7 @@ parts and definitions, which the diagram gives as its ``report_kind``. The parts
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
@@ -15,9 +15,10 @@ from ...blocks.core import OptionError
 from ..flat import WiredDiagram
 from ..report_writing import Section
 from ..requirements import Requirements
-from .case import Case, ReportedExperiment
+from .case import AxisUnits, Case, ReportedExperiment
 from .review import check_names
 
+RADIANS = AxisUnits()
 C = TypeVar("C", bound=Case)
 C_contra = TypeVar("C_contra", bound=Case, contravariant=True)
 
@@ -67,6 +68,7 @@ class MakesSections(Protocol):
         tell: Callable[[str], None],
         stairs: str | None = None,
         requirements: Requirements | None = None,
+        axes: AxisUnits = RADIANS,
     ) -> tuple[Case, tuple[Section, ...]]:
         """Return the case of a diagram, and its sections."""
 
@@ -92,11 +94,14 @@ class ReportKind(Generic[C]):
         The parts in the order in which they stand in the report.
     definitions : mapping
         Definitions of the terms in the paths of numbers.
+    titles : mapping
+        Titles of sections, by their keys, in place of those that their parts give.
     """
 
     case: Callable[[WiredDiagram, Any, ReportedExperiment | None, tuple[str, ...] | None, str | None], C]
     parts: tuple[ReportPart[C], ...]
     definitions: Mapping[str, str] = field(default_factory=dict)
+    titles: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -125,6 +130,7 @@ class ReportKind(Generic[C]):
         tell: Callable[[str], None],
         stairs: str | None = None,
         requirements: Requirements | None = None,
+        axes: AxisUnits = RADIANS,
     ) -> tuple[Case, tuple[Section, ...]]:
         """Return the case of a diagram, and its sections.
 
@@ -136,11 +142,14 @@ class ReportKind(Generic[C]):
             Keys of the sections that are made; all without it.
         requirements : Requirements, optional
             Requirements on the design, which decide on the variants and steps that are tried.
+        axes : AxisUnits
+            Units of the axes of frequency responses.
         tell : callable
             Told "variants" before the case is made, and the key of each section before it is made.
         """
         tell("variants")
         case = self.case(diagram, point, experiment, wires, stairs)
+        case.axes = axes
         if requirements is not None:
             case.requirements = requirements
             check_names(case, requirements)
@@ -155,7 +164,8 @@ class ReportKind(Generic[C]):
                 tell(key)
                 made = [section for part in parts if (section := part.make(case)) is not None]
                 if made:
-                    yield joined(made)
+                    whole = joined(made)
+                    yield replace(whole, title=self.titles.get(key, whole.title))
 
 
 def joined(sections: list[Section]) -> Section:

@@ -24,6 +24,7 @@ from ..report_writing import Section, Table, Texts
 from . import plots as figures
 from .case import Case
 from .disks import several
+from .gang import gang_of_four
 from .pole_texts import list_poles
 from .uncertainty import LoopPart, cut_key, left_out, widened
 from .variant import Cut, Variant, in_s
@@ -44,6 +45,7 @@ ROWS: Mapping[str, str] = {
     "mt_frequency": "M_t at",
     "bandwidth": "bandwidth",
 }
+LOOPS_TITLE = "Loops"
 PERIODIC = frozenset(f.name for f in fields(PeriodicMargins))
 
 
@@ -58,7 +60,7 @@ def inner(case: Case) -> Section:
             parts.append(widened(wire, part))
     if not parts and len(text) == 1:
         text.append(TEXTS.line("no_loop"))
-    return Section("inner", "Inner loops", tuple(text), sections=tuple(parts))
+    return Section("inner", LOOPS_TITLE, tuple(text), sections=tuple(parts))
 
 
 def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
@@ -87,7 +89,7 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
             continue
         at = cut_key(v, cut)
         found[at], loops[at], titles[at] = m, L, title
-        designs += [at] if v.is_design else []
+        designs += [at] if v.is_design or v.is_actual else []
         own[v, cut] = with_findings(_numbers(m), m.findings)
         numbers |= {f"{at}.{name}": number for name, number in own[v, cut].items()}
         if m.hidden_unstable:
@@ -129,27 +131,35 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
             ("", *(titles[k] for k in found)),
             tuple((text, *(m.numbers()[name] for m in found.values())) for name, text in ROWS.items()),
         ),
-        Table("Crossings", ("variant", "crossing of", "frequency", "margin there"), tuple(_crossings(found, titles))),
         Table(
-            "Closed-loop poles",
+            f"Crossings at {wire}",
+            ("variant", "crossing of", "frequency", "margin there"),
+            tuple(_crossings(found, titles)),
+            details=True,
+        ),
+        Table(
+            f"Closed-loop poles of the loop at {wire}",
             ("variant", "poles, s = log(z)/T where sampled [1/s]", "hidden: not in this loop"),
             tuple(
                 (titles[k], _poles(m.closed_loop_poles, loops[k].dt), _poles(m.hidden_poles, loops[k].dt))
                 for k, m in found.items()
             ),
             "Multiple poles scatter, as ε^(1/multiplicity).",
+            details=True,
         ),
     ]
     if periodic:
         tables.append(_periodic_table(wire, periodic))
     if beside:
         columns = ("variant", "number", "here", "python-control", "its function", "right", "why")
-        tables.append(Table("Beside python-control's own values", columns, tuple(beside)))
+        title = f"Margins at {wire} beside python-control's own values"
+        tables.append(Table(title, columns, tuple(beside), details=True))
     plain = {at: loops[at] for at in designs}
     plots = (
-        figures.bode(f"inner_{key}_bode", wire, plain, found, titles),
+        figures.bode(f"inner_{key}_bode", wire, plain, found, titles, case.axes),
         figures.nyquist(f"inner_{key}_nyquist", wire, plain, found, titles),
-        figures.sensitivities(f"inner_{key}_sensitivities", wire, plain, found, titles),
+        figures.sensitivities(f"inner_{key}_sensitivities", wire, plain, found, titles, case.axes),
+        *gang_of_four(case, key, wire),
     )
     return LoopPart(Section(key, f"Loop at {wire}", tuple(notes), tuple(tables), plots, numbers), own)
 

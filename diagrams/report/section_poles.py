@@ -11,7 +11,7 @@ from .stability import ON_THE_LIMIT, Stability, scatter
 from .variant import in_s
 
 TEXTS = Texts(__package__, "poles")
-POLES_TITLE = "Poles asked and got"
+POLES_TITLE = "Closed-loop poles"
 
 
 def closed_loops(case: Case) -> Section:

@@ -20,6 +20,7 @@ from . import plots as figures
 from .case import Case
 from .stability import Stability
 from .variant import Variant, in_s
+from .wires import blocks_on_loops
 
 TEXTS = Texts(__package__, "steps")
 TITLE = "Step and disturbance responses"
@@ -164,7 +165,10 @@ def _commands(diagram: WiredDiagram, wire: str) -> list[str]:
     table = diagram.structure
     names = {(w.block, w.port): name for name, w in diagram.names.items() if w.index is None}
     found: dict[str, None] = {}
+    inside = blocks_on_loops(diagram)
     for (block, _), w in table.wires.items():
+        if w.block not in inside:
+            continue
         source = table.clock(table.subsystem_of[w.block])
         sampled = source is not None and table.clock(table.subsystem_of[block]) is None
         if table.blocks[block].stepped or (sampled and not table.blocks[w.block].stepped):
@@ -188,11 +192,18 @@ def _limits_reached(diagram: WiredDiagram, got: StepResponse) -> list[str]:
 
 def _effort(got: StepResponse, test: StepTest) -> Iterator[tuple[str, float, float]]:
     if not test.output:
-        yield test.wire, math.nan, float(np.max(np.abs(got.v)))
+        yield test.wire, _rounded(got.wire_before, 1.0), float(np.max(np.abs(got.v)))
     for i, name in enumerate(got.outputs):
         plain = name.partition("[")[0]
         if plain.rpartition(".")[2] != "excess":
-            yield name, float(got.before[i]), float(np.max(np.abs(got.y[:, i])))
+            largest = float(np.max(np.abs(got.before)))
+            change = _rounded(float(np.max(np.abs(got.y[:, i]))), max(largest, float(np.max(np.abs(got.y)))))
+            yield name, _rounded(float(got.before[i]), largest), change
+
+
+def _rounded(value: float, size: float) -> float:
+    """Return a value, 0 where it is rounding beside values of a size."""
+    return 0.0 if abs(value) <= 1e-12 * max(size, 1e-300) else value
 
 
 def _numbers(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]:

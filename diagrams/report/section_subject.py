@@ -21,6 +21,10 @@ TEXTS = Texts(__package__, "subject")
 
 CONFIRMED = {PointOrigin.RUN: "the run's own next tick and rates", PointOrigin.TRIM: "the trim's equations"}
 """Confirmation of the residual of an operating point."""
+VALUES = frozenset({"value", "values", "initial_value", "final_value", "amplitude", "bias"})
+"""Parameters of a source that are in the unit of its signal."""
+MANY = 12
+"""Entries up to which a parameter is shown."""
 SUBJECT_TITLE = "What was analysed"
 PACKAGES = ("loopwright", "numpy", "scipy", "casadi", "control", "fmpy", "matplotlib")
 
@@ -57,13 +61,11 @@ def subject(case: Case) -> Section:
             )
         )
     for path, block in sorted(diagram.blocks.items()):
-        rows = list(_parameters(block))
+        rows = list(_fmu_parameters(block) if isinstance(block, Fmu) else _parameters(block))
         for name, shown, unit, value in rows:
             parameters.append((path, type(block).__name__, name, shown, symbol(unit)))
             if isinstance(value, float) and np.isfinite(value):
                 numbers[f"{path}.{name}"] = Number(value, unit or "1", 0.0, "given", given=True)
-        if not rows:
-            parameters.append((path, type(block).__name__, "", "", ""))
         if isinstance(block, Fmu):
             plants.append(_plant(path, block))
     tables = [
@@ -74,10 +76,11 @@ def subject(case: Case) -> Section:
         ),
     ]
     if plants:
-        columns = ("block", "file", "model", "generation tool", "token", "SHA-256", "derivatives")
+        columns = ("block", "model", "version", "made by", "FMI", "gives", "SHA-256")
         tables.append(Table("FMUs", columns, tuple(plants)))
-    tables.append(Table("Blocks and parameters", ("block", "type", "parameter", "value", "unit"), tuple(parameters)))
-    tables.append(Table("Versions", ("package", "version"), tuple(versions().items())))
+    tables.insert(0, _variants(case))
+    tables.append(Table("Parameters", ("block", "type", "parameter", "value", "unit"), tuple(parameters)))
+    tables.append(Table("Versions", ("package", "version"), tuple(versions().items()), details=True))
     text = [TEXTS.line("diagram", name=diagram.name, blocks=len(diagram.blocks), wires=len(diagram.names))]
     if case.experiment is not None:
         name = case.experiment.diagram.name.replace("_", " ")
@@ -93,11 +96,36 @@ def remarks(case: Case) -> Section | None:
 def _parameters(block: Block) -> Any:
     for name, spec in block.parameter_specs.items():
         value = getattr(block, name)
+        if name == "unit" and isinstance(value, str):
+            continue  # it stands beside the value
         if hasattr(value, "parameter_specs"):
             inner = ", ".join(f"{n} = {_shown(getattr(value, n))}" for n in value.parameter_specs if n[:6] != "start_")
             yield name, f"{type(value).__name__}({inner})", "", value
         elif value is not None and not (isinstance(value, dict) and not value):
-            yield name, _shown(value), spec.unit or "", value
+            own = getattr(block, "unit", None)
+            yield name, _shown(value), spec.unit or (str(own) if own and name in VALUES else ""), value
+
+
+def _fmu_parameters(block: Fmu) -> Any:
+    """Yield the FMU's parameters with the values that they have here, and the block's own options."""
+    for name, variable in sorted(block.description.variables.items()):
+        value = block.start.get(name, variable.start)
+        if variable.causality == "parameter" and value is not None and np.size(value) <= MANY:
+            yield name, _shown(np.asarray(value, dtype=float)), variable.unit or "", value
+    for name in sorted(set(block.start) - set(block.description.of("parameter"))):
+        yield f"start.{name}", _shown(block.start[name]), "", None
+    for name, value in (("rename", block.rename),):
+        if value:
+            yield name, _shown(value), "", None
+
+
+def _variants(case: Case) -> Table:
+    """Return the table of the variants: their names, and their parts of dotted paths."""
+    rows = []
+    for v in case.variants.values():
+        rate = "sampled" if not v.problem and v.model.dt else "–" if v.problem else "continuous"
+        rows.append((v.title, v.key, "left out" if v.problem else f"{rate}, order {len(v.model.states)}"))
+    return Table("Variants that were analysed", ("variant", "in paths", "linear model"), tuple(rows))
 
 
 def _shown(value: Any) -> str:
@@ -121,8 +149,8 @@ def _plant(path: str, block: Fmu) -> tuple[Any, ...]:
         )
         if has
     ]
-    tool = getattr(d, "generation_tool", "") or "not read"
-    return (path, str(d.file.name), d.model_name, tool, d.token, d.digest, ", ".join(given) or "none")
+    tool = d.generation_tool or "–"
+    return (path, d.model_name, d.model_version or "–", tool, d.fmi, ", ".join(given) or "–", d.digest)
 
 
 def operating_points(case: Case) -> Section:
@@ -150,11 +178,12 @@ def operating_points(case: Case) -> Section:
     first = next(case.usable(), None)
     if first is not None:
         values = [
-            (name, _shown(_value(first, wire)))
+            (name, _shown(_rounded(_value(first, wire))))
             for name, wire in sorted(first.diagram.names.items())
             if f"{wire.block}.{wire.port}" in first.point.values
         ]
-        tables.append(Table(f"Named wires there ({first.title})", ("wire", "value"), tuple(values)))
+        named = f"Named wires there ({first.title})"
+        tables.append(Table(named, ("wire", "value"), tuple(values), details=True))
     text = (*TEXTS.paragraphs("operating_points"), *notes)
     return Section("operating_points", "Operating points", text, tuple(tables), (), numbers)
 
@@ -162,6 +191,13 @@ def operating_points(case: Case) -> Section:
 def _moving(v: Variant) -> str:
     """Return the notes on an operating point that is no equilibrium."""
     return TEXTS.line("moving", variant=v.title, point=v.point, alone=v.moving_alone)
+
+
+def _rounded(value: Any) -> Any:
+    """Return a value without rounding errors: entries below 1e-12 of the largest, or of 1, are 0; nine digits."""
+    data = np.asarray(value, dtype=float)
+    small = np.abs(data) <= 1e-12 * max(1.0, float(np.max(np.abs(data), initial=0.0)))
+    return np.where(small, 0.0, data)
 
 
 def _value(v: Variant, wire: Wire) -> Any:

@@ -63,7 +63,7 @@ def _requirements(case: Case, reviewed: Review) -> Table:
     """Return the table of requirements: those that fail first, then those that are not decided."""
     ranked = sorted(reviewed.results, key=lambda r: (ORDER.index(r.verdict), _relative(r)))
     rows = tuple(_row(case, result) for result in ranked)
-    columns = ("requirement", "at", "variant", "required", "found", "distance", "verdict")
+    columns = ("verdict", "requirement", "at", "variant", "required", "found", "distance")
     return Table("Requirements", columns, rows, TEXTS.line("distance"))
 
 
@@ -81,8 +81,8 @@ def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
         distance = Number(result.distance, number.unit, number.tolerance, number.confirmed_by, findings=number.findings)
     place = case.loop_wires().get(result.loop, result.loop) or (result.detail if result.quantity[:5] == "step." else "")
     return (
-        words_of(result.quantity), place or "whole diagram", variant.title if variant else "–",
-        _required(result.limit, unit), result.number if result.number is not None else "–", distance, said,
+        said, words_of(result.quantity), place or "whole diagram", variant.title if variant else "–",
+        _required(result.limit, unit), result.number if result.number is not None else "–", distance,
     )  # fmt: skip
 
 

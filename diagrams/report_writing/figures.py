@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from dataclasses import dataclass
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ class Picture:
     height: float = 0.0
 
 
-def embedded(figure: Any, key: str) -> Picture:
+def embedded(figure: Any, key: str, caption: str = "") -> Picture:
     """Return a figure as a page holds it; a wide one twice, for the screen and, to be turned, for paper.
 
     Parameters
@@ -43,9 +44,14 @@ def embedded(figure: Any, key: str) -> Picture:
         The figure, or SVG.
     key : str
         Goes ahead of every id in it, so that the figures of a page don't share any.
+    caption : str
+        Its text for people who don't see it.
     """
     svg = figure if isinstance(figure, str) else _drawn(figure)
     svg = re.sub(r"<\?xml.*?\?>|<!DOCTYPE.*?>|<!--.*?-->|<metadata>.*?</metadata>", "", svg, flags=re.DOTALL).strip()
+    head, rest = svg[: svg.index(">")], svg[svg.index(">") :]
+    head = re.sub(r'\s(role|aria-label)="[^"]*"', "", head)
+    svg = f'{head} role="img" aria-label="{escape(caption, quote=True)}"{rest}'
     found = re.search(r'<svg[^>]*?\bwidth="([\d.]+)(pt|px)?" height="([\d.]+)', svg)
     if found is None:
         return Picture(_own_ids(svg, key))

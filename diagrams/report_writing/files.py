@@ -9,17 +9,18 @@ from ...blocks.core import OptionError, replace_file, write_text
 from .html import to_html
 from .json import to_json
 from .model import Document
-from .pdf import printer, write_pdf
+from .pdf import check_paper, printer, write_pdf
 
 
-def check_files(path: str | os.PathLike[str] | None, *, pdf: bool, json: bool) -> None:
+def check_files(path: str | os.PathLike[str] | None, *, pdf: bool, json: bool, paper: str = "A4") -> None:
     """Find out, before anything is computed, whether the files of a report can be written.
 
     Raises
     ------
     OptionError
-        A name that does not end in ``.html``, a folder that isn't there, or no library for PDF.
+        A name that does not end in ``.html``, a folder that isn't there, an unknown paper, or no library for PDF.
     """
+    check_paper(paper)
     if path is None:
         if pdf or json:
             raise OptionError('a PDF or JSON stands beside the page; give its path, such as "fig3.html".', port="path")
@@ -41,7 +42,12 @@ def check_files(path: str | os.PathLike[str] | None, *, pdf: bool, json: bool) -
 
 
 def write_report(
-    report: Document, path: str | os.PathLike[str] | None, *, pdf: bool = False, json: bool = False
+    report: Document,
+    path: str | os.PathLike[str] | None,
+    *,
+    pdf: bool = False,
+    json: bool = False,
+    paper: str = "A4",
 ) -> list[Path]:
     """Write a report's page and, beside it, its PDF and its numbers; return the files."""
     if path is None:
@@ -53,7 +59,7 @@ def write_report(
     if pdf:
         files.append(file.with_suffix(".pdf"))
         with replace_file(files[-1]) as fresh:
-            write_pdf(page, fresh)
+            write_pdf(page, fresh, paper)
     if json:
         files.append(file.with_suffix(".json"))
         write_text(files[-1], to_json(report))

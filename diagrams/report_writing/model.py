@@ -12,12 +12,13 @@ from ..requirements import Review
 
 @dataclass(frozen=True)
 class Table:
-    """A table: a title, column headings, and rows of texts or numbers."""
+    """A table: a title, column headings, and rows of texts or numbers; one of ``details`` stands in the appendix."""
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[Any, ...], ...]
     note: str = ""
+    details: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,10 +10,12 @@ from typing import Any
 from ..frequency import Number
 from .definitions import LOOP_TERMS, definition
 from .figures import Picture, embedded
-from .model import Document, Plot, Section
+from .model import Document, Plot, Section, Table
 from .tables import Numbered, TableView, anchor
 from .values import cell, mark, reason, symbol, tolerance_text, value_text
 
+ELSEWHERE = frozenset({"definitions", "versions", "variants", "fmus"})
+"""Entries of ``meta`` that stand in sections."""
 ITEM = "- "
 """Beginning of a text that is an item of a list."""
 
@@ -26,6 +28,23 @@ class FigureView:
     anchor: str
     caption: str
     picture: Picture
+
+
+@dataclass(frozen=True)
+class LinkView:
+    """A link to another place of the page."""
+
+    text: str
+    anchor: str
+
+
+@dataclass(frozen=True)
+class DetailsView:
+    """Tables of a section that stand in the appendix."""
+
+    title: str
+    anchor: str
+    tables: tuple[TableView, ...]
 
 
 @dataclass(frozen=True)
@@ -42,6 +61,8 @@ class SectionView:
     tables: tuple[TableView, ...]
     figures: tuple[FigureView, ...]
     sections: tuple[SectionView, ...]
+    details: tuple[LinkView, ...] = ()
+    """Tables of it that stand in the appendix."""
 
     @property
     def kept(self) -> bool:
@@ -88,6 +109,8 @@ class Page:
     terms: tuple[TermView, ...]
     defines_loop: bool
     """Whether terms take the loop for granted, so that it is defined as well."""
+    details: tuple[DetailsView, ...] = ()
+    """Tables of the appendix, by the sections that they belong to."""
 
     @classmethod
     def of(cls, report: Document) -> Page:
@@ -110,14 +133,17 @@ class Page:
         ]
         tops = dict.fromkeys(path.partition(".")[0] for path in numbers)
         terms = tuple(dict.fromkeys(term for term in known.values() if term is not None))
+        numbering = _Numbering(numbers)
+        sections = numbering.sections(report.sections, "", "")
         return cls(
             report.title,
             tuple(_about(report.meta)),
-            _Numbering(numbers).sections(report.sections, "", ""),
+            sections,
             tuple(tuple(line for line in lines if line.path.partition(".")[0] == top) for top in tops),
             tuple(reasons),
             terms,
             not LOOP_TERMS.isdisjoint(term.term for term in terms),
+            numbering.details(),
         )
 
 
@@ -127,6 +153,14 @@ class _Numbering:
     def __init__(self, numbers: Mapping[str, Number]):
         self.tables = Numbered(numbers)
         self.figures: dict[str, None] = {}
+        self.left: list[tuple[str, str, tuple[Table, ...]]] = []
+        """Titles and anchors of sections with their tables for the appendix."""
+
+    def details(self) -> tuple[DetailsView, ...]:
+        """Return the tables of the appendix, numbered after all others."""
+        return tuple(
+            DetailsView(title, name, tuple(map(self.tables.view, tables))) for title, name, tables in self.left
+        )
 
     def sections(self, sections: Sequence[Section], prefix: str, number: str) -> tuple[SectionView, ...]:
         """Return sections that stand side by side."""
@@ -134,6 +168,9 @@ class _Numbering:
 
     def _section(self, section: Section, key: str, number: str) -> SectionView:
         ahead = tuple(self._figure(plot) for plot in section.plots if plot.ahead)
+        later = tuple(table for table in section.tables if table.details)
+        if later:
+            self.left.append((f"{number} {section.title}", anchor("x", key), later))
         return SectionView(
             number,
             anchor("s", key),
@@ -141,9 +178,10 @@ class _Numbering:
             section.title,
             tuple((listed, tuple(texts)) for listed, texts in _grouped(section.text)),
             ahead,
-            tuple(map(self.tables.view, section.tables)),
+            tuple(self.tables.view(table) for table in section.tables if not table.details),
             tuple(self._figure(plot) for plot in section.plots if not plot.ahead),
             self.sections(section.sections, f"{key}.", f"{number}."),
+            tuple(LinkView(table.title, anchor("x", key)) for table in later),
         )
 
     def _figure(self, plot: Plot) -> FigureView:
@@ -152,7 +190,7 @@ class _Numbering:
             key += "_"
         self.figures[key] = None
         name = anchor("f", key)
-        return FigureView(len(self.figures), name, plot.caption, embedded(plot.figure, name))
+        return FigureView(len(self.figures), name, plot.caption, embedded(plot.figure, name, plot.caption))
 
 
 def _term(path: str, more: Mapping[str, str]) -> TermView | None:
@@ -169,7 +207,7 @@ def _grouped(texts: Sequence[str]) -> Any:
 def _about(meta: Mapping[str, Any]) -> Any:
     """Yield the names and values of what was analysed, when and with which versions."""
     for key, value in meta.items():
-        if key == "definitions" or value in (None, "", {}, ()):
+        if key in ELSEWHERE or value in (None, "", {}, ()):
             continue
         if isinstance(value, Mapping):
             pairs = {str(k): cell(v) for k, v in value.items()}

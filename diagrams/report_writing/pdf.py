@@ -28,8 +28,23 @@ def printer() -> Any:
     return plutoprint
 
 
-def write_pdf(html: str, path: str | os.PathLike[str]) -> int:
-    """Write a page as PDF, A4; return the number of its pages.
+PAPERS = ("A4", "letter")
+
+
+def check_paper(paper: str) -> None:
+    """Refuse an unknown size of paper.
+
+    Raises
+    ------
+    OptionError
+        It is none of the known ones.
+    """
+    if paper not in PAPERS:
+        raise OptionError(f"found {paper!r}; expected one of {', '.join(PAPERS)}. Choose one of them.", port="paper")
+
+
+def write_pdf(html: str, path: str | os.PathLike[str], paper: str = "A4") -> int:
+    """Write a page as PDF; return the number of its pages.
 
     Parameters
     ----------
@@ -37,9 +52,21 @@ def write_pdf(html: str, path: str | os.PathLike[str]) -> int:
         The report's page.
     path : path
         The file.
+    paper : {"A4", "letter"}
+        Size of the paper.
+
+    Raises
+    ------
+    OptionError
+        Another paper, or no library for PDF.
     """
+    check_paper(paper)
     library = printer()
-    book = library.Book(library.PAGE_SIZE_A4, library.PAGE_MARGINS_NONE, library.MEDIA_TYPE_PRINT)
+    book = library.Book(
+        library.PAGE_SIZE_LETTER if paper == "letter" else library.PAGE_SIZE_A4,
+        library.PAGE_MARGINS_NONE,
+        library.MEDIA_TYPE_PRINT,
+    )
     book.load_html(html, base_url="file:///report.html")
     book.write_to_pdf(str(Path(path)))
     return int(book.get_page_count())

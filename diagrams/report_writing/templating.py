@@ -35,8 +35,19 @@ def environment(package: str) -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    made.filters["digits"] = lambda value, most: f"{value:.{most}g}"
+    made.filters["digits"] = write_digits
     return made
+
+
+def write_digits(value: float, most: int) -> str:
+    """Return a number with so many digits at most; rounding errors, and −0, are 0.
+
+    Examples
+    --------
+    >>> write_digits(-0.0, 3), write_digits(1.2e-17, 3), write_digits(2 / 3, 3)
+    ('0', '0', '0.667')
+    """
+    return "0" if abs(value) < 1e-15 else f"{value:.{most}g}"
 
 
 @dataclass(frozen=True)

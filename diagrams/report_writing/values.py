@@ -11,6 +11,10 @@ import numpy as np
 
 from ..frequency import MARK, Number
 
+NOTHING = 1e-9
+"""Size below which a number within its own tolerance is written as 0."""
+ROUNDING = 1e-15
+"""Size below which any number is written as 0."""
 _POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _UNITS = {"1": "", "deg": "°"}
 
@@ -43,6 +47,8 @@ def plain(value: float, digits: int = 6) -> str:
 def value_text(number: Number, most: int = 6) -> str:
     """Return a number's value with the digits that its tolerance bears, at most so many."""
     value, tolerance = number.value, number.tolerance
+    if abs(value) < NOTHING and (abs(value) <= tolerance or abs(value) < ROUNDING):
+        return "0"
     digits = most
     if math.isfinite(value) and value and tolerance > 0 and math.isfinite(tolerance):
         digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(tolerance)) + 1

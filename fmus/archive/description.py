@@ -93,6 +93,10 @@ class FmuDescription:
     exchange: ExchangeInfo | None = None
     """The model-exchange interface, if there is one with a library for this platform."""
     co_simulation: bool = True
+    generation_tool: str = ""
+    """Tool that made it, as its description says."""
+    model_version: str = ""
+    """Version of the model, as its description says."""
     """Whether there is a co-simulation interface; ``identifier`` and ``binary`` are else those of model exchange."""
 
     def layout(self, names: Iterable[str]) -> Layout:
@@ -241,7 +245,8 @@ def _read(
         ) from error
     return FmuDescription(
         version, path, archive.digest, model.modelName, identifier, model.instantiationToken or "",
-        binary, complaints=complaints, limits=limits, findings=archive.findings, **found,
+        binary, complaints=complaints, limits=limits, findings=archive.findings,
+        generation_tool=root.get("generationTool", ""), model_version=root.get("version", ""), **found,
     )  # fmt: skip
 
 

@@ -40,6 +40,6 @@ def test_the_report_writes_the_pole_of_a_loop_that_alternates():
 
     report = Diagram("d", box()).report(only=("inner",))
     (loop,) = report.sections[0].sections
-    rows = next(t for t in loop.tables if t.title == "Closed-loop poles").rows
+    rows = next(t for t in loop.tables if t.title == "Closed-loop poles of the loop at box.u").rows
     (z,) = control.feedback(control.tf([0.9], [1.0, -0.5], T), 1).poles()
     assert rows[0][1] == f"{np.log(-z.real) / T:.6g} + jπ/T (z = -0.4)"

@@ -2,14 +2,17 @@
 
 import json
 import math
+import pickle
 
 import control
 import numpy as np
 import pytest
 
 from loopwright.blocks import Gain, Integrator, Quantizer, Saturation, UnknownNameError
-from loopwright.diagrams import Diagram, Requirements, Verdict, analyse, subsystem
+from loopwright.diagrams import Diagram, Requirements, Verdict, analyse, experiments, subsystem
 from loopwright.diagrams.cli.command_line import main
+from loopwright.diagrams.report.case import Case
+from loopwright.diagrams.report.content_hash import content_hash
 from loopwright.diagrams.report_writing.html import to_html
 from loopwright.diagrams.report_writing.json import to_json
 from loopwright.diagrams.requirements import Reason
@@ -38,7 +41,7 @@ def verdicts(report):
     first = report.sections[0]
     assert first.key == "summary"
     (table,) = (t for t in first.tables if "verdict" in t.columns)
-    rows = sorted(str(row[-1]).partition(":")[0] for row in table.rows)
+    rows = sorted(str(row[0]).partition(":")[0] for row in table.rows)
     assert rows == sorted(r["verdict"] for r in tree["requirements"]["results"])
     return shown, tree["requirements"]["verdict"]
 
@@ -250,3 +253,54 @@ def test_check_without_requirements_and_names_that_are_not_there_are_wrong_usage
     assert main(["report", "loop.py:loop", "--requirements", "limits.toml"]) == 2
     assert "a loop 'w'" in capsys.readouterr().err
     assert not list(tmp_path.glob("*.html"))
+
+
+# --- the document -------------------------------------------------------------------------------------------------------
+
+
+def test_the_revision_changes_with_what_the_diagram_does_and_with_nothing_else():
+    same = {content_hash(loop()), content_hash(loop()), content_hash(pickle.loads(pickle.dumps(loop())))}
+    assert len(same) == 1
+    others = [loop().replace({"controller.gain.gain": 3.0 + 1e-15}), loop(limit=1.0), loop(start=0.5), reviewed.tank()]
+    others += [loop().replace({"controller.delay": 1}), loop().replace({"controller.sample_time": 0.02})]
+    assert len({*same, *map(content_hash, others)}) == 7
+
+
+def test_the_heading_has_its_lines_and_the_page_no_path_of_this_machine():
+    about = {"title": "The tank", "author": "M. Muster", "project": "Plant 7", "date": "2026-11-22"}
+    report = analyse(loop(), only=("subject",), about=about)
+    page = to_html(report)
+    assert report.title == "The tank"
+    for text in (*about.values(), content_hash(loop())[:16]):
+        assert text in page
+    plant = experiments.path_following().diagram
+    assert str(plant["plant"].file.parent) not in to_html(analyse(plant, only=("subject",)))
+
+
+def test_an_fmu_is_named_by_model_tool_and_digest():
+    plant = experiments.path_following().diagram
+    (section,) = analyse(plant, only=("subject",)).sections
+    (table,) = [t for t in section.tables if t.title == "FMUs"]
+    row = dict(zip(table.columns, table.rows[0], strict=True))
+    assert row["model"] == "gantry"
+    assert row["made by"].startswith("Loopwright")
+    assert len(row["SHA-256"]) == 64
+    (parameters,) = [t for t in section.tables if t.title == "Parameters"]
+    assert ("plant", "Fmu", "gravity", "9.81", "m/s²") in parameters.rows
+
+
+def test_the_weakest_margin_is_named_with_the_place_where_it_is_lost():
+    report = reviewed_report("tank")
+    text = next(t for t in report.sections[0].text if t.startswith("Weakest"))
+    alpha = report.numbers()["inner.q.sampled_d0.disk_margin"].value
+    assert f"at controller.q, with the disk margin α = {alpha:.3g}" in text
+    assert f"{(2 - alpha) / (2 + alpha):.3g} to {(2 + alpha) / (2 - alpha):.3g}" in text
+    assert any("“without sampling”" in t for t in report.sections[0].text)
+
+
+def test_the_diagram_as_it_is_comes_first():
+    for delay, key in ((0, "sampled_d0"), (1, "sampled_d1"), (2, "sampled_own")):
+        variants = list(Case(reviewed.tank(delay=delay)).variants.values())
+        assert (variants[0].key, variants[0].title) == (key, "as it is")
+        assert sum(v.is_actual for v in variants) == 1
+        assert len({v.title for v in variants}) == len(variants)

@@ -11,7 +11,6 @@ from loopwright.blocks import PID, Constant, Encoder, FmuError, Integrator, Unkn
 from loopwright.diagrams import Diagram, analyse, subsystem
 from loopwright.diagrams.paper.report_kind import FIG3
 from loopwright.diagrams.report_writing.definitions import definition
-from loopwright.diagrams.report_writing.html import to_html
 from loopwright.fmus import Fmu, dc_motor
 
 T, KP, KI = 1e-3, 0.05, 2.0
@@ -168,10 +167,10 @@ def test_where_python_control_gives_no_value_it_is_not_called_right():
     assert all("right: ours" in n.confirmed_by for n in theirs.values())
 
 
-def test_a_variant_that_is_called_as_its_key_is_named_once():
-    page = to_html(analyse(Diagram("open", Integrator(name="x")(Constant(value=1.0))), only=("poles",)))
-    assert "continuous: as it is" in page
-    assert "continuous continuous" not in page
+def test_variants_stand_in_a_table_with_their_part_of_paths():
+    diagram = Diagram("open", Integrator(name="x")(Constant(value=1.0)))
+    (section,) = analyse(diagram, only=("subject",)).sections
+    assert ("as it is", "continuous", "continuous, order 1") in section.tables[0].rows
 
 
 @pytest.mark.slow

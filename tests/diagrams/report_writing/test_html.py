@@ -4,6 +4,7 @@ import json
 import math
 import re
 import sys
+from dataclasses import replace
 
 import html5lib
 import pypdfium2
@@ -335,3 +336,49 @@ def test_files_that_cannot_be_written_are_refused_beforehand(path, message, tmp_
 
 def test_a_notebook_shows_the_page_in_a_frame():
     assert report()._repr_html_().startswith('<iframe srcdoc="&lt;!DOCTYPE html&gt;')
+
+
+def test_every_figure_has_its_caption_for_people_who_do_not_see_it():
+    tree = parsed(to_html(with_drawing(report(), experiments.compliance().diagram)))
+    drawn = [svg for svg in tree.iter() if str(svg.tag).endswith("svg") and svg.get("role") == "img"]
+    captions = {text_of(caption).partition(". ")[2] for caption in tree.iter("figcaption")}
+    assert len(drawn) >= 4
+    assert {svg.get("aria-label").replace("`", "") for svg in drawn} == captions
+
+
+def test_details_stand_in_the_appendix_numbered_last_and_linked():
+    found = report()
+    subject, inner = found.sections
+    tables = (replace(inner.tables[0], details=True), *inner.tables[1:])
+    page = to_html(replace(found, sections=(subject, replace(inner, tables=tables))))
+    tree = parsed(page)
+    (details,) = [section for section in tree.iter("section") if section.get("id") == "details"]
+    assert [text_of(caption) for caption in details.iter("caption")] == ["Table 2. Margins & more"]
+    (link,) = [a for a in tree.iter("a") if text_of(a) == "Margins & more"]
+    assert link.get("href") == "#x-inner"
+    assert page.index('id="details"') > page.index('id="definitions"')
+
+
+@pytest.mark.parametrize(
+    ("number", "text"),
+    [
+        (Number(-0.0, "1", 0.0, "x"), "0"),
+        (Number(1e-17, "1", 0.0, "x"), "0"),
+        (Number(2e-15, "1", 1e-9, "x"), "0"),
+        (Number(-3e-12, "s", 1e-11, "x"), "0"),
+        (Number(2e-7, "1", 6e-7, "x"), "2×10⁻⁷"),
+        (Number(2e-12, "1", 1e-15, "x"), "2×10⁻¹²"),
+    ],
+)
+def test_rounding_errors_are_written_as_zero(number, text):
+    assert value_text(number) == text
+
+
+def test_a_pdf_is_on_the_paper_that_is_asked_for(tmp_path):
+    small = Report("R", (Section("a", "A", ("Text.",)),))
+    write_report(small, tmp_path / "r.html", pdf=True, paper="letter")
+    document = pypdfium2.PdfDocument(tmp_path / "r.pdf")
+    assert document[0].get_size() == pytest.approx((612, 792), abs=1)
+    document.close()
+    with pytest.raises(OptionError, match="paper: found 'A5'; expected one of A4, letter"):
+        write_report(small, tmp_path / "r.html", pdf=True, paper="A5")
