@@ -93,7 +93,7 @@ class FmuInstance(StepFailures):
             self.step, self.exchange, self.read = (self._bind_plain if plain else self._bind_typed)(ins, outs, call)
         else:
             shared = SharedSteps(self, ins, outs, call)
-            self.step, self.exchange, self.read = shared.step, shared.exchange, shared.read
+            self.step, self.exchange, self.read = shared.bind_step(), shared.exchange, shared.read
             self.start_step, self.finish_step = shared.start, shared.finish
         self._call = call
         careful = needs_care(self.description, self.block.stepping)

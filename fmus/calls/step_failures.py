@@ -27,6 +27,16 @@ class StepFailures(LoadedFmu):
     _call: StepCall | None = None
     _has_retried = _has_been_off = False
 
+    @property
+    def now(self) -> ctypes.c_double:
+        """Start of the step in s, as the argument of the FMU's function."""
+        return self._now
+
+    @property
+    def width(self) -> ctypes.c_double:
+        """Length of the step in s, as the argument of the FMU's function."""
+        return self._width
+
     def set_span(self, t: float, h: float) -> None:
         """Set start and length of the next step in s."""
         self._now.value, self._width.value = t, h

@@ -46,6 +46,16 @@ class Transfer:
         return (self.groups[0].function, self.groups[0].arguments) if self.groups else None
 
     @property
+    def is_whole(self) -> bool:
+        """Whether the values of the calls are those of the vector, all of one type and contiguous."""
+        return all(group.is_whole for group in self.groups) and self.vector.flags.c_contiguous
+
+    @property
+    def views(self) -> list[tuple[memoryview, memoryview]]:
+        """Memory of the vector, and of the values of each call."""
+        return [(memoryview(self.vector), memoryview(group.buffer)) for group in self.groups if group.size]
+
+    @property
     def calls(self) -> list[Call]:
         """The calls, one for each type."""
         return [(group.function, group.arguments) for group in self.groups]

@@ -61,8 +61,10 @@ class Child:
         self.parent, self.me = about["parent"], os.getpid()
         with open(about["shared"], "r+b") as file:
             self.memory = mmap.mmap(file.fileno(), about["size"])
+        self.is_own = False
         with suppress(AttributeError, OSError):  # a copy of the process has no part in it
             self.memory.madvise(mmap.MADV_DONTFORK)
+            self.is_own = True
         self.base = ctypes.addressof(ctypes.c_char.from_buffer(self.memory))
         self.words = memoryview(self.memory).cast("Q")
         self.log = os.open(about["log"], os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
@@ -86,7 +88,7 @@ class Child:
         while True:
             for _ in range(patience.looks):
                 if get(REQUEST) != last:
-                    patience.watched()
+                    patience.pause = wire.FEWEST
                     break
             else:
                 patience.slept()
@@ -122,7 +124,8 @@ class Child:
             worst |= status
         else:
             status = worst
-        self._leave_copy()
+        if not self.is_own:
+            self._leave_copy()
         words[STATUS] = status & 0xFFFFFFFF
 
     def _leave_copy(self) -> None:

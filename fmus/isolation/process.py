@@ -25,6 +25,7 @@ from ...blocks.core import FmuEnd, FmuError, FmuProcessError
 from ..calls import printf
 from . import wire
 from .endings import copy_files, count_cores, read_end
+from .output import ChildOutput
 from .wire import (
     CAUSE,
     CHILD_SLEEPS,
@@ -45,8 +46,8 @@ _START = (
     "m.__path__ = sys.argv[1:3]; sys.modules[m.__name__] = m; from loopwright_child.child import main; main()"
 )
 _LOOKS = 2000
+_take, _give = wire.ORDER.acquire, wire.ORDER.release
 _LOOK = 0.05  # s between two looks at a process that does not answer
-_LAST_LINES = 5
 
 
 class ChildProcess:
@@ -72,7 +73,8 @@ class ChildProcess:
         self.used, self.alive = False, False
         self.folder = Path(tempfile.mkdtemp(prefix="loopwright-fmu-"))
         self._peak = 0
-        self._log_position, self._number, self._allotted = 0, 0, DATA
+        self._output = ChildOutput(self.folder)
+        self._number, self._allotted = 0, DATA
         self._watches = wire.ORDERED and count_cores() > 1
         self._patience = wire.Patience(_LOOKS, may=self._watches)
         self._names: list[list[str]] = []
@@ -128,6 +130,11 @@ class ChildProcess:
         if self._poll is not None:
             self._poll.register(self._out, select.POLLIN)
         self.alive = True
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the process; None if it has ended."""
+        return None if self._process is None else self._process.pid
 
     # ---- memory ----
 
@@ -214,52 +221,54 @@ class ChildProcess:
         if not self.alive:
             self._check_alive(self._place_name(sequence))
         words[SEQUENCE] = sequence
-        self._number += 1
-        words[REQUEST] = self._number
-        wire.order_memory()
+        words[REQUEST] = self._number = self._number + 1
+        if _take(False):
+            _give()
         if words[CHILD_SLEEPS] or not wire.ORDERED:
-            try:
-                os.write(self._in, WAKE)
-            except OSError as error:
-                self._fail(self._place_name(sequence), error=error)
+            self._wake(sequence)
+
+    def _wake(self, sequence: int) -> None:
+        try:
+            os.write(self._in, WAKE)
+        except OSError as error:
+            self._fail(self._place_name(sequence), error=error)
 
     def finish(self, sequence: int, seconds: float) -> int:
         """Return the status of a sequence that was posted; see `failed_place`."""
-        words, number, get = self._words, self._number, self._words.__getitem__
-        for _ in range(self._patience.looks):
-            if get(REPLY) == number:
-                self._patience.watched()
-                break
-        else:
-            self._patience.slept()
-            self._sleep(sequence, number, seconds)
-        if words[MESSAGES]:
-            self.fetch_messages()
-        return words[STATUS]
-
-    def _sleep(self, sequence: int, number: int, seconds: float) -> None:
-        """Sleep until the reply is there."""
-        words = self._words
-        deadline = time.monotonic() + seconds
+        words, number, get, patience = self._words, self._number, self._words.__getitem__, self._patience
         try:
-            words[PARENT_SLEEPS] = 1
-            wire.order_memory()
-            while words[REPLY] != number:
-                if self._is_readable(_LOOK):
-                    if not os.read(self._out, 4096) and words[REPLY] != number:
-                        self._fail(self._place_name(sequence))
-                elif words[REPLY] != number:
-                    if self.has_ended():
-                        self._fail(self._place_name(sequence))
-                    if time.monotonic() >= deadline:
-                        self._fail(self._place_name(sequence), FmuEnd.TIMEOUT, seconds=seconds)
-            words[PARENT_SLEEPS] = 0
+            for _ in range(patience.looks):
+                if get(REPLY) == number:
+                    patience.pause = wire.FEWEST
+                    break
+            else:
+                patience.slept()
+                self._sleep(sequence, number, seconds)
         except FmuProcessError:
             raise
         except BaseException:  # an interrupt: the reply is still to come
             self.used = True
             self.end()
             raise
+        if words[MESSAGES]:
+            self.fetch_messages()
+        return words[STATUS]
+
+    def _sleep(self, sequence: int, number: int, seconds: float) -> None:
+        """Sleep until the reply is there."""
+        words, deadline = self._words, time.monotonic() + seconds
+        words[PARENT_SLEEPS] = 1
+        wire.order_memory()
+        while words[REPLY] != number:
+            if self._is_readable(_LOOK):
+                if not os.read(self._out, 4096) and words[REPLY] != number:
+                    self._fail(self._place_name(sequence))
+            elif words[REPLY] != number:
+                if self.has_ended():
+                    self._fail(self._place_name(sequence))
+                if time.monotonic() >= deadline:
+                    self._fail(self._place_name(sequence), FmuEnd.TIMEOUT, seconds=seconds)
+        words[PARENT_SLEEPS] = 0
 
     def _is_readable(self, seconds: float) -> bool:
         if self._poll is not None:
@@ -294,25 +303,8 @@ class ChildProcess:
     def fetch_messages(self) -> None:
         """Give the FMU's log messages to `told`."""
         self._words[MESSAGES] = 0
-        with suppress(OSError), open(self.folder / "log", "rb") as file:
-            file.seek(self._log_position)
-            data = file.read()
-            at, head = 0, wire.LOG_HEAD
-            while at + head.size <= len(data):
-                status, n = head.unpack_from(data, at)
-                if at + head.size + n > len(data):
-                    break
-                self.told(status, data[at + head.size : at + head.size + n].decode(errors="replace"))
-                at += head.size + n
-            self._log_position += at
-
-    def read_printed(self) -> list[str]:
-        """Return the last lines that the FMU has written to its standard output."""
-        with suppress(OSError), open(self.folder / "printed", "rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - 4096))
-            lines = file.read().decode(errors="replace").splitlines()
-            return [line.strip() for line in lines if line.strip()][-_LAST_LINES:]
-        return []
+        for status, text in self._output.read_messages():
+            self.told(status, text)
 
     # ---- the end ----
 
@@ -340,7 +332,7 @@ class ChildProcess:
                 break
             time.sleep(0.01)
         self.fetch_messages()
-        printed = self.read_printed()
+        printed = self._output.read_printed()
         noted = int(self._words[CAUSE])
         status = self._finish_process()
         if cause is None:

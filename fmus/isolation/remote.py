@@ -36,8 +36,9 @@ class RemoteBoundCalls(BoundCalls):
 
     def run(self) -> int:
         """Run them and return the status; see `BoundCalls`."""
-        self.start()
-        return self.finish()
+        self._process.post(self._sequence)
+        status = self._process.finish(self._sequence, self._seconds)
+        return status if status <= WARNING else self._note(status)
 
     def start(self) -> None:
         """Let the child begin."""
@@ -46,10 +47,12 @@ class RemoteBoundCalls(BoundCalls):
     def finish(self) -> int:
         """Wait for the child, and return the status."""
         status = self._process.finish(self._sequence, self._seconds)
-        if status > 1:
-            if status >= ERROR:
-                self._process.used = True
-            self.failed = self._process.failed_place
+        return status if status <= WARNING else self._note(status)
+
+    def _note(self, status: int) -> int:
+        if status >= ERROR:
+            self._process.used = True
+        self.failed = self._process.failed_place
         return status
 
 

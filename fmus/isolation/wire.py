@@ -33,8 +33,8 @@ LONGEST_MESSAGE, MOST_MESSAGES = 8192, 20000
 ORDERED = platform.machine().lower() in ("x86_64", "amd64", "i686")
 """Whether memory is written in the order of the program, so that words can be watched without barriers."""
 _HEAD = struct.Struct("<II")
-_FEWEST, _RAREST = 4, 1024
-_LOCK = threading.Lock()
+FEWEST, _RAREST = 4, 1024
+ORDER = threading.Lock()
 
 
 class Patience:
@@ -48,21 +48,22 @@ class Patience:
         Number of looks, of some 40 ns each, if watching is right.
     may : bool
         Whether to watch at all.
+
+    Attributes
+    ----------
+    pause : int
+        Number of readings until the next trial; its reader sets it to `FEWEST` whenever watching was right.
     """
 
     def __init__(self, looks: int, *, may: bool):
         self._looks, self.looks = looks if may else 0, 0
-        self._pause = self._left = _FEWEST
-
-    def watched(self) -> None:
-        """Note that watching was right."""
-        self._pause = _FEWEST
+        self.pause = self._left = FEWEST
 
     def slept(self) -> None:
         """Note that the reader slept; after ever longer pauses watching is tried again."""
         if self.looks:
-            self.looks, self._left = 0, self._pause
-            self._pause = min(2 * self._pause, _RAREST)
+            self.looks, self._left = 0, self.pause
+            self.pause = min(2 * self.pause, _RAREST)
         else:
             self._left -= 1
             if self._left <= 0:
@@ -71,8 +72,8 @@ class Patience:
 
 def order_memory() -> None:
     """Let earlier writes be seen before later reads are done: a lock's atomic operation is a full barrier on x86."""
-    if _LOCK.acquire(False):
-        _LOCK.release()
+    if ORDER.acquire(False):
+        ORDER.release()
 
 
 def write_message(memory: mmap.mmap, words: memoryview, file: str, message: Any, blobs: Sequence[bytes]) -> None:

@@ -1,0 +1,238 @@
+"""Load, run, close, again and again: memory, handles, threads, processes and files stay as they are."""
+
+import gc
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import FmuError, FmuRuntimeError
+from loopwright.fmus import Fmu, Isolation
+from loopwright.fmus.isolation import count_processes, end_idle
+from support.zoo import zoo_fmu
+
+ON_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("zoo")
+
+
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """Folder of all temporary files."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
+
+
+def run_once(plant, steps=3):
+    """Load, run, close; return the last output."""
+    with plant.instantiate(["u"], None) as one:
+        u, y = np.ones(1), np.zeros(1)
+        one.bind(u, y)
+        one.begin()
+        for k in range(steps):
+            one.step(0.01 * k, 0.01)
+        return y[0]
+
+
+def count_resources(temporary):
+    """Return memory in MB, and counts of handles, threads, children and temporary files."""
+    gc.collect()
+    status = Path("/proc/self/status").read_text()
+    memory = int(status.split("VmRSS:")[1].split()[0]) / 1e3
+    children = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+    files = sum(1 for _ in temporary.rglob("*"))
+    return memory, [len(os.listdir("/proc/self/fd")), threading.active_count(), len(children), files]
+
+
+def check_flat(cycle, temporary, count, warm=5, growth=8.0):
+    """Run a cycle many times; all counts stay, and memory grows by some MB at most."""
+    for k in range(warm):
+        cycle(k)
+    end_idle()
+    before, counts = count_resources(temporary)
+    for k in range(count):
+        cycle(k)
+    end_idle()
+    deadline = time.monotonic() + 12.0  # the timer of idle processes ends by itself
+    after, later = count_resources(temporary)
+    while later[1] > counts[1] and time.monotonic() < deadline:
+        time.sleep(0.2)
+        after, later = count_resources(temporary)
+    assert later == counts
+    assert after - before < growth, f"{after - before:.1f} MB in {count} cycles"
+    assert count_processes() == (0, 0)
+
+
+@ON_LINUX
+@pytest.mark.parametrize(
+    ("isolate", "count"),
+    [(False, 20), (True, 10), pytest.param(False, 2000, marks=pytest.mark.slow),
+     pytest.param(True, 2000, marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_cycles_of_one_fmu_leave_nothing_behind(folder, temporary, isolate, count):
+    plant = Fmu(zoo_fmu(folder, 3), name="plant", isolate=isolate)
+
+    def cycle(k):
+        assert run_once(plant) == pytest.approx(0.03)
+
+    check_flat(cycle, temporary, count)
+
+
+@pytest.mark.slow
+@ON_LINUX
+@pytest.mark.parametrize("isolate", [False, True])
+def test_cycles_of_fifty_fmus_leave_nothing_behind(folder, temporary, isolate, tmp_path_factory):
+    """Fifty contents: the comment of each archive is another."""
+    import shutil
+    import zipfile
+
+    others = tmp_path_factory.mktemp("others")
+    plants = []
+    for k in range(50):
+        file = others / f"{k}.fmu"
+        shutil.copy(zoo_fmu(folder, 3), file)
+        with zipfile.ZipFile(file, "a") as archive:
+            archive.comment = f"number {k}".encode()
+        plants.append(Fmu(file, name="plant", isolate=isolate))
+
+    def cycle(k):
+        assert run_once(plants[k % 50]) == pytest.approx(0.03)
+
+    check_flat(cycle, temporary, 2000 if not isolate else 400, warm=50, growth=20.0)
+
+
+@ON_LINUX
+@pytest.mark.parametrize(
+    "fault", ["step segfault 0.01", "enter exit", "load abort", "free segfault", "step error 0.01"]
+)
+def test_cycles_with_a_fault_leave_nothing_behind(folder, temporary, fault):
+    plant = Fmu(zoo_fmu(folder, 3, fault), name="plant", isolate=True)
+
+    def cycle(k):
+        with nullcontext() if fault.startswith("free") else pytest.raises((FmuError, FmuRuntimeError)):
+            run_once(plant)
+
+    check_flat(cycle, temporary, 4, warm=2)
+
+
+def test_two_versions_of_one_fmu_run_side_by_side(folder):
+    one, two = (Fmu(zoo_fmu(folder, 3, fault), name="plant", isolate=True) for fault in ("", "step warning 1000.0"))
+    with one.instantiate(["u"], None) as a, two.instantiate(["u"], None) as b:
+        u, y, z = np.ones(1), np.zeros(1), np.zeros(1)
+        a.bind(u, y)
+        b.bind(2.0 * u, z)
+        a.begin()
+        b.begin()
+        for k in range(5):
+            a.step(0.01 * k, 0.01)
+            b.step(0.01 * k, 0.01)
+    assert y[0] == pytest.approx(0.05)
+    assert z[0] == pytest.approx(0.10)
+    end_idle()
+
+
+def test_runs_in_threads_have_processes_of_their_own(folder):
+    plant = Fmu(zoo_fmu(folder, 3), name="plant", isolate=True)
+    found = []
+    threads = [threading.Thread(target=lambda: found.append(run_once(plant, 200))) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert np.allclose(found, 2.0)
+    assert len(found) == 4
+    end_idle()
+    assert count_processes() == (0, 0)
+
+
+SCRIPT = """
+import sys, time, numpy as np
+from loopwright.fmus import Fmu
+from loopwright.fmus.isolation import count_processes
+plant = Fmu(sys.argv[1], name="plant", isolate=True)
+instance = plant.instantiate(["u"], None)
+one = instance.__enter__()
+one.bind(np.ones(1), np.zeros(1))
+one.begin()
+one.step(0.0, 0.01)
+print(one.fmi.process.pid, one.fmi.process.folder, flush=True)
+if sys.argv[2] == "hang":
+    one.step(0.01, 0.01)
+if sys.argv[2] == "wait":
+    time.sleep(60.0)
+"""
+
+
+def is_there(pid):
+    try:
+        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+
+
+@ON_LINUX
+@pytest.mark.parametrize(("how", "kill"), [("end", False), ("wait", True), ("hang", True)])
+def test_the_child_ends_with_its_parent_and_removes_its_folder(folder, tmp_path, how, kill):
+    """At the end of a script that closes nothing; and where the parent is killed, idle or in a call that hangs."""
+    file = zoo_fmu(folder, 3, "step deaf_hang 0.01" if how == "hang" else "")
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    parent = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, str(file), how], stdout=subprocess.PIPE, text=True, env=environment
+    )
+    pid, place = parent.stdout.readline().split()
+    assert how == "end" or is_there(pid)
+    if kill:
+        time.sleep(0.3)
+        parent.kill()
+    parent.wait(20.0)
+    parent.stdout.close()
+    deadline = time.monotonic() + 5.0
+    while (is_there(pid) or Path(place).exists()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    assert not is_there(pid)
+    assert not Path(place).exists()
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_an_idle_process_ends_after_a_while(folder, monkeypatch):
+    monkeypatch.setattr("loopwright.fmus.isolation.pool._IDLE", 0.2)
+    end_idle()
+    run_once(Fmu(zoo_fmu(folder, 3), name="plant", isolate=Isolation()))
+    assert count_processes() == (1, 1)
+    deadline = time.monotonic() + 5.0
+    while count_processes() != (0, 0) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert count_processes() == (0, 0)
+
+
+def test_a_process_that_died_while_idle_is_replaced(folder):
+    from loopwright.fmus.isolation import pool
+
+    plant = Fmu(zoo_fmu(folder, 3), name="plant", isolate=True)
+    end_idle()
+    run_once(plant)
+    ((_, process, _),) = pool._IDLE_ONES
+    process._process.kill()
+    time.sleep(0.1)
+    assert run_once(plant) == pytest.approx(0.03)
+    end_idle()
+    assert count_processes() == (0, 0)
+
+
+def test_what_it_writes_into_its_resources_is_not_there_in_the_next_run(folder):
+    """It writes a file beside its working folder's others; the process with traces is not used again."""
+    plant = Fmu(zoo_fmu(folder, 3, "step file"), name="plant", isolate=True)
+    here = set(os.listdir())
+    run_once(plant)
+    assert set(os.listdir()) == here
+    end_idle()
