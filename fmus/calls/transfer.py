@@ -53,7 +53,7 @@ class Transfer:
     @property
     def views(self) -> list[tuple[memoryview, memoryview]]:
         """Memory of the vector, and of the values of each call."""
-        return [(memoryview(self.vector), memoryview(group.buffer)) for group in self.groups if group.size]
+        return [(self.vector.data, group.buffer.data) for group in self.groups if group.size]
 
     @property
     def calls(self) -> list[Call]:
