@@ -27,7 +27,7 @@ _REQUIRED = {
 def find_binary(path: Path, entries: Collection[str], version: str, identifier: str) -> str:
     """Return the library for this platform: that of the model identifier, else the only one in the folder."""
     platform = native_platform()
-    folder = _FOLDERS2.get(platform, platform) if version.startswith("2.") else platform
+    folder = platform if version.startswith("3.") else _FOLDERS2.get(platform, platform)
     with_abi = {e.split("/")[1] for e in entries if e.startswith(f"binaries/{platform}-")}  # FMI 3.0, 2.5.1.4
     if with_abi and not any(e.startswith(f"binaries/{folder}/") for e in entries):
         folder = min(with_abi)

@@ -213,15 +213,22 @@ def _read(
     entries, text = set(archive.files), archive.description()
     root = parse_xml(path, DESCRIPTION, text)
     version = root.get("fmiVersion", "2.0")  # without one, it is no description, as its reading says
-    if not re.fullmatch(r"2\.0|3\.0(\.\d+)?", version):
+    if not re.fullmatch(r"1\.0|2\.0|3\.0(\.\d+)?", version):
         raise FmuFileError(
-            f"{str(path)!r} is an FMU of FMI {version}; expected FMI 2.0 or 3.0. Export it again with one of "
+            f"{str(path)!r} is an FMU of FMI {version}; expected FMI 1.0, 2.0 or 3.0. Export it again with one of "
             "them, for co-simulation or model exchange.",
             fault=FmuFault.VERSION,
             subject=version,
         )
     model, complaints = read_model(path, text, root, limits)
     interface = model.coSimulation or model.modelExchange
+    if version == "1.0" and model.coSimulation is None:
+        raise FmuFileError(
+            f"{str(path)!r} is an FMU of FMI 1.0 for model exchange; expected one for co-simulation, or of FMI 2.0 or "
+            "3.0. Export it again.",
+            fault=FmuFault.VERSION,
+            subject=version,
+        )
     if interface is None:
         raise FmuFileError(
             f"{str(path)!r} has neither a co-simulation nor a model-exchange interface; export it with one of them.",
@@ -288,7 +295,9 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
 def _capabilities(root: Any, version: str) -> dict[str, Any]:
     """Return the interfaces' flags (FMI 2.0, 3.3.1 and 4.3.1; FMI 3.0, 3.4 and 4.4), some of which FMPy drops."""
     steps, exchange = root.find("CoSimulation"), root.find("ModelExchange")
-    two = version.startswith("2.")
+    if version == "1.0":
+        steps = root.find("Implementation//Capabilities")
+    two = not version.startswith("3.")
     state = "FMUstate" if two else "FMUState"
     derivative = "providesDirectionalDerivative" if two else "providesDirectionalDerivatives"
     fixed = None if steps is None or two else steps.get("fixedInternalStepSize")

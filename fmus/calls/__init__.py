@@ -6,6 +6,7 @@ from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance
 from .loaded_library import CALLS, LoadedFmu, MakeCalls
+from .missing_functions import exported_name
 from .native_step import NativeStep
 from .saved_state import FmuState
 from .step_failures import NEAR
@@ -30,5 +31,6 @@ __all__ = [
     "StepOptions",
     "StepTime",
     "check_offered",
+    "exported_name",
     "is_smooth",
 ]

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...blocks.core import FmuProcessError
 from .bound_calls import DISCARD, ERROR, FATAL, PENDING, STATUS, WARNING, BoundCalls, Call
-from .missing_functions import allow_missing
+from .missing_functions import allow_missing, exported_name
 
 __all__ = ["DISCARD", "ERROR", "FATAL", "PENDING", "STATUS", "WARNING", "FmiCalls"]
 
@@ -207,12 +207,16 @@ class FmiCalls(ABC):
     def value_arguments(self, references: Any, count: int, address: int, size: int) -> tuple[Any, ...]:
         """Return the arguments of a `value_function`: a C array of references, and the address of the values."""
 
+    def exported(self, name: str) -> str:
+        """Return the name that the library gives to a function."""
+        return exported_name(name, self.prefix, self.fmu.modelIdentifier)
+
     def _function(self, name: str) -> Callable[..., int]:
         """Return a C function without declared arguments, which takes those that are made for it.
 
         Its status is unsigned, so that a negative one, which the standard doesn't have, is no success.
         """
-        function = self.fmu.dll[name]
+        function = self.fmu.dll[self.exported(name)]
         function.restype = ctypes.c_uint
         return function  # type: ignore[no-any-return]
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from ...blocks.core import FmuError, FmuFileError, FmuProcessError, FmuRuntimeError, UnknownNameError, near
 from ..archive import FmuVariable, inexact, unpack
+from .fmi1 import Fmi1Calls
 from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
 from .fmi_calls import FATAL, FmiCalls
@@ -23,7 +24,7 @@ from .process_ends import describe_end
 from .step_options import allows_early_return, uses_event_mode
 from .texts import is_readable, list_limits, read_text, write_text
 
-CALLS: dict[str, type[FmiCalls]] = {"2": Fmi2Calls, "3": Fmi3Calls}
+CALLS: dict[str, type[FmiCalls]] = {"1": Fmi1Calls, "2": Fmi2Calls, "3": Fmi3Calls}
 """Functions by the major version of FMI."""
 MakeCalls = Callable[..., FmiCalls]
 R = TypeVar("R")

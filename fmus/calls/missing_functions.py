@@ -29,9 +29,21 @@ def allow_missing(kind: Any, prefix: str, required: tuple[str, ...]) -> Any:
     def load(fmu: Any) -> None:
         fmu.missing_functions = set()
         for name in dir(fmu):
-            if name.startswith(prefix) and name not in needed and not hasattr(fmu.dll, name):
+            shown = exported_name(name, prefix, fmu.modelIdentifier)
+            if name.startswith(prefix) and name not in needed and not hasattr(fmu.dll, shown):
                 fmu.missing_functions.add(name)
-                setattr(fmu.dll, name, ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR))
+                setattr(fmu.dll, shown, ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR))
         kind._loadFunctions(fmu)
 
     return type(kind.__name__, (kind,), {"_loadFunctions": load})  # FMPy reads the version from the class's name
+
+
+def exported_name(name: str, prefix: str, identifier: str) -> str:
+    """Return the name of a function in a library; those of FMI 1.0 begin with the model identifier.
+
+    Examples
+    --------
+    >>> exported_name("fmi1DoStep", "fmi1", "ball")
+    'ball_fmiDoStep'
+    """
+    return f"{identifier}_{name.replace('fmi1', 'fmi', 1)}" if prefix == "fmi1" else name

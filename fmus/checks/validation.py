@@ -121,7 +121,7 @@ def validate(file: Path, *, run: bool = True, limits: ArchiveLimits | None = Non
         if wrong is not None:
             problems.append(wrong)
     if fmi == "1.0":
-        left.append("it was not run: FMI 1.0 isn't supported")
+        left.append("it was not run: FMI 1.0 is not tried")
     return ValidationReport(tuple(problems), tuple(done), tuple(left))
 
 

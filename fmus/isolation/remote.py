@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import FmuError
-from ..calls import CALLS, ERROR, WARNING, BoundCalls, Call, FmiCalls, Log
+from ..calls import CALLS, ERROR, WARNING, BoundCalls, Call, FmiCalls, Log, exported_name
 from .library import RemoteLibrary, describe_call, seconds_for
 from .limits import Isolation
 from .pool import give_back
@@ -73,7 +73,7 @@ class RemoteCalls(FmiCalls):
             fmu.unzipDirectory, fmu.instanceName = given["unzipDirectory"], given["instanceName"]
             fmu.fmiCallLogger, fmu.requireFunctions, fmu._functions = None, True, {}
             names = [name for name in dir(fmu) if name.startswith(prefix)]
-            shown = [_exported(name, prefix, given["modelIdentifier"]) for name in names]
+            shown = [exported_name(name, prefix, given["modelIdentifier"]) for name in names]
             fmu.dll = RemoteLibrary(process, path, shown, limits)
             fmu.missing_functions = set()
             for name, export in zip(names, shown, strict=True):
@@ -90,7 +90,7 @@ class RemoteCalls(FmiCalls):
         return type(kind.__name__, (kind,), {"__init__": initialize, "freeLibrary": unload})(**arguments)
 
     def _function(self, name: str) -> Callable[..., int]:
-        return self.fmu.dll[name]  # type: ignore[no-any-return]
+        return self.fmu.dll[self.exported(name)]  # type: ignore[no-any-return]
 
     def instantiate(self, log: Log) -> None:
         """Make the instance; its messages go to ``log``."""
@@ -149,11 +149,6 @@ class RemoteCalls(FmiCalls):
         self._path, self._unloaded = library, False
         self._freed: deque[Any] = deque()
         super().__init__(name=name, token=token, folder=folder, library=library, model_exchange=model_exchange)  # type: ignore[safe-super]
-
-
-def _exported(name: str, prefix: str, identifier: str) -> str:
-    """Return the name of a function in the library; those of FMI 1.0 begin with the model identifier."""
-    return f"{identifier}_{name.replace('fmi1', 'fmi', 1)}" if prefix == "fmi1" else name
 
 
 def make_remote_calls(version: str, process: ChildProcess, limits: Isolation, **arguments: Any) -> FmiCalls:

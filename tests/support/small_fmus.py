@@ -36,8 +36,16 @@ _OF = {
         "Instantiate": "void *NAME() { return calloc(1, sizeof(instance)); }",
         "SetupExperiment": "int NAME() { return 0; }",
     },
+    "fmi1": {
+        "GetVersion": _COMMON["GetVersion"],
+        "InstantiateSlave": "void *NAME() { return calloc(1, sizeof(instance)); }",
+        "InitializeSlave": "int NAME() { return 0; }",
+        "TerminateSlave": "int NAME() { return 0; }",
+        "ResetSlave": _COMMON["Reset"],
+        "FreeSlaveInstance": _COMMON["FreeInstance"],
+    },
 }
-_VERSIONS = {"fmi3": "3.0", "fmi2": "2.0"}
+_VERSIONS = {"fmi3": "3.0", "fmi2": "2.0", "fmi1": "1.0"}
 GET, SET = (
     """
 int {prefix}{verb}{suffix}(void *p, const unsigned vr[], size_t n, {const}{type} v[]{size}) {{
@@ -71,13 +79,16 @@ def small_fmu(folder, prefix, source, description, *, name="small"):
         if f"{prefix}{end}(" not in source
     )
     text = f"{_HEAD}{source}\n{more}"
+    if prefix == "fmi1":  # names begin with the model identifier
+        text = text.replace("fmi1", f"{name}_fmi")
     library = folder / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.so"
     if not library.exists():
         compile_shared({"small.c": text}, library)
-    token = {"fmi3": "instantiationToken", "fmi2": "guid"}[prefix]
+    token = "instantiationToken" if prefix == "fmi3" else "guid"
+    more = f' modelIdentifier="{name}" numberOfContinuousStates="0" numberOfEventIndicators="0"' * (prefix == "fmi1")
     xml = (
         f'<?xml version="1.0" encoding="UTF-8"?>\n<fmiModelDescription fmiVersion="{_VERSIONS[prefix]}" '
-        f'modelName="{name}" {token}="x">{description}</fmiModelDescription>'
+        f'modelName="{name}" {token}="x"{more}>{description}</fmiModelDescription>'
     )
     here = native_platform()
     platform = here if prefix == "fmi3" else {"x86_64-linux": "linux64"}.get(here, here)

@@ -318,16 +318,6 @@ def test_an_fmu_of_which_a_process_can_have_one_instance_is_refused_a_second(msd
         pass
 
 
-def test_fmi_1_is_refused_by_its_version(msd, tmp_path):
-    text = '<?xml version="1.0"?><fmiModelDescription fmiVersion="1.0" modelName="m" modelIdentifier="m" guid="g" '
-    text += 'numberOfContinuousStates="0" numberOfEventIndicators="0"><ModelVariables/></fmiModelDescription>'
-    path = tmp_path / "old.fmu"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("modelDescription.xml", text)
-    with pytest.raises(FmuFileError, match=r"is an FMU of FMI 1.0; expected FMI 2.0 or 3.0"):
-        Fmu(path)
-
-
 # --- messages ---------------------------------------------------------------------------------------------------------
 
 

@@ -1,0 +1,166 @@
+"""Calls of FMI 1.0 for co-simulation."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from ...blocks.core import FmuError
+from .fmi_calls import PENDING, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
+from .printf import Logger, format_message
+
+_LONGEST_WAIT = 0.01  # s between two looks at a step that is pending
+_STEP_STATUS, _LAST_SUCCESSFUL_TIME = 0, 2  # fmiStatusKind
+_REQUIRED = ("GetVersion", "InstantiateSlave", "InitializeSlave", "FreeSlaveInstance", "DoStep")
+
+
+class Fmi1Calls(FmiCalls):
+    """Functions of a library of FMI 1.0 for co-simulation; clauses are those of its document for co-simulation.
+
+    It has no Initialization Mode: entering it initializes the FMU, and leaving it does nothing. Names of the library's
+    functions begin with the model identifier.
+    """
+
+    prefix = "fmi1"
+    types: ClassVar = {
+        "Float64": TypeCalls("Real", ctypes.c_double),
+        "Int32": TypeCalls("Integer", ctypes.c_int32),
+        "Boolean": TypeCalls("Boolean", ctypes.c_bool),
+        "Enumeration": TypeCalls("Integer", ctypes.c_int32),
+    }
+    exchange_names: ClassVar = {}
+
+    def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
+        from fmpy.fmi1 import FMU1Slave
+
+        if model_exchange:
+            raise FmuError("model exchange of FMI 1.0 is not supported. Export it for co-simulation, or with FMI 2.0.")
+        self.fmu = self._open(
+            FMU1Slave,
+            _REQUIRED,
+            guid=token,
+            modelIdentifier=library.stem,
+            unzipDirectory=str(folder),
+            instanceName=name,
+            libraryPath=str(library),
+        )
+        for kind, function in self.fmu._functions.items():  # FMPy takes the statuses of some for texts
+            if not any(
+                kind.endswith(end) for end in ("GetVersion", "Platform", "InstantiateSlave", "FreeSlaveInstance")
+            ):
+                function.restype = ctypes.c_int
+
+    def instantiate(self, log: Log) -> None:
+        """Make the instance; its messages go to ``log``. Memory is the C library's (3.2)."""
+        from fmpy import calloc, free
+        from fmpy.fmi1 import (
+            fmi1CallbackAllocateMemoryTYPE,
+            fmi1CallbackFreeMemoryTYPE,
+            fmi1CallbackFunctions,
+            fmi1CallbackLoggerTYPE,
+        )
+
+        def message(component: Any, name: Any, status: int, category: Any, text: bytes | None, *arguments: Any) -> None:
+            if status:  # the others are not kept
+                log(status, format_message(text or b"", arguments))
+
+        self._logger = Logger(message)  # kept as long as the library may call it
+        callbacks = fmi1CallbackFunctions()
+        callbacks.logger = ctypes.cast(self._logger, fmi1CallbackLoggerTYPE)
+        callbacks.allocateMemory = fmi1CallbackAllocateMemoryTYPE(calloc)
+        callbacks.freeMemory = fmi1CallbackFreeMemoryTYPE(free)
+        callbacks.stepFinished = None
+        self.fmu.instantiate(functions=callbacks, loggingOn=True)
+        if not self.fmu.component:
+            raise RuntimeError("fmiInstantiateSlave returned nothing")
+
+    def set_up(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
+        """Do nothing: `enter_initialization_mode` takes the times, and tolerances are not told."""
+
+    def enter_initialization_mode(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
+        """Initialize the FMU (3.3)."""
+        self.fmu.initialize(start_time, stop_time)
+
+    def exit_initialization_mode(self) -> None:
+        """Do nothing: the FMU is ready to be stepped."""
+
+    def _get(self, suffix: str, references: list[int], size: int) -> list[Any]:
+        return list(getattr(self.fmu, f"get{suffix}")(references))
+
+    def value_arguments(self, references: Any, count: int, address: int, size: int) -> tuple[Any, ...]:
+        """Return the arguments of a `value_function` (3.5)."""
+        component = ctypes.c_void_p(self.fmu.component)
+        return component, references, ctypes.c_size_t(count), ctypes.c_void_p(address)
+
+    @property
+    def final(self) -> Any:
+        """A flag that FMI 1.0 does not have."""
+        return self.variable(ctypes.c_bool)
+
+    def step_call(self, now: ctypes.c_double, width: ctypes.c_double, final: Any) -> StepCall:
+        """Return fmiDoStep with its arguments (3.4); each step is a new one."""
+        flags, component = self.variable(ctypes.c_bool * 4), ctypes.c_void_p(self.fmu.component)
+        reached = self.variable(ctypes.c_double)
+        reached.value = math.nan
+        arguments = (component, now, width, ctypes.c_bool(True))
+        any_flag = ctypes.c_uint32.from_buffer(flags)
+        return StepCall(self._function("fmi1DoStep"), arguments, any_flag, flags, reached)
+
+    def end_step(self, status: int) -> tuple[int, bool]:
+        """Wait for a step that is pending (3.4); FMI 1.0 has no request to end the simulation."""
+        wait = 1e-5
+        while status == PENDING:
+            time.sleep(wait)
+            wait = min(2 * wait, _LONGEST_WAIT)
+            status = self.fmu.getStatus(_STEP_STATUS).value
+        return status, False
+
+    def time_after_discard(self, t: float, h: float) -> float | None:
+        """Return the FMU's lastSuccessfulTime (3.6); None if it does not say one within the step."""
+        from fmpy.fmi1 import FMICallException
+
+        try:
+            found = float(self.fmu.getRealStatus(_LAST_SUCCESSFUL_TIME).value)
+        except FMICallException:
+            return None
+        return min(max(found, t), t + h) if t - 1e-9 * h <= found <= t + h * (1.0 + 1e-9) else None
+
+    def do_step(self, t: float, h: float, final: bool) -> bool:
+        """Take a step; it neither ends early nor asks to end the simulation."""
+        from fmpy.fmi1 import FMICallException
+
+        try:
+            self.fmu.doStep(t, h)
+        except FMICallException as error:
+            status, _ = self.end_step(error.status)
+            if status > 1:
+                raise FMICallException(function=error.function, status=status) from None
+        return False
+
+    def set_input_derivatives(self, references: Sequence[int], values: Sequence[float]) -> None:
+        """Tell the first time derivatives of real inputs (3.5)."""
+        from fmpy.fmi1 import FMICallException
+
+        n = len(references)
+        kept, orders = (ctypes.c_uint * n)(*references), (ctypes.c_int * n)(*[1] * n)
+        function = self.fmu._functions["fmi1SetRealInputDerivatives"]
+        if (status := function(self.fmu.component, kept, n, orders, (ctypes.c_double * n)(*values))) > 1:
+            raise FMICallException(function="fmiSetRealInputDerivatives", status=status)
+
+    def directional_derivative(
+        self, unknowns: Sequence[int], knowns: Sequence[int], seed: Sequence[float], size: int
+    ) -> list[float]:
+        """Refuse: FMI 1.0 has none."""
+        raise NotImplementedError("FMI 1.0 has no directional derivatives")
+
+    def update_discrete_states(self) -> bool:
+        """Refuse: FMI 1.0 has no Event Mode in co-simulation."""
+        raise NotImplementedError("FMI 1.0 has no Event Mode in co-simulation")
+
+    def update_events(self) -> EventUpdate:
+        """Refuse: FMI 1.0 has no Event Mode in co-simulation."""
+        raise NotImplementedError("FMI 1.0 has no Event Mode in co-simulation")
