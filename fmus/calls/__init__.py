@@ -1,12 +1,11 @@
 """FMI calls into a library that is loaded in this process."""
 
-from .bound_calls import BoundCalls, Call
+from .bound_calls import BoundCalls, Call, exported_name
 from .exchange_instance import ExchangeInstance, is_smooth
 from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance
 from .loaded_library import CALLS, LoadedFmu, MakeCalls
-from .missing_functions import exported_name
 from .native_step import NativeStep
 from .saved_state import FmuState
 from .step_failures import NEAR
