@@ -52,13 +52,15 @@ class Links:
 
     @cached_property
     def by_states(self) -> np.ndarray:
-        """Which inputs follow continuous states of blocks, shape (inputs,)."""
-        found = self.flat.exchange.depends("z", "x")[:, self.flat.continuous].any(axis=1)
+        """Which inputs follow states that change between ticks, continuous ones or by events, shape (inputs,)."""
+        flat = self.flat
+        between = np.setdiff1d(np.arange(flat.width), flat.taken_at(frozenset(flat.distinct)))
+        found = flat.exchange.depends("z", "x")[:, between].any(axis=1)
         return np.asarray(found & self._is_plant_input, dtype=bool)
 
     @cached_property
     def moving(self) -> np.ndarray:
-        """Which inputs change between ticks: they follow outputs, continuous states or the time, shape (inputs,)."""
+        """Which inputs change between ticks: they follow outputs, states or the time, shape (inputs,)."""
         by_time = self.flat.exchange.depends("z", "t").any(axis=1) & self._is_plant_input
         return np.asarray(self.by_outputs.any(axis=1) | self.by_states | by_time)
 
@@ -67,11 +69,16 @@ class Links:
         """Which outputs act on an input or on a block in continuous time between ticks, shape (outputs,)."""
         return np.asarray(self.by_outputs.any(axis=0) | self.felt_by_blocks)
 
+    @property
+    def exist(self) -> bool:
+        """Whether anything is exchanged between ticks: else all schemes are the same."""
+        return bool(self.moving.any() or self.felt.any())
+
     @cached_property
     def felt_by_blocks(self) -> np.ndarray:
-        """Which outputs act on continuous states or events of blocks between ticks, shape (outputs,)."""
+        """Which outputs act on continuous states, events or delays of blocks between ticks, shape (outputs,)."""
         flat = self.flat
-        found = np.zeros(flat.plant_outputs.total, dtype=bool)
+        found = flat.exchange.depends("z", "w")[~self._is_plant_input].any(axis=0)
         if flat.continuous.size:
             found = found | flat.flow.depends("dx", "w").any(axis=0)
         if flat.events:
@@ -208,15 +215,23 @@ class Links:
         return []
 
 
-def direct_ports(flat: FlatDiagram) -> set[tuple[str, str, str]]:
-    """Return the plants with an input and an output that may follow it at once; a plant that doesn't say so may."""
-    found = set()
+def direct_ports(flat: FlatDiagram, *, wired: bool = False) -> set[tuple[str, str, str]]:
+    """Return the plants with an input and an output that may follow it at once; a plant that doesn't say so may.
+
+    Parameters
+    ----------
+    wired : bool
+        Whether only outputs that something is wired to are looked at.
+    """
+    found, used = set(), {(wire.block, wire.port) for wire in flat.table.wires.values()}
     for path, block in stepped_blocks(flat.table).items():
         plant: Any = block
         ins, outs = (getattr(plant, f"{kind}_variables", None) for kind in ("input", "output"))
         for port in block.inputs:
             if join(path, port) in flat.plant_inputs.slices:
                 for output in block.outputs:
+                    if wired and (path, output) not in used:
+                        continue
                     if ins is None or outs is None or plant.description.feeds_through(ins[port], outs[output]):
                         found.add((path, port, output))
     return found

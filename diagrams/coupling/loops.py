@@ -21,7 +21,7 @@ def note_loops(flat: FlatDiagram, coupling: Coupling) -> tuple[str, ...]:
 
 def _may_loop(flat: FlatDiagram) -> bool:
     """Whether wires in continuous time close a loop through inputs that FMUs pass straight on; without any trace."""
-    table, straight = flat.table, direct_ports(flat)
+    table, straight = flat.table, direct_ports(flat, wired=True)
     outputs = {(path, output) for path, _, output in straight}
     inputs = {(path, port) for path, port, _ in straight}
     after = {output: _inputs_behind(flat, table, *output) & inputs for output in outputs}

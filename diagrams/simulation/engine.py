@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...blocks.core import Block, SimulationError, UnknownNameError, near
-from ..coupling import CoupledSteps, Plant, PlantSteps, load_plants, refuse_exchanged, to_coupling
+from ..coupling import CoupledSteps, Links, Plant, PlantSteps, load_plants, refuse_exchanged, to_coupling
 from ..exchange import ExchangedBlock, ExchangedBlocks
 from ..flat import FlatDiagram
 from ..results import Occurrence, OperatingPoint, Recorder, TextSignal
@@ -99,9 +99,8 @@ class Engine:
             self.position.time_of,
             every_tick=self.every_tick,
         )
-        if not self.coupling.is_plain and flat.plant_ticks:
+        if not self.coupling.is_plain and flat.plant_ticks and Links(flat).exist:
             refuse_exchanged(self.coupling, self.exchanged.evaluators)
-            self._part = ContinuousPart(self.workspace, self.continuous)
             self.coupled = CoupledSteps(
                 flat,
                 name,
@@ -111,7 +110,7 @@ class Engine:
                 self.workspace.z,
                 self.workspace.here.w,
                 self.workspace.bind_exchange(),
-                self._part,
+                ContinuousPart(self.workspace, self.continuous),
             )
 
     def load(self, stack: ExitStack, start_time: float) -> None:

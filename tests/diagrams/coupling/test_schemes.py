@@ -2,14 +2,26 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
-from loopwright.blocks import OptionError, SimulationError
-from loopwright.diagrams import Coupling
+from loopwright.blocks import (
+    Compare,
+    Gain,
+    Integrator,
+    OptionError,
+    Relay,
+    SimulationError,
+    StopCondition,
+    TransportDelay,
+)
+from loopwright.diagrams import Coupling, Diagram, subsystem
 from loopwright.diagrams.coupling import step_all
 from loopwright.fmus import Fmu
 from support.oscillators import (
+    PULL,
     coupled_by_inertia,
     coupled_by_inertia_exactly,
+    mass,
     mass_and_filter,
     mass_and_filter_exactly,
     two_masses,
@@ -23,6 +35,13 @@ STEPS = (1 / 50, 1 / 100, 1 / 200)
 def order_of(errors):
     """Return the orders that successive errors show where the step is halved."""
     return np.log2(np.array(errors[:-1]) / errors[1:])
+
+
+def relay_and_mass():
+    """A mass that a relay in continuous time pulls to and fro, by the state of a filter."""
+    a, state = mass("a", 0.1), Integrator(name="filter", initial_value=0.1)
+    push = Relay(on_point=0.03, off_point=-0.03, on_value=-20.0, off_value=20.0, name="relay")(state.y)
+    return Diagram("relay", a(force=push), state(40.0 * (a.position - state.y)))
 
 
 def largest_error(diagram, exactly, signals, **options):
@@ -91,16 +110,20 @@ def test_adaptive_steps_follow_the_allowed_error(cache, scheme):
     assert fine < 100 * 1e-4
 
 
-def test_fmus_that_nothing_couples_take_the_longest_adaptive_steps(cache):
-    from loopwright.diagrams import Diagram
-    from support.oscillators import mass
+@pytest.mark.parametrize("coupling", ["gauss_seidel", "iterated", Coupling(error=1e-6)], ids=str)
+def test_an_fmu_under_a_sampled_controller_needs_no_coupling(cache, monkeypatch, coupling):
+    monkeypatch.setattr(Fmu, "can_save", property(lambda self: False))
+    plant = mass("a", 0.1)
 
-    run = Diagram("alone", mass("a", 0.1)(force=0.0)).simulate(
-        0.5, step=0.1, progress=False, coupling=Coupling(error=1e-6)
-    )
-    assert run.messages == (
-        "coupling jacobi: 10 communication steps, 0 more repeated with a shorter one, the shortest of 0.05 s.",
-    )
+    @subsystem(sample_time=0.01)
+    def controller(y):
+        return Gain(gain=-PULL, name="gain")(y)
+
+    diagram = Diagram("d", plant(force=controller(plant.position)))
+    runs = [diagram.simulate(0.5, progress=False, coupling=c) for c in ("jacobi", coupling)]
+    assert runs[0]["a.position"].tolist() == runs[1]["a.position"].tolist()
+    assert not runs[1].messages
+    diagram.linearize(runs[1].at(0.2))  # the same model for all of them
 
 
 def test_the_default_is_jacobi_to_the_last_bit(cache):
@@ -245,3 +268,61 @@ def test_a_step_that_has_begun_is_ended_where_another_one_fails(fails, calls_mad
     with pytest.raises(SimulationError, match="no"):
         step_all([Apart("a", calls, fails[0]), Apart("b", calls, fails[1])], 0.0, 0.1)
     assert calls == calls_made
+
+
+# --- events, stops and delays within a step ------------------------------------------------------------------------------
+
+
+def test_events_within_a_repeated_step_happen_once(cache):
+    """The relay switches within steps, by whose jump every scheme is of first order there; shorter steps find it."""
+    fine = relay_and_mass().simulate(0.5, step=1e-3, progress=False, coupling="iterated")
+    told = relay_and_mass().simulate(0.5, step=1e-3, progress=False)
+    assert len(told.events) == len(fine.events) == 2
+    for coupling, off in (("iterated", 0.02), (Coupling(scheme="iterated", error=1e-4), 0.002)):
+        run = relay_and_mass().simulate(0.5, step=1e-2, progress=False, coupling=coupling)
+        assert [e.event for e in run.events] == [e.event for e in fine.events]
+        assert [e.t for e in run.events] == pytest.approx([e.t for e in fine.events], abs=off)
+
+
+@pytest.mark.parametrize(
+    "coupling", ["jacobi", "gauss_seidel", "iterated", Coupling(scheme="iterated", error=1e-4)], ids=str
+)
+def test_a_stop_condition_between_two_ticks_ends_the_run_in_any_coupling(cache, coupling):
+    a, state = mass("a", 0.1), Integrator(name="filter")
+    stop = StopCondition(name="stop")(Compare(relation=">", name="above")(state.y, 0.05))
+    diagram = Diagram("d", a(force=-PULL * state.y), state(20.0 * (a.position - state.y)), stop)
+    run = diagram.simulate(1.0, step=0.01, progress=False, coupling=coupling)
+    assert run.stopped is not None
+    times = np.linspace(0.0, 0.2, 20001)
+    expected = times[np.argmax(mass_and_filter_exactly(times)[:, 1] > 0.05)]
+    assert run.stopped.t == pytest.approx(expected, abs=0.01)
+    assert run.t[-1] == run.stopped.t
+
+
+@pytest.mark.parametrize(("scheme", "order"), ORDERS)
+def test_a_transport_delay_between_two_fmus_keeps_the_order(cache, scheme, order):
+    """The second mass feels the first one, which nothing drives, 0.1 s later."""
+    a, b = mass("a", 0.1), mass("b")
+    late = TransportDelay(delay=0.1, name="late")(a.position)
+    diagram = Diagram("d", a(force=0.0), b(force=Gain(gain=PULL, name="spring")(late)))
+    both = np.zeros((4, 4))
+    both[:2, :2] = both[2:, 2:] = np.array([[0.0, 1.0], [-100.0, -1.0]])
+    both[3, 0] = PULL
+
+    def exactly(times):
+        return np.array([(expm(both * max(0.0, t - 0.1)) @ [0.1, 0.0, 0.0, 0.0])[2:3] for t in times])
+
+    errors = [largest_error(diagram, exactly, ("b.position",), step=h, coupling=scheme)[0] for h in STEPS[1:]]
+    assert order_of(errors) == pytest.approx([order], abs=0.3)
+
+
+def test_states_that_were_gone_back_to_are_freed(cache, monkeypatch):
+    from loopwright.fmus.calls import FmuInstance
+
+    counts, restore = [], FmuInstance.restore
+    monkeypatch.setattr(
+        FmuInstance, "restore", lambda self, state: (counts.append(len(self._handles)), restore(self, state))[1]
+    )
+    two_masses().simulate(0.2, step=0.01, progress=False, coupling=Coupling(scheme="iterated", error=1e-5))
+    assert len(counts) > 100
+    assert max(counts) <= 4
