@@ -72,10 +72,10 @@ def add_commands(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     inspect.add_argument("--json", action="store_true", help="the same as JSON, all variables")
     check = commands.add_parser(
         "validate",
-        help="check an FMU and run it for one step",
+        help="check an FMU and run it for some steps",
         formatter_class=raw,
         description="Check an FMU of any tool: archive, description, model structure, binaries, sources; then run each "
-        "interface\nfor one step, in a process of its own.",
+        "interface\nfor some steps, in a process of its own.",
         epilog=_STATUS.format(one="problems were found").strip(),
     )
     check.add_argument("file", metavar="FILE.fmu")

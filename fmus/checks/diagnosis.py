@@ -10,6 +10,7 @@ from typing import Any
 
 from ..archive import FmuFault, FmuFinding, FmuSeverity
 from .summary import INTERFACES
+from .trial import RUNS
 
 _CONTROL = {code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"}
 _MOST = 5
@@ -147,7 +148,7 @@ class FmuDiagnosis:
             if trial.left:
                 yield "not tried", f"{name}: {trial.left}"
             else:
-                yield "tried", f"{name}: {'one step, ' if trial.ran else 'failed after '}{trial.seconds:.1f} s"
+                yield "tried", f"{name}: {RUNS[trial.interface] if trial.ran else 'failed'}, {trial.seconds:.1f} s"
 
 
 def _first_sentence(text: str) -> str:

@@ -26,7 +26,8 @@ from .diagnosis import FmuDiagnosis, FmuTrial, FmuVerdict
 from .functions import missing_promises
 from .libraries import binaries_of, native_libraries, tuple_of
 from .summary import INTERFACES, summarize
-from .validation import FmuProblem, reason_not_to_run, try_out, validate
+from .trial import FmuProblem, split_step, try_out
+from .validation import reason_not_to_run, validate
 
 _ABSENT = (FmuFault.NO_BINARY, FmuFault.OTHER_PLATFORM, FmuFault.VERSION, FmuFault.INTERFACE)
 """Errors of an FMU that may run elsewhere."""
@@ -113,10 +114,8 @@ def _as_error(error: FmuFileError, path: Path) -> FmuFinding:
     who = repr(str(path))
     if text.startswith(who):
         text = f"it{text.removeprefix(who)}"
-    sentences = text.split(". ")
-    step = sentences[-1] if len(sentences) > 1 else "Export it again."
-    found = ". ".join(sentences[:-1]) if len(sentences) > 1 else sentences[0]
-    return FmuFinding(fault, error.subject or "", f"{found.rstrip('.')}.", step, FmuSeverity.ERROR)
+    found, step = split_step(text)
+    return FmuFinding(fault, error.subject or "", found, step, FmuSeverity.ERROR)
 
 
 # --- this machine ---------------------------------------------------------------------------------------------------
@@ -273,7 +272,7 @@ def _try(
     if left:
         return FmuTrial(kind, ran=False, left=left), None
     began = time.perf_counter()
-    problem = try_out(path, kind)
+    problem = try_out(path, kind, summary["default_experiment"], archive.limits)
     took = time.perf_counter() - began
     if problem is None:
         return FmuTrial(kind, ran=True, seconds=took), None

@@ -1,164 +1,157 @@
-"""Trial run of an FMU in this process, which the FMU may crash.
-
-The command is ``python -m loopwright.fmus.checks.trial FILE INTERFACE REPORT``.
-
-A line of JSON in the report names each stage before it begins, so that a crash shows its stage. The last line of a
-complete run has the stage "done".
-"""
+"""Trial run of an FMU's interface, in a process of its own, as a run of a diagram would load it."""
 
 from __future__ import annotations
 
-import ctypes
-import json
 import math
-import sys
-import tempfile
-from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..archive import DESCRIPTION, FmuArchive, check_binary, find_binary, parse_xml, read_model, write_files
+import numpy as np
 
-_MESSAGES = 20
+from ...blocks.core import FmuEnd, FmuFileError, FmuProcessError, LoopwrightError
+from ..archive import ArchiveLimits, FmuDescription, FmuFault
+from ..isolation import Isolation
+from ..running import Fmu
+from .summary import INTERFACES
 
-
-def main(file: str, interface: str, report: str) -> None:
-    """Instantiate, initialize, step once, get the outputs, terminate."""
-    with open(report, "w", encoding="utf-8") as stream, tempfile.TemporaryDirectory(prefix="loopwright-") as folder:
-
-        def tell(stage: str, **more: Any) -> None:
-            stream.write(json.dumps({"stage": stage, **more}) + "\n")
-            stream.flush()
-
-        messages: deque[str] = deque(maxlen=_MESSAGES)
-        stage = "load"
-
-        def begin(name: str) -> None:
-            nonlocal stage
-            stage = name
-            tell(name)
-
-        try:
-            begin("load")
-            archive = FmuArchive.open(file)
-            write_files(archive, Path(folder))
-            text = archive.description()
-            model, _ = read_model(archive.path, text, parse_xml(archive.path, DESCRIPTION, text))
-            library = _find_library(archive, model, interface)
-            notes = _run(folder, model, interface, library, begin, messages)
-        except Exception as error:
-            said = [m for m in messages if m.strip()]
-            kind = "" if type(error) is Exception else f"{type(error).__name__}: "  # FMPy raises bare exceptions
-            tell("failed", at=stage, error=f"{kind}{error}", messages=said[-3:])
-        else:
-            tell("done", **notes)
+PATIENCE = 120.0
+"""Seconds that a call of the FMU may take before it counts as hung."""
+STEPS = 10
+"""Number of steps in co-simulation."""
+RUNS = {"CoSimulation": f"run for {STEPS} steps", "ModelExchange": "evaluated at its start"}
+"""Kinds of trial runs in words."""
+_CHOICES = {"CoSimulation": "co_simulation", "ModelExchange": "model_exchange"}
+_LOOK = "Check its start values and inputs: see them with loopwright inspect."
+BY_END = {
+    FmuEnd.CRASH: "Don't load it into a program whose work you need (isolate=False). Report it to its makers.",
+    FmuEnd.EXIT: "It may miss a licence or a file; ask its makers. Don't load it with isolate=False.",
+    FmuEnd.TIMEOUT: "Run it in the tool that exported it; it may wait for a licence or another program.",
+}
 
 
-def _find_library(archive: FmuArchive, model: Any, interface: str) -> str:
-    """Return the path of the interface's library in the archive, after checking it."""
-    about = model.coSimulation if interface == "CoSimulation" else model.modelExchange
-    library = find_binary(archive.path, archive.files, model.fmiVersion, about.modelIdentifier)
-    check_binary(archive, library, model.fmiVersion, model_exchange=interface == "ModelExchange")
-    return library
+@dataclass(frozen=True)
+class FmuProblem:
+    """A fault of an FMU.
+
+    Parameters
+    ----------
+    found : str
+        The fault, and its place.
+    step : str
+        The next step.
+    fault : FmuFault
+        Kind of the fault.
+    subject : str
+        File of the archive concerned; empty for the description, and for a run.
+    """
+
+    found: str
+    step: str
+    fault: FmuFault = FmuFault.STANDARD
+    subject: str = ""
 
 
-def _run(
-    folder: str, model: Any, interface: str, library: str, begin: Callable[[str], None], messages: deque[str]
-) -> dict[str, Any]:
-    from fmpy.simulation import instantiate_fmu
+def try_out(
+    file: Path, interface: str, experiment: dict[str, Any], limits: ArchiveLimits | None = None
+) -> FmuProblem | None:
+    """Run an FMU for some steps in a process of its own; return its fault, or None.
 
-    three = model.fmiVersion.startswith("3.")
+    In model exchange the derivatives are evaluated at the start.
 
-    def log(*parts: Any) -> None:  # FMI 2.0: environment, instance, status, category, text; 3.0: no instance
-        messages.append((parts[-1] or b"").decode(errors="replace"))
-
-    start, stop, step = _times(model, interface)
-    fmu = instantiate_fmu(
-        folder,
-        model,
-        fmi_type=interface,
-        logger=log,
-        debug_logging=True,
-        library_path=str(Path(folder, library)),
-        require_functions=False,
-    )
-    begin("initialize")
-    if three:
-        fmu.enterInitializationMode(startTime=start, stopTime=stop)
-    else:
-        fmu.setupExperiment(startTime=start, stopTime=stop)
-        fmu.enterInitializationMode()
-    fmu.exitInitializationMode()
-    begin("step")
-    if interface == "CoSimulation":
-        fmu.doStep(start, step)
-        missing: list[str] = []
-    else:
-        missing = _derivatives(fmu, model, three, start)
-    begin("get")
-    missing += _not_finite(fmu, model, three)
-    begin("terminate")
-    fmu.terminate()
-    fmu.freeInstance()
-    return {"step": step if interface == "CoSimulation" else None, "not_finite": missing}
-
-
-def _times(model: Any, interface: str) -> tuple[float, float | None, float]:
-    """Return start time, stop time and step of the default experiment, with usual values for missing ones."""
-    experiment = model.defaultExperiment
-    start, stop, step = (
-        None if (text := getattr(experiment, name, None)) is None else float(text)
-        for name in ("startTime", "stopTime", "stepSize")
-    )
-    start = start or 0.0
-    slave = model.coSimulation
-    fixed = getattr(slave, "fixedInternalStepSize", None)
-    if interface == "CoSimulation" and fixed is not None and not slave.canHandleVariableCommunicationStepSize:
-        step = float(fixed)
-    if step is None:
-        step = (stop - start) / 1000 if stop is not None and stop > start else 1e-3
-    return start, stop if stop is not None and stop >= start + step else None, step
+    Parameters
+    ----------
+    file : Path
+        The FMU; it must have a library for this machine.
+    interface : {"CoSimulation", "ModelExchange"}
+        The interface to run.
+    experiment : dict
+        Default experiment: ``start_time``, ``stop_time`` and ``step_size`` in s, where they are given.
+    limits : ArchiveLimits, optional
+        Limits of its size; the usual ones without it.
+    """
+    name = INTERFACES[interface]
+    try:
+        plant = Fmu(
+            file,
+            name="trial",
+            interface=_CHOICES[interface],
+            isolate=Isolation(step_time=PATIENCE, start_time=PATIENCE),
+            limits=limits,
+        )
+        lost = _step(plant, experiment) if interface == "CoSimulation" else _evaluate(plant, experiment)
+    except FmuProcessError as error:
+        found = f"{error.message.partition('. ')[0]}.{error.printed}"  # the rest is about runs
+        return FmuProblem(f"{name}: {found}", BY_END.get(error.cause, _LOOK), FmuFault.TRIAL)
+    except FmuFileError as error:
+        step = "Look at what it says; it may miss a licence, a file or the program that exported it."
+        return FmuProblem(f"{name}: {split_step(error.message)[0]}", step, FmuFault.TRIAL)
+    except LoopwrightError as error:
+        found, step = split_step(error.message)
+        when = "" if error.t is None else f" at t = {error.t:.9g} s"
+        return FmuProblem(f"{name}{when}: {found}", step, FmuFault.TRIAL)
+    if lost:
+        return FmuProblem(f"{name}: {lost} is no finite number.", _LOOK, FmuFault.TRIAL)
+    return None
 
 
-def _derivatives(fmu: Any, model: Any, three: bool, start: float) -> list[str]:
-    """Enter Continuous-Time Mode and evaluate the derivatives; return the names of those that are not finite."""
-    more = True
-    rounds = 0
-    while more:
-        result = fmu.updateDiscreteStates() if three else fmu.newDiscreteStates()
-        more, rounds = bool(result[0]), rounds + 1
-        if rounds > 1000:
-            raise RuntimeError("the iteration for new discrete states at the start has not ended after 1000 rounds")
-    fmu.enterContinuousTimeMode()
-    fmu.setTime(start)
-    n = fmu.getNumberOfContinuousStates() if three else model.numberOfContinuousStates
-    if not n:
-        return []
-    values = (ctypes.c_double * n)()
-    (fmu.getContinuousStateDerivatives if three else fmu.getDerivatives)(values, n)
-    return [f"derivative {i + 1}" for i, value in enumerate(values) if not math.isfinite(value)]
-
-
-def _not_finite(fmu: Any, model: Any, three: bool) -> list[str]:
-    """Return the names of outputs that are not finite."""
-    found = []
-    for v in model.modelVariables:
-        if v.causality != "output" or v.clocks or v.type not in ("Real", "Float64", "Float32"):
-            continue
-        if not three:
-            values = fmu.getReal([v.valueReference])
-        elif all(d.start is not None for d in v.dimensions or ()):
-            n = math.prod(int(d.start) for d in v.dimensions or ())
-            get = fmu.getFloat64 if v.type == "Float64" else fmu.getFloat32
-            values = get([v.valueReference], n)
-        else:
-            continue
-        if not all(math.isfinite(value) for value in values):
-            found.append(v.name)
+def experiment_of(get: Callable[[str], str | None]) -> dict[str, Any]:
+    """Return the times of a default experiment that are numbers, from a function that gets its attributes."""
+    found = {}
+    for key, attribute in (("start_time", "startTime"), ("stop_time", "stopTime"), ("step_size", "stepSize")):
+        with suppress(TypeError, ValueError):
+            found[key] = float(get(attribute))  # type: ignore[arg-type]  # None is a TypeError
     return found
 
 
-if __name__ == "__main__":
-    file, interface, report = sys.argv[1:]
-    main(str(Path(file)), interface, report)
+def split_step(message: str) -> tuple[str, str]:
+    """Return an error's message without its last sentence, and that sentence, which is the next step."""
+    head, dot, step = message.rstrip().rpartition(". ")
+    return (f"{head}.", step) if dot else (message, "Export it again.")
+
+
+def _step(plant: Fmu, experiment: dict[str, Any]) -> str:
+    """Take steps; return the time and names of outputs that are not finite, empty if all are."""
+    start, stop, step = _times(plant.description, experiment)
+    layout = plant.description.layout([v.name for v in plant.output_variables.values()])
+    outputs = np.zeros(layout.total)
+    with plant.instantiate([], stop, start_time=start) as run:
+        run.bind(np.zeros(0), outputs)
+        run.begin()
+        for k in range(STEPS):
+            run.step(start + k * step, step)
+            lost = [name for name, part in layout.split(outputs).items() if not np.isfinite(part).all()]
+            if lost:
+                steps = "one step" if k == 0 else f"{k + 1} steps"
+                return f"after {steps} from its start values, {', '.join(lost)}"
+    return ""
+
+
+def _evaluate(plant: Fmu, experiment: dict[str, Any]) -> str:
+    """Evaluate outputs and derivatives at the start; return the names of those that are not finite."""
+    start, _, _ = _times(plant.description, experiment)
+    with plant.exchange([], start_time=start) as run:
+        state = run.begin_exchange()
+        evaluate = run.evaluation(tuple(plant.outputs), rates=True, indicators=False)
+        values = np.asarray(evaluate(start, state, np.zeros(0)), dtype=float)
+    bad = [i for i, value in enumerate(values) if not math.isfinite(value)]
+    n = len(values) - len(state)
+    names = [f"derivative {i - n + 1}" if i >= n else f"output element {i + 1}" for i in bad[:5]]
+    return f"at its start, {', '.join(names)}" if names else ""
+
+
+def _times(description: FmuDescription, experiment: dict[str, Any]) -> tuple[float, float | None, float]:
+    """Return start time, stop time and step of the default experiment, with usual values for impossible ones."""
+    start, stop, step = (_finite(experiment.get(key)) for key in ("start_time", "stop_time", "step_size"))
+    start = start or 0.0
+    if description.fixed_internal_step is not None and not description.variable_step:
+        step = description.fixed_internal_step
+    if step is None or step <= 0.0:
+        step = (stop - start) / 1000.0 if stop is not None and stop > start else 1e-3
+    return start, stop if stop is not None and stop >= start + STEPS * step else None, step
+
+
+def _finite(value: Any) -> float | None:
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) else None

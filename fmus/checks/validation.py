@@ -1,22 +1,15 @@
 """Validation of a third-party FMU, by FMPy and by further checks.
 
 The checks cover the archive, the description (against the standard's schemas, which FMPy ships), the model structure,
-and the declared binaries and sources. Then each interface is instantiated, initialized and stepped once in a process of
-its own.
+and the declared binaries and sources. Then each interface is tried in a process of its own.
 """
 
 from __future__ import annotations
 
-import json
-import os
 import posixpath
 import re
-import signal
-import subprocess
-import sys
-import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,33 +19,9 @@ from ..archive import BUILD_DESCRIPTION, DESCRIPTION, ArchiveLimits, FmuArchive,
 from ..platform import native_platform
 from .libraries import binaries_of, library_name, native_libraries, tuple_of
 from .summary import INTERFACES, open_fmu
-from .trial_stages import STAGES
+from .trial import RUNS, FmuProblem, experiment_of, try_out
 
-#: Seconds that an FMU may take for its first step before it counts as hung.
-PATIENCE = 120.0
 _AGAIN = "Export it again with a newer version of its tool ({tool}), or report it to its makers."
-
-
-@dataclass(frozen=True)
-class FmuProblem:
-    """A fault of an FMU.
-
-    Parameters
-    ----------
-    found : str
-        The fault, and its place.
-    step : str
-        The next step.
-    fault : FmuFault
-        Kind of the fault.
-    subject : str
-        File of the archive concerned; empty for the description, and for a run.
-    """
-
-    found: str
-    step: str
-    fault: FmuFault = FmuFault.STANDARD
-    subject: str = ""
 
 
 @dataclass(frozen=True)
@@ -116,8 +85,9 @@ def validate(file: Path, *, run: bool = True, limits: ArchiveLimits | None = Non
         if reason:
             left.append(f"{name} was not run: {reason}")
             continue
-        wrong = try_out(file, kind)
-        done.append(f"{name} run for one step")
+        given = root.find("DefaultExperiment")
+        wrong = try_out(file, kind, {} if given is None else experiment_of(given.get), limits)
+        done.append(f"{name} {RUNS[kind]}")
         if wrong is not None:
             problems.append(wrong)
     if fmi == "1.0":
@@ -291,95 +261,3 @@ def reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]])
     if native_libraries(native, folders, [element.get("modelIdentifier") or ""]) is not None:
         return ""
     return f"it has no binary for this machine, {native}"
-
-
-def try_out(file: Path, interface: str) -> FmuProblem | None:
-    """Run an FMU for one step in a process of its own; return its fault, or None.
-
-    Parameters
-    ----------
-    file : Path
-        The FMU; it must have a binary for this machine.
-    interface : {"CoSimulation", "ModelExchange"}
-        The interface to run.
-    """
-    name = INTERFACES[interface]
-    with tempfile.TemporaryDirectory(prefix="loopwright-") as folder:
-        report = Path(folder) / "report"
-        command = [sys.executable, "-m", "loopwright.fmus.checks.trial", str(file.resolve()), interface, str(report)]
-        # A session of its own, so that the processes that a hung FMU has started end with it.
-        process = subprocess.Popen(
-            command,
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-        )
-        hung = False
-        try:
-            output, _ = process.communicate(timeout=PATIENCE)
-        except subprocess.TimeoutExpired:
-            hung = True
-            _kill(process)
-            output, _ = process.communicate()
-        except BaseException:
-            _kill(process)
-            process.wait()
-            raise
-        lines = report.read_text(encoding="utf-8").splitlines() if report.is_file() else []
-    told = [json.loads(line) for line in lines]
-    last = told[-1] if told else {"stage": "load"}
-    said = _quote_lines([*last.get("messages", []), *output.decode(errors="replace").splitlines()])
-    if hung:
-        return FmuProblem(
-            f"{name}: {STAGES.get(last['stage'], 'it')} has not ended after {PATIENCE:g} s.{said}",
-            "Run it in the tool that exported it; it may wait for a licence or another program.",
-            FmuFault.TRIAL,
-        )
-    if last["stage"] == "done":
-        if last["not_finite"]:
-            return FmuProblem(
-                f"{name}: after one step from its start values, {', '.join(last['not_finite'])} is no finite number.",
-                "Check its start values and inputs: see them with loopwright inspect.",
-                FmuFault.TRIAL,
-            )
-        return None if process.returncode == 0 else FmuProblem(
-            f"{name}: it ran, and then {_describe_exit(process.returncode)}.{said}", "Report it to its makers.",
-            FmuFault.TRIAL,
-        )  # fmt: skip
-    if last["stage"] == "failed":
-        step = "Check its start values and inputs: see them with loopwright inspect."
-        if last["at"] == "load":
-            step = "If it says nothing of use, look for libraries that it lacks: loopwright doctor names them."
-        return FmuProblem(
-            f"{name}: {STAGES[last['at']]} failed: {_end_sentence(last['error'])}{said}", step, FmuFault.TRIAL
-        )
-    return FmuProblem(
-        f"{name}: {STAGES[last['stage']]} {_describe_exit(process.returncode)}.{said}",
-        "Don't load it into a program whose work you need. Report it to its makers.",
-        FmuFault.TRIAL,
-    )
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    """End a trial and all processes that it has started."""
-    if sys.platform == "win32":
-        process.kill()
-    else:
-        os.killpg(process.pid, signal.SIGKILL)
-
-
-def _describe_exit(code: int) -> str:
-    if code < 0:
-        try:
-            return f"crashed the process ({signal.Signals(-code).name})"
-        except ValueError:
-            return f"crashed the process (signal {-code})"
-    return f"ended the process with exit code {code}"
-
-
-def _quote_lines(lines: Iterable[str]) -> str:
-    """Quote the last lines of an FMU's output."""
-    kept = [line.strip() for line in lines if line.strip()]
-    return f" It says: {' / '.join(kept[-4:])}" if kept else ""

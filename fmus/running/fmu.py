@@ -23,14 +23,14 @@ from ...blocks.core import (
     near,
     parameter,
 )
-from ..archive import FmuDescription, FmuVariable, OtherVariable, read_description
+from ..archive import ArchiveLimits, FmuDescription, FmuVariable, OtherVariable, read_description
 from ..calls import FmuInstance, StepOptions, check_offered
 from ..isolation import Isolation, check_isolation, open_fmu
 from .exchange import ExchangeMembers, choose_interface
 from .linearization import STEP, FmuLinearization, linear_model, step_difference
 from .ports import FmuPorts, choose_ports
 from .replacement import check_replacement
-from .start_values import check_start, check_value
+from .start_values import check_start, check_value, read_sized
 
 
 class Fmu(ExchangeMembers):
@@ -75,6 +75,8 @@ class Fmu(ExchangeMembers):
         default=None, description="'co_simulation' or 'model_exchange'; None for co-simulation where it is offered"
     )
 
+    limits: ArchiveLimits | None = parameter(default=None, description="limits of the file; None for the usual ones")
+
     def check(self) -> None:
         """Check the file, the names of ``ports`` and ``rename``, and names, shapes and values of ``start``."""
         who = self.label
@@ -90,15 +92,9 @@ class Fmu(ExchangeMembers):
         for old, new in self.rename.items():
             if not isinstance(old, str) or not isinstance(new, str):
                 raise ParameterError(f"found {old!r}: {new!r}; expected two names.", block=who, port="rename")
-        try:
-            description = read_description(self.file)
-            sizes = {n: v for n, v in self.start.items() if n in description.structural}
-            if sizes:
-                sizes = {n: int(check_value(description, n, v, who)) for n, v in sizes.items()}
-                description = read_description(self.file, sizes)
-        except FmuError as error:
-            error.at(block=who)
-            raise
+        if not isinstance(self.limits, ArchiveLimits | None):
+            raise ParameterError(f"found {self.limits!r}; expected ArchiveLimits(…).", block=who, port="limits")
+        description, sizes = read_sized(self.file, self.start, self.limits, who)
         object.__setattr__(self, "_content", description.digest)
         object.__setattr__(self, "_sizes", sizes)
         choose_interface(description, self.interface, who)
@@ -180,7 +176,7 @@ class Fmu(ExchangeMembers):
             If the file is missing, or has changed since the block was made.
         """
         try:
-            found = read_description(self.file, self.__dict__["_sizes"])
+            found = read_description(self.file, self.__dict__["_sizes"], limits=self.limits)
         except FmuError as error:
             error.at(block=self.label)
             raise

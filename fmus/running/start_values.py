@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import ParameterError, UnknownNameError, near
-from ..archive import FmuDescription, FmuVariable
+from ...blocks.core import FmuError, ParameterError, UnknownNameError, near
+from ..archive import ArchiveLimits, FmuDescription, FmuVariable, read_description
 
 
 def check_start(description: FmuDescription, start: Mapping[str, Any], label: str) -> dict[str, Any]:
@@ -141,3 +142,35 @@ def _range_text(variable: FmuVariable) -> str:
 
 def _article(noun: str) -> str:
     return f"an {noun}" if noun[0] in "aeio" else f"a {noun}"
+
+
+def read_sized(
+    file: str | os.PathLike[str], start: Mapping[str, Any], limits: ArchiveLimits | None, label: str
+) -> tuple[FmuDescription, dict[str, int]]:
+    """Return an FMU's description with the sizes of arrays that start values give, and those start values.
+
+    Parameters
+    ----------
+    file : str or PathLike
+        The FMU.
+    start : mapping
+        Start values by the FMU's names; structural parameters among them count.
+    limits : ArchiveLimits, optional
+        Limits of the file.
+    label : str
+        Name of the block, for messages.
+
+    Raises
+    ------
+    FmuFileError
+        If the file can't be used here.
+    ParameterError
+        If a structural parameter can't have the value.
+    """
+    try:
+        description = read_description(file, limits=limits)
+        sizes = {n: int(check_value(description, n, v, label)) for n, v in start.items() if n in description.structural}
+        return (read_description(file, sizes, limits=limits) if sizes else description), sizes
+    except FmuError as error:
+        error.at(block=label)
+        raise

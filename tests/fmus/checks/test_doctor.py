@@ -124,7 +124,7 @@ def test_a_capability_without_its_function_is_told(examine):
 
 def test_an_fmu_that_needs_another_program_is_tried_if_asked_only(examine, monkeypatch):
     tried = []
-    monkeypatch.setattr("loopwright.fmus.checks.examination.try_out", lambda path, kind: tried.append(kind))
+    monkeypatch.setattr("loopwright.fmus.checks.examination.try_out", lambda path, kind, *_: tried.append(kind))
     needs = described((r"<CoSimulation ", '<CoSimulation needsExecutionTool="true" '))
     diagnosis = examine(needs, run=None)
     assert tried == ["ModelExchange"]
@@ -159,8 +159,11 @@ def test_an_fmu_of_many_variables_is_examined_in_time(examine):
 @pytest.mark.parametrize(
     "fault",
     [
-        "step crash 0",
-        *(pytest.param(fault, marks=pytest.mark.slow) for fault in ("", "instantiate exit 0", "initialize abort 0")),
+        "step segfault 0",
+        *(
+            pytest.param(fault, marks=pytest.mark.slow)
+            for fault in ("", "instantiate exit 0", "enter abort 0", "get fatal 0")
+        ),
     ],
 )
 def test_a_trial_run_may_crash(tmp_path, fault):
@@ -178,9 +181,9 @@ def test_a_trial_run_may_crash(tmp_path, fault):
 
 
 def test_one_of_two_interfaces_may_fail(examine, monkeypatch):
-    from loopwright.fmus.checks.validation import FmuProblem
+    from loopwright.fmus.checks.trial import FmuProblem
 
-    def run(path, kind):
+    def run(path, kind, *_):
         return FmuProblem("its first step crashed.", "Report it.") if kind == "CoSimulation" else None
 
     monkeypatch.setattr("loopwright.fmus.checks.examination.try_out", run)

@@ -368,7 +368,8 @@ def test_what_goes_wrong_in_the_first_step_is_told(models, beside, tmp_path):
     assert validate(build_python(models.Odd(), tmp_path, files=beside, step_size=0.2)).problems == ()
     problems = validate(build_python(models.Fails(), tmp_path, files=beside, step_size=0.5, stop_time=2.0)).problems
     assert len(problems) == 1
-    assert problems[0].found.startswith("co-simulation: its first step failed: FMICallException: fmi2DoStep failed")
+    assert problems[0].found.startswith("co-simulation at t = 0 s: ")
+    assert "failed with fmi2Fatal" in problems[0].found
     assert "y is nan; expected finite numbers" in problems[0].found
 
 
