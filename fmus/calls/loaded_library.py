@@ -19,7 +19,7 @@ from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
 from .fmi_calls import FATAL, FmiCalls
 from .fmu_block import FmuBlock
-from .message_log import MessageLog
+from .message_log import MessageLog, clean_text
 from .process_ends import describe_end
 from .step_options import allows_early_return, uses_event_mode
 from .texts import is_readable, list_limits, read_text, write_text
@@ -385,6 +385,8 @@ class LoadedFmu:
             if not self.fatal:
                 self._end_by(self.fmi.free_instance)
         finally:
+            if lines := self.fmi.read_printed():
+                self.add_note(f"it printed, in its own process: {clean_text(' / '.join(lines))}")
             self.fmi.end()
 
     def _end_by(self, function: Callable[[], None]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ...blocks.core import FmuEnd, FmuProcessError
+from .message_log import clean_text
 
 _RERUN = "Samples until then are in error.run. The FMU can be run again; other FMUs and this process go on."
 _ADVICE = {
@@ -19,4 +20,4 @@ _ADVICE = {
 
 def describe_end(error: FmuProcessError, said: str) -> str:
     """Return the text that follows the cause: messages of the FMU (``said``), lines that it printed, the next step."""
-    return f"{said.removeprefix('.')}{error.printed} {_ADVICE[error.cause]}"
+    return f"{said.removeprefix('.')}{clean_text(error.printed)} {_ADVICE[error.cause]}"

@@ -16,7 +16,12 @@ class ChildOutput:
     """Files of a child: ``log`` and ``printed`` in its folder."""
 
     def __init__(self, folder: Path):
-        self.folder, self._position = folder, 0
+        self.folder, self._position, self._printed = folder, 0, 0
+
+    def begin_again(self) -> None:
+        """Forget what has been printed so far."""
+        with suppress(OSError):
+            self._printed = (self.folder / "printed").stat().st_size
 
     def read_messages(self) -> Iterator[tuple[int, str]]:
         """Yield status and text of each log message that hasn't been read yet."""
@@ -37,7 +42,8 @@ class ChildOutput:
     def read_printed(self) -> list[str]:
         """Return the last lines that the FMU has written to its standard output and standard error."""
         with suppress(OSError), open(self.folder / "printed", "rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - 4096))
+            size = file.seek(0, os.SEEK_END)
+            file.seek(max(0, size - 4096, self._printed if self._printed <= size else 0))  # it may have begun anew
             lines = file.read().decode(errors="replace").splitlines()
             return [line.strip() for line in lines if line.strip()][-_LAST_LINES:]
         return []

@@ -112,6 +112,8 @@ def _end_all() -> None:
 def _forget() -> None:
     """Forget all processes in a fork of this process: they belong to the other one."""
     _LOCKS[0] = threading.RLock()
+    for _, process in _ALL.values():
+        process.disown()
     _IDLE_ONES.clear()
     _ALL.clear()
     _TIMER.clear()

@@ -172,20 +172,9 @@ class ChildProcess:
     def request(
         self, operation: str, *arguments: Any, blobs: Sequence[bytes] = (), call: str, seconds: float
     ) -> tuple[Any, list[bytes]]:
-        """Let the child do something, and return its result.
+        """Let the child do its method ``do_…`` with numbers, texts and lists, and with bytes, and return its result.
 
-        Parameters
-        ----------
-        operation : str
-            Method ``do_…`` of the child.
-        *arguments
-            Numbers, texts, lists.
-        blobs : sequence of bytes
-            Bytes that go with them.
-        call : str
-            Call of the FMU, for an error.
-        seconds : float
-            Time after which the process is ended.
+        ``call`` is the call of the FMU, for an error; after ``seconds`` the process is ended.
 
         Raises
         ------
@@ -306,6 +295,10 @@ class ChildProcess:
         for status, text in self._output.read_messages():
             self.told(status, text)
 
+    def read_printed(self) -> list[str]:
+        """Return the last lines that the FMU has written since the present instance was made."""
+        return self._output.read_printed()
+
     # ---- the end ----
 
     def _check_alive(self, call: str) -> None:
@@ -383,9 +376,18 @@ class ChildProcess:
             self._process = None
         shutil.rmtree(self.folder, ignore_errors=True)
 
+    def disown(self) -> None:
+        """Leave the process to the one that this process is a fork of."""
+        self.alive, self.used = False, True
+        if self._process is not None:
+            self._process.returncode = 0  # it is waited for there
+            self._process = None
+        self.folder = self.folder / "disowned"
+
     def begin_again(self) -> None:
         """Prepare for another instance: forget memory, sequences and messages."""
         self._allotted = DATA
         self._names.clear()
         self.told, self.lose = lambda status, text: None, lambda error: error
+        self._output.begin_again()
         self._words[MESSAGES] = 0

@@ -141,6 +141,10 @@ class RemoteCalls(FmiCalls):
         if status > WARNING:
             raise FMICallException("fmi3SetBinary", status)
 
+    def read_printed(self) -> list[str]:
+        """Return the last lines that the FMU has written to its standard output in this process's hold of it."""
+        return self.process.read_printed()
+
     def end(self) -> None:
         """Keep the process for another instance, or end it."""
         give_back(self.process, self._unloaded)

@@ -69,6 +69,7 @@ static int act(const char *here, instance *c, double t) {
     if (IS("spin")) for (volatile int i = 0;; i++) {}
     if (IS("deaf_hang")) { signal(SIGTERM, SIG_IGN); signal(SIGINT, SIG_IGN); for (;;) pause(); }
     if (IS("slow")) nap(0.02);
+    if (IS("print")) puts("step by 0.01");
     if (IS("log_hang")) { log_a_little(c); for (;;) pause(); }
     if (IS("memory")) for (;;) sink = memset(malloc(1 << 24), 1, 1 << 24);
     if (IS("leak")) sink = memset(malloc(1 << 20), 1, 1 << 20);

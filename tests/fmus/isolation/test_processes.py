@@ -1,9 +1,14 @@
 """FMUs in processes of their own: equal numbers, and faults that end the run alone. The FMU of the zoo is y' = u."""
 
 import os
+import resource
+import subprocess
+import sys
 import tempfile
 import threading
 import time
+import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -241,6 +246,54 @@ def test_a_wrong_limit_is_refused(msd):
         Isolation(step_time=-1)
     with pytest.raises(ParameterError, match="found 'yes'; expected True, False, None or an Isolation"):
         Fmu(msd, isolate="yes")
+
+
+def test_what_an_fmu_prints_is_told_at_the_end(folder):
+    plant = Fmu(zoo_fmu(folder, 3, "step print"), name="plant", isolate=True)
+    for _ in range(2):  # the second one in the same process
+        with plant.instantiate(["u"], None) as one:
+            one.bind(np.ones(1), np.zeros(1))
+            one.begin()
+            one.step(0.0, 0.01)
+        assert [m for m in one.messages if "printed" in m] == ["plant: it printed, in its own process: step by 0.01"]
+    with Fmu(zoo_fmu(folder, 3), isolate=True).instantiate(["u"], None) as one:
+        one.begin()
+    assert one.messages == []
+
+
+def test_the_child_imports_the_standard_library_only():
+    """It is a second of NumPy, CasADi and FMPy faster so."""
+    from loopwright.fmus.calls import printf
+    from loopwright.fmus.isolation import process
+
+    begin = process._START.replace("; main()", "; import loopwright_child.printf; print(*sys.modules)")
+    here = [str(Path(module.__file__).parent) for module in (process, printf)]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run([sys.executable, "-c", begin, *here], capture_output=True, text=True, check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert "loopwright_child.child" in done.stdout.split()
+    assert not {"numpy", "casadi", "fmpy", "loopwright", "scipy"} & set(done.stdout.split())
+    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    assert used < 0.3  # 0.06 s where the machine is quiet
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_a_fork_of_this_process_leaves_its_fmus_alone(folder):
+    with Fmu(zoo_fmu(folder, 3), name="plant", isolate=True).instantiate(["u"], None) as one:
+        y = np.zeros(1)
+        one.bind(np.ones(1), y)
+        one.begin()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of threads of other tests
+            pid = os.fork()
+        if pid == 0:
+            with suppress(BaseException):
+                one.close()
+                end_idle()
+            os._exit(0)
+        os.waitpid(pid, 0)
+        one.step(0.0, 0.01)
+        assert y[0] == pytest.approx(0.01)
 
 
 def test_an_interrupt_ends_the_process_of_a_step(folder):
