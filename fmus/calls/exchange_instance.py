@@ -53,7 +53,7 @@ class ExchangeInstance(LoadedFmu):
         self._time = self.fmi.variable(ctypes.c_double)
         self._x, self._dx, self._kept = (self._allocate(n) for _ in range(3))
         self._indicators = self._allocate(len(self.about.indicators))
-        self.next_time, self.nominals = math.inf, np.ones(n)
+        self.next_time, self.nominals, self._has_odd_nominals = math.inf, np.ones(n), False
         self._evaluations: dict[Any, Evaluation] = {}
         self.ends_run = False
         """Whether the FMU has asked to end the simulation (terminateSimulation)."""
@@ -183,11 +183,23 @@ class ExchangeInstance(LoadedFmu):
         self.begin()
         self._time.value = self._began
         x = self._iterate(self._began)
-        self.nominals = self._get("nominals")
+        self.nominals = self._read_nominals()
         return x
 
     def _states(self) -> np.ndarray:
         return self._get("get_states")
+
+    def _read_nominals(self) -> np.ndarray:
+        """Return the states' nominal values; 1 stands in for a value that is 0 or no number."""
+        found = np.abs(self._get("nominals"))
+        usable = np.isfinite(found) & (found > 0.0)
+        if not usable.all() and not self._has_odd_nominals:
+            self._has_odd_nominals = True
+            self.add_note(
+                f"the nominal values of its states are {found.tolist()}; expected positive numbers. 1 stands in for "
+                "the others in the solver's tolerances"
+            )
+        return np.where(usable, found, 1.0)
 
     def _get(self, quantity: str) -> np.ndarray:
         """Return a vector of the FMU's for its states."""
@@ -259,7 +271,7 @@ class ExchangeInstance(LoadedFmu):
         self.next_time = made.next_time
         x = self._states()
         if nominals:
-            self.nominals = self._get("nominals")
+            self.nominals = self._read_nominals()
         self.call("entering Continuous-Time Mode", self.fmi.enter_continuous_time_mode)
         return x
 

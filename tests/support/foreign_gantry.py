@@ -121,8 +121,11 @@ def by_casadi(folder):
     mass, coulomb, viscous, weight = (36.87, 21.20), (65.42, 37.69), (175.93, 62.83), (0.0, 9.81 * 4.41)
     dae = ca.DaeBuilder("casadi_gantry", "")
     u, f = ([dae.add(f"{name}[{i}]", "input") for i in (1, 2)] for name in ("motor_force", "external_force"))
-    s = [dae.add(f"position[{i + 1}]", "output", {"start": start}) for i, start in enumerate((0.8, 0.5))]
-    v = [dae.add(f"velocity[{i}]", "output", {"start": 0.0}) for i in (1, 2)]
+    s = [
+        dae.add(f"position[{i + 1}]", "output", {"start": start, "initial": "exact"})
+        for i, start in enumerate((0.8, 0.5))
+    ]
+    v = [dae.add(f"velocity[{i}]", "output", {"start": 0.0, "initial": "exact"}) for i in (1, 2)]
     for i in (0, 1):
         a = (u[i] + f[i] - coulomb[i] * ca.tanh(v[i] / 0.01) - viscous[i] * v[i] - weight[i]) / mass[i]
         dae.eq(dae.der(s[i]), v[i])

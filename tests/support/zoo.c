@@ -149,7 +149,8 @@ F(SetTime)(void *c, double t) { ((instance *)c)->t = t; return act("time", c, t)
 F(SetContinuousStates)(void *c, const double x[], size_t n) {
     ((instance *)c)->y = x[0]; return act("states", c, ((instance *)c)->t); }
 F(GetContinuousStates)(void *c, double x[], size_t n) { x[0] = ((instance *)c)->y; return 0; }
-F(GetNominalsOfContinuousStates)(void *c, double x[], size_t n) { x[0] = 1.0; return act("nominals", c, 0.0); }
+F(GetNominalsOfContinuousStates)(void *c, double x[], size_t n) {
+    char f[64]; x[0] = match("nominal", 0.0, f) ? IS("nan") ? NAN : 0.0 : 1.0; return act("nominals", c, 0.0); }
 F(GetEventIndicators)(void *c, double z[], size_t n) { z[0] = 1.0; return act("indicators", c, ((instance *)c)->t); }
 F(EnterEventMode)(void *c) { return act("event_mode", c, ((instance *)c)->t); }
 F(EnterContinuousTimeMode)(void *c) { return act("continuous_mode", c, 0.0); }

@@ -11,7 +11,7 @@ import pytest
 
 from loopwright.diagrams import experiments
 from loopwright.fmus import Fmu, gantry, gantry_contact, gantry_elastic, gantry_stiction, scara
-from support.foreign_gantry import by_pythonfmu, by_pythonfmu3
+from support.foreign_gantry import by_casadi, by_pythonfmu, by_pythonfmu3
 
 from .test_plants_under_the_controller import PATH, follow
 
@@ -61,6 +61,27 @@ def test_arms_of_both_versions_follow_alike():
         assert np.array_equal(runs[0][name], runs[1][name]), name
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("plant", PLANTS, ids=lambda p: p.__name__.rpartition(".")[2])
+def test_model_exchange_of_both_versions_gives_the_same_numbers(plant):
+    runs = [run_experiment(Fmu(plant.build(fmi=fmi), interface="model_exchange"), 0.3) for fmi in (2, 3)]
+    for name in SIGNALS:
+        assert np.array_equal(runs[0][name], runs[1][name]), name
+
+
+@pytest.mark.slow
+def test_in_model_exchange_the_acceleration_answers_the_motor_force_at_once():
+    """The plant's difference: co-simulation shows the force of before the step, and steps with its own integrator."""
+    exchanged = run_experiment(Fmu(gantry.build(), interface="model_exchange"), 0.3)
+    stepped = run_experiment(gantry.build(), 0.3)
+    smooth = largest_differences(exchanged, stepped, SIGNALS[:5])
+    assert max(smooth.values()) < 2e-6  # of the Runge-Kutta steps of 0.2 ms
+    jump = np.diff(stepped["motor_force"], axis=0) / [36.87, 21.20]  # m/s2, by Table II
+    ahead = exchanged["plant.acceleration"][1:] - stepped["plant.acceleration"][1:]
+    assert np.abs(jump).max() > 1.0
+    np.testing.assert_allclose(ahead, jump, rtol=0, atol=1e-4 * np.abs(jump).max())
+
+
 # --- the gantry of other tools --------------------------------------------------------------------------------------
 
 TOOLS = {"pythonfmu": by_pythonfmu, "pythonfmu3": by_pythonfmu3}
@@ -75,3 +96,11 @@ def test_a_gantry_that_another_tool_has_exported(tmp_path, tool, letter):
         pytest.skip(f"{tool} is not installed (extra: test)")
     run, own = run_experiment(TOOLS[tool](tmp_path), letter=letter), run_experiment(gantry.build(), letter=letter)
     assert max(largest_differences(run, own, SIGNALS).values()) < 1e-13
+
+
+@pytest.mark.slow
+def test_a_gantry_for_model_exchange_that_casadi_has_exported(tmp_path):
+    """The one solver takes the one right-hand side from two libraries: rounding remains."""
+    plants = Fmu(by_casadi(tmp_path)), Fmu(gantry.build(), interface="model_exchange")
+    run, own = (run_experiment(plant, 0.3) for plant in plants)
+    assert max(largest_differences(run, own, SIGNALS).values()) < 1e-12

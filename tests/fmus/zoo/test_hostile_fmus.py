@@ -378,6 +378,16 @@ def test_a_rate_that_is_no_number_names_the_state(host, place, fmi, fault):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.parametrize("value", ["zero", "nan"])
+def test_a_nominal_value_that_is_none_is_told_and_replaced(host, place, fmi, value):
+    answer = host.run(zoo_fmu(place, fmi, f"nominal {value}"), interface="model_exchange")
+    check_host(answer)
+    assert len(answer["t"]) == N, answer["text"]
+    assert any("nominal" in text for text in answer["messages"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fmi", [2, 3])
 def test_an_event_iteration_without_end_is_ended(host, place, fmi):
     answer = host.run(zoo_fmu(place, fmi, "update endless"), interface="model_exchange")
     fail(answer, "SimulationError", 0, "event iteration")
