@@ -11,6 +11,8 @@ import numpy as np
 
 from ...blocks.core import FmuError, FmuProcessError
 from ..archive import FmuVariable
+from ..host_state import guard_host
+from ..platform import is_built_here
 from .fmi_calls import StepCall
 from .fmu_block import FmuBlock
 from .loaded_library import MakeCalls
@@ -70,6 +72,7 @@ class FmuInstance(StepFailures):
         """Time of the instance in s."""
         return self._now.value + self._width.value if self._running else self._began
 
+    @guard_host
     def begin(self) -> None:
         """Leave Initialization Mode and read the outputs at the start of the run."""
         super().begin()
@@ -104,6 +107,8 @@ class FmuInstance(StepFailures):
             self.step = partial(self._step_marked, self._careful.step)
         if self._texts.variables:
             self.step = partial(self._step_and_note, self.step)
+        if self.fmi.in_process and not is_built_here(self.description.digest):
+            self.step = partial(self._step_guarded, self.step)
         if isinstance(self.step, partial):
             self.start_step, self.finish_step = self._ask, self._take
         self.read(self._began)
@@ -129,6 +134,10 @@ class FmuInstance(StepFailures):
     def _step_and_note(self, step: Callable[[float, float], None], t: float, h: float) -> None:
         step(t, h)
         self.call("reading its texts", self._texts.note, t + h)
+
+    def _step_guarded(self, step: Callable[[float, float], None], t: float, h: float) -> None:
+        with self.host:
+            step(t, h)
 
     def _step_marked(self, step: Callable[[float, float], None], t: float, h: float) -> None:
         self.is_stepping = True

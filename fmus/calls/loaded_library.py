@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from itertools import groupby
-from pathlib import Path
 from typing import Any, TypeVar
 from weakref import WeakSet
 
@@ -14,6 +12,7 @@ import numpy as np
 
 from ...blocks.core import FmuError, FmuFileError, FmuProcessError, FmuRuntimeError, UnknownNameError, near
 from ..archive import FmuVariable, inexact, unpack
+from ..host_state import HostState, guard_host
 from .fmi1 import Fmi1Calls
 from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
@@ -44,7 +43,7 @@ class LoadedFmu:
         self.log = MessageLog(block.label, list_limits(block.label, self.description))
         self._open = self._running = False
         self._began = 0.0
-        description, folder = self.description, Path.cwd()
+        description, self.host = self.description, HostState(self.add_note)
         if make_calls is None:
             self._refuse_second()
         make = make_calls or CALLS[description.fmi[0]]
@@ -53,6 +52,7 @@ class LoadedFmu:
         except FmuError as error:
             error.at(block=block.label)
             raise
+        self.host.__enter__()
         try:
             self.fmi = make(
                 name=block.label,
@@ -79,7 +79,7 @@ class LoadedFmu:
                 block=block.label,
             ) from error
         finally:
-            os.chdir(folder)  # FMPy stays in the binary's folder if loading fails
+            self.host.__exit__()  # FMPy stays in the binary's folder if loading fails, too
         self._open = True
         if description.only_once and self.fmi.in_process:
             _OPEN.add(self)
@@ -144,6 +144,7 @@ class LoadedFmu:
 
     # ---- initialization ----
 
+    @guard_host
     def initialize(
         self, stop_time: float | None, *, start_time: float = 0.0, values: Mapping[str, np.ndarray] | None = None
     ) -> None:
@@ -371,6 +372,7 @@ class LoadedFmu:
 
     # ---- the end ----
 
+    @guard_host
     def close(self) -> None:
         """Terminate and free the instance; what fails then is noted, as the run is complete."""
         if not self._open:

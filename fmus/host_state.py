@@ -1,0 +1,112 @@
+"""State of this process that a library can change for all: working folder, rounding mode, floating-point traps."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+
+_CONTROLS = {"x86_64": ((0, 2), (28, 32)), "aarch64": ((0, 4),)}
+"""Bytes of C's ``fenv_t`` that hold rounding modes and traps, by the machine; glibc's layout."""
+_FLAGS = 0x3F
+"""Bits of the last of them on x86_64 that tell past exceptions, which are no modes."""
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class _FloatingPoint:
+    """Rounding modes and traps of this thread, read and set by the C library."""
+
+    def __init__(self) -> None:
+        self.places = _CONTROLS.get(platform.machine().lower(), ()) if sys.platform == "linux" else ()
+        library = ctypes.CDLL("libm.so.6") if self.places else None
+        self.get: Callable[[Any], int] = getattr(library, "fegetenv", lambda at: 0)
+        self.set: Callable[[Any], int] = getattr(library, "fesetenv", lambda at: 0)
+
+    def modes(self, environment: Any) -> tuple[bytes, ...]:
+        """Return the modes in a ``fenv_t``."""
+        found = [environment.raw[start:stop] for start, stop in self.places]
+        if len(found) > 1:
+            found[-1] = bytes([found[-1][0] & ~_FLAGS]) + found[-1][1:]
+        return tuple(found)
+
+
+_floating_point: _FloatingPoint | None = None
+
+
+def _modes() -> _FloatingPoint:
+    global _floating_point  # noqa: PLW0603 (loaded at the first call: importing loads nothing)
+    if _floating_point is None:
+        _floating_point = _FloatingPoint()
+    return _floating_point
+
+
+class HostState:
+    """The state as it is at the start of a ``with`` statement; its end sets it back, and tells what has been changed.
+
+    Rounding modes and traps are kept on Linux alone.
+
+    Parameters
+    ----------
+    tell : callable
+        Told once for each thing that was changed.
+    """
+
+    def __init__(self, tell: Callable[[str], None]):
+        self._tell = tell
+        self._numbers, self._now = ctypes.create_string_buffer(64), ctypes.create_string_buffer(64)
+        self._floating_point = _modes()
+        self._told: set[str] = set()
+        self._folder = ""
+
+    def __enter__(self) -> HostState:
+        with suppress(OSError):  # a folder that has been removed
+            self._folder = os.getcwd()
+        self._floating_point.get(self._numbers)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        numbers = self._floating_point
+        numbers.get(self._now)
+        if numbers.modes(self._now) != numbers.modes(self._numbers):
+            numbers.set(self._numbers)
+            self._note("the rounding mode or the traps of floating-point numbers")
+        folder = ""
+        with suppress(OSError):
+            folder = os.getcwd()
+        if folder != self._folder and self._folder:
+            with suppress(OSError):
+                os.chdir(self._folder)
+            self._note("the working folder")
+
+    def _note(self, change: str) -> None:
+        if change not in self._told:
+            self._told.add(change)
+            self._tell(f"the FMU has changed {change} of this process; it was set back")
+
+
+class _Host(Protocol):
+    """Instance whose calls are guarded."""
+
+    @property
+    def host(self) -> HostState:
+        """The state of this process before its call."""
+
+
+H = TypeVar("H", bound=_Host)
+
+
+def guard_host(method: Callable[Concatenate[H, P], R]) -> Callable[Concatenate[H, P], R]:
+    """Let a method of an instance leave this process's state as it was."""
+
+    @wraps(method)
+    def guarded(self: H, /, *arguments: P.args, **options: P.kwargs) -> R:
+        with self.host:
+            return method(self, *arguments, **options)
+
+    return guarded

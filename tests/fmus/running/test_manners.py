@@ -1,0 +1,103 @@
+"""Manners of FMUs that were seen: changed modes of the process, threads that log, formats, names, ends."""
+
+import ctypes
+import os
+import sys
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Constant
+from loopwright.diagrams import Diagram
+from loopwright.fmus import Fmu
+from support.small_fmus import small_fmu, values
+
+# `fault` tells the place: 1 initialization, 2 step, 3 terminate; `kind` the thing: 1 rounding, 2 traps, 3 folder.
+CHANGES = (
+    """
+#include <pthread.h>
+#include <unistd.h>
+extern int feenableexcept(int);
+typedef struct { double t, stop; int fault, kind, threads; void (*log)(void *, const char *, int, const char *, const char *, ...); }
+    instance;
+typedef struct { void (*log)(void *, const char *, int, const char *, const char *, ...); void *rest[4]; } callbacks;
+void *fmi2Instantiate(const char *n, int type, const char *g, const char *r, const callbacks *f, int v, int logging) {
+    instance *c = calloc(1, sizeof(instance)); c->log = f->log; c->stop = -1; return c; }
+int fmi2SetupExperiment(void *p, int d, double tol, double t, int defined, double stop) {
+    if (defined) ((instance *)p)->stop = stop; return 0; }
+static void change(instance *c, int place) {
+    if (c->fault != place) return;
+    if (c->kind == 1) fesetround(FE_UPWARD);
+    if (c->kind == 2) feenableexcept(FE_DIVBYZERO);
+    if (c->kind == 3 && chdir("/")) abort(); }
+int fmi2EnterInitializationMode(void *p) { change(p, 1); return 0; }
+int fmi2Terminate(void *p) { change(p, 3); return 0; }
+static void *speak(void *p) { instance *c = p; c->log(c, "small", 1, "w", "%s%n of %d", "a thread", 7); return NULL; }
+int fmi2DoStep(void *p, double t, double h, int f) {
+    instance *c = p; c->t = t + h; change(c, 2);
+    if (c->stop >= 0 && c->t > c->stop) return 4;
+    if (c->threads) { pthread_t one; pthread_create(&one, NULL, speak, c); pthread_join(one, NULL); }
+    return 0; }
+"""
+    + values("fmi2", "Get", "Real", "double", {1: "c->t"})
+    + values("fmi2", "Get", "Integer", "int", {2: "c->fault", 3: "c->kind", 4: "c->threads"})
+    + values("fmi2", "Set", "Integer", "int", {2: "c->fault", 3: "c->kind", 4: "c->threads"})
+)
+MODEL = """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="true"/><ModelVariables>
+<ScalarVariable name="time" valueReference="1" causality="output"><Real/></ScalarVariable>
+<ScalarVariable name="fault" valueReference="2" causality="parameter" variability="fixed"><Integer start="0"/></ScalarVariable>
+<ScalarVariable name="kind" valueReference="3" causality="parameter" variability="fixed"><Integer start="0"/></ScalarVariable>
+<ScalarVariable name="threads" valueReference="4" causality="parameter" variability="fixed"><Integer start="0"/></ScalarVariable>
+</ModelVariables><ModelStructure><Outputs><Unknown index="1"/></Outputs></ModelStructure>"""
+KINDS = {1: "the rounding mode or the traps", 2: "the rounding mode or the traps", 3: "the working folder"}
+
+
+@pytest.fixture(scope="module")
+def file(cache, tmp_path_factory):
+    return small_fmu(tmp_path_factory.mktemp("manners"), "fmi2", CHANGES, MODEL)
+
+
+def modes():
+    library = ctypes.CDLL("libm.so.6")
+    return library.fegetround(), library.fegetexcept(), os.getcwd()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="modes are kept on Linux alone")
+@pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.parametrize(("place", "kind"), [(1, 1), (2, 1), (3, 1), (1, 2), (2, 2), (1, 3), (2, 3), (3, 3)])
+def test_modes_of_this_process_stay_as_they_are(file, place, kind, isolate):
+    before = modes()
+    plant = Fmu(file, name="plant", start={"fault": place, "kind": kind}, isolate=isolate)
+    run = Diagram("d", plant()).simulate(0.5, step=0.1, progress=False)
+    assert modes() == before
+    assert run["plant.time"] == pytest.approx(run.t, abs=1e-12)
+    said = [m for m in run.messages if m.endswith("of this process; it was set back")]
+    assert len(said) == (0 if isolate else 1)
+    assert isolate or f"plant: the FMU has changed {KINDS[kind]}" in said[0]
+    with np.errstate(divide="ignore"):
+        assert np.isinf(np.float64(1.0) / np.zeros(1))[0]  # a trap that stays would end this process
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_a_thread_of_the_fmu_may_log_with_any_format(file, isolate):
+    plant = Fmu(file, name="plant", start={"threads": 1}, isolate=isolate)
+    run = Diagram("d", plant()).simulate(0.2, step=0.1, progress=False)
+    said = [m for m in run.messages if "a thread" in m]
+    assert said == ["plant: warning: a thread%n of 7 (said 2 times)"]
+
+
+def test_an_output_may_be_called_time(file, tmp_path):
+    plant = Fmu(file, name="plant")
+    run = Diagram("d", 2.0 * plant.time, Constant(value=1.0)()).simulate(0.3, step=0.1, progress=False)
+    assert run["time"] == pytest.approx(run.t, abs=1e-15)
+    assert run["gain_of_plant.y"] == pytest.approx(2.0 * run.t, abs=1e-15)
+    run.to_csv(tmp_path / "run.csv")
+    assert (tmp_path / "run.csv").read_text().splitlines()[0].count("time") == 1
+    assert [*run.to_pandas()].count("plant.time") == 1
+
+
+@pytest.mark.parametrize("duration", [0.7, 0.3, 10 * 0.1])
+def test_no_step_passes_a_stop_time_that_was_told(file, duration):
+    """The FMU fails fatally where a step ends a rounding error beyond the end that it was told."""
+    run = Diagram("d", Fmu(file, name="plant")()).simulate(duration, step=0.1, progress=False)
+    assert run.t[-1] == pytest.approx(duration)
