@@ -15,12 +15,13 @@ a held signal then cuts no loop: there is no L.
 **Frequencies** are changed by less than half a sample in a window, so that whole periods fit into it.
 
 **Procedure.** The signal is ramped in over a window. Windows of whole periods follow, until the phasors of two of them
-agree or the largest number of windows is reached. Offset and drift are subtracted. The last window gives the result.
+agree, their distance is noise (it has stopped falling), or the largest number of windows is reached. Offset and drift
+are subtracted. The last window gives the result.
 The rest beside the lines is the distortion, a sign of an amplitude that leaves the linear range.
 
 **Uncertainty.** Three estimates are added up:
 
-- the distance of the last two windows: settling, and noise;
+- the distance of the last two windows: settling; where it is noise, the largest one of the last three;
 - twice the distance to a second measurement, with half the amplitude, the frequencies in reverse order, and a solver
   tolerance ten times smaller: nonlinearity, drift, and the solver's error;
 - the movement of the operating point from before the test signal to after it, less a uniform drift such as that of an

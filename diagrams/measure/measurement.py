@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -87,6 +87,14 @@ def _check_size(run: InjectionRun, part: Part, v: np.ndarray, largest: float) ->
     )
 
 
+def _is_noise(errors: Sequence[np.ndarray], agreement: float) -> bool:
+    """Whether distances of windows, one after the other, don't fall any more where they are too large."""
+    if len(errors) < 7:
+        return False
+    before, lately = np.min(errors[1:-3], axis=0), np.min(errors[-3:], axis=0)
+    return bool(np.all((lately >= 0.9 * before) | (errors[-1] <= agreement)))
+
+
 def measure_part(
     run: InjectionRun, part: Part, entry: int, j: int, every: int, windows: int, agreement: float,
     found: Measurement, i: int,
@@ -98,8 +106,8 @@ def measure_part(
     n = part.samples
     run.play(part.waveform, entry, ramp=n * every * float(run.flat.base))
     run.go(n, every)
-    last, error, count = None, np.full(len(part.lines), np.inf), 0
-    while count < windows and not np.all(error <= agreement):
+    last, count, errors = None, 0, [np.full(len(part.lines), np.inf)]
+    while count < windows and not np.all(errors[-1] <= agreement) and not _is_noise(errors, agreement):
         v, u, y = run.record(n, every)
         _check_size(run, part, v, found.largest)
         here, rest = compute_phasors(part, np.hstack([v, u, y]))
@@ -110,8 +118,10 @@ def measure_part(
                 size = np.linalg.norm(here[:, columns], axis=1)
                 change = np.linalg.norm((here - last)[:, columns], axis=1) + np.finfo(float).eps * np.max(np.abs(data))
                 error += change / np.where(size > 0.0, size, 1.0)
+            errors.append(error)
         last = here
     assert last is not None
+    error = np.max(errors[-3:], axis=0) if _is_noise(errors, agreement) else errors[-1]
     found.held &= run.held
     where = slice(i, i + 1) if found.v.shape[2] > len(part.lines) else slice(None)
     d = last[:, m + j] - last[:, j]  # u − v at the entry where it was added
@@ -120,4 +130,4 @@ def measure_part(
     found.uncertainty[where] = np.maximum(found.uncertainty[where], error)
     found.distortion[where] = np.maximum(found.distortion[where], rest)
     found.windows[where] = np.maximum(found.windows[where], count)
-    found.settled[where] &= error <= agreement
+    found.settled[where] &= errors[-1] <= agreement

@@ -64,7 +64,7 @@ def plan_signal(kind: str, omega: np.ndarray, dt: float, amplitude: float) -> It
     zero = np.zeros(1)
     if kind == "sine":
         for w in omega:
-            periods = max(2, math.ceil(SAMPLES * dt * w / (2.0 * np.pi)))
+            periods = max(1, math.ceil(SAMPLES * dt * w / (2.0 * np.pi)))
             n = round(2.0 * np.pi * periods / (w * dt))
             fits = np.array([2.0 * np.pi * periods / (n * dt)])
             yield Part(Waveform(zero + amplitude, fits, zero, zero, n * dt), n, np.array([periods]), fits, False)

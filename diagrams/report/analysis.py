@@ -91,7 +91,7 @@ def analyse(
     decibels, hertz : bool
         Whether magnitudes are drawn in dB, and over a frequency in Hz; without it plain, over rad/s.
     progress : callable, optional
-        Told the key of each section before it is made.
+        Told the key of each section before it is made, and of the injection check each measurement, too.
 
     Returns
     -------

@@ -24,6 +24,10 @@ AMPLITUDE = 1e-4
 """Size of the test signal of the injection check, relative to 1 + the size of the signal."""
 
 
+SAMPLES, SOLVED = 20_000, 1_000
+"""Samples at most in a period of the injection check, and those where a solver goes from one to the next."""
+
+
 class ReportedExperiment(Protocol):
     """An experiment, as a report's heading names it."""
 
@@ -114,6 +118,8 @@ class Case:
         Requirements on the design.
     axes : AxisUnits
         Units of the axes of frequency responses.
+    tell : callable
+        Told what is being done, where a section takes long.
     """
 
     inputs: tuple[str, ...] = ()
@@ -135,6 +141,7 @@ class Case:
         self.keys: tuple[str, ...] = ()
         self.requirements: Requirements | None = None
         self.axes = AxisUnits()
+        self.tell: Callable[[str], None] = lambda doing: None
         self.variants: dict[str, Variant] = {}
         own = self.own_delay()
         for basis in self.bases():
@@ -173,18 +180,23 @@ class Case:
                 yield variant
 
     def excitation(self, variant: Variant, wire: str) -> InjectionPlan:
-        """Return the test signal of the injection check: small, and spread around the poles of the diagram."""
+        """Return the test signal of the injection check: small, and spread around the poles of the diagram.
+
+        Where a diagram is much slower than its samples, it is spread above the poles: a period is not that long.
+        """
         dt = variant.model.dt
         w = np.abs(in_s(variant.model.poles, dt))
         fastest = np.pi / dt if dt else np.inf
         w = w[(w > 1e-6) & (w < 0.3 * fastest)]
         centre = float(np.median(w)) if len(w) else 0.03 * fastest if dt else 1.0
+        solved = bool(variant.diagram.flatten_like(variant.point).hybrid) if dt else False
+        lowest = max(centre / 10, 2 * np.pi / (dt * (SOLVED if solved else SAMPLES))) if dt else centre / 10
         source = variant.diagram.names.get(wire)
         path = wire if source is None else f"{source.block}.{source.port}"
         value = np.ravel(variant.point.values.get(path, 0.0))
         return InjectionPlan(
             variant,
-            np.geomspace(centre / 10, min(centre * 3, 0.5 * fastest), 5),
+            np.geomspace(lowest, min(max(centre * 3, lowest * 3), 0.5 * fastest), 5),
             AMPLITUDE * (1.0 + float(np.max(np.abs(value), initial=0.0))),
         )
 

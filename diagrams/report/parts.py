@@ -145,11 +145,13 @@ class ReportKind(Generic[C]):
         axes : AxisUnits
             Units of the axes of frequency responses.
         tell : callable
-            Told "variants" before the case is made, and the key of each section before it is made.
+            Told "variants" before the case is made, and the key of each section before it is made; of the injection
+            check each measurement, too.
         """
         tell("variants")
         case = self.case(diagram, point, experiment, wires, stairs)
         case.axes = axes
+        case.tell = tell
         if requirements is not None:
             case.requirements = requirements
             check_names(case, requirements)

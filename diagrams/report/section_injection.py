@@ -43,6 +43,7 @@ def injected(case: Case) -> Section | None:
                 text.append(TEXTS.line("moving", variant=v.title, wire=wire, **_moving(v)))
                 continue
             try:
+                case.tell(f"injection at {wire}, {v.title}")
                 L = v.loop(wire)  # a wire without a loop at one rate needs no measurement
                 found, model = _measured(case, v, wire)
                 deviation = found.deviation(model, "L")

@@ -1,0 +1,105 @@
+"""How long a measurement runs: as short as it settles, and no longer than its noise allows."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Constant, DiscreteIntegrator, TransferFunction
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.measure.measurement import Measurement, measure_part
+from loopwright.diagrams.measure.waveforms import SAMPLES, plan_signal
+from loopwright.diagrams.report import Case
+from loopwright.diagrams.report.case import SAMPLES as LONGEST
+from loopwright.diagrams.report.case import SOLVED
+
+
+class Windows:
+    """A run whose response is 1, and an error that is different in each window."""
+
+    def __init__(self, part, errors, size=1.0):
+        self.part, self.errors, self.size, self.played = part, iter(errors), size, 0
+        self.held = True
+        self.flat = type("Flat", (), {"base": 0.01})()
+
+    def play(self, *arguments, **options):
+        """Play nothing."""
+
+    def go(self, count, every):
+        """Go on."""
+
+    def record(self, n, every):
+        self.played += 1
+        d = np.sin(self.part.omega[0] * 0.01 * np.arange(n + 1))[:, None]
+        v = d * (1.0 + next(self.errors))
+        return v, v + d, np.zeros((n + 1, 0))
+
+
+def measured(errors, windows=40):
+    (part,) = plan_signal("sine", np.array([2.0]), 0.01, 1.0)
+    run, found = Windows(part, errors), Measurement(1, 1, 0)
+    measure_part(run, part, 0, 0, 1, windows, 1e-6, found, 0)
+    return run.played, found
+
+
+def test_a_window_has_one_period_where_that_is_enough_samples():
+    slow, fast = plan_signal("sine", np.array([0.3, 20.0]), 0.01, 1.0)
+    assert slow.samples == pytest.approx(2 * np.pi / 0.3 / 0.01, abs=1)
+    assert fast.samples >= SAMPLES
+    assert fast.samples * 0.01 * fast.omega[0] / (2 * np.pi) == pytest.approx(round(fast.samples * 0.2 / (2 * np.pi)))
+
+
+def test_it_ends_where_two_windows_agree():
+    played, found = measured([0.1 * 0.01**k for k in range(40)])
+    assert played == 5
+    assert found.settled[0]
+
+
+def test_a_slow_decay_is_waited_for():
+    played, found = measured([0.1 * 0.7**k for k in range(60)])
+    assert 25 < played < 40
+    assert found.settled[0]
+
+
+def test_noise_is_not_waited_for_and_is_in_the_uncertainty():
+    noise = 1e-4 * np.random.default_rng(3).standard_normal(40)
+    played, found = measured(noise)
+    assert played < 12
+    assert not found.settled[0]
+    assert found.uncertainty[0] > np.std(noise)
+
+
+def sampled(tau, T, held):
+    """A loop of an integrator on a clock; its plant is continuous, or all of it is sampled."""
+
+    @subsystem(sample_time=T)
+    def controller(y):
+        return DiscreteIntegrator(name="integral")((Constant(value=0.0, name="r") - y) / tau)
+
+    @subsystem(sample_time=T)
+    def both(unused):
+        integral = DiscreteIntegrator(name="integral")
+        return integral(((Constant(value=0.0, name="r") - integral.y) / tau).named("u"))
+
+    if held:
+        return Diagram("d", both(Constant(value=0.0, name="nothing")))
+    plant = TransferFunction(numerator=[1.0], denominator=[0.2 * tau, 1.0], name="plant")
+    return Diagram("d", plant(controller(plant.y).named("u")))
+
+
+@pytest.mark.parametrize(("held", "most"), [(False, SOLVED), (True, LONGEST)])
+def test_a_report_adds_no_sine_that_takes_for_ever(held, most):
+    """A loop that is a million times slower than its samples: periods have a bounded number of them."""
+    case = Case(sampled(1000.0, 0.001, held))
+    variant = case.variants["sampled_d0"]
+    frequencies = case.excitation(variant, next(iter(case.loop_wires().values()))).frequencies
+    assert len(frequencies) == 5
+    assert 2 * np.pi / frequencies[0] / 0.001 <= most * (1 + 1e-12)
+    assert frequencies[-1] < 0.5 * np.pi / 0.001 * (1 + 1e-12)
+    assert frequencies[-1] > 2 * frequencies[0]
+
+
+def test_a_loop_as_fast_as_its_samples_is_measured_around_its_poles():
+    case = Case(sampled(0.05, 0.01, True))
+    variant = case.variants["sampled_d0"]
+    frequencies = case.excitation(variant, next(iter(case.loop_wires().values()))).frequencies
+    pole = -np.log(1 - 0.01 / 0.05) / 0.01
+    assert frequencies[0] == pytest.approx(pole / 10, rel=1e-6)
