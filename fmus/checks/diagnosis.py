@@ -13,6 +13,12 @@ from .summary import INTERFACES
 from .trial import RUNS
 
 _CONTROL = {code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0)) if chr(code) not in "\n\t"}
+_CAUSALITIES = {
+    "local": "local variable",
+    "independent": "independent variable",
+    "structuralParameter": "structural parameter",
+    "calculatedParameter": "calculated parameter",
+}
 _MOST = 5
 """Findings of one kind that the text shows."""
 
@@ -137,7 +143,7 @@ class FmuDiagnosis:
         kinds = ", ".join(INTERFACES[kind] for kind in s["interfaces"]) or "no interface"
         yield "model", f"{s['model_name']}, FMI {s['fmi_version']}, {kinds}"
         yield "made by", s["generation_tool"] or "(not said)"
-        held = [f"{n} {name}{'s' if n > 1 and name != 'local' else ''}" for name, n in self.counts.items()]
+        held = [f"{n} {_CAUSALITIES.get(name, name)}{'s' if n > 1 else ''}" for name, n in self.counts.items()]
         n = s["continuous_states"]
         states = f"{n or 'no'} continuous state{'' if n == 1 else 's'}"
         yield "variables", f"{', '.join(held) or 'none'}; {states}"

@@ -263,8 +263,6 @@ def _try(
     if hopeless:
         return FmuTrial(kind, ran=False, left="it can't run here"), None
     left = reason_not_to_run(kind, attributes, folders)
-    if not left and summary["fmi_version"] == "1.0":
-        left = "its version, FMI 1.0, is not tried"
     if not left and run is None and attributes.get("needsExecutionTool") in (True, 1):
         left = "it needs another program, and may take a licence; --run tries it"
     if not left and run is False:
