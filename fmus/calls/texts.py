@@ -33,10 +33,15 @@ def write_text(fmi: FmiCalls, variable: OtherVariable, value: Text) -> None:
 def list_limits(label: str, about: FmuDescription) -> list[str]:
     """Return messages on ports that are neither read nor set, and on a description that breaks rules."""
     ins, outs = (about.other_ports(causality) for causality in ("input", "output"))
-    outs = [v for v in outs if not v.is_text]
+    outs, clocks = [v for v in outs if not v.is_text], [v for v in ins if v.type_is_clock]
+    ins = [v for v in ins if not v.type_is_clock]
     parts = [f"the outputs {', '.join(map(str, outs))} are not recorded"] if outs else []
     parts += [f"the inputs {', '.join(map(str, ins))} keep their start values"] if ins else []
     found = [f"{label}: no wire carries texts, binaries and clocks: {'; '.join(parts)}"] if parts else []
+    still = [v for v in clocks if not about.has_event_mode or v.interval_variability == "triggered"]
+    if still:
+        why = "triggered clocks are not driven" if about.has_event_mode else "the FMU has no Event Mode (hasEventMode)"
+        found.append(f"{label}: the clocks {', '.join(map(str, still))} never tick: {why}")
     if about.complaints:
         more = f", and {len(about.complaints) - 1} more" if len(about.complaints) > 1 else ""
         found.append(

@@ -119,6 +119,42 @@ def test_periodic_clocks_tick_at_their_times_whatever_the_step(clocked):
         assert run["plant.beats"].tolist() == [1.0, *[np.floor((t - 1e-9) / 0.15) + 1.0 for t in run.t[1:]]]
 
 
+def test_a_countdown_clock_ticks_when_the_fmu_says(folder):
+    """From the time event at 0.25 s on, the FMU counts down 0.18 s, once."""
+    clock = CLOCK.replace('"constant" intervalDecimal="0.15"', '"countdown"')
+    counts = """
+int fmi3GetIntervalDecimal(void *p, const unsigned vr[], size_t n, double v[], int q[]) {
+    instance *c = p; bool now = c->mode == 1 && fabs(c->t - 0.25) < 1e-9; v[0] = 0.18; q[0] = now ? 2 : c->t > 0.25; return 0; }
+int fmi3SetClock(void *p, const unsigned vr[], size_t n, const bool v[]) {
+    instance *c = p; c->beats++; c->level = c->t; return c->mode == 1 && vr[0] == 8 ? 0 : 3; }
+int unused("""
+    source = EVENTS.replace("int fmi3SetClock(", counts)
+    file = small_fmu(
+        folder, "fmi3", source, MODEL.format(clock=clock, outputs=OUTPUTS, variable="true"), name="countdown"
+    )
+    run = simulate(Fmu(file, name="plant"), level=Constant(value=0.0))
+    assert run["plant.beats"].tolist() == [0.0] * 5 + [1.0] * 6
+    assert run["plant.seen"][-1] == pytest.approx(0.43, abs=1e-12)
+
+
+def test_a_tunable_parameter_changes_in_event_mode(folder):
+    row = '<Int32 name="level" valueReference="9" causality="parameter" variability="tunable" start="0"/>'
+    model = re.sub('<Int32 name="level".*?/>', row, MODEL)
+    file = small_fmu(folder, "fmi3", EVENTS, model.format(clock="", outputs=OUTPUTS, variable="true"), name="tunable")
+    ports = ["x", "u", "seen", "level"]
+    run = simulate(Fmu(file, name="plant", stepping=StepOptions(event_mode=True), ports=ports))
+    assert run["plant.seen"].tolist() == [*[1.0] * 4, *[2.0] * 7]
+
+
+def test_clocks_that_never_tick_are_told(folder):
+    clock = CLOCK.replace('"constant" intervalDecimal="0.15"', '"triggered"')
+    file = small_fmu(folder, "fmi3", EVENTS, MODEL.format(clock=clock, outputs=OUTPUTS, variable="true"), name="still")
+    run = simulate(Fmu(file, name="plant"), level=Constant(value=0.0))
+    assert run["plant.beats"][-1] == 0.0
+    text = "plant: the clocks beat (triggered Clock) never tick: triggered clocks are not driven"
+    assert text in run.messages
+
+
 def test_a_clock_between_the_steps_of_an_fmu_with_even_steps_is_refused(folder):
     file = small_fmu(folder, "fmi3", EVENTS, MODEL.format(clock=CLOCK, outputs=OUTPUTS, variable="false"), name="even")
     with pytest.raises(FmuRuntimeError, match=r"^plant, t = 0\.1 s: its clock beat ticks at 0\.15 s, between two") as e:

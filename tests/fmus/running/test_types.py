@@ -256,7 +256,7 @@ def test_variables_that_no_wire_carries_are_said(file3):
     assert "without ports for path (String), blob (Binary), tick (triggered Clock)" in repr(plant)
     run = Diagram("d", plant(**rest(plant))).simulate(0.01, step=0.01, progress=False)
     assert run.messages == (
-        "plant: no wire carries texts, binaries and clocks: the inputs tick (triggered Clock) keep their start values",
+        "plant: the clocks tick (triggered Clock) never tick: the FMU has no Event Mode (hasEventMode)",
         "plant: blob (Binary) is not recorded: the library has no fmi3GetBinary",
     )
 
