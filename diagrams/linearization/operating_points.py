@@ -27,9 +27,26 @@ MORE = {"linearize": ("inputs", "outputs", "openings", "plants", "stairs"), "ope
 
 
 def capture(simulation: Simulation, how: PointOrigin = PointOrigin.RUN) -> OperatingPoint:
-    """Return the operating point at the tick that a simulation has reached."""
+    """Return the operating point at the tick that a simulation has reached.
+
+    Raises
+    ------
+    OptionError
+        If an FMU of one step length is on its way from one communication point to the next.
+    """
     flat, view = simulation.flat, simulation.view
     plants = {path: plant.operating_point() for path, plant in view.plants.items()}
+    for path, reached in simulation.reached.items():
+        if reached != view.tick:
+            now, after = (float(k * flat.base) for k in (reached, flat.next_step(path, view.tick)))
+            raise OptionError(
+                f"at t = {view.t:g} s it is on its way from its communication point at {now:g} s to that at {after:g} "
+                "s, as it takes steps of one length only; expected an operating point at a communication point. Take "
+                f"one of these times, or step={float(flat.base):g}.",
+                block=path,
+                port="operating point",
+                t=view.t,
+            )
     values = {name: view.log[s].reshape(flat.log.shapes[name]).copy() for name, s in flat.log.slices.items()}
     point = OperatingPoint(
         view.t,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack
 from fractions import Fraction
 from typing import Any
@@ -158,6 +159,12 @@ class Simulation:
     def t(self) -> float:
         """Time that the run has reached in s."""
         return self._engine.position.t
+
+    @property
+    def reached(self) -> Mapping[str, int]:
+        """Tick that each plant has reached, by path: one between its communication points is behind the run."""
+        steps = self._engine.steps
+        return dict.fromkeys(steps.reached, self._engine.position.tick) if steps.regular else dict(steps.reached)
 
     @property
     def coupling(self) -> str:

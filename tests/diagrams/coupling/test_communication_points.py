@@ -211,3 +211,15 @@ def test_delays_of_an_fmu_with_a_longer_communication_step(cache):
     found = {c.target: c for c in integral_control(own(4e-3)).report_coupling().connections}
     assert found["plant.force"].step == found["controller.integral.u"].step == 4e-3
     assert found["plant.force"].delay == found["controller.integral.u"].delay == pytest.approx(1.5e-3)  # 0, 1, 2, 3 ms
+
+
+def test_a_point_between_two_steps_of_an_fmu_of_one_length_is_refused(cache, monkeypatch):
+    one_step_only(monkeypatch)
+    diagram = spring(0.02, sampled(0.003, "fast")(Clock()))
+    with pytest.raises(
+        OptionError, match=r"^plant\.operating point, t = 0\.051 s: .* point at 0\.04 s to that at 0\.06 s"
+    ):
+        diagram.linearize(0.051)
+    assert diagram.operating_point(0.06).plants["plant"]["t"] == pytest.approx(0.06)
+    monkeypatch.undo()  # any other steps to the point
+    assert diagram.operating_point(0.051).plants["plant"]["t"] == pytest.approx(0.051)
