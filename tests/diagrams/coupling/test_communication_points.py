@@ -192,6 +192,26 @@ def test_an_fmu_has_a_communication_step_of_its_own(cache, steps, between):
         assert [z for z in seen.poles if abs(z) > 1e-9] == pytest.approx(found, abs=1e-9)
 
 
+def test_a_linear_model_holds_the_outputs_of_an_fmu_between_its_steps(cache):
+    """The acceleration that the controller sees is that under the force of the last step, not of the one that goes on."""
+    mass = own(4e-3)
+
+    @subsystem(sample_time=1e-3)
+    def controller(acceleration):
+        return Gain(gain=-200.0, name="gain")(Integrator(name="integral")(acceleration))
+
+    diagram = Diagram("d", mass(force=controller(mass.acceleration)))
+    big = np.zeros((3, 3))
+    big[:2, :2], big[:2, 2] = A, B
+    whole = expm(big * 4e-3)
+    M = np.zeros((4, 4))  # position, velocity, integral, force of the last step
+    M[:2, :2], M[:2, 2], M[3, 2] = whole[:2, :2], -200.0 * whole[:2, 2], -200.0
+    M[2] = 4e-3 * np.array([*A[1], 0.0, B[1]])
+    M[2, 2] = 1.0
+    found = [z for z in diagram.linearize().poles if abs(z) > 1e-9]
+    assert np.sort_complex(found) == pytest.approx(np.sort_complex(np.linalg.eigvals(M)), abs=1e-9)
+
+
 def test_an_own_communication_step_is_a_clock_and_must_fit_the_others(cache, steps):
     alone = own(0.01)
     run = Diagram("d", alone(force=0.0)).simulate(0.1, progress=False)
