@@ -20,6 +20,7 @@ from .fmi_calls import FATAL, FmiCalls
 from .fmu_block import FmuBlock
 from .message_log import MessageLog, clean_text
 from .process_ends import describe_end
+from .shared_reading import SharedReading
 from .step_options import allows_early_return, uses_event_mode
 from .texts import is_readable, list_limits, read_text, write_text
 
@@ -61,7 +62,7 @@ class LoadedFmu:
                 library=files / (description.model_exchange_binary if model_exchange else description.binary),
                 model_exchange=model_exchange,
             )
-            self._fmu, self.fmi.lose = self.fmi.fmu, self.lose
+            self._fmu, self.fmi.lose, self._reading = self.fmi.fmu, self.lose, SharedReading(self.fmi)
             self._check_version()
             self._choose_modes()
             self.fmi.instantiate(self.log.take)
@@ -295,13 +296,13 @@ class LoadedFmu:
             If the FMU's function fails, or a value is an integer that a float64 can't hold.
         """
         found: list[np.ndarray] = []
-        for type_, group in groupby(variables, key=lambda v: v.type):
-            alike = list(group)
-            n = sum(v.size for v in alike)
-            if not n:
-                continue
+        groups = [list(group) for _, group in groupby((v for v in variables if v.size), key=lambda v: v.type)]
+        together = self._reading.read(groups)
+        for k, alike in enumerate(groups):
             purpose = f"reading {', '.join(v.name for v in alike)}"
-            values = np.array(self.call(purpose, self.fmi.get, type_, [r for v in alike for r in v.references], n))
+            size, references = sum(v.size for v in alike), [r for v in alike for r in v.references]
+            given = together[k] if together else self.call(purpose, self.fmi.get, alike[0].type, references, size)
+            values = np.array(given)
             if alike[0].is_integer and inexact(values):
                 raise FmuRuntimeError(
                     f"{purpose}: found {values[[inexact(v) for v in values]][0]}; expected at most 2**53 in size, up "
