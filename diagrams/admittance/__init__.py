@@ -3,6 +3,7 @@
 from .compliance_loop import SIDES, AdmittanceLoop, control_rate
 from .contact import Contact, make_contact
 from .contact_admittance import ContactAdmittance
+from .contact_confirmation import ContactConfirmation, ContactTrial
 from .contact_limits import ContactLimit, ContactMap
 from .coupled import crossing_frequency, growth_rate, poles
 from .rendered import Passivity, passivity, rendered_admittance, rendered_response, rendered_system, target_admittance
@@ -21,8 +22,10 @@ __all__ = [
     "AdmittanceLoop",
     "Contact",
     "ContactAdmittance",
+    "ContactConfirmation",
     "ContactLimit",
     "ContactMap",
+    "ContactTrial",
     "Passivity",
     "StabilityLimit",
     "StabilityMap",

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ..flat import WiredDiagram
     from ..linearization import PointLike
     from ..results import OperatingPoint
+    from .contact_confirmation import ContactConfirmation
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +63,8 @@ class Contact:
     parts: ContactParts = field(repr=False)
     filter: AdmittanceFilter | None = field(default=None, repr=False)
     scale: float = 1.0
+    ports: Ports = field(default=Ports("plant", "external_force", "position", "velocity"), repr=False)
+    measured: str | None = field(default=None, repr=False)
 
     @property
     def sample_time(self) -> float:
@@ -166,6 +169,35 @@ class Contact:
         check_properties(environment, vary)
         return find_limit(self.parts, self.direction, vary, environment, low=low, high=high, per_decade=per_decade)
 
+    def confirm(self, limit: ContactLimit, *, push: float = 1e-6) -> ContactConfirmation:
+        """Run the nonlinear diagram at 0.97 and at 1.03 of a limit, with the environment inside the plant.
+
+        The environment joins the plant's own equations, in its own FMU or block; the controller is the diagram's. The
+        growth rate of the mode is measured, and compared with the linear loop's.
+
+        Parameters
+        ----------
+        limit : ContactLimit
+            Of `stability_limit`, finite and not 0.
+        push : float
+            Velocity in m/s with which the contact is set in motion; so small that friction and limits are linear.
+
+        Returns
+        -------
+        ContactConfirmation
+            Both growth rates, measured and predicted, and the amplitude that they hold for.
+
+        Raises
+        ------
+        OptionError
+            If the plant is none of the library, or the contact is not at the diagram's start.
+        ConfirmationError
+            If the runs contradict the limit.
+        """
+        from .contact_confirmation import confirm_limit
+
+        return confirm_limit(self, limit, push)
+
     def stability_map(
         self, x_values: Array, y_values: Array, *, x: str = "stiffness", y: str = "damping", **environment: float
     ) -> ContactMap:
@@ -213,7 +245,9 @@ def make_contact(
         point = _move_on(point)
         parts, _ = take_apart(diagram, ports, force, point, taken)
     unit, side, scale = _find_direction(diagram, point, ports, direction, parts.force.shape[1])
-    return Contact(diagram, ports.plant, unit, side, point, parts, _find_filter(diagram, side, len(unit)), scale)
+    return Contact(
+        diagram, ports.plant, unit, side, point, parts, _find_filter(diagram, side, len(unit)), scale, ports, force
+    )
 
 
 def _move_on(point: OperatingPoint) -> OperatingPoint:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError
-from ..admittance import SIDES, Contact, ContactLimit, StabilityLimit, make_contact
+from ...blocks.core import ConfirmationError, LoopwrightError, OptionError
+from ..admittance import SIDES, Contact, ContactConfirmation, ContactLimit, StabilityLimit, make_contact
 from ..frequency import Number, with_findings
 from ..linearization import StepsOnly
 from ..report import Implementation
@@ -19,6 +19,10 @@ from .report_figures import TARGET, draw_admittances
 
 TEXTS = Texts(__package__, "admittance")
 DAMPINGS = (0.0, 10.0, 100.0)
+TRIED_DAMPING = 10.0
+"""Damping in N·s/m of the environment at which limits are tried in the nonlinear run."""
+PUSHES = (1e-6, 1e-8, 1e-10)
+"""Velocities in m/s that set it in motion."""
 SPRING = 10.0
 """Spring in N/m that holds a mass where the admittance has no stiffness."""
 Contacts = Mapping[str, Mapping[Implementation, Contact]]
@@ -63,13 +67,15 @@ def _side(variants: Mapping[Implementation, Contact], side: str, titles: Mapping
         ("stiffness", a.stiffness, "N/m"),
     ):
         numbers[f"target.{name}"] = Number(value, unit, 1e-15 * abs(value), "given", given=True)
+    tried, said = _tried(variants, numbers, titles)
     tables = (
         _passivity(variants, numbers, titles),
         _limits(variants, numbers, titles),
         _masses(variants, a.stiffness > 0, numbers, titles),
+        *tried,
     )
     symbol = "along the path, ∥" if side == "par" else "across the path, ⊥"
-    text = (*TEXTS.paragraphs("asked_of", filter=a, scale=one.scale), one.passivity().caveat)
+    text = (*TEXTS.paragraphs("asked_of", filter=a, scale=one.scale), one.passivity().caveat, *said)
     return Section(side, f"Direction {symbol}", text, tables, (_rendered(variants, side, titles),), numbers)
 
 
@@ -104,6 +110,49 @@ def _limits(variants: Mapping[Implementation, Contact], numbers: dict[str, Numbe
             rows.append((titles.get(name, name), f"{b:g} N·s/m", *shown))
     columns = ("variant", "b_e", "largest k_e", "oscillates at", "moves", "stable again")
     return Table("Largest stiffness of the environment", columns, tuple(rows))
+
+
+def _tried(
+    variants: Mapping[Implementation, Contact], numbers: dict[str, Number], titles: Mapping[str, str]
+) -> tuple[list[Table], list[str]]:
+    """Return the table of limits that were tried in the nonlinear run, and why others were not.
+
+    Raises
+    ------
+    ConfirmationError
+        If the run contradicts a limit however small the push.
+    """
+    rows, said = [], dict[str, None]()
+    for name, contact in variants.items():
+        limit = contact.stability_limit("stiffness", damping=TRIED_DAMPING)
+        if not (math.isfinite(limit.value) and limit.value > 0.0):
+            continue
+        try:
+            found = _smallest_push(contact, limit)
+        except OptionError as error:
+            said[str(error)] = None
+            continue
+        for where, trial in zip(("below", "above"), found.trials, strict=True):
+            path = f"tried.ke_limit.{name}.be_{TRIED_DAMPING:g}.{where}.growth_rate"
+            how = "the nonlinear run with the environment inside the plant, beside the linear loop's poles"
+            numbers[path] = Number(trial.measured, "1/s", found.within, how)
+            rows.append(
+                (titles.get(name, name), f"{trial.factor:g}", f"{trial.value:.6g} N/m", numbers[path],
+                 f"{trial.predicted:.4g} 1/s", f"{trial.fastest:.2g} m/s")
+            )  # fmt: skip
+    columns = ("variant", "of the limit", "k_e", "growth rate, measured", "predicted", "speeds up to")
+    title = f"Limits of stiffness at b_e = {TRIED_DAMPING:g} N·s/m, tried in the nonlinear run"
+    return ([Table(title, columns, tuple(rows))] if rows else []), list(said)
+
+
+def _smallest_push(contact: Contact, limit: ContactLimit) -> ContactConfirmation:
+    """Return the confirmation by the largest push that leaves the diagram linear."""
+    for push in PUSHES[:-1]:
+        try:
+            return contact.confirm(limit, push=push)
+        except ConfirmationError:
+            continue  # friction that is linear at smaller amplitudes alone, such as bristles that hold
+    return contact.confirm(limit, push=PUSHES[-1])
 
 
 def _masses(

@@ -157,3 +157,15 @@ def test_an_arm_has_the_limits_of_its_own_matrices(direction, vary, held):
     expected = brentq(growth, 0.9 * found.value, 1.1 * found.value, xtol=1e-300, rtol=1e-14)
     assert found.value == pytest.approx(expected, rel=1e-9)
     assert found.growth_below == pytest.approx(growth(0.97 * found.value), rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("vary", "held"), [("stiffness", {"damping": 5.0}), ("mass", {"stiffness": 50.0})])
+def test_an_arms_limits_hold_in_the_nonlinear_run_with_the_environment_inside(vary, held):
+    ports = {"position": "arm.position", "velocity": "arm.velocity", "force": "felt"}
+    here = arm_diagram().contact("arm.external_force", direction=(0.6, 0.8), **ports)
+    found = here.confirm(here.stability_limit(vary, **held), push=1e-8)
+    names = {"stiffness": 0.0, "damping": 0.0, "mass": 0.0, **held}
+    k, b, m = (names | {vary: found.above.value}).values()
+    assert found.above.measured == pytest.approx(arm_growth(k, b, m, np.array((0.6, 0.8))), rel=0.02)
+    assert found.below.measured < 0 < found.above.measured

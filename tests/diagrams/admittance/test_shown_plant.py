@@ -339,7 +339,7 @@ def test_a_report_of_another_plant_has_the_limits_of_its_contact_and_says_why(pl
     words = section(found, "admittance")
     assert words.text[0].startswith("The admittance Y(jω)")
     assert words.text[-1] == refusal(diagram(plant))
-    assert "none was tried in time domain" in to_html(found)
+    assert "tried in the nonlinear run" in to_html(found)
     kind = plant.__name__.rpartition("_")[2]
     for side in SIDES:
         limit = numbers[f"admittance.{side}.ke_limit.sampled_d0.be_0"]

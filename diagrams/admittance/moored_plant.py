@@ -1,0 +1,259 @@
+"""Diagrams whose plant has an environment inside: spring, damper and mass as a part of the plant's own equations.
+
+An FMU of a plant of the library is built anew, with the environment in it. It keeps the parameters and start values of
+the diagram's FMU. A plant that is a block of the diagram is replaced by one with the environment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks import Constant, ForceSensor, Reference, Sum
+from ...blocks.core import Array, Block, OptionError, Output, Source, parameter
+from ...fmus.export import build
+from ...fmus.models import gantry, gantry_elastic, gantry_stiction, scara
+from ...fmus.running import Fmu
+from ..linearization import find_signal
+from ..wiring import Wire
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ..flat import WiredDiagram
+
+INTERNAL_STEP = 1e-4
+"""Longest internal step in s of an FMU with an environment: its contact is faster than the plant alone."""
+LIBRARY = {
+    model.__name__.rpartition(".")[2]: type(model.nominal) for model in (gantry, gantry_elastic, gantry_stiction, scara)
+}
+"""Plants of the library with a force port, by the names of their FMUs' models."""
+FORCE = "environment_force"
+"""Output with the force of the environment."""
+
+
+@dataclass(frozen=True)
+class Mooring:
+    """An environment that is put into a plant.
+
+    Attributes
+    ----------
+    direction, anchor : ndarray
+        Unit vector along which it acts, and the place where its spring is relaxed.
+    stiffness, damping, mass : float
+        Its properties, N/m, N·s/m and kg.
+    kick, kick_time : float
+        A force in N in its direction in the first seconds, which sets it in motion.
+    """
+
+    direction: np.ndarray
+    anchor: np.ndarray
+    stiffness: float = 0.0
+    damping: float = 0.0
+    mass: float = 0.0
+    kick: float = 0.0
+    kick_time: float = 0.0
+
+    def parameters(self) -> dict[str, Any]:
+        """Return the parameters of a moored plant."""
+        names = ("direction", "anchor", "stiffness", "damping", "mass", "kick", "kick_time")
+        return {f"environment_{name}": getattr(self, name) for name in names}
+
+
+class _Pushed:
+    """Inputs of a plant, with another force at one port."""
+
+    def __init__(self, u: Any, port: str, force: Any):
+        self._inputs, self._port, self._force = u, port, force
+
+    def __getattr__(self, name: str) -> Any:
+        return self._force if name == self._port else getattr(self._inputs, name)
+
+
+def moor(plant: type[Block], port: str, position: str, velocity: str) -> type[Block]:
+    """Return the class of a plant with an environment inside, by the plant's own equations.
+
+    Parameters
+    ----------
+    plant : type of Block
+        Class of the plant: its acceleration is affine in the force.
+    port, position, velocity : str
+        Its ports of the force, and of position and velocity at the contact.
+    """
+
+    def read(block: Block, t: Array, x: Any, u: Any, name: str) -> Any:
+        if name in block.states:
+            return getattr(x, name)
+        own = [output for output in block.outputs if output not in block.states and output != FORCE]
+        found = plant.output(block, t, x, u)  # type: ignore[attr-defined]
+        return (found if isinstance(found, tuple) else (found,))[own.index(name)]
+
+    def rate(block: Block, t: Array, x: Any, u: Any) -> Any:
+        """Return the acceleration of the contact: the velocity's derivative, or the output of that name."""
+        if velocity in block.states:
+            found = plant.derivative(block, t, x, u)  # type: ignore[attr-defined]
+            return (found if isinstance(found, tuple) else (found,))[list(block.states).index(velocity)]
+        return read(block, t, x, u, "acceleration")
+
+    class MooredPlant(plant):  # type: ignore[valid-type,misc]
+        """The plant with an environment in one direction."""
+
+        environment_direction: Array = parameter(default=(1.0, 0.0), shape=(2,), unit="1", description="unit vector")
+        environment_anchor: Array = parameter(default=(0.0, 0.0), shape=(2,), unit="m", description="spring is relaxed")
+        environment_stiffness: float = parameter(default=0.0, unit="N/m", description="stiffness k_e")
+        environment_damping: float = parameter(default=0.0, unit="N.s/m", description="damping b_e")
+        environment_mass: float = parameter(default=0.0, unit="kg", description="mass m_e")
+        environment_kick: float = parameter(default=0.0, unit="N", description="force at the beginning")
+        environment_kick_time: float = parameter(default=0.0, unit="s", description="end of that force")
+        environment_force = Output(shape=(2,), unit="N", description="force of the environment on the plant")
+
+        def moored_force(self, t: Array, x: Any, u: Any) -> Array:
+            """Return the force of the environment; a mass moves along, which is solved for the force."""
+            d = self.environment_direction
+            p, v = (read(self, t, x, u, name) for name in (position, velocity))
+            f = np.where(t < self.environment_kick_time, self.environment_kick, 0.0)
+            f = (
+                f
+                - self.environment_stiffness * (d @ (p - self.environment_anchor))
+                - self.environment_damping * (d @ v)
+            )
+            there = [_Pushed(u, port, getattr(u, port) + d * force) for force in (0.0, 1.0)]
+            a0, a1 = (d @ rate(self, t, x, pushed) for pushed in there)
+            return d * ((f - self.environment_mass * a0) / (1.0 + self.environment_mass * (a1 - a0)))
+
+        def _moored(self, t: Array, x: Any, u: Any) -> tuple[_Pushed, Array]:
+            force = self.moored_force(t, x, u)
+            return _Pushed(u, port, getattr(u, port) + force), force
+
+        def derivative(self, t: Array, x: Any, u: Any) -> Any:
+            """Return the plant's own derivative under the force."""
+            return plant.derivative(self, t, x, self._moored(t, x, u)[0])  # type: ignore[attr-defined]
+
+        def output(self, t: Array, x: Any, u: Any) -> Any:
+            """Return the plant's own outputs under the force, and the force; nothing has acted yet at the start."""
+            pushed, force = self._moored(t, x, u)
+            found = plant.output(self, t, x, pushed)  # type: ignore[attr-defined]
+            found = found if isinstance(found, tuple) else (found,)
+            return *found, np.where(t > 0.0, force, 0.0 * force)
+
+    return MooredPlant
+
+
+@cache
+def _moored_file(name: str, port: str, position: str, velocity: str) -> Path:
+    """Return the FMU of a plant of the library with an environment inside."""
+    return build(moor(LIBRARY[name], port, position, velocity)(), name=f"moored_{name}", internal_step=INTERNAL_STEP)
+
+
+def library_class(block: Block) -> type[Block] | None:
+    """Return the class of the plant of the library that a block is, or is the FMU of by its name; None for others."""
+    if not isinstance(block, Fmu):
+        known = [cls for cls in LIBRARY.values() if type(block) is cls]
+        return known[0] if known else None
+    found = LIBRARY.get(block.description.model_name)
+    parameters = {name for name in (found.parameter_specs if found else ()) if name[:6] != "start_"}
+    return found if found is not None and parameters <= set(block.description.variables) else None
+
+
+def moored_diagram(
+    diagram: WiredDiagram,
+    plant: str,
+    ports: tuple[str, str, str],
+    measured: str | None,
+    mooring: Mooring,
+    tool_mass: float | None = None,
+) -> WiredDiagram:
+    """Return a diagram with an environment inside its plant; the measured force has the environment's.
+
+    Parameters
+    ----------
+    diagram : WiredDiagram
+        The diagram.
+    plant : str
+        Path of its plant, one of the library.
+    ports : (str, str, str)
+        Ports of force, position and velocity at the contact.
+    measured : str, optional
+        Wire of the measured force.
+    mooring : Mooring
+        The environment.
+    tool_mass : float, optional
+        Mass beyond the force sensor in kg; the diagram's own without it.
+
+    Raises
+    ------
+    OptionError
+        If the plant is none of the library, or measures the force itself.
+    """
+    block = diagram.blocks[plant]
+    cls = library_class(block)
+    if cls is None:
+        raise OptionError(
+            f"found {type(block).__name__}, which is no plant of the library; expected one of {', '.join(LIBRARY)}.",
+            block=plant,
+        )
+    table = diagram.scheduled.copy()
+    for path, settings in table.subsystems.items():
+        table.subsystems[path] = replace(settings, delay=0)  # the delays have become blocks
+    if isinstance(block, Fmu):
+        names = {new: old for old, new in block.rename.items()}
+        force, position, velocity = (names.get(port, port) for port in ports)
+        file = _moored_file(block.description.model_name, force, position, velocity)
+        table.blocks[plant] = block.replace(file=file, start={**_own_start(block, cls), **mooring.parameters()})
+    else:
+        values = {name: getattr(block, name) for name in cls.parameter_specs}
+        made: Any = moor(cls, *ports)
+        table.blocks[plant] = made(**{k: v for k, v in values.items() if v is not None}, **mooring.parameters(),
+                                   name=block.label)  # fmt: skip
+    if tool_mass is not None:
+        for path, sensor in table.blocks.items():
+            if isinstance(sensor, ForceSensor):
+                table.blocks[path] = sensor.replace(tool_mass=tool_mass)
+    if measured is not None:
+        signal = find_signal(diagram.flatten(), measured)
+        source = signal.port
+        if source[0] == plant:
+            raise OptionError(
+                f"found {measured!r}, which the plant measures itself; expected a sensor outside of it.", block=plant
+            )
+        total = "environment_sum"
+        while total in table.blocks or total in table.subsystems:
+            total += "_"
+        for group in (table.wires, table.controls):
+            for key, wire in list(group.items()):
+                if (wire.block, wire.port) == source:
+                    group[key] = Wire(total, "y", wire.index)  # type: ignore[index]
+        table.blocks[total], table.subsystem_of[total] = Sum(name=total), ""
+        table.wires[total, "u1"], table.wires[total, "u2"] = Wire(*source), Wire(plant, FORCE)
+    return diagram.with_structure(table)
+
+
+def _own_start(block: Fmu, cls: type[Block]) -> Mapping[str, Any]:
+    """Return the values of an FMU's parameters and states, as start values of another FMU of the plant."""
+    known = block.description.variables
+    names = [name for name in (*cls.parameter_specs, *_states(cls)) if name in known and name[:6] != "start_"]
+    found = {name: known[name].start for name in names if known[name].start is not None}
+    own = {name: value for name, value in block.start.items() if name in {*known} - {"internal_step"}}
+    return {**found, **own}
+
+
+def _states(cls: type[Block]) -> tuple[str, ...]:
+    return tuple(cls().states)
+
+
+def hold_sources(diagram: WiredDiagram, values: Mapping[str, Any]) -> WiredDiagram:
+    """Return a diagram whose sources stand still, at their values at an operating point."""
+    changes: dict[str, Any] = {}
+    for path, block in diagram.blocks.items():
+        if isinstance(block, Source) and not isinstance(block, Constant | Reference) and f"{path}.y" in values:
+            value = np.asarray(values[f"{path}.y"], dtype=float)
+            name = path.rpartition(".")[2]
+            if type(block).y.shape == (3,):
+                changes[path] = Reference(float(value[0]), unit=block.unit, name=name)
+            else:
+                changes[path] = Constant(value=value, unit=block.unit, name=name)
+    return diagram.replace(changes) if changes else diagram
