@@ -36,6 +36,7 @@ class FmuFault(StrEnum):
     DIMENSION = "impossible dimension"
     EXPERIMENT = "impossible default experiment"
     STANDARD = "violation of the standard"
+    NAME = "name with another meaning elsewhere"
     # the libraries
     NO_BINARY = "no binary for this platform"
     OTHER_NAME = "library with another name"
@@ -46,6 +47,7 @@ class FmuFault(StrEnum):
     MISSING_SYMBOL = "missing function"
     UNDEFINED_SYMBOL = "undefined symbol"
     # running
+    LOADING = "refused to be loaded or instantiated"
     TOOL = "needs another program"
     PYTHON = "needs Python"
     TRIAL = "failed trial run"

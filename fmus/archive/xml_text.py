@@ -41,7 +41,7 @@ def parse_xml(path: Path, name: str, text: bytes) -> Any:
         raise FmuFileError(
             f"the {name} of {str(path)!r} "
             + ("defines XML entities, which may be made to fill the memory" if bomb else "is no XML")
-            + f": {error}. Export the FMU again.",
+            + f": {error.msg}. Export the FMU again.",
             fault=FmuFault.ENTITY if bomb else FmuFault.XML,
             subject=name,
         ) from None

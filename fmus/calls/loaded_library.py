@@ -11,7 +11,7 @@ from weakref import WeakSet
 import numpy as np
 
 from ...blocks.core import FmuError, FmuFileError, FmuProcessError, FmuRuntimeError, UnknownNameError, near
-from ..archive import FmuVariable, inexact, unpack
+from ..archive import FmuFault, FmuVariable, inexact, unpack
 from ..host_state import HostState, guard_host
 from .fmi1 import Fmi1Calls
 from .fmi2 import Fmi2Calls
@@ -75,8 +75,10 @@ class LoadedFmu:
         except Exception as error:
             self._end_calls()
             raise FmuFileError(
-                f"the FMU {str(description.file)!r} can't be loaded: {error}{self._quote_messages()} Check it with "
-                f"'fmpy validate {description.file}'.",
+                f"the FMU {str(description.file)!r} can't be loaded: {error}{self._quote_messages()} Look for "
+                f"its fault with 'loopwright doctor {description.file}'.",
+                fault=FmuFault.LOADING,
+                subject=description.identifier,
                 block=block.label,
             ) from error
         finally:

@@ -77,8 +77,9 @@ def doctor(
     except FmuFileError as error:
         reason = _as_error(error, path)
         return FmuDiagnosis(str(path), _decide([reason], [], []), (reason,))
-    counts = Counter(v["causality"] for v in summary.pop("variables"))
-    found = [*_judge_platform(archive, summary), *_judge_content(summary)]
+    variables = summary.pop("variables")
+    counts = Counter(v["causality"] for v in variables)
+    found = [*_judge_platform(archive, summary), *_judge_content(summary), *_judge_names(variables)]
     found += _judge_rules(path, archive, found)
     errors = [a for a in found if a.severity == FmuSeverity.ERROR]
     trials: list[FmuTrial] = []
@@ -217,6 +218,18 @@ def _judge_content(summary: Mapping[str, Any]) -> Iterator[FmuFinding]:
     start, stop = numbers.get("start_time", 0.0), numbers.get("stop_time", math.inf)
     if stop < start:
         yield _experiment("stop_time", f"stops at {stop:g} s, before its start at {start:g} s", "a later")
+
+
+def _judge_names(variables: list[dict[str, Any]]) -> Iterator[FmuFinding]:
+    for v in variables:
+        if v["name"] == "time" and v["causality"] != "independent":
+            yield FmuFinding(
+                FmuFault.NAME,
+                "time",
+                f"its {v['causality']} 'time' is a variable, and not the time of the simulation.",
+                "It is recorded under its block's name here; other tools may mix them up: rename it there.",
+                FmuSeverity.NOTE,
+            )
 
 
 def _number(value: Any) -> float:

@@ -4,10 +4,13 @@ import json
 import re
 import sys
 
+import numpy as np
 import pytest
 
+from loopwright.blocks import FmuFileError
+from loopwright.diagrams import Diagram
 from loopwright.diagrams.cli import main
-from loopwright.fmus import FmuFault, FmuSeverity, FmuVerdict, doctor, mass_spring_damper
+from loopwright.fmus import Fmu, FmuFault, FmuSeverity, FmuVerdict, doctor, mass_spring_damper
 from loopwright.fmus.platform import native_platform
 from support.hostile import CASES, XML, binaries, described, good_files, library, packed, without_library
 from support.zoo import zoo_fmu
@@ -151,6 +154,35 @@ def test_an_fmu_of_many_variables_is_examined_in_time(examine):
     bad = described(convention, (r"</ModelVariables>", row + r"\g<0>"))
     (found,) = findings(examine(bad), FmuFault.STANDARD)
     assert found.found.startswith('The variable "a b" (line')
+
+
+def test_an_output_that_is_called_time_runs_and_is_told(good, tmp_path):
+    """Its values are those of the output, not of the time."""
+    path = tmp_path / "plant.fmu"
+    rename = ((r'name="time"', 'name="t0"'), (r'name="position"', 'name="time"'))
+    path.write_bytes(described(*rename)(good))
+    (note,) = findings(doctor(path, run=False), FmuFault.NAME)
+    assert note.severity == FmuSeverity.NOTE
+    other = tmp_path / "other.fmu"
+    other.write_bytes(packed(good))
+    values = [
+        Diagram("d", Fmu(file, name="plant", start={"force": 1.0}, isolate=False)()).simulate(
+            0.01, step=1e-3, progress=False
+        )[f"plant.{name}"]
+        for file, name in ((path, "time"), (other, "position"))
+    ]
+    assert np.array_equal(*values)
+
+
+def test_a_token_of_another_fmu_is_refused_with_its_words(good, tmp_path):
+    path = tmp_path / "plant.fmu"
+    path.write_bytes(described((r'instantiationToken="[^"]*"', 'instantiationToken="another"'))(good))
+    with pytest.raises(FmuFileError, match=r"can't be loaded.* The FMU says: .*token") as caught:
+        Diagram("d", Fmu(path, name="plant", start={"force": 1.0}, isolate=False)()).simulate(
+            0.01, step=1e-3, progress=False
+        )
+    assert caught.value.fault == FmuFault.LOADING
+    assert caught.value.block == "plant"
 
 
 # --- trials -------------------------------------------------------------------------------------------------------------
