@@ -20,7 +20,7 @@ from .fmi_calls import FATAL, FmiCalls
 from .fmu_block import FmuBlock
 from .message_log import MessageLog, clean_text
 from .process_ends import describe_end
-from .shared_reading import SharedReading
+from .shared_steps import SharedReading
 from .step_options import allows_early_return, uses_event_mode
 from .texts import is_readable, list_limits, read_text, write_text
 

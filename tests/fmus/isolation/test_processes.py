@@ -2,6 +2,7 @@
 
 import os
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -296,10 +297,16 @@ def test_a_fork_of_this_process_leaves_its_fmus_alone(folder):
         assert y[0] == pytest.approx(0.01)
 
 
-def test_an_interrupt_ends_the_process_of_a_step(folder):
-    """Ctrl-C while the FMU works: the run ends at once, and the process with it."""
-    import signal
+@pytest.fixture
+def interruptible():
+    """SIGINT raises KeyboardInterrupt, which it doesn't in a process that was started in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
+
+def test_an_interrupt_ends_the_process_of_a_step(folder, interruptible):
+    """Ctrl-C while the FMU works: the run ends at once, and the process with it."""
     plant = Fmu(zoo_fmu(folder, 3, "step deaf_hang 0.02"), name="plant", isolate=True)
     timer = threading.Timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT))
     with plant.instantiate(["u"], None) as one:
