@@ -74,13 +74,9 @@ class LoadedFmu:
             raise
         except Exception as error:
             self._end_calls()
-            raise FmuFileError(
-                f"the FMU {str(description.file)!r} can't be loaded: {error}{self._quote_messages()} Look for "
-                f"its fault with 'loopwright doctor {description.file}'.",
-                fault=FmuFault.LOADING,
-                subject=description.identifier,
-                block=block.label,
-            ) from error
+            text = f"the FMU {str(description.file)!r} can't be loaded: {error}{self._quote_messages()} "
+            text += f"Look for its fault with 'loopwright doctor {description.file}'."
+            raise FmuFileError(text, fault=FmuFault.LOADING, block=block.label) from error
         finally:
             self.host.__exit__()  # FMPy stays in the binary's folder if loading fails, too
         self._open = True
