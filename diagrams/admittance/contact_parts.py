@@ -310,9 +310,11 @@ def _check_rates(
         )
     moving = "" if diagram.blocks[path].stepped else moves_between_ticks(diagram, at, outputs, sources)
     if moving:
+        exchanged = diagram.blocks[path].evaluated_outside
+        advice = "Take co-simulation for it, interface='co_simulation'" if exchanged else "Give it as an FMU"
         raise OptionError(
             f"found {moving!r}, which acts on continuous blocks between the ticks; expected a plant whose inputs are "
-            "held and whose outputs are sampled. Give it as an FMU, or sample the blocks around it.",
+            f"held and whose outputs are sampled. {advice}, or sample the blocks around it.",
             block=path,
         )
 

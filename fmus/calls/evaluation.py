@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from .bound_calls import BoundCalls
+from .bound_calls import BoundCalls, Call
 from .fmi_calls import WARNING, FmiCalls
 from .transfer import Transfer
 
@@ -24,7 +24,7 @@ class Vector:
 
 
 class Evaluation:
-    """Calls that set time, states and inputs, and get outputs, derivatives and indicators.
+    """Calls that set time, states and inputs, and get outputs, derivatives and indicators; ``then`` follow others.
 
     Each call is bound once, to vectors that stay where they are: a process of its own can make one round trip of it.
 
@@ -47,6 +47,7 @@ class Evaluation:
         outputs: Transfer,
         rates: Vector | None,
         indicators: Vector | None,
+        then: Sequence[tuple[Call, str]] = (),
     ):
         self._time, self._inputs, self._index, self._outputs = time, inputs, index, outputs
         self.rates, self.indicators = rates, indicators
@@ -61,6 +62,7 @@ class Evaluation:
         starting = [*more]  # derivatives and indicators can't be computed yet (FMI 2.0, 3.2.3)
         more += _vector_call(fmi, rates, "computing the derivatives of its states")
         more += _vector_call(fmi, indicators, "computing the event indicators")
+        more += [(*call, action) for call, action in then]
         self._running, self._starting = (_bind(fmi, calls) for calls in ([*at, *more], starting))
 
     def run(self, t: float, u: np.ndarray, *, running: bool) -> tuple[int, str]:

@@ -9,20 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import FmuError, FmuRuntimeError, Layout
+from ...blocks.core import FmuRuntimeError, Layout
 from ..archive import ExchangeInfo, FmuVariable
+from .bound_calls import DISCARD, ERROR, FATAL, WARNING, BoundCalls, Call
 from .evaluation import Evaluation, Vector
-from .exchange_states import pack_state, unpack_state
-from .fmi_calls import DISCARD, ERROR, FATAL, WARNING
+from .exchange_states import SavedExchange
+from .fmi_calls import EventUpdate
 from .fmu_block import FmuBlock
-from .loaded_library import LoadedFmu, MakeCalls
+from .loaded_library import MakeCalls
 from .transfer import Transfer, UnfitError
 
 _ROUNDS = 100  # of an event iteration
 _SAME = 1e-12  # relative change of a continuous input that is no jump
 
 
-class ExchangeInstance(LoadedFmu):
+class ExchangeInstance(SavedExchange):
     """Loaded FMU whose continuous states a solver integrates.
 
     After `begin` it is in Continuous-Time Mode. There `evaluation` sets time, states and continuous inputs and gets
@@ -57,6 +58,10 @@ class ExchangeInstance(LoadedFmu):
         self._evaluations: dict[Any, Evaluation] = {}
         self.ends_run = False
         """Whether the FMU has asked to end the simulation (terminateSimulation)."""
+        self._events = self.fmi.event_calls()
+        self._event: Evaluation | None = None
+        self._completion: Evaluation | None = None
+        self._bound: dict[tuple[str, int], BoundCalls] = {}
         self._all_inputs: Transfer | None = None
         self._final = True
         self._discarded = ""
@@ -97,9 +102,12 @@ class ExchangeInstance(LoadedFmu):
 
         return evaluate
 
-    def _bind(self, ports: tuple[str, ...], rates: bool, indicators: bool) -> Evaluation:
+    def _bind(
+        self, ports: tuple[str, ...], rates: bool, indicators: bool, then: tuple[tuple[Call, str], ...] = ()
+    ) -> Evaluation:
         outputs = {port: self.block.output_variables[port] for port in ports}
-        used = {port: v for port, v in self._smooth.items() if self._is_used(port, outputs, rates, indicators)}
+        every = indicators or bool(then)
+        used = {port: v for port, v in self._smooth.items() if every or self._is_used(port, outputs, rates)}
         index = [np.arange(self._places[p].start, self._places[p].stop) for p in used]
         inputs = self._allocate(sum(v.size for v in used.values()))
         got = self._allocate(sum(v.size for v in outputs.values()))
@@ -112,12 +120,11 @@ class ExchangeInstance(LoadedFmu):
             outputs=Transfer(self.fmi, "Get", outputs, got),
             rates=Vector("derivatives", self._dx) if rates else None,
             indicators=Vector("indicators", self._indicators) if indicators else None,
+            then=then,
         )
 
-    def _is_used(self, port: str, outputs: dict[str, FmuVariable], rates: bool, indicators: bool) -> bool:
+    def _is_used(self, port: str, outputs: dict[str, FmuVariable], rates: bool) -> bool:
         """Whether an input has to be set: what is wanted may depend on it."""
-        if indicators:
-            return True
         unknown = [*outputs.values()]
         if rates:
             unknown += [self.description.find(name) for name in self.description.states.values()]
@@ -175,8 +182,10 @@ class ExchangeInstance(LoadedFmu):
     def exchange(self, u: np.ndarray) -> np.ndarray:
         """In Initialization Mode: set the inputs, and return the continuous states that follow."""
         self._u = u.copy()
-        self._set(u, self._began)
-        return self._states()
+        status = self._fill(u, self._began).set() if self._wired else 0
+        if not 0 <= status <= WARNING:
+            raise self._error("setting the inputs", status, self._began)
+        return self._get("get_states")
 
     def begin_exchange(self) -> np.ndarray:
         """Leave Initialization Mode, settle the events at the start, and return the continuous states."""
@@ -185,9 +194,6 @@ class ExchangeInstance(LoadedFmu):
         x = self._iterate(self._began)
         self.nominals = self._read_nominals()
         return x
-
-    def _states(self) -> np.ndarray:
-        return self._get("get_states")
 
     def _read_nominals(self) -> np.ndarray:
         """Return the states' nominal values; 1 stands in for a value that is 0 or no number."""
@@ -201,33 +207,39 @@ class ExchangeInstance(LoadedFmu):
             )
         return np.where(usable, found, 1.0)
 
-    def _get(self, quantity: str) -> np.ndarray:
-        """Return a vector of the FMU's for its states."""
+    def _get(self, quantity: str, *then: Call) -> np.ndarray:
+        """Return a vector of the FMU's for its states, and make further calls behind it."""
         n = self._x.size
-        made = np.zeros(n)
+        made, calls = np.zeros(n), [*then]
         if n:
             address, length = ctypes.c_void_p(self._kept.ctypes.data), ctypes.c_size_t(n)
             arguments = self.fmi.instance_argument, address, length
-            status = self.fmi.bind([(self.fmi.exchange_function(quantity), arguments)]).run()
+            calls.insert(0, (self.fmi.exchange_function(quantity), arguments))
+        if calls:
+            bound = self._bound.get((quantity, len(calls)))
+            if bound is None:
+                bound = self._bound[quantity, len(calls)] = self.fmi.bind(calls)
+            status = bound.run()
             if not 0 <= status <= WARNING:
                 raise self._error(_READING[quantity], status, self.t)
+        if n:
             made[self._order] = self._kept
         return made
 
-    def _set(self, u: np.ndarray, t: float) -> None:
-        """Set all wired inputs, discrete ones too."""
-        if not self._wired:
-            return
+    def _fill(self, u: np.ndarray, t: float) -> Transfer:
+        """Return the transfer of all wired inputs, discrete ones too, with their values."""
         if self._all_inputs is None:
             vector = self._allocate(sum(v.size for v in self._wired.values()))
             self._all_inputs = Transfer(self.fmi, "Set", self._wired, vector)
-        self._all_inputs.vector[:] = np.concatenate([u[self._places[port]] for port in self._wired])
+        inputs = self._all_inputs
+        if self._wired:
+            inputs.vector[:] = np.concatenate([u[self._places[port]] for port in self._wired])
         try:
-            status = self._all_inputs.set()
+            for group in inputs.groups:
+                group.check_and_fill(inputs.vector)
         except UnfitError as error:
             raise self._unfit(error, t) from None
-        if not 0 <= status <= WARNING:
-            raise self._error("setting the inputs", status, t)
+        return inputs
 
     # ---- events ----
 
@@ -244,22 +256,40 @@ class ExchangeInstance(LoadedFmu):
 
     def handle_event(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Go through Event Mode at an instant, and return the continuous states after it."""
-        self.evaluation((), rates=False, indicators=bool(self.about.indicators))(t, x, u)
-        self.call("entering Event Mode", self.fmi.enter_event_mode)
-        self._set(u, t)
-        self._u = u.copy()
-        return self._iterate(t)
+        inputs = self._fill(u, t)
+        if self._event is None:
+            calls = self._events
+            sets = [((group.function, group.arguments), "setting the inputs") for group in inputs.groups]
+            more = [(calls.enter, "entering Event Mode"), *sets, (calls.update, "the event iteration")]
+            self._event = self._bind((), False, bool(self.about.indicators), tuple(more))
+        self._u, self._discarded = u.copy(), ""
+        self._run(self._event, t, x, u)
+        self._check_computed(t)
+        return self._iterate(t, self._events.updated())
 
-    def _iterate(self, t: float) -> np.ndarray:
+    def _check_computed(self, t: float) -> None:
+        """Refuse an instant that the solver has reached, and that the FMU can't compute."""
+        if self._discarded:
+            raise self._error(f"{self._discarded}, where the solver has arrived:", DISCARD, t)
+
+    def _call_bound(self, call: Call, action: str, t: float) -> None:
+        status = self.fmi.bind([call]).run()
+        if not 0 <= status <= WARNING:
+            raise self._error(action, status, t)
+
+    def _iterate(self, t: float, made: EventUpdate | None = None) -> np.ndarray:
         """Update the discrete states until they settle, and return to Continuous-Time Mode."""
-        nominals = False
+        calls, nominals = self._events, False
         for _ in range(_ROUNDS):
-            made = self.call("the event iteration", self.fmi.update_events)
+            if made is None:
+                self._call_bound(calls.update, "the event iteration", t)
+                made = calls.updated()
             nominals |= made.nominals_changed
             if made.terminate:
                 self._note_end(t, "in Event Mode")
             if not made.again:
                 break
+            made = None
         else:
             raise FmuRuntimeError(
                 f"its discrete states don't settle at t = {t:.9g} s: after {_ROUNDS} rounds of the event iteration it "
@@ -268,11 +298,11 @@ class ExchangeInstance(LoadedFmu):
                 block=self.block.label,
                 t=t,
             )
+        assert made is not None
         self.next_time = made.next_time
-        x = self._states()
+        x = self._get("get_states", calls.leave)
         if nominals:
             self.nominals = self._read_nominals()
-        self.call("entering Continuous-Time Mode", self.fmi.enter_continuous_time_mode)
         return x
 
     def accept(self, t: float, x: np.ndarray, u: np.ndarray) -> bool:
@@ -286,8 +316,12 @@ class ExchangeInstance(LoadedFmu):
             self._u[self._places[port]] = values
         if not self.about.completes_steps:
             return changed
-        self.evaluation((), rates=True)(t, x, u)
-        wants, terminate = self.call("completing a step", self.fmi.complete_step, self._final)
+        if self._completion is None:
+            self._completion = self._bind((), False, False, ((self._events.complete, "completing a step"),))
+        self._events.final.value, self._discarded = self._final, ""
+        self._run(self._completion, t, x, u)
+        self._check_computed(t)
+        wants, terminate = self._events.completed()
         if terminate:
             self._note_end(t, "after a step of the solver")
         return wants or changed
@@ -314,75 +348,6 @@ class ExchangeInstance(LoadedFmu):
     def _unfit(self, error: UnfitError, t: float) -> FmuRuntimeError:
         advice = "Convert the signal before this input, with Quantizer, say, or leave this output out, by ports=."
         return FmuRuntimeError(f"{error.reason}. {advice}", block=self.block.label, port=error.port, t=t)
-
-    # ---- saved states ----
-
-    def operating_point(self) -> dict[str, Any]:
-        """Return the present ``t``, ``state`` and ``inputs``, for `Fmu.linear_model`."""
-        about = self.description
-
-        def read(variable: FmuVariable) -> np.ndarray:
-            return self.read_variables([variable]).reshape(variable.shape)
-
-        state = {name: read(about.find(name)) for name in (*about.states, *about.discrete_states)}
-        return {"t": self.t, "state": state, "inputs": {port: read(v) for port, v in self._ports.items()}}
-
-    @property
-    def can_serialize(self) -> bool:
-        """Whether its state can be turned into bytes."""
-        return self.about.can_serialize
-
-    def serialize(self) -> bytes:
-        """Return its complete state.
-
-        Raises
-        ------
-        FmuError
-            If the FMU can't serialize its state (`can_serialize`).
-        FmuRuntimeError
-            If the FMU's function fails.
-        """
-        self._check_can()
-        self._final = False
-        handle = self.call("saving its state", self.fmi.save_state)
-        try:
-            data = self.call("serializing its state", self.fmi.serialize_state, handle)
-        finally:
-            self.free_state(handle)
-        return pack_state(self.description, self.t, self.next_time, self._u, bytes(data))
-
-    def restore_bytes(self, data: bytes) -> None:
-        """Go to a state that `serialize` has returned.
-
-        Raises
-        ------
-        FmuError
-            If the bytes are no state of this FMU in model exchange on this platform.
-        FmuRuntimeError
-            If the FMU's function fails.
-        """
-        self._check_can()
-        try:
-            t, next_time, u, rest = unpack_state(self.description, data, sum(v.size for v in self._ports.values()))
-        except FmuError as error:
-            raise error.at(block=self.block.label) from None
-        handle = self.call("reading a serialized state", self.fmi.deserialize_state, rest)
-        try:
-            self.call("restoring its state", self.fmi.set_state, handle)
-        finally:
-            self.free_state(handle)
-        self.failed, self._running, self._final = False, True, False
-        self._u, self.next_time, self._time.value = u, next_time, t
-
-    def _check_can(self) -> None:
-        if self.can_serialize:
-            return
-        flag = self.description.state_flags[1 if self.about.can_save else 0]
-        raise FmuError(
-            f"its state can't be turned into bytes: {flag} is false for model exchange in the FMU's description. "
-            "Export it with that capability, or run again from the start.",
-            block=self.block.label,
-        )
 
 
 _READING = {"get_states": "reading the continuous states", "nominals": "reading the nominal values of the states"}

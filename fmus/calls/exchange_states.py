@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
 import struct
+from typing import Any
 
 import numpy as np
 
 from ...blocks.core import FmuError
-from ..archive import FmuDescription
+from ..archive import ExchangeInfo, FmuDescription, FmuVariable
 from ..platform import native_platform
+from .loaded_library import LoadedFmu
 
 _HEADER = struct.Struct("<8s32s24sdd")  # magic, FMU's digest, platform, time, next time event
 _MAGIC = b"lw-fmu-x"
@@ -56,3 +59,81 @@ def unpack_state(description: FmuDescription, data: bytes, width: int) -> tuple[
             "FMU that was saved."
         )
     return t, next_time, np.frombuffer(data[_HEADER.size : n], "<f8").copy(), data[n:]
+
+
+class SavedExchange(LoadedFmu):
+    """Instance in model exchange whose complete state can be saved, where the FMU can serialize it."""
+
+    about: ExchangeInfo
+    next_time: float
+    _ports: dict[str, FmuVariable]
+    _u: np.ndarray
+    _time: ctypes.c_double
+    _final: bool
+
+    def operating_point(self) -> dict[str, Any]:
+        """Return the present ``t``, ``state`` and ``inputs``, for `Fmu.linear_model`."""
+        about = self.description
+
+        def read(variable: FmuVariable) -> np.ndarray:
+            return self.read_variables([variable]).reshape(variable.shape)
+
+        state = {name: read(about.find(name)) for name in (*about.states, *about.discrete_states)}
+        return {"t": self.t, "state": state, "inputs": {port: read(v) for port, v in self._ports.items()}}
+
+    @property
+    def can_serialize(self) -> bool:
+        """Whether its state can be turned into bytes."""
+        return self.about.can_serialize
+
+    def serialize(self) -> bytes:
+        """Return its complete state.
+
+        Raises
+        ------
+        FmuError
+            If the FMU can't serialize its state (`can_serialize`).
+        FmuRuntimeError
+            If the FMU's function fails.
+        """
+        self._check_can()
+        self._final = False
+        handle = self.call("saving its state", self.fmi.save_state)
+        try:
+            data = self.call("serializing its state", self.fmi.serialize_state, handle)
+        finally:
+            self.free_state(handle)
+        return pack_state(self.description, self.t, self.next_time, self._u, bytes(data))
+
+    def restore_bytes(self, data: bytes) -> None:
+        """Go to a state that `serialize` has returned.
+
+        Raises
+        ------
+        FmuError
+            If the bytes are no state of this FMU in model exchange on this platform.
+        FmuRuntimeError
+            If the FMU's function fails.
+        """
+        self._check_can()
+        try:
+            t, next_time, u, rest = unpack_state(self.description, data, sum(v.size for v in self._ports.values()))
+        except FmuError as error:
+            raise error.at(block=self.block.label) from None
+        handle = self.call("reading a serialized state", self.fmi.deserialize_state, rest)
+        try:
+            self.call("restoring its state", self.fmi.set_state, handle)
+        finally:
+            self.free_state(handle)
+        self.failed, self._running, self._final = False, True, False
+        self._u, self.next_time, self._time.value = u, next_time, t
+
+    def _check_can(self) -> None:
+        if self.can_serialize:
+            return
+        flag = self.description.state_flags[1 if self.about.can_save else 0]
+        raise FmuError(
+            f"its state can't be turned into bytes: {flag} is false for model exchange in the FMU's description. "
+            "Export it with that capability, or run again from the start.",
+            block=self.block.label,
+        )

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .fmi_calls import DISCARD, PENDING, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
+from .fmi_calls import DISCARD, PENDING, EventCalls, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
 from .printf import Logger, format_message
 
 _LONGEST_WAIT = 0.01  # s between two looks at a step that is pending
@@ -165,3 +165,30 @@ class Fmi2Calls(FmiCalls):
         """Take a round of the event iteration, and return what it says (3.2.2)."""
         again, terminate, nominals, states, defined, t = self.fmu.newDiscreteStates()
         return EventUpdate(bool(again), bool(terminate), bool(nominals), bool(states), t if defined else math.inf)
+
+    def event_calls(self) -> EventCalls:
+        """Return the functions of events in model exchange (3.2.2), with memory of their own."""
+        from fmpy.fmi2 import fmi2EventInfo
+
+        info, flags = self.variable(fmi2EventInfo), self.variable(ctypes.c_int * 2)
+        final, instance, at = self.variable(ctypes.c_int), self.instance_argument, ctypes.addressof(flags)
+        final.value = 1
+
+        def updated() -> EventUpdate:
+            again, terminate = info.newDiscreteStatesNeeded, info.terminateSimulation
+            nominals, states = info.nominalsOfContinuousStatesChanged, info.valuesOfContinuousStatesChanged
+            t = info.nextEventTime if info.nextEventTimeDefined else math.inf
+            return EventUpdate(bool(again), bool(terminate), bool(nominals), bool(states), t)
+
+        return EventCalls(
+            self._mode_call("EnterEventMode"),
+            (self._function("fmi2NewDiscreteStates"), (instance, ctypes.byref(info))),
+            self._mode_call("EnterContinuousTimeMode"),
+            (
+                self._function("fmi2CompletedIntegratorStep"),
+                (instance, final, ctypes.c_void_p(at), ctypes.c_void_p(at + ctypes.sizeof(ctypes.c_int))),
+            ),
+            final,
+            updated,
+            lambda: (bool(flags[0]), bool(flags[1])),
+        )

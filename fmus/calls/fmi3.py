@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from .fmi_calls import MOST_ROUNDS, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
+from .fmi_calls import MOST_ROUNDS, EventCalls, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
 
 _INTEGERS = {f"{sign}Int{bits}": getattr(ctypes, f"c_{sign.lower()}int{bits}")
              for sign in ("", "U") for bits in (8, 16, 32, 64)}  # fmt: skip
@@ -126,3 +126,24 @@ class Fmi3Calls(FmiCalls):
         """Take a round of the event iteration, and return what it says (FMI 3.0, 2.3.5)."""
         again, terminate, nominals, states, defined, t = self.fmu.updateDiscreteStates()
         return EventUpdate(bool(again), bool(terminate), bool(nominals), bool(states), t if defined else math.inf)
+
+    def event_calls(self) -> EventCalls:
+        """Return the functions of events in model exchange (FMI 3.0, 2.3.5 and 3.2), with memory of their own."""
+        flags, t = self.variable(ctypes.c_bool * 8), self.variable(ctypes.c_double)
+        final, instance, at = self.variable(ctypes.c_bool), self.instance_argument, ctypes.addressof(flags)
+        final.value = True
+        addresses = [ctypes.c_void_p(at + i) for i in range(7)]
+
+        def updated() -> EventUpdate:
+            again, terminate, nominals, states, defined = flags[:5]
+            return EventUpdate(again, terminate, nominals, states, t.value if defined else math.inf)
+
+        return EventCalls(
+            self._mode_call("EnterEventMode"),
+            (self._function("fmi3UpdateDiscreteStates"), (instance, *addresses[:5], ctypes.byref(t))),
+            self._mode_call("EnterContinuousTimeMode"),
+            (self._function("fmi3CompletedIntegratorStep"), (instance, final, *addresses[5:])),
+            final,
+            updated,
+            lambda: (flags[5], flags[6]),
+        )

@@ -33,6 +33,23 @@ class TypeCalls:
     ctype: type[Any]
 
 
+@dataclass(frozen=True)
+class EventCalls:
+    """Functions of events in model exchange with their arguments, to be bound, and what they have said."""
+
+    enter: Call
+    update: Call
+    leave: Call
+    complete: Call
+    """It tells a step of the solver that was accepted."""
+    final: Any
+    """Argument of ``complete``: whether no earlier state will be restored, a C value that can be changed."""
+    updated: Callable[[], EventUpdate]
+    """Answer of the last ``update``."""
+    completed: Callable[[], tuple[bool, bool]]
+    """Answer of the last ``complete``: whether Event Mode is wanted, and the end of the run."""
+
+
 @dataclass
 class StepCall:
     """The function that takes a step, with arguments that are made once, so that no call checks their types."""
@@ -336,16 +353,12 @@ class FmiCalls(ABC):
     def update_events(self) -> EventUpdate:
         """Take a round of the event iteration, and return what it says."""
 
-    def complete_step(self, final: bool) -> tuple[bool, bool]:
-        """Tell a step of the solver that was accepted; return whether Event Mode is wanted, and the end of the run.
+    def event_calls(self) -> EventCalls:
+        """Return the functions of events in model exchange, with memory of their own."""
+        raise NotImplementedError
 
-        Parameters
-        ----------
-        final : bool
-            Whether no earlier state will be restored.
-        """
-        enter, terminate = self.fmu.completedIntegratorStep(final)
-        return bool(enter), bool(terminate)
+    def _mode_call(self, name: str) -> Call:
+        return self._function(f"{self.prefix}{name}"), (self.instance_argument,)
 
     def enter_event_mode(self) -> None:
         """Enter Event Mode."""
