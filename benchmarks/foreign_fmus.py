@@ -211,19 +211,44 @@ def study(file: Path, seconds: float) -> list[dict[str, object]]:
 
 
 def as_table(rows: list[dict[str, object]]) -> str:
-    """Return the rows as Markdown."""
-    lines = [
-        "| source | FMU | tool | FMI | interface | Loopwright | FMPy | difference |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    """Return two tables as Markdown: counts for each source, and the runs in which the importers differ."""
+    lines = ["| source | tools | FMI | run here | run in FMPy | of | agree |", "|---|---|---|---|---|---|---|"]
+    for source in dict.fromkeys(row["source"] for row in rows):
+        here = [row for row in rows if row["source"] == source]
+        tools = ", ".join(sorted({short_name(str(row["tool"])) for row in here}))
+        versions = ", ".join(sorted({str(row["fmi"]) for row in here}))
+        both = [row for row in here if row["gap"] is not None]
+        counts = [sum(row[importer] == "runs" for row in here) for importer in ("ours", "fmpy")]
+        close = sum(agrees(row) for row in both)
+        lines.append(
+            f"| {source} | {tools} | {versions} | {counts[0]} | {counts[1]} | {len(here)} | {close} of {len(both)} |"
+        )
+    lines += ["", "| FMU | tool | FMI | Loopwright | FMPy | difference |", "|---|---|---|---|---|---|"]
     for row in rows:
-        gap = row["gap"]
-        difference = "" if gap is None else "agree" if gap <= CLOSE else f"{gap:.1e} ({row['where']})"
-        kind = "CS" if row["interface"] == "CoSimulation" else "ME" if row["interface"] == "ModelExchange" else "?"
+        if row["ours"] == row["fmpy"] == "runs" and agrees(row):
+            continue
+        difference = "" if row["gap"] is None else f"{row['gap']:.1e} ({row['where']})"
+        kind = {"CoSimulation": "CS", "ModelExchange": "ME"}.get(str(row["interface"]), "?")
         said = (" ".join(str(row[k]).split()).replace("|", "\\|")[:160] for k in ("ours", "fmpy"))
-        lines.append(f"| {row['source']} | {row['file']} | {row['tool']} | {row['fmi']} | {kind} | {' | '.join(said)} "
-                     f"| {difference} |")  # fmt: skip
+        lines.append(f"| {row['source']}: {row['file']} | {short_name(str(row['tool']))} | {row['fmi']} {kind} "
+                     f"| {' | '.join(said)} | {difference} |")  # fmt: skip
     return "\n".join(lines) + "\n"
+
+
+def agrees(row: dict[str, object]) -> bool:
+    """Whether both runs are one, to rounding in co-simulation and to ten times the tolerance in model exchange."""
+    return row["gap"] is not None and float(row["gap"]) <= (CLOSE if row["interface"] == "CoSimulation" else 1e-6)
+
+
+def short_name(tool: str) -> str:
+    """Return a tool's name without its version."""
+    words = tool.replace("/", " ").replace(",", " ").split()
+    kept = [
+        word
+        for word in words
+        if not any(c.isdigit() for c in word) and word.lower() not in ("version", "-", "compiler")
+    ]
+    return " ".join(kept[:3]) or "not stated"
 
 
 def main() -> None:

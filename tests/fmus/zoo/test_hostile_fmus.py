@@ -291,7 +291,8 @@ def test_an_initialization_that_fails_says_so(host, place, fmi, where, fault):
     [slow("null", "instantiate"), quick("licence", "Licence checkout failed: no seat is free"), slow("error", "this is an error")],
 )  # fmt: skip
 def test_an_instance_that_can_t_be_had_says_so(host, place, fmi, fault, word):
-    fail(host.run(zoo_fmu(place, fmi, f"instantiate {fault}")), "FmuFileError", 0, word)
+    answer = host.run(zoo_fmu(place, fmi, f"instantiate {fault}"))
+    fail(answer, "FmuFileError", 0, word, "loopwright doctor")
 
 
 @pytest.mark.slow
