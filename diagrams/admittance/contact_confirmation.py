@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from ...blocks.core import ConfirmationError, OptionError
+from ..linearization import find_signal
 from .contact_limits import ContactLimit, CoupledLoop, to_rates
 from .contact_parts import ContactParts, Ports
 from .moored_plant import Mooring, hold_sources, library_class, moored_diagram
@@ -211,6 +212,12 @@ def _check(contact: TriedContact, limit: ContactLimit, push: float) -> None:
             "into. Compare with a run of your own, with the environment as blocks.",
             block=contact.plant,
         )
+    if not contact.sample_time and contact.diagram.blocks[contact.plant].stepped:
+        raise OptionError(
+            "found a continuous diagram around an FMU, which exchanges signals with it at the ends of steps alone; "
+            "expected one that can be run as its limit is computed. Confirm a sampled one: diagram.sampled(1e-3).",
+            block=contact.plant,
+        )
     if contact.point.t > START * float(contact.point.base):
         raise OptionError(
             f"found a contact at t = {contact.point.t:g} s; expected one at the start, from which the runs with the "
@@ -260,7 +267,8 @@ def _run(
     )  # fmt: skip
     ports = (contact.ports.force, contact.ports.position, contact.ports.velocity)
     still = hold_sources(contact.diagram, contact.point.values)
-    made: Any = moored_diagram(still, contact.plant, ports, contact.measured, mooring, tool)
+    source = find_signal(still.flatten_like(contact.point), contact.measured) if contact.measured else None
+    made: Any = moored_diagram(still, contact.plant, ports, source, mooring, tool)
     options: dict[str, Any] = {} if made.has_clock else {"step": step}
     name = f"{contact.plant}.{contact.ports.velocity}"
     run = made.simulate(duration + 4 * step, progress=False, record=[name], states=False, **options)

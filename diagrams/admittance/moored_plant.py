@@ -18,13 +18,13 @@ from ...blocks.core import Array, Block, OptionError, Output, Source, parameter
 from ...fmus.export import build
 from ...fmus.models import gantry, gantry_elastic, gantry_stiction, scara
 from ...fmus.running import Fmu
-from ..linearization import find_signal
 from ..wiring import Wire
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from ..flat import WiredDiagram
+    from ..linearization import Tap
 
 INTERNAL_STEP = 1e-4
 """Longest internal step in s of an FMU with an environment: its contact is faster than the plant alone."""
@@ -163,7 +163,7 @@ def moored_diagram(
     diagram: WiredDiagram,
     plant: str,
     ports: tuple[str, str, str],
-    measured: str | None,
+    measured: Tap | None,
     mooring: Mooring,
     tool_mass: float | None = None,
 ) -> WiredDiagram:
@@ -177,8 +177,8 @@ def moored_diagram(
         Path of its plant, one of the library.
     ports : (str, str, str)
         Ports of force, position and velocity at the contact.
-    measured : str, optional
-        Wire of the measured force.
+    measured : Tap, optional
+        Signal of the measured force.
     mooring : Mooring
         The environment.
     tool_mass : float, optional
@@ -214,11 +214,11 @@ def moored_diagram(
             if isinstance(sensor, ForceSensor):
                 table.blocks[path] = sensor.replace(tool_mass=tool_mass)
     if measured is not None:
-        signal = find_signal(diagram.flatten(), measured)
-        source = signal.port
+        source = measured.port
         if source[0] == plant:
             raise OptionError(
-                f"found {measured!r}, which the plant measures itself; expected a sensor outside of it.", block=plant
+                f"found {measured.name!r}, which the plant measures itself; expected a sensor outside of it.",
+                block=plant,
             )
         total = "environment_sum"
         while total in table.blocks or total in table.subsystems:

@@ -124,6 +124,8 @@ def _tried(
     """
     rows, said = [], dict[str, None]()
     for name, contact in variants.items():
+        if not contact.sample_time:
+            continue  # a run exchanges signals with the FMU at ticks only
         limit = contact.stability_limit("stiffness", damping=TRIED_DAMPING)
         if not (math.isfinite(limit.value) and limit.value > 0.0):
             continue

@@ -81,6 +81,14 @@ def test_what_cannot_be_confirmed_says_why():
         later.confirm(limit)
 
 
+def test_a_continuous_diagram_around_an_fmu_is_refused():
+    sampled = contact("gantry", "perp")
+    ideal = sampled.diagram.continuous().contact(direction="perp")
+    limit = replace(sampled.stability_limit("stiffness"), value=1e4)
+    with pytest.raises(OptionError, match=r"a continuous diagram around an FMU.*Confirm a sampled one"):
+        ideal.confirm(limit)
+
+
 def test_plants_of_the_library_are_known_by_their_models_and_parameters():
     assert set(LIBRARY) == {"gantry", "gantry_elastic", "gantry_stiction", "scara"}
     assert library_class(Fmu(gantry_elastic.build(), name="plant")) is LIBRARY["gantry_elastic"]
