@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -87,24 +87,32 @@ class Coupling:
         return 2 if self.scheme == Scheme.ITERATED else 1
 
 
-def refuse_exchanged(coupling: Coupling, paths: Iterable[str]) -> None:
-    """Refuse a scheme that goes back over a step where FMUs are evaluated by the solver, by their paths.
+def refuse_exchanged(coupling: Coupling, blocks: Mapping[str, Any]) -> None:
+    """Refuse a scheme that goes back over a step where a model-exchange FMU can't.
+
+    Parameters
+    ----------
+    coupling : Coupling
+        The coupling.
+    blocks : mapping
+        The FMUs that are evaluated by the solver, by path.
 
     Raises
     ------
     OptionError
-        If there is one: the events of a model-exchange FMU can't be taken back.
+        If one can't turn its state into bytes.
     """
     if coupling.scheme != Scheme.ITERATED and coupling.error is None:
         return
-    for path in paths:
-        raise OptionError(
-            f"found coupling {str(coupling)!r}, which goes back to the beginning of a step; expected no FMU in model "
-            "exchange, whose events can't be taken back. Take coupling='gauss_seidel' or 'jacobi', or the FMU's "
-            "co-simulation.",
-            block=path,
-            port="coupling",
-        )
+    for path, block in blocks.items():
+        if not block.description.exchange.can_serialize:
+            raise OptionError(
+                f"found coupling {str(coupling)!r}, which goes back to the beginning of a step; expected a "
+                "model-exchange FMU that can turn its state into bytes (canSerializeFMUState of its description is "
+                "false). Take coupling='gauss_seidel' or 'jacobi', or the FMU's co-simulation.",
+                block=path,
+                port="coupling",
+            )
 
 
 def to_coupling(value: Any, *, block: str) -> Coupling:

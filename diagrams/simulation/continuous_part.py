@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ..exchange import ExchangedBlocks
 from ..results import Occurrence
 from .continuous import Continuous
 from .workspace import Workspace
@@ -18,6 +19,7 @@ class _Saved:
     t: float
     x: np.ndarray
     continuous: Any
+    exchanged: Mapping[str, bytes]
     messages: tuple[str, ...]
     events: int
 
@@ -33,10 +35,12 @@ class ContinuousPart:
         The run's numbers.
     continuous : Continuous or None
         The solver with its events; None where nothing happens between ticks.
+    exchanged : ExchangedBlocks
+        Model-exchange FMUs, which keep memory of their own.
     """
 
-    def __init__(self, workspace: Workspace, continuous: Continuous | None):
-        self._workspace, self._continuous = workspace, continuous
+    def __init__(self, workspace: Workspace, continuous: Continuous | None, exchanged: ExchangedBlocks):
+        self._workspace, self._continuous, self._exchanged = workspace, continuous, exchanged
         self._events: list[Occurrence] = []
         self.sample: Callable[[float], bool] = lambda t: False
         """Records the instant at which a stop condition ends the run."""
@@ -57,7 +61,8 @@ class ContinuousPart:
         """Return the present state."""
         here, workspace = self._workspace.here, self._workspace
         continuous = None if self._continuous is None else self._continuous.save()
-        return _Saved(float(here.t[0]), here.x.copy(), continuous, workspace.messages, len(self._events))
+        exchanged = {path: block.serialize() for path, block in self._exchanged.blocks.items()}
+        return _Saved(float(here.t[0]), here.x.copy(), continuous, exchanged, workspace.messages, len(self._events))
 
     def restore(self, saved: _Saved) -> None:
         """Go back to a state."""
@@ -65,6 +70,8 @@ class ContinuousPart:
         here.t[0], here.x[:] = saved.t, saved.x
         workspace.messages = saved.messages
         del self._events[saved.events :]
+        for path, block in self._exchanged.blocks.items():
+            block.restore_bytes(saved.exchanged[path])
         if self._continuous is not None:
             self._continuous.restore(saved.continuous)
 

@@ -100,7 +100,7 @@ class Engine:
             every_tick=self.every_tick,
         )
         if not self.coupling.is_plain and flat.plant_ticks and Links(flat).exist:
-            refuse_exchanged(self.coupling, self.exchanged.evaluators)
+            refuse_exchanged(self.coupling, {path: flat.table.blocks[path] for path in flat.outside})
             self.coupled = CoupledSteps(
                 flat,
                 name,
@@ -110,7 +110,7 @@ class Engine:
                 self.workspace.z,
                 self.workspace.here.w,
                 self.workspace.bind_exchange(),
-                ContinuousPart(self.workspace, self.continuous),
+                ContinuousPart(self.workspace, self.continuous, self.exchanged),
             )
 
     def load(self, stack: ExitStack, start_time: float) -> None:

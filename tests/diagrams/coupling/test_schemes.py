@@ -1,5 +1,7 @@
 """Orders of the coupling schemes against closed forms, loops of direct feedthrough, adaptive steps."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -65,6 +67,21 @@ def test_blocks_in_continuous_time_take_part(cache, scheme, order):
         largest_error(mass_and_filter(), mass_and_filter_exactly, signals, step=h, coupling=scheme)[0] for h in STEPS
     ]
     assert order_of(errors) == pytest.approx([order, order], abs=0.25)
+
+
+@pytest.mark.parametrize(("scheme", "order"), ORDERS)
+def test_an_fmu_in_model_exchange_beside_one_in_co_simulation(cache, monkeypatch, scheme, order):
+    diagram = two_masses()
+    diagram = diagram.replace({"b": diagram["b"].replace(interface="model_exchange")})
+    signals = ("a.position", "b.position")
+    errors = [largest_error(diagram, two_masses_exactly, signals, step=h, coupling=scheme)[0] for h in STEPS[1:]]
+    assert order_of(errors) == pytest.approx([order], abs=0.2)
+    if scheme == "iterated":
+        info = dataclasses.replace(diagram["b"].description.exchange, can_serialize=False)
+        about = dataclasses.replace(diagram["b"].description, exchange=info)
+        monkeypatch.setattr(Fmu, "description", property(lambda self: about))
+        with pytest.raises(OptionError, match=r"^b\.coupling: .*canSerializeFMUState"):
+            diagram.simulate(0.1, step=0.01, progress=False, coupling=scheme)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.9, 1.5])  # plain repetition diverges from 1 on
