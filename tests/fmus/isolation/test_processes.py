@@ -221,6 +221,42 @@ def test_saved_states_go_across_the_process(folder):
         one.save()
 
 
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_model_exchange_and_linear_models_are_bit_for_bit_those_in_process(cache, fmi):
+    from loopwright.fmus import build_fmu
+
+    file = build_fmu(mass_spring_damper(), fmi=fmi)
+    one, two = (Fmu(file, name="plant", isolate=isolate) for isolate in (True, False))
+    for interface in ("model_exchange", "co_simulation"):
+        for exact in (True, False):
+            a, b = (plant.linear_model(interface=interface, exact=exact) for plant in (one, two))
+            assert all(np.array_equal(getattr(a, name), getattr(b, name)) for name in ("A", "B", "C", "D", "y0"))
+            assert a.derivation == b.derivation
+    a, b = (plant.step_difference(0.01) for plant in (one, two))
+    assert np.array_equal(a.A, b.A)
+    x, y = (
+        Diagram("d", plant.replace(interface="model_exchange")(force=1.0)).simulate(0.5, step=0.01, progress=False)
+        for plant in (one, two)
+    )
+    for port in one.outputs:
+        assert np.array_equal(x[f"plant.{port}"], y[f"plant.{port}"]), port
+
+
+def test_a_crash_in_model_exchange_names_the_time(msd):
+    """The library's process is ended between two evaluations, as by a system that is out of memory."""
+    file = msd
+    plant = Fmu(file, name="plant", interface="model_exchange", isolate=True)
+    with plant.exchange([*plant.inputs]) as one:
+        one.begin_exchange()
+        evaluate = one.evaluation([*plant.outputs], rates=True)
+        evaluate(0.25, np.zeros(2), np.ones(1))
+        os.kill(one.fmi.process.pid, signal.SIGKILL)
+        with pytest.raises(FmuProcessError, match="SIGKILL") as caught:
+            evaluate(0.5, np.zeros(2), np.ones(1))
+    assert caught.value.block == "plant"
+    assert caught.value.t == 0.5
+
+
 def test_foreign_fmus_are_isolated_and_own_builds_are_not(folder, msd, tmp_path):
     assert find_limits(Fmu(zoo_fmu(folder, 3))) == Isolation()
     assert find_limits(Fmu(msd)) is None
