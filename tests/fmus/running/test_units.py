@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, Gain, Sine, Sum, UnitConversion, UnitError
+from loopwright.blocks import Block, Constant, Gain, Input, Output, Sine, Sum, UnitConversion, UnitError
 from loopwright.diagrams import Diagram
-from loopwright.fmus import Fmu
+from loopwright.fmus import Fmu, mass_spring_damper
 from support.typed_fmus import typed_fmu
 
 UNITS = {
@@ -111,3 +111,59 @@ def test_a_replacement_in_other_units_fits_if_it_converts(file):
     ][-1] == pytest.approx(np.pi / 2)
     with pytest.raises(UnitError, match="deg and rad"):
         diagram.replace(plant=Fmu(file))
+
+
+class Controller(Block):
+    """Proportional controller with a reference of its own; units as its parameters say."""
+
+    k: float
+    reference: float
+    length: str = "m"
+    power: str = "N"
+
+    @property
+    def inputs(self):
+        return {"position": Input(unit=self.length, name="position")}
+
+    @property
+    def outputs(self):
+        return {"u": Output(unit=self.power, name="u")}
+
+    def output(self, t, x, u):
+        return self.k * (self.reference - u.position)
+
+
+@pytest.fixture(scope="module")
+def loops(cache):
+    """One loop twice: a controller in mm and kN whose wires are converted, and one in m and N."""
+    file = mass_spring_damper.build()
+    found = []
+    for controller, converts in (
+        (Controller(k=2e-3, reference=100.0, length="mm", power="kN", name="controller"), True),
+        (Controller(k=2e3, reference=0.1, name="controller"), False),
+    ):
+        plant = Fmu(file, name="plant", convert_units=converts)
+        found.append(Diagram("d", plant(force=controller(position=plant.position))))
+    return found
+
+
+def test_runs_linear_models_and_trims_are_those_of_one_unit(loops):
+    mixed, plain = loops
+    runs = [d.simulate(0.2, step=0.01, progress=False)["plant.position"] for d in loops]
+    assert runs[0] == pytest.approx(runs[1], rel=1e-9)
+    poles = [np.sort_complex(np.linalg.eigvals(d.linearize(step=0.01).A)) for d in loops]
+    assert poles[0] == pytest.approx(poles[1], rel=1e-6)
+    points = [d.trim() for d in loops]
+    assert points[0].values["plant.position"] == pytest.approx(points[1].values["plant.position"], rel=1e-6)
+    assert mixed.blocks.keys() == plain.blocks.keys()  # the conversions are no blocks of the user's
+
+
+def test_a_contact_is_that_of_one_unit(loops):
+    omega = np.array([1.0, 10.0, 50.0])
+    found = [
+        d.sampled(0.01)
+        .contact(port="plant.force", force=None, direction=(1.0,), at=d.sampled(0.01).trim())
+        .admittance(omega)
+        for d in loops
+    ]
+    assert found[0].rendered == pytest.approx(found[1].rendered, rel=1e-6)
