@@ -261,6 +261,10 @@ class FmuInstance(StepFailures):
         steps = None if self._careful is None else self._careful.memory()
         return self._keep(self.call("saving its state", self.fmi.save_state), self.t, self._running, steps)
 
+    def go_back(self, state: FmuState) -> None:
+        """Set the FMU back to a state, without its outputs; for steps that are taken again."""
+        self.call("restoring its state", self.fmi.set_state, state._handle)
+
     def restore(self, state: FmuState) -> None:
         """Restore a saved state, earlier or later, and get the outputs there; this is allowed after an error, too.
 

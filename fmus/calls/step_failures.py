@@ -76,7 +76,8 @@ class StepFailures(LoadedFmu):
         if ends:
             self._width.value = 0.0
             raise self.termination(t, h)
-        if status == DISCARD and self._call is not None and retry_discarded(self, self._call, t, h):
+        again = status == DISCARD and self._call is not None and not self.block.stepping.rollback
+        if again and self._call is not None and retry_discarded(self, self._call, t, h):
             return
         if status > 1:
             raise self._step_error(status, t, h)

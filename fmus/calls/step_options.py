@@ -36,6 +36,9 @@ class StepOptions:
     retries : int
         Number of times that a discarded step is halved. It is done where the FMU takes steps of any length and is in a
         known state: in FMI 3.0 that before the step, in FMI 2.0 that at its lastSuccessfulTime.
+    rollback : bool
+        Save the FMU's state before each step, so that a discarded one is taken again from there (FMI 2.0, 4.2.2), by
+        the length that its lastSuccessfulTime says, or half of it. The FMU must be able to save its state.
     input_derivatives : bool
         Tell an FMU of FMI 2.0 with ``canInterpolateInputs`` the slopes of its real inputs, by the difference from the
         step before. This helps where inputs are smooth; where they are held or jump, it overshoots.
@@ -55,6 +58,7 @@ class StepOptions:
     event_mode: bool | None = None
     early_return: bool | None = None
     retries: int = 10
+    rollback: bool = False
     input_derivatives: bool = False
     time: StepTime | str = StepTime.MULTIPLIED
     communication_step: float | Fraction | None = None
@@ -82,9 +86,9 @@ class StepOptions:
                 "halved.",
                 port="stepping.retries",
             )
-        for name in ("event_mode", "early_return", "input_derivatives"):
+        for name in ("event_mode", "early_return", "rollback", "input_derivatives"):
             value = getattr(self, name)
-            if not isinstance(value, bool) and not (value is None and name != "input_derivatives"):
+            if not isinstance(value, bool) and not (value is None and name in ("event_mode", "early_return")):
                 raise ParameterError(
                     f"found {value!r}; expected True or False. Give one of them.", port=f"stepping.{name}"
                 )
@@ -112,6 +116,7 @@ def check_offered(options: object, about: FmuDescription, label: str) -> None:
     for name, offered, needed in (
         ("event_mode", about.has_event_mode, "hasEventMode is false in its description"),
         ("early_return", about.fmi.startswith("3"), f"only FMI 3.0 has that, and it is of FMI {about.fmi}"),
+        ("rollback", about.can_save, f"{about.state_flags[0]} is false in its description"),
         ("input_derivatives", about.interpolates_inputs, "canInterpolateInputs is not true in its description"),
     ):
         if getattr(options, name) and not offered:

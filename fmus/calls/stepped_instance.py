@@ -9,6 +9,7 @@ from ...blocks.core import FmuRuntimeError
 from ..archive import FmuDescription
 from .fmi_calls import FmiCalls, StepCall
 from .fmu_block import FmuBlock
+from .saved_state import FmuState
 from .transfer import UnfitError
 
 R = TypeVar("R")
@@ -53,3 +54,13 @@ class SteppedInstance(Protocol):
 
     def note_retry(self, t: float, h: float, count: int) -> None:
         """Keep the message of a step that was taken in parts."""
+
+
+class SavedInstance(SteppedInstance, Protocol):
+    """Instance whose state can be saved."""
+
+    def save(self) -> FmuState:
+        """Save its state."""
+
+    def go_back(self, state: FmuState) -> None:
+        """Set the FMU back to a state, and nothing else."""

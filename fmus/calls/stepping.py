@@ -15,10 +15,10 @@ import numpy as np
 
 from ...blocks.core import FmuRuntimeError, Layout
 from ..archive import FmuDescription, FmuVariable, OtherVariable
-from .fmi_calls import DISCARD, MOST_ROUNDS, StepCall
-from .saved_state import StepMemory
+from .fmi_calls import DISCARD, MOST_ROUNDS, WARNING, StepCall
+from .saved_state import FmuState, StepMemory
 from .step_options import StepOptions, StepTime, allows_early_return, uses_event_mode
-from .stepped_instance import SteppedInstance
+from .stepped_instance import SavedInstance, SteppedInstance
 from .transfer import Transfer, UnfitError
 
 _ROUNDED = 1e-9
@@ -34,6 +34,7 @@ def needs_care(about: FmuDescription, options: StepOptions) -> bool:
         uses_event_mode(about, options)
         or allows_early_return(about, options)
         or options.input_derivatives
+        or options.rollback
         or options.time is StepTime.ADDED
     )
 
@@ -91,7 +92,7 @@ class CarefulSteps:
 
     Parameters
     ----------
-    instance : SteppedInstance
+    instance : SavedInstance
         The instance.
     inputs, outputs : mapping of str to FmuVariable
         Variables of the ports.
@@ -105,7 +106,7 @@ class CarefulSteps:
 
     def __init__(
         self,
-        instance: SteppedInstance,
+        instance: SavedInstance,
         inputs: Mapping[str, FmuVariable],
         vector: np.ndarray,
         outs: Transfer,
@@ -225,15 +226,40 @@ class CarefulSteps:
     def _take(self, t: float, h: float) -> tuple[float, bool]:
         """Step once; return the time that was reached, and whether the FMU asks for Event Mode."""
         instance, call = self.instance, self.call
+        state = instance.save() if self.options.rollback else None
         instance.set_span(t, h)
         if (status := call.function(*call.arguments)) > 1:
-            instance.end_step(status, t, h)
+            if state is None or self.fmi.end_step(status)[0] != DISCARD or not self._redo(state, t, h):
+                instance.end_step(status, t, h)
             return t + h, False
         event, ends, early, _ = call.flags
         if early and not ends and allows_early_return(self.about, self.options):
             return min(max(call.reached.value, t), t + h), bool(event)
         instance.check_flags(call, t, h)
         return t + h, bool(event)
+
+    def _redo(self, state: FmuState, t: float, h: float) -> bool:
+        """Take a discarded step again from its start, in smaller ones; return whether that has worked."""
+        instance, call, end = self.instance, self.call, t + h
+        now, part, count, status, smallest = t, h, 0, DISCARD, h * 0.5**self.options.retries
+        while end - now > _ROUNDED * smallest:
+            if status == DISCARD:
+                known = self.fmi.time_after_discard(now, part)
+                instance.go_back(state)
+                part = known - now if known is not None and smallest < known - now < part else 0.5 * part
+                if part < smallest * (1.0 - _ROUNDED):
+                    return False
+            else:
+                state, part = instance.save(), end - now
+            instance.set_span(now, part)
+            status, _ = self.fmi.end_step(call.function(*call.arguments))
+            if status <= WARNING:
+                now, count = now + part, count + 1
+            elif status != DISCARD:
+                return False
+        instance.set_span(t, h)
+        instance.note_retry(t, h, count)
+        return True
 
     # ---- values ----
 

@@ -290,6 +290,34 @@ def test_steps_that_are_always_discarded_end_the_run(folder, fmi, options):
     assert e.value.run["plant.steps"].tolist() == [0, 1, 2]  # what was right is kept
 
 
+ROLLS_BACK = (
+    """
+typedef struct { double t, reached, x; int steps; } instance;
+int fmi2DoStep(void *p, double t, double h, int f) {  /* a step ends at 0.25 s, or before it; a discarded one spoils all */
+    instance *c = p; if (fabs(t - c->t) > 1e-12) return 3;
+    if (t < 0.25 - 1e-9 && t + h > 0.25 + 1e-9) { c->t = c->reached = 0.25; c->x += 100; return 2; }
+    c->t = t + h; c->x += h; c->steps++; return 0; }
+int fmi2GetRealStatus(void *p, int kind, double *v) { *v = ((instance *)p)->reached; return kind == 2 ? 0 : 3; }
+int fmi2GetBooleanStatus(void *p, int kind, int *v) { *v = 0; return 0; }
+int fmi2GetFMUstate(void *p, void **s) { if (!*s) *s = malloc(sizeof(instance)); memcpy(*s, p, sizeof(instance)); return 0; }
+int fmi2SetFMUstate(void *p, void *s) { memcpy(p, s, sizeof(instance)); return 0; }
+int fmi2FreeFMUstate(void *p, void **s) { free(*s); *s = 0; return 0; }
+"""
+    + values("fmi2", "Get", "Real", "double", {1: "c->x"})
+    + values("fmi2", "Get", "Integer", "int", {2: "c->steps"})
+)
+
+
+@pytest.mark.parametrize("isolate", [True, False])
+def test_a_discarded_step_is_taken_again_from_its_start(folder, isolate):
+    model = SIMPLE2.format(variable="true", more='canGetAndSetFMUstate="true"')
+    file = small_fmu(folder, "fmi2", ROLLS_BACK, model, name="back")
+    plant = Fmu(file, name="plant", stepping=StepOptions(rollback=True), isolate=isolate)
+    run = Diagram("d", plant()).simulate(0.4, step=0.1, progress=False)
+    assert run["plant.y"] == pytest.approx(run.t, abs=1e-12)  # nothing of the discarded step is left
+    assert run["plant.steps"].tolist() == [0, 1, 2, 4, 5] or isolate
+
+
 def test_no_step_is_tried_again_without_retries(folder):
     plant = Fmu(discarding(folder, 3, "0.03"), name="plant", stepping=StepOptions(retries=0))
     with pytest.raises(FmuRuntimeError, match="was discarded"):
@@ -407,7 +435,12 @@ def test_wrong_options_are_refused(options, text):
 
 @pytest.mark.parametrize(
     ("name", "flag"),
-    [("event_mode", "hasEventMode"), ("early_return", "FMI 3.0"), ("input_derivatives", "canInterpolateInputs")],
+    [
+        ("rollback", "canGetAndSetFMUstate"),
+        ("event_mode", "hasEventMode"),
+        ("early_return", "FMI 3.0"),
+        ("input_derivatives", "canInterpolateInputs"),
+    ],
 )
 def test_options_that_the_fmu_does_not_offer_are_refused(folder, name, flag):
     file = discarding(folder, 2, "0.03")
