@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ...blocks.core import FmuFileError
 from ..platform import native_platform
-from .faults import FmuFault
+from .faults import FmuFault, FmuFinding
 from .library import SharedLibrary, read_library
 from .zip_file import FmuArchive
 
@@ -52,6 +52,17 @@ def find_binary(path: Path, entries: Collection[str], version: str, identifier: 
         f"or build it for this platform; 'loopwright doctor {path}' says what would run it.",
         fault=FmuFault.NO_BINARY,
         subject=folder,
+    )
+
+
+def judge_name(binary: str, identifier: str) -> tuple[FmuFinding, ...]:
+    """Return the finding that a library's name is not the model identifier's (FMI 2.0, 2.3.1; FMI 3.0, 2.5.1.4)."""
+    name = binary.rpartition("/")[2]
+    if name.rpartition(".")[0] == identifier:
+        return ()
+    found = f"its library is called {name}, as the only one in its folder; expected the model identifier, {identifier}."
+    return (
+        FmuFinding(FmuFault.OTHER_NAME, binary, found, "It runs here; other tools may not find it. Tell its maker."),
     )
 
 

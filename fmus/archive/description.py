@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import FmuFileError, Layout
-from .binaries import find_binary
+from .binaries import find_binary, judge_name
 from .exchange import ExchangeInfo, read_exchange
 from .faults import FmuFault, FmuFinding
 from .feedthrough import Feedthrough, feeds_through, read_feedthrough
@@ -252,7 +252,7 @@ def _read(
         ) from error
     return FmuDescription(
         version, path, archive.digest, model.modelName, identifier, model.instantiationToken or "",
-        binary, complaints=complaints, limits=limits, findings=archive.findings,
+        binary, complaints=complaints, limits=limits, findings=(*archive.findings, *judge_name(binary, identifier)),
         generation_tool=root.get("generationTool", ""), model_version=root.get("version", ""), **found,
     )  # fmt: skip
 

@@ -31,7 +31,7 @@ def write_text(fmi: FmiCalls, variable: OtherVariable, value: Text) -> None:
 
 
 def list_limits(label: str, about: FmuDescription) -> list[str]:
-    """Return messages on ports that are neither read nor set, and on a description that breaks rules."""
+    """Return messages on ports that are neither read nor set, and on a file or description that breaks rules."""
     ins, outs = (about.other_ports(causality) for causality in ("input", "output"))
     outs, clocks = [v for v in outs if not v.is_text], [v for v in ins if v.type_is_clock]
     ins = [v for v in ins if not v.type_is_clock]
@@ -48,6 +48,7 @@ def list_limits(label: str, about: FmuDescription) -> list[str]:
             f"{label}: its description breaks the standard: {about.complaints[0].rstrip('.')}{more}. "
             f"'loopwright validate {about.file}' has them all"
         )
+    found += [f"{label}: {finding.found.rstrip('.')}" for finding in about.findings]
     return found + [f"{label}: {text}" for text in about.unit_complaints]
 
 

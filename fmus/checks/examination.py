@@ -275,7 +275,7 @@ def _try(
     folders = binaries_of(archive.files)
     if hopeless:
         return FmuTrial(kind, ran=False, left="it can't run here"), None
-    left = reason_not_to_run(kind, attributes, folders)
+    left = reason_not_to_run(kind, attributes, folders, summary["fmi_version"])
     if not left and run is None and attributes.get("needsExecutionTool") in (True, 1):
         left = "it needs another program, and may take a licence; --run tries it"
     if not left and run is False:

@@ -134,8 +134,8 @@ def _notes(fmi: str, entries: Iterable[str], interfaces: Mapping[str, Mapping[st
     notes = []
     if fmi == "1.0":
         notes.append(
-            "FMI 1.0 runs here for co-simulation alone, without saved states and derivatives, and its validation does "
-            "not run it. Export it with FMI 3.0 where you can."
+            "FMI 1.0 runs here for co-simulation alone, without saved states and derivatives. Export it with FMI 3.0 "
+            "where you can."
         )
     if _needs_python(entries, tool):
         notes.append(

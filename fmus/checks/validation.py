@@ -76,12 +76,12 @@ def validate(file: Path, *, run: bool = True, limits: ArchiveLimits | None = Non
     folders = binaries_of(entries)
     if folders:
         done.append(f"binaries for {', '.join(folders)}")
-    for kind in INTERFACES:
-        element = root.find(kind)
-        if element is None or not run:
-            continue
+    elements = {kind: element for kind in INTERFACES if (element := root.find(kind)) is not None}
+    if fmi == "1.0":  # the interface is no element there
+        elements = {"ModelExchange" if not root.xpath("Implementation") else "CoSimulation": root}
+    for kind, element in elements.items() if run else ():
         name = INTERFACES[kind]
-        reason = reason_not_to_run(kind, element, folders)
+        reason = reason_not_to_run(kind, element, folders, fmi)
         if reason:
             left.append(f"{name} was not run: {reason}")
             continue
@@ -90,8 +90,6 @@ def validate(file: Path, *, run: bool = True, limits: ArchiveLimits | None = Non
         done.append(f"{name} {RUNS[kind]}")
         if wrong is not None:
             problems.append(wrong)
-    if fmi == "1.0":
-        left.append("it was not run: FMI 1.0 is not tried")
     return ValidationReport(tuple(problems), tuple(done), tuple(left))
 
 
@@ -243,7 +241,7 @@ def _binaries(archive: FmuArchive, root: Any, tool: str) -> Iterator[FmuProblem]
 # --- running --------------------------------------------------------------------------------------------------------
 
 
-def reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]]) -> str:
+def reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]], version: str) -> str:
     """Return the reason why an interface can't be run here; empty if there is none.
 
     Parameters
@@ -254,9 +252,13 @@ def reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]])
         Its attributes; an XML element serves.
     folders : mapping
         Libraries by folder, as `binaries_of` returns them.
+    version : str
+        Version of FMI.
     """
     if kind == "ScheduledExecution":
         return "scheduled execution needs a scheduler"
+    if kind == "ModelExchange" and version == "1.0":
+        return "model exchange of FMI 1.0 is not supported"
     native = native_platform()
     if native_libraries(native, folders, [element.get("modelIdentifier") or ""]) is not None:
         return ""

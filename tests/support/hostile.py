@@ -312,7 +312,7 @@ LIBRARIES = {
         lambda files: packed(without_library(files), ("binaries/riscv64-linux/plant.so", files[binaries(files)[0]])),
         FmuFault.NO_BINARY,
     ),
-    "of another name": Case(other_name("other.so"), None),
+    "of another name": Case(other_name("other.so"), None, FmuFault.OTHER_NAME),
     "of two other names": Case(other_name("one.so", "two.so"), FmuFault.AMBIGUOUS),
     "empty": Case(library(lambda data: b""), FmuFault.TRUNCATED),
     "a text": Case(library(lambda data: b"version https://git-lfs.github.com/spec/v1\n"), FmuFault.TRUNCATED),

@@ -476,7 +476,7 @@ def test_inspect_fmi_1(tmp_path, capsys):
     assert (found["on"]["start"], found["text"]["start"], found["x"]["start"]) == (True, "1 2", 1.5)
     assert main(["validate", str(file)]) == 1  # no library: MZ alone is none
     out = capsys.readouterr().out
-    assert "not checked: it was not run: FMI 1.0 is not tried" in out
+    assert "not checked: model exchange was not run: model exchange of FMI 1.0 is not supported" in out
     assert "binaries/win32/old.dll is for no platform known here: it is no shared library; expected x86-windows." in out
 
 

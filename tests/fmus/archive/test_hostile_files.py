@@ -6,7 +6,8 @@ import subprocess
 import pytest
 
 from loopwright.blocks import FmuFileError
-from loopwright.fmus import ArchiveLimits, FmuFault, mass_spring_damper, read_description
+from loopwright.diagrams import Diagram
+from loopwright.fmus import ArchiveLimits, Fmu, FmuFault, mass_spring_damper, read_description
 from loopwright.fmus.archive import FmuArchive, unpack
 from support.hostile import ARCHIVES, CASES, XML, good_files, packed
 
@@ -126,3 +127,15 @@ def test_a_large_file_is_refused_before_it_is_unpacked(place):
         read_description(path)
     assert caught.value.fault == FmuFault.RATIO
     assert caught.value.subject == "resources/zeros"
+
+
+def test_the_messages_of_a_run_tell_what_is_wrong_with_the_file(good, tmp_path, monkeypatch):
+    monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "cache"))
+    path = tmp_path / "plant.fmu"
+    path.write_bytes(CASES["library: of another name"].make(good))
+    plant = Fmu(path, name="plant", start={"force": 1.0}, isolate=False)
+    (message,) = Diagram("d", plant()).simulate(0.01, step=1e-3, progress=False).messages
+    assert message == (
+        "plant: its library is called other.so, as the only one in its folder; expected the model identifier, "
+        "mass_spring_damper"
+    )
