@@ -35,6 +35,8 @@ def check_system(cls: type[Block], system: Any, kind: str, *, discrete: bool) ->
     if not isinstance(system, wanted):
         other = isinstance(system, control.StateSpace | control.TransferFunction)
         step = f"Convert it: control.{'ss' if kind == 'StateSpace' else 'tf'}(system)." if other else "Give one."
+        if not other and isinstance(system, control.NonlinearIOSystem):
+            step = "Write its equations as a Block, or take its linear model: control.linearize(system, x0, u0)."
         raise ParameterError(
             f"found a {type(system).__name__}; expected a control.{kind}. {step}", block=cls.__name__, port="system"
         )

@@ -1,7 +1,10 @@
 """Margins, Nyquist, disks and pole placement of linear systems."""
 
+from typing import TYPE_CHECKING
+
 from .carried import with_findings
 from .disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
+from .loop_class import loop_class
 from .loop_margins import margins
 from .margins_found import GainCrossover, Margins, PhaseCrossover
 from .number import MARK, Number
@@ -14,6 +17,9 @@ from .python_control import Comparison, compare_margins, compare_with_control
 from .realization import Realization
 from .sensitivities import GangOfFour, complementary, delayed_hold, delayed_hold_margin, gang_of_four, sensitivity
 from .state_space import read_matrices
+
+if TYPE_CHECKING:
+    from .loop_transfer import LoopTransfer as LoopTransfer
 
 __all__ = [
     "MARK",
@@ -36,6 +42,7 @@ __all__ = [
     "disk_margin",
     "gang_of_four",
     "loop_at",
+    "loop_class",
     "margins",
     "mimo_disk_margin",
     "nyquist_count",

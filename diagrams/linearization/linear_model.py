@@ -19,6 +19,7 @@ import numpy as np
 from ...blocks.core import Finding, LoopwrightError, OptionError
 from ...fmus.running import Derivation, DerivativeMethod
 from ..flat import NONE, TickPattern, WiredDiagram
+from ..frequency import loop_class
 from ..results import OperatingPoint
 from ..wiring import exact_time
 from .checks import check_loop, check_opening, refuse_transport_delays, replace_stairs
@@ -43,6 +44,8 @@ from .signal_paths import SignalPaths
 
 if TYPE_CHECKING:
     from control import StateSpace
+
+    from ..frequency import LoopTransfer
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +132,7 @@ class Linearization:
         """
         return self._state_space(self.C, self.D, self.diagram.name)
 
-    def _state_space(self, C: np.ndarray, D: np.ndarray, name: str) -> StateSpace:
+    def _state_space(self, C: np.ndarray, D: np.ndarray, name: str, kind: type[StateSpace] | None = None) -> Any:
         from control import StateSpace
 
         if not self.inputs or not self.outputs:
@@ -143,7 +146,7 @@ class Linearization:
             key: [e.replace(".", "_") for e in labels]
             for key, labels in (("inputs", self.inputs), ("outputs", self.outputs), ("states", self.states))
         }
-        system = StateSpace(
+        system = (kind or StateSpace)(
             self.A, self.B, C, D, self.dt, name=name.replace(".", "_"), remove_useless_states=False, **names
         )
         system.findings = self.carried
@@ -175,7 +178,7 @@ class Linearization:
         to: str | Iterable[str] = (),
         lifted: bool = False,
         slow: Literal["closed", "open"] = "closed",
-    ) -> StateSpace:
+    ) -> LoopTransfer:
         """Return the loop transfer function L at a wire, all other loops closed: S = 1/(1 + L).
 
         The wire is cut behind the port, for all consumers: L = −(returning signal)/(injected signal). With several
@@ -197,8 +200,9 @@ class Linearization:
 
         Returns
         -------
-        control.StateSpace
-            L, with the names of the wires as inputs and outputs. Its ``findings`` limit it; its ``notes`` are their
+        LoopTransfer
+            L, a `control.StateSpace` with the names of the wires as inputs and outputs. It plots itself: ``bode``,
+            ``nyquist``, ``nichols``, ``step``, ``gang_of_four``. Its ``findings`` limit it; its ``notes`` are their
             texts, and which entry was taken where one was asked for.
 
         Raises
@@ -219,7 +223,9 @@ class Linearization:
             diagram, point, port = split_consumers(self.diagram, self.point, wires, _as_list(to))
             return replace(self, diagram=diagram, point=point).loop(port, lifted=lifted, slow=slow)
         cut = self._make_at(wires, openings=wires, loop="lifted" if lifted else "one", slow=slow)
-        return cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})")
+        made = cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})", loop_class())
+        made.linearization, made.wires = self, wires
+        return made
 
     def sensitivity(self, *wires: str) -> StateSpace:
         """Return S at a wire, from the injected signal to that of the consumers, with all loops closed.

@@ -1,0 +1,176 @@
+"""Loops that plot themselves: the curves against python-control and closed forms, overlays, and refusals."""
+
+import control
+import numpy as np
+import pytest
+
+from loopwright.blocks import Constant, Gain, Integrator, OptionError, TransferFunction
+from loopwright.diagrams import Diagram, subsystem
+
+KP, KI, TAU = 5.0, 4.0, 0.05
+
+
+def drive(sample_time=None):
+    """PI control of 1/(s (τ s + 1)): the wires u and y."""
+    lag, place = TransferFunction(numerator=[1.0], denominator=[TAU, 1.0], name="lag"), Integrator(name="place")
+    pi = TransferFunction(numerator=[KP, KI], denominator=[1.0, 0.0], name="pi")
+
+    @subsystem(sample_time=sample_time)
+    def controller(y):
+        return pi(Constant(value=0.0, name="r") - y)
+
+    return Diagram("drive", place(lag(controller(place.y).named("u"))).named("y"))
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return drive().linearize().loop("u")
+
+
+@pytest.fixture(scope="module")
+def sampled():
+    return drive(0.02).linearize().loop("u")
+
+
+def exact(w):
+    s = 1j * w
+    return (KP * s + KI) / s, 1 / (s * (TAU * s + 1))
+
+
+def curve(axes, i=0):
+    return tuple(np.asarray(part, dtype=float) for part in axes.lines[i].get_data())
+
+
+def test_a_loop_is_a_state_space_of_python_control(loop):
+    assert isinstance(loop, control.StateSpace)
+    assert type(2 * loop) is control.StateSpace
+    assert loop.name == "L(u)"
+    assert loop.wires == ("u",)
+    assert control.margin(loop)[1] == pytest.approx(float(control.margin(control.ss(loop))[1]))
+
+
+@pytest.mark.parametrize(("db", "hz"), [(True, False), (False, True)])
+def test_bode_is_the_closed_form(loop, db, hz):
+    figure = loop.bode(db=db, hz=hz)
+    gain, phase = figure.axes
+    w, size = curve(gain)
+    w = w * (2 * np.pi if hz else 1.0)
+    C, P = exact(w)
+    assert np.allclose(10 ** (size / 20) if db else size, np.abs(C * P), rtol=1e-9)
+    assert np.allclose(curve(phase)[1], np.degrees(np.unwrap(np.angle(C * P))), atol=1e-6)
+    crossover = w[np.argmin(np.abs(np.abs(C * P) - 1))]
+    assert w[0] < crossover / 20 < 20 * crossover < w[-1]
+    assert ("Hz" in phase.get_xlabel()) == hz
+
+
+def test_a_sampled_loop_ends_at_half_its_sampling_frequency_and_is_that_of_python_control(loop, sampled):
+    figure = loop.bode(sampled)
+    w, size = curve(figure.axes[0], 1)
+    assert w[-1] == pytest.approx(np.pi / 0.02, rel=1e-2)
+    assert w[-1] < np.pi / 0.02
+    expected = np.abs(np.ravel(control.ss(sampled)(np.exp(0.02j * w))))
+    assert np.allclose(10 ** (size / 20), expected, rtol=1e-6)
+    assert curve(figure.axes[0], 0)[0][-1] > np.pi / 0.02 or w[-1] > 10
+
+
+def test_nyquist_is_the_closed_form_with_its_mirror_and_crossings_in_view(loop):
+    figure = loop.nyquist(omega=np.geomspace(0.5, 50.0, 40))
+    C, P = exact(np.geomspace(0.5, 50.0, 40))
+    axes = figure.axes[0]
+    drawn = {tuple(np.round(curve(axes, i)[1][:3], 9)) for i in range(len(axes.lines))}
+    assert tuple(np.round((C * P).imag[:3], 9)) in drawn
+    assert tuple(np.round(-(C * P).imag[:3], 9)) in drawn
+    far = control.tf([20.0], [1.0, 3.0, 3.0, 1.0])  # crosses at −20/8
+    assert loop.nyquist(far).axes[0].get_xlim()[0] < -2.5
+
+
+def test_nichols_is_gain_over_phase(loop):
+    w = np.geomspace(0.5, 50.0, 40)
+    phase, gain = curve(loop.nichols(omega=w).axes[0])
+    C, P = exact(w)
+    assert np.allclose(gain, 20 * np.log10(np.abs(C * P)), atol=1e-9)
+    assert np.allclose(phase, np.degrees(np.unwrap(np.angle(C * P))), atol=1e-9)
+
+
+def test_a_step_is_that_of_the_closed_loop(loop, sampled):
+    axes = loop.step(sampled, t=3.0).axes[0]
+    C, P = control.tf([KP, KI], [1.0, 0.0]), control.tf([1.0], [TAU, 1.0, 0.0])
+    t, y = curve(axes)
+    assert np.allclose(y, control.step_response(control.feedback(C * P, 1), T=t).y[0, 0], atol=1e-6)
+    t, y = curve(axes, 1)
+    assert np.allclose(np.diff(t), 0.02)
+    assert np.allclose(y, control.step_response(control.feedback(control.ss(sampled), 1), T=t).y[0, 0], atol=1e-9)
+    assert loop.step().axes[0].get_xlim()[1] == pytest.approx(30 / 4.9, rel=0.1)
+
+
+def test_the_gang_of_four_is_that_of_plant_and_controller(loop):
+    w = np.geomspace(0.1, 100.0, 30)
+    figure = loop.gang_of_four("y", omega=w)
+    C, P = exact(w)
+    S = 1 / (1 + C * P)
+    expected = {"|S|": S, "|PS|": P * S, "|CS|": C * S, "|T|": 1 - S}
+    assert {axes.get_ylabel() for axes in figure.axes} == set(expected)
+    for axes in figure.axes:
+        assert np.allclose(curve(axes)[1], np.abs(expected[axes.get_ylabel()]), rtol=1e-7)
+
+
+def test_several_loops_and_measured_data_stand_in_one_figure(loop):
+    C, P = exact(np.array([1.0, 10.0]))
+    data = control.frd(C * P, np.array([1.0, 10.0]), name="measured")
+    plain = control.tf([KP], [TAU, 1.0, 0.0], name="plain")
+    axes = loop.bode(plain, data, loop).axes[0]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["L(u) (1)", "plain", "measured", "L(u) (2)"]
+    w, size = curve(axes, 2)
+    assert list(w) == [1.0, 10.0]
+    assert np.allclose(10 ** (size / 20), np.abs(C * P))
+    assert axes.lines[2].get_marker() == "o"
+    own = loop.bode(plain, labels=["a", "b"]).axes[0].get_legend().get_texts()
+    assert [text.get_text() for text in own] == ["a", "b"]
+
+
+def test_figures_leave_pyplot_alone(loop):
+    import matplotlib.pyplot as plt
+
+    before = plt.get_fignums()
+    for figure in (loop.bode(), loop.nyquist(), loop.nichols(), loop.step(), loop.gang_of_four("y")):
+        assert figure._repr_png_().startswith(b"\x89PNG")
+    assert plt.get_fignums() == before
+
+
+def unstable():
+    place = Integrator(name="place")
+    return Diagram("d", place(Gain(gain=3.0, name="g")(place.y).named("u"))).linearize().loop("u")
+
+
+@pytest.mark.parametrize(
+    ("ask", "text"),
+    [
+        (lambda L: L.bode(labels=["a", "b"]), "2 labels for 1 loops; expected one for each"),
+        (lambda L: L.bode(omega=[-1.0]), "expected positive frequencies"),
+        (lambda L: L.bode(control.ss([[0.0]], [[1.0, 1.0]], [[1.0]], [[0.0, 0.0]])), "1 outputs and 2 inputs"),
+        (lambda L: L.nyquist("u"), "found str; expected a loop"),
+        (lambda L: L.step(t=0.0), "expected times in s above 0"),
+        (lambda L: L.step(control.frd([1.0 + 0j], [1.0])), "data has no step response"),
+        (lambda L: unstable().step(), r"a pole at 3\+0j, which is not stable"),
+        (lambda L: L.gang_of_four("y", control.ss(L)), r"expected a loop of linearize\(\).loop"),
+    ],
+)
+def test_what_does_not_fit_is_refused(loop, ask, text):
+    with pytest.raises(OptionError, match=text):
+        ask(loop)
+
+
+def test_interconnected_systems_come_in_and_go_out():
+    """python-control's own interconnection as a block: its step response in a run, and back again."""
+    from loopwright.blocks import StateSpace, Step
+
+    P = control.ss([[0, 1], [0, -2]], [[0], [1]], [[1, 0]], 0, name="P", inputs="u", outputs="y")
+    C = control.tf([6, 1], [0.1, 1], name="C", inputs="e", outputs="u")
+    closed = control.interconnect([P, C, control.summing_junction(["r", "-y"], "e")], inputs="r", outputs="y")
+    block = StateSpace.from_control(closed, name="closed")
+    run = Diagram("d", block(Step(times=0.0, values=1.0))).simulate(2.0, step=0.1, rtol=1e-9, atol=1e-11, progress=False)
+    expected = control.step_response(control.ss(closed), T=run.t).y[0, 0]
+    assert np.max(np.abs(run["closed.y"] - expected)) < 1e-7
+    back = block.to_control()
+    assert np.allclose(back(1j), closed(1j))
+    assert back.input_labels == ["r"]
