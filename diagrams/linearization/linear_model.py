@@ -223,7 +223,7 @@ class Linearization:
             diagram, point, port = split_consumers(self.diagram, self.point, wires, _as_list(to))
             return replace(self, diagram=diagram, point=point).loop(port, lifted=lifted, slow=slow)
         cut = self._make_at(wires, openings=wires, loop="lifted" if lifted else "one", slow=slow)
-        made = cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})", loop_class())
+        made: LoopTransfer = cut._state_space(-cut.C, -cut.D, f"L({', '.join(wires)})", loop_class())
         made.linearization, made.wires = self, wires
         return made
 
