@@ -13,8 +13,10 @@ def note_loops(flat: FlatDiagram, coupling: Coupling) -> tuple[str, ...]:
     if coupling.scheme == Scheme.ITERATED or not _may_loop(flat):
         return ()
     return tuple(
-        f"{', '.join(ports)}: direct feedthrough in a loop across FMUs. With coupling {str(coupling)!r} each of these "
-        "outputs follows the others one communication step later. Take coupling='iterated', which solves the loop."
+        f"{', '.join(ports)}: by their model structures these outputs follow one another at once, in a loop across "
+        "FMUs (an output without stated dependencies counts as one that follows all inputs). With coupling "
+        f"{str(coupling)!r} each follows the others one communication step later. Take coupling='iterated', which "
+        "solves the loop."
         for ports in Links(flat).loops
     )
 

@@ -50,7 +50,7 @@ def run_ticks(
     t, log = workspace.here.t, workspace.log
     each = [plant.step for plant in plants.values()] if steps.regular and coupled is None else []
     only = each[0] if len(each) == 1 else None
-    together = steps.regular and steps.apart
+    together, regular = steps.regular and steps.apart, steps.regular
     n, d, h = flat.base.numerator, flat.base.denominator, float(flat.base)
     always = workspace.bind_tick(flat.acting(0)) if all(c == EVERY for c in flat.distinct) else None
     count, now, before, width = 0, k * n / d, k, 1
@@ -78,7 +78,7 @@ def run_ticks(
             always()
         else:
             workspace.tick(flat.acting(k))
-        if not steps.regular:
+        if not regular:
             steps.hold(k)
         row(now, log)
         if arrived(k):
