@@ -40,6 +40,10 @@ class ExchangedBlock(Protocol):
         """Time in s of its next event that is known beforehand; infinite without one."""
 
     @property
+    def discarded(self) -> str:
+        """The last evaluation that it could not compute; empty if there is none."""
+
+    @property
     def ends_run(self) -> bool:
         """Whether it asks for the end of the run, at the instant that is reached."""
 
@@ -198,12 +202,17 @@ class ExchangeEvaluator:
             J = self.differences(names, t, x, u)
         return np.hstack([np.full((len(J), 1), math.nan), J])
 
-    def differences(self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Return the derivative of `evaluate` by (x, u), by central differences over parts of the nominal values."""
+    def differences(
+        self, names: tuple[str, ...], t: float, x: np.ndarray, u: np.ndarray, scale: float = 1.0
+    ) -> np.ndarray:
+        """Return the derivative of `evaluate` by (x, u), by central differences over parts of the nominal values.
+
+        ``scale`` makes the differences longer.
+        """
         columns = []
         scales = [*self.block.nominals, *(0.0 for _ in u)]
         for i, (at, nominal) in enumerate(zip([*x, *u], scales, strict=True)):
-            step = _STEP * max(abs(at), nominal or 1.0)
+            step = scale * _STEP * max(abs(at), nominal or 1.0)
             made = []
             for side in (step, -step):
                 moved = np.concatenate([x, u])

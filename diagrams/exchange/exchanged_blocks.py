@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, SimulationError
+from ...blocks.core import LoopwrightError, NonFiniteError, SimulationError
 from ..flat import FlatDiagram
 from .evaluator import Exchangeable, ExchangedBlock, ExchangeEvaluator, Look
 
@@ -83,6 +83,12 @@ class ExchangedBlocks:
     def ends_run(self) -> str:
         """Return the path of a block that asks for the end of the run; empty if none does."""
         return next((path for path, block in self.blocks.items() if block.ends_run), "")
+
+    def explain(self, error: SimulationError) -> None:
+        """Add to the error of a value that is not finite what its block could not compute."""
+        block = self.blocks.get(error.block or "")
+        if isinstance(error, NonFiniteError) and block is not None and block.discarded:
+            error.add(f" The last that it could not compute: {block.discarded}.")
 
     def nominals(self) -> np.ndarray:
         """Return the nominal value of each entry of x, 1 for those of other blocks."""

@@ -220,7 +220,7 @@ class Engine:
     def take_texts(self) -> dict[str, TextSignal]:
         """Return texts and binary data of the plants by dotted path; their record begins anew with the last ones."""
         found = {}
-        for path, plant in self.plants.items():
+        for path, plant in self.loaded.items():
             for port, changes in getattr(plant, "texts", {}).items():
                 found[f"{path}.{port}"] = TextSignal.of(changes)
                 del changes[:-1]
@@ -246,6 +246,7 @@ class Engine:
         for path, plant in self.loaded.items():
             if plant.failed:
                 error.blame(path)
+        self.exchanged.explain(error)
         opaque = opaque_failure(self.flat)
         return error if opaque is None else opaque.at(t=error.t)
 

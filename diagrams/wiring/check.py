@@ -204,8 +204,9 @@ def _check_subsystems(table: Structure, traced: dict[str, Traced], shapes: dict[
             )
     for path in sorted(table.blocks):
         gates = table.gates(table.subsystem_of[path])
-        if gates and path not in traced:
+        if gates and (path not in traced or table.blocks[path].evaluated_outside):
             kind = "a transport delay" if table.blocks[path].transport else "a block that is stepped, such as an FMU,"
+            kind = "an FMU in model exchange" if path in traced else kind
             raise WiringError(
                 f"{kind} can't stand in a subsystem that is {table.subsystems[gates[-1]].control} ({gates[-1]}): its "
                 "time goes on while the subsystem waits. Put it outside, and wire its outputs in.",

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 
 from ...blocks.core import FmuRuntimeError, Layout
 from ..archive import ExchangeInfo, FmuVariable
+from ..platform import is_built_here
 from .bound_calls import DISCARD, ERROR, FATAL, WARNING, BoundCalls, Call
 from .evaluation import Evaluation, Vector
 from .exchange_states import SavedExchange
 from .fmi_calls import EventUpdate
 from .fmu_block import FmuBlock
 from .loaded_library import MakeCalls
+from .texts import Text, TextRecord
 from .transfer import Transfer, UnfitError
 
 _ROUNDS = 100  # of an event iteration
+_NOTHING = nullcontext()
 _SAME = 1e-12  # relative change of a continuous input that is no jump
 
 
@@ -58,6 +62,8 @@ class ExchangeInstance(SavedExchange):
         self._evaluations: dict[Any, Evaluation] = {}
         self.ends_run = False
         """Whether the FMU has asked to end the simulation (terminateSimulation)."""
+        self._guarded = self.fmi.in_process and not is_built_here(self.description.digest)
+        self._texts = TextRecord(self.fmi, block.text_variables)
         self._events = self.fmi.event_calls()
         self._event: Evaluation | None = None
         self._completion: Evaluation | None = None
@@ -135,13 +141,14 @@ class ExchangeInstance(SavedExchange):
     def _run(self, made: Evaluation, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         self._x[:] = x[self._order]
         try:
-            status, action = made.run(t, u, running=self._running)
+            with self.host if self._guarded else _NOTHING:
+                status, action = made.run(t, u, running=self._running)
         except UnfitError as error:
             raise self._unfit(error, t) from None
         if status:
             if status != DISCARD:
                 raise self._error(action, status, t)
-            self._discarded = f"{action} at t = {t:.9g} s"
+            self._discarded = f"{action} at t = {t:.9g} s{self._quote_messages().rstrip('.')}"
             made.result[:] = math.nan
         elif made.rates is not None:
             made.result[made.rates_at][self._order] = self._dx
@@ -193,7 +200,18 @@ class ExchangeInstance(SavedExchange):
         self._time.value = self._began
         x = self._iterate(self._began)
         self.nominals = self._read_nominals()
+        for text in self.call("reading its texts", self._texts.go_back, self._began):
+            self.add_note(text)
         return x
+
+    @property
+    def texts(self) -> Mapping[str, list[tuple[float, Text]]]:
+        """Texts and binary data by port: each value with the time in s from which on it held."""
+        return self._texts.values
+
+    def _note_texts(self, t: float) -> None:
+        if self._texts.variables:
+            self.call("reading its texts", self._texts.note, t)
 
     def _read_nominals(self) -> np.ndarray:
         """Return the states' nominal values; 1 stands in for a value that is 0 or no number."""
@@ -303,6 +321,7 @@ class ExchangeInstance(SavedExchange):
         x = self._get("get_states", calls.leave)
         if nominals:
             self.nominals = self._read_nominals()
+        self._note_texts(t)
         return x
 
     def accept(self, t: float, x: np.ndarray, u: np.ndarray) -> bool:
@@ -314,6 +333,9 @@ class ExchangeInstance(SavedExchange):
         for port, values in kept.items():  # they are taken over by an event alone
             changed |= not np.array_equal(values, u[self._places[port]])
             self._u[self._places[port]] = values
+        if self._texts.variables:
+            self.evaluation(())(t, x, u)
+            self._note_texts(t)
         if not self.about.completes_steps:
             return changed
         if self._completion is None:

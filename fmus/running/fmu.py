@@ -206,12 +206,14 @@ class Fmu(ExchangeMembers):
     @property
     def can_save(self) -> bool:
         """Whether the state of a run can be saved and restored (canGetAndSetFMUState)."""
-        return self.description.can_save
+        exchange = self.description.exchange if self.evaluated_outside else None
+        return self.description.can_save if exchange is None else exchange.can_save
 
     @property
     def can_serialize(self) -> bool:
         """Whether a saved state can go to another process (canSerializeFMUState)."""
-        return self.description.can_serialize
+        exchange = self.description.exchange if self.evaluated_outside else None
+        return self.description.can_serialize if exchange is None else exchange.can_serialize
 
     @property
     def label(self) -> str:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, Gain, Quantizer, SimulationError, Step, Sum
+from loopwright.blocks import Constant, Gain, Quantizer, SimulationError, Step, Sum, WiringError
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu
 from support.eventful import eventful_fmu
@@ -116,3 +116,14 @@ def test_discrete_signals_that_chase_each_other_end_in_an_error(file):
     )
     with pytest.raises(SimulationError, match=r"plant.*(without end|still change)"):
         diagram.simulate(0.2, step=0.1, progress=False)
+
+
+def test_it_refuses_to_stand_in_an_enabled_subsystem(file):
+    @subsystem(enabled="held")
+    def box(u):
+        return plant(file)(u=u, n=Constant(value=0.0, name="n")).x
+
+    with pytest.raises(
+        WiringError, match=r"box.plant: an FMU in model exchange can't stand in a subsystem that is enabled"
+    ):
+        Diagram("d", box(Constant(value=1.0), enable=Constant(value=1.0)).named("x"))
