@@ -165,7 +165,7 @@ class ChildProcess:
 
     def find(self, address: int) -> int | None:
         """Return the place of an address in the shared memory; None if it isn't there."""
-        return place if 0 <= (place := address - self._base) < self.size else None
+        return place if DATA <= (place := address - self._base) < self._allotted else None
 
     # ---- requests ----
 
