@@ -11,13 +11,14 @@ K, D, M = 100.0, 1.0, 1.0  # of the library's oscillator
 PULL = 60.0
 
 
-def mass(name, position=0.0, **start):
-    return Fmu(mass_spring_damper.build(), name=name, start={"position": position, "velocity": 0.0, **start})
+def mass(name, position=0.0, fmi=3, **start):
+    file = mass_spring_damper.build(fmi=fmi)
+    return Fmu(file, name=name, start={"position": position, "velocity": 0.0, **start})
 
 
-def two_masses(**options):
+def two_masses(fmi=3, **options):
     """Masses of 1 kg and 2 kg, pulled together by a spring, which is a gain in continuous time."""
-    a, b = mass("a", 0.1), mass("b", mass=2.0)
+    a, b = mass("a", 0.1, fmi), mass("b", fmi=fmi, mass=2.0)
     pull = Gain(gain=PULL, name="spring")(b.position - a.position)
     return Diagram("two", a(force=pull), b(force=-1.0 * pull), **options)
 

@@ -222,6 +222,28 @@ def test_a_step_that_gets_too_short_says_so(cache):
     assert e.value.t == 0.0
 
 
+def test_a_linear_model_over_steps_is_that_of_the_default_coupling(cache):
+    """Both masses go a step with the force of its beginning: the transition is written down by hand."""
+    h, M = 0.02, np.zeros((4, 4))
+    for first, m, sign in ((0, 1.0, 1.0), (2, 2.0, -1.0)):
+        big = np.zeros((3, 3))
+        big[:2] = [[0.0, 1.0, 0.0], [-100.0 / m, -1.0 / m, 1.0 / m]]
+        whole = expm(big * h)
+        M[first : first + 2, first : first + 2] = whole[:2, :2]
+        M[first : first + 2] += np.outer(whole[:2, 2], sign * PULL * np.array([-1.0, 0.0, 1.0, 0.0]))
+    model = two_masses().linearize(step=h)
+    found = np.sort_complex([z for z in model.poles if abs(z) > 1e-9])
+    assert found == pytest.approx(np.sort_complex(np.linalg.eigvals(M)), abs=1e-9)
+    run = two_masses().simulate(0.2, step=h, progress=False)
+    expected = [np.linalg.matrix_power(M, k) @ [0.1, 0.0, 0.0, 0.0] for k in range(11)]
+    assert run["b.position"] == pytest.approx([x[2] for x in expected], rel=1e-6, abs=1e-10)
+
+
+def test_fmus_of_fmi_2_and_3_are_coupled_alike(cache):
+    runs = [two_masses(fmi).simulate(0.1, step=0.01, progress=False, coupling="iterated") for fmi in (2, 3)]
+    assert runs[0]["a.position"] == pytest.approx(runs[1]["a.position"], rel=1e-12)
+
+
 def test_a_linear_model_over_steps_of_another_coupling_is_refused(cache):
     diagram = two_masses()
     run = diagram.simulate(0.1, step=0.01, progress=False, coupling="gauss_seidel")

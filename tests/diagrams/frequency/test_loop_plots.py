@@ -168,7 +168,9 @@ def test_interconnected_systems_come_in_and_go_out():
     C = control.tf([6, 1], [0.1, 1], name="C", inputs="e", outputs="u")
     closed = control.interconnect([P, C, control.summing_junction(["r", "-y"], "e")], inputs="r", outputs="y")
     block = StateSpace.from_control(closed, name="closed")
-    run = Diagram("d", block(Step(times=0.0, values=1.0))).simulate(2.0, step=0.1, rtol=1e-9, atol=1e-11, progress=False)
+    run = Diagram("d", block(Step(times=0.0, values=1.0))).simulate(
+        2.0, step=0.1, rtol=1e-9, atol=1e-11, progress=False
+    )
     expected = control.step_response(control.ss(closed), T=run.t).y[0, 0]
     assert np.max(np.abs(run["closed.y"] - expected)) < 1e-7
     back = block.to_control()
