@@ -86,7 +86,8 @@ def _set_timer() -> None:
 def end_idle(seconds: float = 0.0) -> None:
     """End the processes that have been idle for so many seconds."""
     with _LOCKS[0]:
-        _TIMER.clear()
+        while _TIMER:
+            _TIMER.pop().cancel()
         old = [entry for entry in _IDLE_ONES if time.monotonic() - entry[2] >= seconds]
         _IDLE_ONES[:] = [entry for entry in _IDLE_ONES if entry not in old]
         _set_timer()

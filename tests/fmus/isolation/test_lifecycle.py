@@ -115,6 +115,7 @@ def test_cycles_of_fifty_fmus_leave_nothing_behind(folder, temporary, isolate, t
 @pytest.mark.parametrize(
     "fault", ["step segfault 0.01", "enter exit", "load abort", "free segfault", "step error 0.01"]
 )
+@pytest.mark.drawn(2)
 def test_cycles_with_a_fault_leave_nothing_behind(folder, temporary, fault):
     plant = Fmu(zoo_fmu(folder, 3, fault), name="plant", isolate=True)
 
