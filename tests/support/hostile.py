@@ -214,6 +214,10 @@ ARCHIVES = {
         lambda files: patched(packed(files), XML, central=10, local=8, form="<H", value=99), FmuFault.COMPRESSION
     ),
     "another size": Case(shorter, FmuFault.DAMAGED),
+    "less than it says": Case(
+        lambda files: patched(packed(files), XML, central=24, local=22, form="<I", value=len(files[XML]) + 1000),
+        FmuFault.DAMAGED,
+    ),
     "another checksum": Case(
         lambda files: patched(packed(files), XML, central=16, local=14, form="<I", value=7), FmuFault.DAMAGED
     ),
