@@ -32,12 +32,12 @@ from .validation import reason_not_to_run, validate
 _ABSENT = (FmuFault.NO_BINARY, FmuFault.OTHER_PLATFORM, FmuFault.VERSION, FmuFault.INTERFACE)
 """Errors of an FMU that may run elsewhere."""
 _RUNNERS = {
-    "x86_64-windows": "Windows of 64 bits, or Wine with a Python for Windows, here",
-    "x86-windows": "a Python of 32 bits on Windows (or in Wine)",
+    "x86_64-windows": "64-bit Windows, or here in Wine with a Python for Windows",
+    "x86-windows": "Windows, or here in Wine, with a 32-bit Python",
     "aarch64-windows": "Windows on ARM",
-    "x86_64-linux": "Linux of 64 bits",
-    "x86-linux": "a Python of 32 bits on Linux, with the system's libraries for i386",
-    "aarch64-linux": "Linux on ARM of 64 bits",
+    "x86_64-linux": "64-bit Linux",
+    "x86-linux": "Linux with a 32-bit Python, and the system's libraries for i386",
+    "aarch64-linux": "64-bit Linux on ARM",
     "x86_64-darwin": "macOS on Intel, or on Apple silicon by Rosetta",
     "aarch64-darwin": "macOS on Apple silicon",
 }
@@ -154,7 +154,7 @@ def _judge_platform(archive: FmuArchive, summary: Mapping[str, Any]) -> Iterator
             FmuSeverity.ERROR,
         )
     undefined = summary["native"]["undefined_symbols"]
-    if undefined and not lost:
+    if undefined and not lost and not summary["python"]:
         python = sum(name.startswith(("Py", "_Py")) for name in undefined) == len(undefined)
         more = f" and {len(undefined) - 1} more" if len(undefined) > 1 else ""
         yield FmuFinding(
@@ -169,11 +169,11 @@ def _judge_platform(archive: FmuArchive, summary: Mapping[str, Any]) -> Iterator
 def _absent(native: str, binaries: Mapping[str, list[str]], summary: Mapping[str, Any]) -> FmuFinding:
     """Return the finding that there is no library for this machine, with what would run the FMU."""
     runners = {_RUNNERS[p] for folder in binaries if (p := tuple_of(folder)) in _RUNNERS and binaries[folder]}
-    steps = [f"Run it on {', or on '.join(sorted(runners))}"] if runners else []
+    steps = [f"Run it on {'; or on '.join(sorted(runners))}"] if runners else []
     if any(name.endswith((".c", ".cpp")) for name in summary["sources"]):
         steps.append("build a library for this machine from its sources (fmpy compile)")
     steps.append(f"export it for {native} with its tool ({summary['generation_tool'] or 'not named'})")
-    text = ", or ".join(steps)
+    text = "; or ".join(steps)
     there = ", ".join(sorted(binaries)) or "none"
     return FmuFinding(
         FmuFault.NO_BINARY,
@@ -191,7 +191,7 @@ def _judge_content(summary: Mapping[str, Any]) -> Iterator[FmuFinding]:
     """Yield notes on tools that an FMU needs, and faults of its default experiment."""
     tool = summary["generation_tool"] or "not named"
     for kind, attributes in summary["interfaces"].items():
-        if attributes.get("needsExecutionTool") in (True, 1):
+        if _needs_tool(attributes, summary):
             yield FmuFinding(
                 FmuFault.TOOL,
                 kind,
@@ -218,6 +218,11 @@ def _judge_content(summary: Mapping[str, Any]) -> Iterator[FmuFinding]:
     start, stop = numbers.get("start_time", 0.0), numbers.get("stop_time", math.inf)
     if stop < start:
         yield _experiment("stop_time", f"stops at {stop:g} s, before its start at {start:g} s", "a later")
+
+
+def _needs_tool(attributes: Mapping[str, Any], summary: Mapping[str, Any]) -> bool:
+    """Whether an interface says that it needs another program, other than Python."""
+    return attributes.get("needsExecutionTool") in (True, 1) and not summary["python"]
 
 
 def _judge_names(variables: list[dict[str, Any]]) -> Iterator[FmuFinding]:
@@ -276,7 +281,7 @@ def _try(
     if hopeless:
         return FmuTrial(kind, ran=False, left="it can't run here"), None
     left = reason_not_to_run(kind, attributes, folders, summary["fmi_version"])
-    if not left and run is None and attributes.get("needsExecutionTool") in (True, 1):
+    if not left and run is None and _needs_tool(attributes, summary):
         left = "it needs another program, and may take a licence; --run tries it"
     if not left and run is False:
         left = "as asked for"

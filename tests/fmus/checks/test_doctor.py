@@ -77,8 +77,8 @@ def test_a_good_file_has_nothing_wrong(examine):
 @pytest.mark.parametrize(
     ("folder", "says"),
     [
-        ("x86_64-windows/mass_spring_damper.dll", "Run it on Windows of 64 bits, or Wine"),
-        ("x86-linux/mass_spring_damper.so", "Run it on a Python of 32 bits on Linux"),
+        ("x86_64-windows/mass_spring_damper.dll", "Run it on 64-bit Windows, or here in Wine"),
+        ("x86-linux/mass_spring_damper.so", "Run it on Linux with a 32-bit Python"),
         ("aarch64-darwin/mass_spring_damper.dylib", "Run it on macOS on Apple silicon"),
     ],
 )
