@@ -68,7 +68,8 @@ class FmuDescription:
     has_event_mode: bool = False
     """Whether events in co-simulation can be handled in Event Mode (hasEventMode of FMI 3.0)."""
     interpolates_inputs: bool = False
-    """Whether it takes derivatives of its real inputs (canInterpolateInputs of FMI 2.0)."""
+    """Whether it takes slopes of its real inputs (canInterpolateInputs of FMI 1.0 and 2.0), or inputs within a step
+    (providesIntermediateUpdate of FMI 3.0)."""
     variable_step: bool = False
     """Whether communication steps may differ in length (canHandleVariableCommunicationStepSize)."""
     fixed_internal_step: float | None = None
@@ -307,7 +308,7 @@ def _capabilities(root: Any, version: str) -> dict[str, Any]:
         "has_derivatives": _flag(steps, derivative),
         "only_once": _flag(steps, "canBeInstantiatedOnlyOncePerProcess"),
         "has_event_mode": _flag(steps, "hasEventMode"),
-        "interpolates_inputs": two and _flag(steps, "canInterpolateInputs"),
+        "interpolates_inputs": _flag(steps, "canInterpolateInputs" if two else "providesIntermediateUpdate"),
         "variable_step": _flag(steps, "canHandleVariableCommunicationStepSize"),
         "fixed_internal_step": None if fixed is None else float(fixed),
         "model_exchange": None if exchange is None else exchange.get("modelIdentifier"),
@@ -323,7 +324,9 @@ def _dropped_attributes(root: Any) -> dict[str, Mapping[str, str]]:
     """Return attributes that FMPy drops, by the variable's name: bounds of unsigned integers, intervals of clocks."""
     tags = " or ".join(f"starts-with(name(), '{kind}')" for kind in _DROPPED)
     found: dict[str, Mapping[str, str]] = {}
-    for element in root.xpath(f"ModelVariables/*[{tags} or @relativeQuantity or Real/@relativeQuantity]"):
+    for element in root.xpath(
+        f"ModelVariables/*[{tags} or @relativeQuantity or @intermediateUpdate or Real/@relativeQuantity]"
+    ):
         inner = element.find("Real")  # of FMI 2.0
         found[element.get("name", "")] = (element if inner is None else inner).attrib
     return found

@@ -46,6 +46,8 @@ class FmuVariable:
     """Type as FMI 3.0 names it; FMI 2.0's Real is Float64, its Integer is Int32."""
     items: Mapping[str, int] = field(default_factory=dict)
     """Values of an enumeration by their names."""
+    intermediate: bool = False
+    """Whether it can be set or read within a step (intermediateUpdate of FMI 3.0)."""
 
     @property
     def reference(self) -> int:
@@ -210,6 +212,7 @@ def read_variable(v: Any, dropped: Mapping[str, str], units: FmuUnits) -> FmuVar
         v.initial or ("calculated" if v.causality in ("output", "local", None) else "exact"),
         type_,
         items if type_ == "Enumeration" else {},
+        dropped.get("intermediateUpdate") in ("true", "1"),
     )
 
 

@@ -141,14 +141,16 @@ class Fmi1Calls(FmiCalls):
                 raise FMICallException(function=error.function, status=status) from None
         return False
 
-    def set_input_derivatives(self, references: Sequence[int], values: Sequence[float]) -> None:
+    def set_input_slopes(
+        self, t: float, references: Sequence[int], inputs: Sequence[float], slopes: Sequence[float]
+    ) -> None:
         """Tell the first time derivatives of real inputs (3.5)."""
         from fmpy.fmi1 import FMICallException
 
         n = len(references)
         kept, orders = (ctypes.c_uint * n)(*references), (ctypes.c_int * n)(*[1] * n)
         function = self.fmu._functions["fmi1SetRealInputDerivatives"]
-        if (status := function(self.fmu.component, kept, n, orders, (ctypes.c_double * n)(*values))) > 1:
+        if (status := function(self.fmu.component, kept, n, orders, (ctypes.c_double * n)(*slopes))) > 1:
             raise FMICallException(function="fmiSetRealInputDerivatives", status=status)
 
     def directional_derivative(

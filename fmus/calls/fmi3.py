@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,6 +20,9 @@ class Fmi3Calls(FmiCalls):
     """Functions of a library of FMI 3.0."""
 
     prefix = "fmi3"
+    intermediate_status = 0
+    """Worst status of inputs that were set within a step."""
+    _slopes: tuple[float, Any, Any, list[tuple[float, float]]] | None = None
     types: ClassVar = {
         "Float64": TypeCalls("Float64", ctypes.c_double),
         "Float32": TypeCalls("Float32", ctypes.c_float),
@@ -54,9 +58,12 @@ class Fmi3Calls(FmiCalls):
         def message(environment: Any, status: int, category: bytes | None, text: bytes | None) -> None:
             log(status, (text or b"").decode(errors="replace"))
 
-        modes = {}
+        modes: dict[str, Any] = {}
         if self.event_mode_used or self.early_return_allowed:
             modes = {"eventModeUsed": self.event_mode_used, "earlyReturnAllowed": self.early_return_allowed}
+        if self.intermediate_inputs:
+            modes["intermediateUpdate"] = self._update_inputs
+            modes["requiredIntermediateVariables"] = list(self.intermediate_inputs)
         self.fmu.instantiate(logMessage=message, loggingOn=True, **modes)
 
     def set_up(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
@@ -92,6 +99,32 @@ class Fmi3Calls(FmiCalls):
         )
         any_flag = ctypes.c_uint32.from_buffer(flags)
         return StepCall(self._function("fmi3DoStep"), arguments, any_flag, flags, reached)
+
+    def set_input_slopes(
+        self, t: float, references: Sequence[int], inputs: Sequence[float], slopes: Sequence[float]
+    ) -> None:
+        """Keep the slopes of inputs, which are set when the FMU asks for that within a step (FMI 3.0, 4.2.2)."""
+        if self.intermediate_status > 1:
+            raise RuntimeError(f"fmi3SetFloat64 failed within a step with {self.status_name(self.intermediate_status)}")
+        kept, n = (ctypes.c_uint * len(references))(*references), len(inputs)
+        self._slopes = t, kept, (ctypes.c_double * n)(), list(zip(inputs, slopes, strict=True))
+
+    def _update_inputs(self, environment: Any, t: float, set_requested: bool, *others: Any) -> None:
+        """Set the inputs at a time within a step; called by the FMU."""
+        if not set_requested or self._slopes is None:
+            return
+        start, references, buffer, lines = self._slopes
+        for i, (value, slope) in enumerate(lines):
+            buffer[i] = value + slope * (t - start)
+        status = self._set_inputs(self.fmu.component, references, len(references), buffer, len(lines))
+        self.intermediate_status = max(self.intermediate_status, status)
+
+    @cached_property
+    def _set_inputs(self) -> Callable[..., int]:
+        function = ctypes.CFUNCTYPE(
+            ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_void_p, ctypes.c_size_t
+        )
+        return function(("fmi3SetFloat64", self.fmu.dll))
 
     def end_step(self, status: int) -> tuple[int, bool]:
         """Return the status: in FMI 3.0 a step is never pending, and flags ask to end the simulation."""

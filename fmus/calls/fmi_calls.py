@@ -128,6 +128,8 @@ class FmiCalls(ABC):
     """Whether the FMU is told that its events are handled in Event Mode; set it before `instantiate`."""
     early_return_allowed = False
     """Whether the FMU is told that it may end a step early; set it before `instantiate`."""
+    intermediate_inputs: tuple[int, ...] = ()
+    """Value references of inputs that are set within a step (FMI 3.0, 4.2.2); set them before `instantiate`."""
 
     def version(self) -> str:
         """Return the version of FMI that the library states; empty if it states none."""
@@ -266,9 +268,11 @@ class FmiCalls(ABC):
         """Return the time in s at which the FMU stands after a step from t over h was discarded; None if unknown."""
         return t
 
-    def set_input_derivatives(self, references: Sequence[int], values: Sequence[float]) -> None:
-        """Tell the first time derivatives of real inputs; only FMI 1.0 and 2.0 have them."""
-        self.fmu.setRealInputDerivatives(list(references), [1] * len(references), list(values))
+    def set_input_slopes(
+        self, t: float, references: Sequence[int], inputs: Sequence[float], slopes: Sequence[float]
+    ) -> None:
+        """Let real inputs go on from their elements' values at t, in s, with slopes within the step from there."""
+        self.fmu.setRealInputDerivatives(list(references), [1] * len(references), list(slopes))
 
     def enter_step_mode(self) -> None:
         """Go back from Event Mode to Step Mode (FMI 3.0, 4.2.1)."""

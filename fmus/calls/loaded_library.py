@@ -21,7 +21,7 @@ from .fmu_block import FmuBlock
 from .message_log import MessageLog, clean_text
 from .process_ends import describe_end
 from .shared_steps import SharedReading
-from .step_options import allows_early_return, uses_event_mode
+from .step_options import choose_modes
 from .texts import is_readable, list_limits, read_text, write_text
 
 CALLS: dict[str, type[FmiCalls]] = {"1": Fmi1Calls, "2": Fmi2Calls, "3": Fmi3Calls}
@@ -64,7 +64,8 @@ class LoadedFmu:
             )
             self._fmu, self.fmi.lose, self._reading = self.fmi.fmu, self.lose, SharedReading(self.fmi)
             self._check_version()
-            self._choose_modes()
+            if not model_exchange:
+                choose_modes(self.fmi, description, block.stepping)
             self.fmi.instantiate(self.log.take)
         except FmuProcessError as error:
             raise self.lose(error) from None
@@ -82,13 +83,6 @@ class LoadedFmu:
         self._open = True
         if description.only_once and self.fmi.in_process:
             _OPEN.add(self)
-
-    def _choose_modes(self) -> None:
-        """Tell the calls whether Event Mode is used and early return allowed, in co-simulation of FMI 3.0."""
-        if not self.model_exchange:
-            options = self.block.stepping
-            self.fmi.event_mode_used = uses_event_mode(self.description, options)
-            self.fmi.early_return_allowed = allows_early_return(self.description, options)
 
     def _end_calls(self) -> None:
         """Give up the calls after an error in the course of loading."""

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from enum import Enum
 from fractions import Fraction
 
-from ...blocks.core import ParameterError
+from ...blocks.core import FmuError, ParameterError
 from ..archive import FmuDescription
+from .fmi_calls import FmiCalls
 
 
 class StepTime(Enum):
@@ -40,8 +41,10 @@ class StepOptions:
         Save the FMU's state before each step, so that a discarded one is taken again from there (FMI 2.0, 4.2.2), by
         the length that its lastSuccessfulTime says, or half of it. The FMU must be able to save its state.
     input_derivatives : bool
-        Tell an FMU of FMI 2.0 with ``canInterpolateInputs`` the slopes of its real inputs, by the difference from the
-        step before. This helps where inputs are smooth; where they are held or jump, it overshoots.
+        Let real inputs go on with their slopes within a step, by the difference from the step before: in FMI 1.0 and
+        2.0 where the FMU has ``canInterpolateInputs``; in FMI 3.0 for inputs with ``intermediateUpdate`` where it has
+        ``providesIntermediateUpdate``, in this process alone. This helps where inputs are smooth; where they are held
+        or jump, it overshoots.
     time : StepTime or {"multiplied", "added"}
         Arithmetic by which the FMU is told the time.
     communication_step : float or Fraction, optional
@@ -117,7 +120,7 @@ def check_offered(options: object, about: FmuDescription, label: str) -> None:
         ("event_mode", about.has_event_mode, "hasEventMode is false in its description"),
         ("early_return", about.fmi.startswith("3"), f"only FMI 3.0 has that, and it is of FMI {about.fmi}"),
         ("rollback", about.can_save, f"{about.state_flags[0]} is false in its description"),
-        ("input_derivatives", about.interpolates_inputs, "canInterpolateInputs is not true in its description"),
+        ("input_derivatives", about.interpolates_inputs, f"{_slopes_flag(about)} is not true in its description"),
     ):
         if getattr(options, name) and not offered:
             raise ParameterError(
@@ -136,3 +139,29 @@ def uses_event_mode(about: FmuDescription, options: StepOptions) -> bool:
 def allows_early_return(about: FmuDescription, options: StepOptions) -> bool:
     """Whether an FMU of FMI 3.0 may end a step early."""
     return uses_event_mode(about, options) if options.early_return is None else options.early_return
+
+
+def choose_modes(fmi: FmiCalls, about: FmuDescription, options: StepOptions) -> None:
+    """Tell the calls of co-simulation of FMI 3.0, before `FmiCalls.instantiate`, how the FMU is stepped.
+
+    Raises
+    ------
+    FmuError
+        If inputs are to be set within a step, and the FMU is in another process.
+    """
+    fmi.event_mode_used = uses_event_mode(about, options)
+    fmi.early_return_allowed = allows_early_return(about, options)
+    if options.input_derivatives and about.fmi.startswith("3"):
+        if not fmi.in_process:
+            raise FmuError(
+                "stepping=StepOptions(input_derivatives=True) sets inputs of FMI 3.0 within a step, which works in "
+                "this process alone; it is loaded in one of its own. Give isolate=False, or leave the option out."
+            )
+        inputs = about.of("input").values()
+        fmi.intermediate_inputs = tuple(
+            r for v in inputs if v.intermediate and v.type == "Float64" for r in v.references
+        )
+
+
+def _slopes_flag(about: FmuDescription) -> str:
+    return "providesIntermediateUpdate" if about.fmi.startswith("3") else "canInterpolateInputs"

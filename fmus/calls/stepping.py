@@ -115,6 +115,7 @@ class CarefulSteps:
         self.instance, self.outs, self.call = instance, outs, call
         self.about, self.options = instance.description, instance.block.stepping
         self.fmi = instance.fmi
+        self.old = not self.about.fmi.startswith("3")
         self.has_events = uses_event_mode(self.about, self.options)
         jumping = [port for port, v in inputs.items() if self.has_events and v.variability != "continuous"]
         self.smooth = _Part(instance, inputs, vector, [port for port in inputs if port not in jumping])
@@ -284,14 +285,15 @@ class CarefulSteps:
     def _tell_slopes(self, t: float) -> None:
         """Tell the slopes of the real inputs by their differences from the step before (FMI 2.0, 4.2.1)."""
         now = np.array(self.smooth.values)
+        slopes = np.zeros(now.size)
         if self._last is not None and t > self._last[0]:
             slopes = (now - self._last[1]) / (t - self._last[0])
-            ports = [port for port, v in self.smooth.ports.items() if v.type == "Float64"]
-            references = [r for port in ports for r in self.smooth.ports[port].references]
-            values = [float(s) for port in ports for s in slopes[self.smooth.places[port]]]
-            if references:
-                call = (self.fmi.set_input_derivatives, references, values)
-                self.instance.call("telling the slopes of its inputs", *call)
+        ports = {p: v for p, v in self.smooth.ports.items() if v.type == "Float64" and (v.intermediate or self.old)}
+        if ports:
+            references = [r for v in ports.values() for r in v.references]
+            index = np.concatenate([np.r_[self.smooth.places[port]] for port in ports])
+            call = (self.fmi.set_input_slopes, t, references, now[index].tolist(), slopes[index].tolist())
+            self.instance.call("telling the slopes of its inputs", *call)
         self._last = t, now
 
     # ---- events ----

@@ -5,7 +5,17 @@ import re
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Constant, FmuRuntimeError, OptionError, Output, ParameterError, Sine
+from loopwright.blocks import (
+    Block,
+    Constant,
+    FmuError,
+    FmuRuntimeError,
+    Gain,
+    OptionError,
+    Output,
+    ParameterError,
+    Sine,
+)
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, StepOptions
 from support.small_fmus import small_fmu, values
@@ -370,6 +380,49 @@ def test_slopes_of_inputs_raise_the_order(integrator, slopes, order):
         run = Diagram("d", plant(u=wave)).simulate(1.0, step=1.0 / n, progress=False)
         errors.append(abs(run["plant.x"][n // 4] - (1.0 - np.cos(2.0 * np.pi * run.t[n // 4])) / (2.0 * np.pi)))
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.25)
+
+
+# x' = u with the input at the middle of the step, or that of its start where it is not set within the step.
+BETWEEN = """
+typedef struct { double t, x, u[2]; void (*update)(void *, double, bool, bool, bool, bool, bool *, double *); } instance;
+void *fmi3InstantiateCoSimulation(const char *n, const char *k, const char *r, bool v, bool l, bool event, bool early,
+        const unsigned required[], size_t nr, void *e, void *log, void *update) {
+    instance *c = calloc(1, sizeof(instance)); c->update = nr == 1 && required[0] == 2 ? update : NULL; return c; }
+int fmi3SetFloat64(void *p, const unsigned vr[], size_t n, const double v[], size_t nv) {
+    if (n != 1 || vr[0] != 2 || nv != 2) return 3; memcpy(((instance *)p)->u, v, 2 * sizeof(double)); return 0; }
+int fmi3GetFloat64(void *p, const unsigned vr[], size_t n, double v[], size_t nv) {
+    instance *c = p; for (size_t i = 0; i < n; i++) if (vr[i] == 1) *v++ = c->x; else { *v++ = c->u[0]; *v++ = c->u[1]; }
+    return 0; }
+int fmi3DoStep(void *p, double t, double h, bool f, bool *e, bool *stop, bool *early, double *last) {
+    instance *c = p; bool asked = false; double when = 0; *e = *stop = *early = false;
+    if (c->update) c->update(NULL, t + 0.5 * h, true, false, false, false, &asked, &when);
+    c->x += h * (c->u[0] + c->u[1]); c->t = *last = t + h; return 0; }
+"""
+BETWEEN_MODEL = """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="true"
+ providesIntermediateUpdate="true"/><ModelVariables><Float64 name="x" valueReference="1" causality="output"/>
+<Float64 name="u" valueReference="2" causality="input" start="0 0" intermediateUpdate="true"><Dimension start="2"/></Float64>
+</ModelVariables><ModelStructure><Output valueReference="1"/></ModelStructure>"""
+
+
+@pytest.mark.parametrize(("slopes", "order"), [(False, 1), (True, 2)])
+def test_inputs_are_set_within_a_step_of_fmi_3(folder, slopes, order):
+    file = small_fmu(folder, "fmi3", BETWEEN, BETWEEN_MODEL, name="between")
+    plant = Fmu(file, name="plant", stepping=StepOptions(input_derivatives=slopes), isolate=False)
+    errors = []
+    for n in (160, 320):
+        wave = Gain(gain=np.array([0.25, 0.75]))(Sine(amplitude=1.0, frequency=1.0))
+        run = Diagram("d", plant(u=wave)).simulate(1.0, step=1.0 / n, progress=False)
+        errors.append(abs(run["plant.x"][n // 4] - (1.0 - np.cos(2.0 * np.pi * run.t[n // 4])) / (2.0 * np.pi)))
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.25)
+
+
+def test_inputs_within_a_step_need_this_process(folder):
+    file = small_fmu(folder, "fmi3", BETWEEN, BETWEEN_MODEL, name="between")
+    plant = Fmu(file, name="plant", stepping=StepOptions(input_derivatives=True), start={"u": (0.0, 0.0)})
+    with pytest.raises(
+        FmuError, match=r"^plant: stepping=StepOptions\(input_derivatives=True\) sets inputs of FMI 3\.0"
+    ):
+        Diagram("d", plant()).simulate(0.1, step=0.1, progress=False)
 
 
 # --- options ------------------------------------------------------------------------------------------------------------
