@@ -73,7 +73,7 @@ def doctor(
     path = Path(file).expanduser()
     try:
         archive = FmuArchive.open(path, limits)
-        summary = summarize(path, limits=limits)
+        summary = summarize(path, limits=limits, load=run is not False)
     except FmuFileError as error:
         reason = _as_error(error, path)
         return FmuDiagnosis(str(path), _decide([reason], [], []), (reason,))

@@ -69,12 +69,21 @@ def native_libraries(
 
 
 def native_binary(
-    archive: FmuArchive, native: str, binaries: Mapping[str, list[str]], interfaces: Mapping[str, Mapping[str, Any]]
+    archive: FmuArchive,
+    native: str,
+    binaries: Mapping[str, list[str]],
+    interfaces: Mapping[str, Mapping[str, Any]],
+    *,
+    load: bool = True,
 ) -> dict[str, Any]:
-    """Return whether there is a binary for this machine, and the libraries and symbols that it lacks here."""
+    """Return whether there is a binary for this machine, and the libraries and symbols that it lacks here.
+
+    With ``load`` false no code of the FMU's runs, and they are sought on Linux only.
+    """
     identifiers = [str(attributes.get("modelIdentifier")) for attributes in interfaces.values()]
     found = native_libraries(native, binaries, identifiers)
-    missing, undefined = find_missing(archive, native, *found) if found else ([], [])
+    sought = found is not None and (load or native.endswith("-linux"))
+    missing, undefined = find_missing(archive, native, *found) if found is not None and sought else ([], [])
     return {
         "platform": native,
         "available": found is not None,

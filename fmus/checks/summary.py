@@ -23,7 +23,7 @@ INTERFACES = {
 """Names of the interfaces by their elements in ``modelDescription.xml``."""
 
 
-def summarize(file: Path, *, limits: ArchiveLimits | None = None) -> dict[str, Any]:
+def summarize(file: Path, *, limits: ArchiveLimits | None = None, load: bool = True) -> dict[str, Any]:
     """Return a summary of an FMU's description and archive.
 
     Parameters
@@ -32,6 +32,9 @@ def summarize(file: Path, *, limits: ArchiveLimits | None = None) -> dict[str, A
         An FMU of FMI 1.0, 2.0 or 3.0.
     limits : ArchiveLimits, optional
         Limits of its size; the usual ones without it.
+    load : bool
+        Whether another process may load its library to find missing ones, where the system's loader can't be asked:
+        elsewhere than on Linux.
 
     Returns
     -------
@@ -79,7 +82,7 @@ def summarize(file: Path, *, limits: ArchiveLimits | None = None) -> dict[str, A
             if getattr(experiment, attribute, None) is not None
         },
         "platforms": {folder: {"platform": tuple_of(folder), "files": names} for folder, names in binaries.items()},
-        "native": native_binary(archive, native, binaries, interfaces),
+        "native": native_binary(archive, native, binaries, interfaces, load=load),
         "sources": [name for name in entries if name.startswith("sources/")],
         "documentation": any(name.startswith("documentation/") for name in entries),
         "log_categories": [category.name for category in model.logCategories],

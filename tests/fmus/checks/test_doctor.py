@@ -125,6 +125,37 @@ def test_a_capability_without_its_function_is_told(examine):
     assert "lacks fmi3SetDebugLogging, which the standard asks for" in found.found
 
 
+def test_missing_libraries_and_symbols_are_told_by_name(examine, monkeypatch):
+    """Found by the system's loader in the slow tests of the commands; here by a stand-in for it."""
+    place = "loopwright.fmus.checks.libraries.find_missing"
+    monkeypatch.setattr(place, lambda *_: (["libone.so.3", "libtwo.so"], []))
+    diagnosis = examine(lambda files: packed(files, ("resources/lib/libtwo.so", b"x")))
+    (found,) = findings(diagnosis, FmuFault.MISSING_LIBRARY)
+    assert diagnosis.verdict == FmuVerdict.NOT_HERE
+    assert found.found == "its library needs shared libraries that are missing here: libone.so.3, libtwo.so."
+    assert "libtwo.so is in the FMU, as resources/lib/libtwo.so: set LD_LIBRARY_PATH" in found.step
+    monkeypatch.setattr(place, lambda *_: ([], ["acos", "cos"]))
+    diagnosis = examine(packed)
+    (found,) = findings(diagnosis, FmuFault.UNDEFINED_SYMBOL)
+    assert diagnosis.runs
+    assert found.found == "its library takes the symbol acos and 1 more from the program that loads it."
+
+
+def test_nothing_is_loaded_without_a_run_where_the_system_cannot_be_asked(examine, monkeypatch):
+    def refuse(*arguments):
+        raise AssertionError("code of the FMU ran")
+
+    monkeypatch.setattr("loopwright.fmus.checks.libraries.find_missing", refuse)
+    for module in ("summary", "examination"):
+        monkeypatch.setattr(f"loopwright.fmus.checks.{module}.native_platform", lambda: "x86_64-darwin")
+    diagnosis = examine(
+        lambda files: packed(
+            files, ("binaries/x86_64-darwin/mass_spring_damper.dylib", b"\xcf\xfa\xed\xfe\x07\0\0\x01")
+        )
+    )
+    assert diagnosis.summary["native"]["available"]
+
+
 def test_an_fmu_that_needs_another_program_is_tried_if_asked_only(examine, monkeypatch):
     tried = []
     monkeypatch.setattr("loopwright.fmus.checks.examination.try_out", lambda path, kind, *_: tried.append(kind))
