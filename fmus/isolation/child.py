@@ -61,7 +61,7 @@ class Child:
         self.parent, self.me = about["parent"], os.getpid()
         with open(about["shared"], "r+b") as file:
             self.memory = mmap.mmap(file.fileno(), about["size"])
-        self.is_own = False
+        self.ordered, self.logged, self.is_own = about["ordered"], 0, False
         with suppress(AttributeError, OSError):  # a copy of the process has no part in it
             self.memory.madvise(mmap.MADV_DONTFORK)
             self.is_own = True
@@ -92,6 +92,8 @@ class Child:
                     break
             else:
                 patience.slept()
+                if not self.ordered:
+                    self._sleep(last)
                 while get(REQUEST) == last:
                     self._sleep(last)
             last = get(REQUEST)
@@ -101,7 +103,7 @@ class Child:
                 self._run(get(SEQUENCE))
             words[REPLY] = last
             wire.order_memory()
-            if words[PARENT_SLEEPS] or not wire.ORDERED:
+            if words[PARENT_SLEEPS] or not self.ordered:
                 os.write(self.replies, WAKE)
 
     def _sleep(self, last: int) -> None:
@@ -109,7 +111,7 @@ class Child:
         words = self.words
         words[CHILD_SLEEPS] = 1
         wire.order_memory()
-        if words[REQUEST] == last and not os.read(self.commands, 4096):
+        if (words[REQUEST] == last or not self.ordered) and not os.read(self.commands, 4096):
             self.leave()
         words[CHILD_SLEEPS] = 0
 
@@ -252,8 +254,9 @@ class Child:
         if not status:
             return
         with self._logging:
-            if self.words[MESSAGES] < wire.MOST_MESSAGES:
+            if self.words[MESSAGES] < wire.MOST_MESSAGES and self.logged < wire.MOST_LOGGED:
                 data = text.encode(errors="replace")[: wire.LONGEST_MESSAGE]
+                self.logged += len(data)
                 os.write(self.log, wire.LOG_HEAD.pack(status, len(data)) + data)
                 self.words[MESSAGES] += 1
 

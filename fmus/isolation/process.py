@@ -108,6 +108,7 @@ class ChildProcess:
             "memory": self.memory_limit,
             "output": self.output_limit,
             "watches": self._watches,
+            "ordered": wire.ORDERED,
             "folder": str(self.folder),
             "files": str(self.folder / "fmu"),
             **{name: str(self.folder / name) for name in ("shared", "log", "printed", "mail")},
@@ -248,8 +249,10 @@ class ChildProcess:
         words, deadline = self._words, time.monotonic() + seconds
         words[PARENT_SLEEPS] = 1
         wire.order_memory()
-        while words[REPLY] != number:
+        arrived = wire.ORDERED  # else the byte in the pipe says that the reply is written
+        while words[REPLY] != number or not arrived:
             if self._is_readable(_LOOK):
+                arrived = True
                 if not os.read(self._out, 4096) and words[REPLY] != number:
                     self._fail(self._place_name(sequence))
             elif words[REPLY] != number:

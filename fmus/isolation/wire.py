@@ -28,7 +28,8 @@ MEMORY, OUTPUT = 1, 2
 WAKE = b"w"
 LOG_HEAD = struct.Struct("<iI")
 """Head of a log message in its file: status and length."""
-LONGEST_MESSAGE, MOST_MESSAGES = 8192, 20000
+LONGEST_MESSAGE, MOST_MESSAGES, MOST_LOGGED = 8192, 20000, 64_000_000
+"""Most bytes of a message, messages in a call, and bytes of messages in a process; the others are left out."""
 
 ORDERED = platform.machine().lower() in ("x86_64", "amd64", "i686")
 """Whether memory is written in the order of the program, so that words can be watched without barriers."""
