@@ -1,6 +1,6 @@
 """Plants of a run: loaded, stepped between their communication points, and coupled with one another."""
 
-from .coupled_steps import CoupledSteps, Effort
+from .coupled_steps import CoupledSteps, Effort, tells_slopes
 from .links import Links
 from .loops import note_loops
 from .options import Coupling, Scheme, refuse_exchanged, to_coupling
@@ -28,5 +28,6 @@ __all__ = [
     "refuse_exchanged",
     "report_coupling",
     "step_all",
+    "tells_slopes",
     "to_coupling",
 ]

@@ -116,6 +116,14 @@ class CoupledSteps:
                     block=path,
                     port="coupling",
                 )
+            if coupling.scheme != Scheme.JACOBI and tells_slopes(blocks[path]):
+                raise OptionError(
+                    f"found input_derivatives with coupling {coupling.scheme!r}, whose inputs are no longer those of "
+                    "the step's beginning, so that a slope from there leads astray; expected coupling 'jacobi', which "
+                    "is of second order with these slopes where inputs are smooth. Take that, or leave them out.",
+                    block=path,
+                    port="coupling",
+                )
             if coupling.error is not None and not takes_any_step(blocks[path]):
                 raise OptionError(
                     "found a coupling with adaptive communication steps; expected an FMU that takes steps of any "
@@ -366,6 +374,11 @@ def _texts(plant: Plant) -> Mapping[str, list[Any]]:
     """Return the record of a plant's texts by port."""
     found: Mapping[str, list[Any]] = getattr(plant, "texts", {})
     return found
+
+
+def tells_slopes(block: Any) -> bool:
+    """Whether a run tells a plant the slopes of its inputs."""
+    return bool(getattr(getattr(block, "stepping", None), "input_derivatives", False))
 
 
 def _can_save(block: Any) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ...blocks.core import OptionError
-from ..coupling import Links
+from ..coupling import Links, tells_slopes
 from ..flat import FlatDiagram
 from ..results import OperatingPoint
 
@@ -17,8 +17,17 @@ def check_coupling(flat: FlatDiagram, at: OperatingPoint) -> None:
     Raises
     ------
     OptionError
-        If an input changes within a step, and the coupling is not the default.
+        If an input changes within a step, and the coupling is not the default; if the run tells an FMU slopes.
     """
+    for path, inputs in Links(flat).inputs.items():
+        if inputs.stop > inputs.start and tells_slopes(flat.table.blocks[path]):
+            raise OptionError(
+                "found input_derivatives among its options: its inputs are ramps over a communication step; expected "
+                "held inputs, which a linear model over communication steps has. Linearize the diagram with "
+                f"replace({{{path!r}: …}}), the FMU without this option.",
+                block=path,
+                port="stepping",
+            )
     if not at.coupling:
         return
     links = Links(flat)

@@ -56,7 +56,7 @@ def initialize(
             jump(nothing)
 
     most = _MAX_PASSES * (10 if workspace.looped else 1)
-    search = Search(Links(flat).smooth_outputs, np.ones(flat.plant_outputs.total))
+    search: Search | None = None
     while True:
         assumed = workspace.here.w.copy()
         _set_initial_states(workspace)
@@ -89,6 +89,7 @@ def initialize(
         if passes == most:
             raise _unsettled(workspace, before) if found else _unsolved_start(workspace, last)
         if plants and passes >= _PLAIN_PASSES:
+            search = search or Search(Links(flat).smooth_outputs, np.ones(flat.plant_outputs.total))
             workspace.here.w[:] = search.next(assumed, workspace.here.w)
         last = workspace.here.x.copy()
 

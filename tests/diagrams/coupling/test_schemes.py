@@ -18,7 +18,7 @@ from loopwright.blocks import (
 )
 from loopwright.diagrams import Coupling, Diagram, subsystem
 from loopwright.diagrams.coupling import step_all
-from loopwright.fmus import Fmu
+from loopwright.fmus import Fmu, StepOptions
 from support.oscillators import (
     PULL,
     coupled_by_inertia,
@@ -220,6 +220,21 @@ def test_a_step_that_gets_too_short_says_so(cache):
     with pytest.raises(SimulationError, match=r"the step would be .* s; expected at least 0\.01 s \(shortest\)") as e:
         two_masses().simulate(0.1, step=0.02, progress=False, coupling=Coupling(error=1e-9, shortest=0.01))
     assert e.value.t == 0.0
+
+
+def test_slopes_of_inputs_make_the_default_second_order_and_go_with_no_other_scheme(cache):
+    diagram = two_masses(fmi=2)
+    told = {path: diagram[path].replace(stepping=StepOptions(input_derivatives=True)) for path in ("a", "b")}
+    diagram = diagram.replace(told)
+    signals = ("a.position", "b.position")
+    errors = [largest_error(diagram, two_masses_exactly, signals, step=h)[0] for h in STEPS[1:]]
+    assert order_of(errors) == pytest.approx([2.0], abs=0.2)
+    for scheme in ("gauss_seidel", "iterated"):  # of first order with them
+        with pytest.raises(OptionError, match=r"^a\.coupling: found input_derivatives with coupling"):
+            diagram.simulate(0.1, step=0.01, progress=False, coupling=scheme)
+    with pytest.raises(OptionError, match=r"^a\.stepping: found input_derivatives .* inputs are ramps"):
+        diagram.linearize(step=0.01)
+    assert len(diagram.linearize().poles) == 4  # in continuous time nothing is held
 
 
 def test_a_linear_model_over_steps_is_that_of_the_default_coupling(cache):
