@@ -45,23 +45,25 @@ class Evaluation:
         inputs: Transfer,
         index: np.ndarray,
         outputs: Transfer,
-        rates: Vector | None,
+        derivatives: Vector,
+        rates: bool,
         indicators: Vector | None,
         then: Sequence[tuple[Call, str]] = (),
     ):
         self._time, self._inputs, self._index, self._outputs = time, inputs, index, outputs
-        self.rates, self.indicators = rates, indicators
-        sizes = [outputs.vector.size, *(0 if v is None else v.values.size for v in (rates, indicators))]
+        self.rates, self.indicators = derivatives if rates else None, indicators
+        sizes = [outputs.vector.size, *(0 if v is None else v.values.size for v in (self.rates, indicators))]
         self.result = np.zeros(sum(sizes))
         self.rates_at = slice(sizes[0], sizes[0] + sizes[1])
         self._outputs_at, self._indicators_at = slice(0, sizes[0]), slice(sizes[0] + sizes[1], sum(sizes))
         at = [(fmi.exchange_function("set_time"), (fmi.instance_argument, time), "setting the time")]
         at += _vector_call(fmi, states, "setting the continuous states")
-        more = [(group.function, group.arguments, "setting the inputs") for group in inputs.groups]
-        more += [(group.function, group.arguments, "reading the outputs") for group in outputs.groups]
-        starting = [*more]  # derivatives and indicators can't be computed yet (FMI 2.0, 3.2.3)
-        more += _vector_call(fmi, rates, "computing the derivatives of its states")
-        more += _vector_call(fmi, indicators, "computing the event indicators")
+        given = [(group.function, group.arguments, "setting the inputs") for group in inputs.groups]
+        got = [(group.function, group.arguments, "reading the outputs") for group in outputs.groups]
+        starting = [*given, *got]  # derivatives and indicators can't be computed yet (FMI 2.0, 3.2.3)
+        # Derivatives come before outputs, wanted or not: FMUs of older tools compute their variables with them alone.
+        slopes = _vector_call(fmi, derivatives, "computing the derivatives of its states") if rates or got else []
+        more = [*given, *slopes, *got, *_vector_call(fmi, indicators, "computing the event indicators")]
         more += [(*call, action) for call, action in then]
         self._running, self._starting = (_bind(fmi, calls) for calls in ([*at, *more], starting))
 

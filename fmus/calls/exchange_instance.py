@@ -124,7 +124,8 @@ class ExchangeInstance(SavedExchange):
             inputs=Transfer(self.fmi, "Set", used, inputs),
             index=np.concatenate([np.zeros(0, dtype=int), *index]),
             outputs=Transfer(self.fmi, "Get", outputs, got),
-            rates=Vector("derivatives", self._dx) if rates else None,
+            derivatives=Vector("derivatives", self._dx),
+            rates=rates,
             indicators=Vector("indicators", self._indicators) if indicators else None,
             then=then,
         )

@@ -21,16 +21,18 @@
 #define JOIN(a, b) JOIN_(a, b)
 #if FMI == 2
 #define F(name) API int JOIN(fmi2, name)
+#define STATE(verb) API int fmi2##verb##FMUstate
 typedef void (*logger)(void *, const char *, int, const char *, const char *, ...);
 typedef struct { logger log; void *allocate, *release, *finished, *environment; } callbacks;
 #define LOG(c, status, text) (c)->log((c)->environment, "zoo", status, "logAll", text)
 #else
 #define F(name) API int JOIN(fmi3, name)
+#define STATE(verb) API int fmi3##verb##FMUState
 typedef void (*logger)(void *, int, const char *, const char *);
 #define LOG(c, status, text) (c)->log((c)->environment, status, "logAll", text)
 #endif
 
-typedef struct { double u, y, p, t, slope; bool running; logger log; void *environment; } instance;
+typedef struct { double u, y, p, t, slope, seen; bool running; logger log; void *environment; } instance;
 static volatile char setting[128] = "@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@";
 static instance *last;
 static void *volatile sink; /* else the compiler leaves allocations out */
@@ -124,8 +126,9 @@ static void spoil(instance *c, double v[], size_t n) {
     for (size_t i = 0; i < n; i++) v[i] = !strcmp(f, "nan") ? NAN : !strcmp(f, "inf") ? INFINITY : -INFINITY;
 }
 static double *at(instance *c, unsigned reference) {
-    static double none;
-    return reference == 1 ? &c->u : reference == 2 ? &c->y : reference == 3 ? &c->p : reference == 4 ? (c->slope = c->u, &c->slope) : &none;
+    static double none; char f[64];
+    return reference == 1 ? &c->u : reference == 2 ? &c->y : reference == 3 ? &c->p : reference == 4 ? (c->slope = c->u, &c->slope)
+        : reference == 5 ? (match("lazy", 0.0, f) ? &c->seen : &c->y) : &none;
 }
 static const char *version(const char *right) {
     static char text[64];
@@ -140,9 +143,9 @@ F(Terminate)(void *c) { return act("terminate", c, 0.0); }
 F(Reset)(void *c) { ((instance *)c)->running = false; ((instance *)c)->y = 0.0; return act("reset", c, 0.0); }
 API void JOIN(JOIN(fmi, FMI), FreeInstance)(void *c) { if (act("free", c, 0.0) < 2 && c) free(c); }
 F(SetDebugLogging)(void) { return 0; }
-F(GetFMUState)(void *c, void **s) { *s = malloc(sizeof(instance)); memcpy(*s, c, sizeof(instance)); return act("save", c, 0.0); }
-F(SetFMUState)(void *c, void *s) { memcpy(c, s, sizeof(instance)); return act("restore", c, 0.0); }
-F(FreeFMUState)(void *c, void **s) { free(*s); *s = NULL; return act("free_state", c, 0.0); }
+STATE(Get)(void *c, void **s) { *s = malloc(sizeof(instance)); memcpy(*s, c, sizeof(instance)); return act("save", c, 0.0); }
+STATE(Set)(void *c, void *s) { memcpy(c, s, sizeof(instance)); return act("restore", c, 0.0); }
+STATE(Free)(void *c, void **s) { free(*s); *s = NULL; return act("free_state", c, 0.0); }
 
 /* model exchange: der(y) = u, one indicator that never crosses zero */
 F(SetTime)(void *c, double t) { ((instance *)c)->t = t; return act("time", c, t); }
@@ -155,7 +158,7 @@ F(GetEventIndicators)(void *c, double z[], size_t n) { z[0] = 1.0; return act("i
 F(EnterEventMode)(void *c) { return act("event_mode", c, ((instance *)c)->t); }
 F(EnterContinuousTimeMode)(void *c) { return act("continuous_mode", c, 0.0); }
 static int derivative(instance *c, double d[]) {
-    char f[64]; d[0] = c->u;
+    char f[64]; d[0] = c->u; c->seen = c->y;
     if (match("slope", c->t, f)) d[0] = IS("nan") ? NAN : INFINITY;
     return act("derivative", c, c->t); }
 static bool updates(instance *c, const char *fault) { char f[64]; return match("update", c->t, f) && IS(fault); }

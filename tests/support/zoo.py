@@ -41,6 +41,7 @@ _DESCRIPTIONS = {
     <ScalarVariable name="y" valueReference="2" causality="output" initial="exact"><Real start="0"/></ScalarVariable>
     <ScalarVariable name="p" valueReference="3" causality="parameter" variability="fixed"><Real start="1"/></ScalarVariable>
     <ScalarVariable name="der(y)" valueReference="4"><Real derivative="2"/></ScalarVariable>
+    <ScalarVariable name="z" valueReference="5"><Real/></ScalarVariable>
   </ModelVariables>
   <ModelStructure>
     <Outputs><Unknown index="2"/></Outputs>
