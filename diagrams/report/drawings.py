@@ -39,4 +39,4 @@ def _drawings(diagram: WiredDiagram) -> Iterator[Plot]:
     yield Plot("diagram", TEXTS.line("diagram", closed=True), draw(diagram, closed=True), ahead=True)
     for subsystem in subsystems:
         inside = draw(diagram, subsystem=subsystem, closed=True)
-        yield Plot(f"diagram.{subsystem}", TEXTS.line("inside", subsystem=subsystem), inside)
+        yield Plot(f"diagram.{subsystem}", TEXTS.line("inside", subsystem=subsystem), inside, details=True)

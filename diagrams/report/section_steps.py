@@ -98,7 +98,7 @@ def steps(case: Case) -> Section | None:
             saturated = _limits_reached(v.diagram, got)
             for name, before, change in _effort(got, test):
                 key = f"effort.{name.replace('.', '_')}"
-                numbers[f"{where}.{key}"] = Number(change, "1", 1e-9 * change, _how(got))
+                numbers[f"{where}.{key}"] = Number(change, _unit(v.diagram, name), 1e-9 * change, _how(got))
                 effort.append((_said(test), v.title, name, before, numbers[f"{where}.{key}"]))
             text += [TEXTS.line("saturated", variant=v.title, wire=test.wire, blocks=saturated)] if saturated else []
             if got.moved > 1e-6:
@@ -201,6 +201,15 @@ def _effort(got: StepResponse, test: StepTest) -> Iterator[tuple[str, float, flo
             yield name, _rounded(float(got.before[i]), largest), change
 
 
+def _unit(diagram: WiredDiagram, name: str) -> str:
+    """Return the unit of a signal, "1" where it is not known or its entries differ."""
+    plain = name.partition("[")[0]
+    wire = diagram.names.get(plain)
+    block, _, port = plain.rpartition(".")
+    unit = diagram.checked.units.get((block, port) if wire is None else (wire.block, wire.port))
+    return unit if isinstance(unit, str) and unit else "1"
+
+
 def _rounded(value: float, size: float) -> float:
     """Return a value, 0 where it is rounding beside values of a size."""
     return 0.0 if abs(value) <= 1e-12 * max(size, 1e-300) else value
@@ -213,7 +222,7 @@ def _numbers(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]
     t = got.t[begins:] - got.t[begins]
     held = got.held and not output
     how = _how(got)
-    units = {"settling": "s", "rise": "s"}
+    units = {"settling": "s", "rise": "s", "peak": _unit(v.diagram, test.output or test.wire)}
     found = {}
     known, target = {}, None
     if got.prediction is not None:
@@ -228,7 +237,7 @@ def _numbers(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]
             factor = abs(got.size) if name == "peak" else 1.0
             said = "the linear model's matrix, sample by sample"
             found[f"linear.{name}"] = Number(factor * value, units.get(name, "1"), factor * tolerance, said)
-        found["deviation"] = Number(_deviation(got), "1", 1e-9, "co-simulation and linear model, sample by sample")
+        found["difference"] = Number(_deviation(got), "1", 1e-9, "co-simulation and linear model, sample by sample")
     return found
 
 

@@ -48,6 +48,8 @@ def definition(path: str, more: Mapping[str, str] = MappingProxyType({})) -> tup
         parts = ["control"]
     elif parts[0] in ("inner", "injection"):
         del parts[1:2]  # the wire's name
+    elif parts[0] == "steps":
+        parts = ["effort"] if "effort" in parts else parts[2:]  # without the names of wires
     for part in reversed(parts):
         for name in _beginnings(part):
             for known in (more, DEFINITIONS):

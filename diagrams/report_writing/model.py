@@ -23,12 +23,16 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Plot:
-    """A figure: a key for its file, a caption, the matplotlib figure or SVG text; ``ahead`` of the tables or not."""
+    """A figure: a key for its file, a caption, the matplotlib figure or SVG text; ``ahead`` of the tables or not.
+
+    One of ``details`` stands in the appendix.
+    """
 
     key: str
     caption: str
     figure: Any
     ahead: bool = False
+    details: bool = False
 
 
 @dataclass(frozen=True, eq=False)

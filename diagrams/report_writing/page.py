@@ -40,11 +40,12 @@ class LinkView:
 
 @dataclass(frozen=True)
 class DetailsView:
-    """Tables of a section that stand in the appendix."""
+    """Tables and figures of a section that stand in the appendix."""
 
     title: str
     anchor: str
     tables: tuple[TableView, ...]
+    figures: tuple[FigureView, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -153,13 +154,14 @@ class _Numbering:
     def __init__(self, numbers: Mapping[str, Number]):
         self.tables = Numbered(numbers)
         self.figures: dict[str, None] = {}
-        self.left: list[tuple[str, str, tuple[Table, ...]]] = []
-        """Titles and anchors of sections with their tables for the appendix."""
+        self.left: list[tuple[str, str, tuple[Table, ...], tuple[Plot, ...]]] = []
+        """Titles and anchors of sections with their tables and figures for the appendix."""
 
     def details(self) -> tuple[DetailsView, ...]:
-        """Return the tables of the appendix, numbered after all others."""
+        """Return the tables and figures of the appendix, numbered after all others."""
         return tuple(
-            DetailsView(title, name, tuple(map(self.tables.view, tables))) for title, name, tables in self.left
+            DetailsView(title, name, tuple(map(self.tables.view, tables)), tuple(map(self._figure, plots)))
+            for title, name, tables, plots in self.left
         )
 
     def sections(self, sections: Sequence[Section], prefix: str, number: str) -> tuple[SectionView, ...]:
@@ -167,10 +169,11 @@ class _Numbering:
         return tuple(self._section(s, prefix + s.key, f"{number}{i}") for i, s in enumerate(sections, 1))
 
     def _section(self, section: Section, key: str, number: str) -> SectionView:
-        ahead = tuple(self._figure(plot) for plot in section.plots if plot.ahead)
+        ahead = tuple(self._figure(plot) for plot in section.plots if plot.ahead and not plot.details)
         later = tuple(table for table in section.tables if table.details)
-        if later:
-            self.left.append((f"{number} {section.title}", anchor("x", key), later))
+        drawn = tuple(plot for plot in section.plots if plot.details)
+        if later or drawn:
+            self.left.append((f"{number} {section.title}", anchor("x", key), later, drawn))
         return SectionView(
             number,
             anchor("s", key),
@@ -179,9 +182,9 @@ class _Numbering:
             tuple((listed, tuple(texts)) for listed, texts in _grouped(section.text)),
             ahead,
             tuple(self.tables.view(table) for table in section.tables if not table.details),
-            tuple(self._figure(plot) for plot in section.plots if not plot.ahead),
+            tuple(self._figure(plot) for plot in section.plots if not (plot.ahead or plot.details)),
             self.sections(section.sections, f"{key}.", f"{number}."),
-            tuple(LinkView(table.title, anchor("x", key)) for table in later),
+            tuple(LinkView(text, anchor("x", key)) for text in (*(t.title for t in later), *_titles(drawn))),
         )
 
     def _figure(self, plot: Plot) -> FigureView:
@@ -191,6 +194,11 @@ class _Numbering:
         self.figures[key] = None
         name = anchor("f", key)
         return FigureView(len(self.figures), name, plot.caption, embedded(plot.figure, name, plot.caption))
+
+
+def _titles(plots: Sequence[Plot]) -> tuple[str, ...]:
+    """Return the captions of figures, to be linked: without their stop."""
+    return tuple(plot.caption.rstrip(".") for plot in plots)
 
 
 def _term(path: str, more: Mapping[str, str]) -> TermView | None:

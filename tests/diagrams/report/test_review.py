@@ -13,6 +13,7 @@ from loopwright.diagrams import Diagram, Requirements, Verdict, analyse, experim
 from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.content_hash import content_hash
+from loopwright.diagrams.report_writing.definitions import definition
 from loopwright.diagrams.report_writing.html import to_html
 from loopwright.diagrams.report_writing.json import to_json
 from loopwright.diagrams.requirements import Reason
@@ -304,3 +305,15 @@ def test_the_diagram_as_it_is_comes_first():
         assert (variants[0].key, variants[0].title) == (key, "as it is")
         assert sum(v.is_actual for v in variants) == 1
         assert len({v.title for v in variants}) == len(variants)
+
+
+def test_every_number_of_a_step_is_defined_and_has_the_units_of_its_signals():
+    numbers = analyse(experiments.path_following().diagram, only=("steps",)).numbers()
+    start = "steps.par.sampled_d0_friction"
+    assert numbers[f"{start}.peak"].unit == "m/s2"
+    assert numbers[f"{start}.settling"].unit == "s"
+    assert numbers[f"{start}.effort.controller_motor_force[1]"].unit == "N"
+    assert numbers[f"{start}.difference"].value < 1e-3
+    for path in numbers:
+        term, _ = definition(path)
+        assert term in ("overshoot", "settling", "rise", "peak", "final", "difference", "effort"), path
