@@ -21,7 +21,12 @@ from tests.support import reviewed
 
 PARTS = ("poles", "inner")
 ASKED = {
-    "drive": {"phase_margin_deg": 55, "delay_margin_samples": 3, "ms": 1.3, "loops": {"voltage": {"disk_margin": 1.5}}},
+    "drive": {
+        "phase_margin_deg": 55,
+        "delay_margin_samples": 3,
+        "ms": 1.3,
+        "loops": {"voltage": {"disk_margin": 1.5}, "controller.current_wanted": {"bandwidth": (40, 90)}},
+    },
     "crane": {"phase_margin_deg": 50, "ms": 1.5, "disk_margin": 1.0, "delay_margin_samples": 10},
     "tank": {"phase_margin_deg": 80, "ms": 1.4, "disk_margin": 1.1, "bandwidth": (0.5, 0.7)},
 }
