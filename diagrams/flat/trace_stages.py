@@ -8,7 +8,7 @@ from typing import Any
 
 import casadi as ca
 
-from .evaluation import Apart, Instant
+from .evaluation import JUMP, Apart, Instant
 from .stages import OpaqueStage, Schedule, TracedStage
 from .vectors import join_columns
 
@@ -29,7 +29,9 @@ def trace_schedule(name: str, arguments: Mapping[str, Any], results: Callable[[A
     cuts = _Cuts()
     made = {n: ca.densify(ca.MX(e)) for n, e in results(cuts).items()}  # a buffer holds every entry, zeros too
     names, symbols = tuple(arguments), tuple(arguments.values())
-    if not cuts.made:
+    _drop_unused(made.values(), cuts.made)
+    if not any(cut.needed for cut in cuts.made):
+        made = _join_again(made, cuts.made)
         function = ca.Function(name, [*symbols], [*made.values()], [*names], [*made])
         last = TracedStage(name, symbols, tuple(made.values()), function, slice(0, 0))
         return Schedule(name, names, tuple(made), (last,), 0)
@@ -56,6 +58,10 @@ class _Cut:
     carried: list[tuple[Any, Any]]
     outputs: list[Any]
     by_time: bool
+    may_drop: bool
+    """Whether it is left out where nothing needs it; a jump is never: it changes what the block keeps."""
+    needed: bool = True
+    """Whether a later stage, or a result, needs what the block makes."""
 
 
 class _Cuts:
@@ -91,6 +97,7 @@ class _Cuts:
                 [*carried.values()],
                 outputs,
                 _varies(instant, path, names),
+                names != (JUMP,) and path in instant.layout.outside,
             )
         )
         return outputs
@@ -106,7 +113,6 @@ def _in_stages(
     name: str, names: tuple[str, ...], symbols: tuple[Any, ...], results: Mapping[str, Any], cuts: Sequence[_Cut]
 ) -> Schedule:
     """Return the schedule of an evaluation that was cut: all that is carried gets its place in one vector c."""
-    _drop_unused(results.values(), cuts)
     places: list[tuple[Any, slice]] = []
     width = 0
 
@@ -115,10 +121,13 @@ def _in_stages(
         width += size
         return slice(width - size, width)
 
-    parts: list[tuple[list[Any], slice, OpaqueStage]] = []
+    parts: list[tuple[list[Any], slice, OpaqueStage | None]] = []
     for cut in cuts:
         first = width
         places += [(symbol, place(symbol.numel())) for symbol, _ in cut.carried]
+        if not cut.needed:
+            parts.append(([e for _, e in cut.carried], slice(first, width), None))
+            continue
         states, inputs = place(cut.states.numel()), place(cut.inputs.numel())
         end = width
         places += [(symbol, place(symbol.numel())) for symbol in cut.outputs]
@@ -133,24 +142,37 @@ def _in_stages(
 
     stages: list[TracedStage | OpaqueStage] = []
     arguments, names_in = (*symbols, c), [*names, "carried"]
-    for i, (expressions, makes, opaque) in enumerate(parts):
+    for i, (expressions, makes, outside) in enumerate(parts):
         if makes.stop > makes.start:
             made = of_c([ca.vertcat(*expressions)])
             function = ca.Function(f"{name}_{i}", [*arguments], [*made], names_in, ["made"])
             stages.append(TracedStage(f"{name}_{i}", arguments, made, function, makes))
-        stages.append(opaque)
+        if outside is not None:
+            stages.append(outside)
     made = of_c(results.values())
     function = ca.Function(name, [*arguments], [*made], names_in, [*results])
     stages.append(TracedStage(name, arguments, made, function, slice(0, 0)))
     return Schedule(name, names, tuple(results), tuple(stages), width)
 
 
+def _join_again(results: Mapping[str, Any], cuts: Sequence[_Cut]) -> dict[str, Any]:
+    """Return the results of an evaluation whose cuts nothing needs, as expressions of its arguments."""
+    expressions = [*results.values()]
+    for cut in reversed(cuts):
+        if cut.carried:
+            symbols, carried = zip(*cut.carried, strict=True)
+            expressions = ca.substitute(expressions, [*symbols], [*carried])
+    return dict(zip(results, expressions, strict=True))
+
+
 def _drop_unused(results: Iterable[Any], cuts: Sequence[_Cut]) -> None:
-    """Leave out what no later stage needs of what was made before a cut."""
+    """Leave out what no later stage needs of what was made before a cut, and evaluations that nothing needs."""
     needed = _symbols_of(results)
     for cut in reversed(cuts):
         cut.carried = [(symbol, e) for symbol, e in cut.carried if symbol.__hash__() in needed]
-        needed |= _symbols_of([*(e for _, e in cut.carried), cut.states, cut.inputs])
+        cut.needed = any(symbol.__hash__() in needed for symbol in cut.outputs) or not cut.may_drop
+        own = [cut.states, cut.inputs] if cut.needed else []
+        needed |= _symbols_of([*(e for _, e in cut.carried), *own])
 
 
 def _symbols_of(expressions: Iterable[Any]) -> set[int]:

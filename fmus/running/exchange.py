@@ -118,7 +118,7 @@ class ExchangeMembers(Block):
         try:
             instance.initialize(None, start_time=start_time)
             if self.interface_text:
-                instance.add_note(f"{self.label}: it runs {self.interface_text}: the solver integrates it")
+                instance.add_note(f"it runs {self.interface_text}: the solver integrates it")
             yield instance
         finally:
             instance.close()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from loopwright.blocks import Gain, SampleTimeError, Sine
+from loopwright.blocks import Gain, Integrator, SampleTimeError, Sine
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, bouncing_ball, mass_spring_damper
 
@@ -131,3 +131,16 @@ def test_it_refuses_to_stand_in_a_sampled_subsystem(files):
 def test_the_representation_says_which_interface_is_used(files):
     assert "interface='model_exchange'" in repr(Fmu(files[mass_spring_damper, 3], interface="model_exchange"))
     assert Fmu(files[mass_spring_damper, 3]).used_interface == "co_simulation"
+
+
+def test_an_evaluation_that_needs_nothing_of_the_fmu_leaves_it_out(files, fmi):
+    plant = Fmu(files[mass_spring_damper, fmi], interface="model_exchange", name="plant")
+    aside = Integrator(name="aside")(Gain(gain=2.0, name="twice")(Sine(frequency=0.5, name="wave")))
+    flat = Diagram("d", plant(force=Sine(frequency=0.5, name="push")), aside).flatten(1)
+    assert len(flat.flow.opaque) == 1
+    asked = flat.output(("twice", "y"))
+    assert not asked.opaque
+    assert asked.function.n_in() == 4
+    found = asked(0.5, flat.x0, [], flat.p)[0]
+    np.testing.assert_allclose(found, [2.0 * np.sin(np.pi * 0.5)])
+    assert [stage.names[0] for stage in flat.jump.opaque][-1] == "jump"
