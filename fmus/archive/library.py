@@ -16,6 +16,8 @@ _MACHINES = {
     "windows": {0x14C: "x86", 0x8664: "x86_64", 0xAA64: "aarch64"},
     "darwin": {0x7: "x86", 0x1000007: "x86_64", 0x100000C: "aarch64"},
 }
+LFS_POINTER = b"version https://git-lfs"
+"""Beginning of the small text that stands for a file in a repository with Git LFS."""
 _LOADED, _DYNAMIC = 1, 2
 _NEEDED, _HASH, _STRTAB, _SYMTAB, _STRSZ, _GNU_HASH = 1, 4, 5, 6, 10, 0x6FFFFEF5
 _SHARED = 3
@@ -60,6 +62,8 @@ def read_library(data: bytes) -> SharedLibrary:
         platforms = _find_platforms(data)
     except (struct.error, IndexError):
         return SharedLibrary(damage=f"it is cut off within its header, after {len(data)} bytes")
+    if data.startswith(LFS_POINTER):
+        return SharedLibrary(damage="it is a pointer of Git LFS in place of the library; 'git lfs pull' gets it")
     if platforms is None:
         return SharedLibrary(damage=f"it is no shared library: it starts with {data[:8]!r}")
     check = {b"\x7fE": _read_elf, b"MZ": _read_pe, b"\xca\xfe": _read_universal}.get(data[:2])

@@ -11,7 +11,7 @@ from ...blocks.core import FmuFileError
 from .faults import FmuFault
 from .limits import ArchiveLimits
 from .repair import repair
-from .rules import check_schema, check_variables
+from .rules import check_schema, check_structure, check_variables
 from .zip_file import DESCRIPTION
 
 
@@ -32,7 +32,7 @@ def read_model(path: Path, text: bytes, root: Any, limits: ArchiveLimits | None 
     Raises
     ------
     FmuFileError
-        If it can't be read, or is refused by `check_variables`.
+        If it can't be read, or is refused by `check_structure` or `check_variables`.
     """
     from fmpy.validation import validate_model_description
     from lxml import etree
@@ -53,6 +53,7 @@ def read_model(path: Path, text: bytes, root: Any, limits: ArchiveLimits | None 
             fault=FmuFault.VERSION,
             subject=version,
         )
+    check_structure(path, root)
     repaired: list[str] = []
     try:
         schema = check_schema(root)

@@ -10,6 +10,7 @@ from typing import Any
 from ...blocks.core import FmuFileError
 from .faults import FmuFault
 from .limits import ArchiveLimits
+from .zip_file import DESCRIPTION
 
 
 def check_schema(root: Any) -> list[str]:
@@ -34,6 +35,42 @@ def _schema(major: str) -> Any:
     folder = Path(fmpy.__file__).parent / "schema"
     name = {"1": "fmiModelDescription", "2": "fmi2ModelDescription", "3": "fmi3ModelDescription"}[major]
     return etree.XMLSchema(file=str(folder / f"fmi{major}" / f"{name}.xsd"))
+
+
+def check_structure(path: Path, root: Any) -> None:
+    """Refuse a description without variables, or with dimensions by variables that don't exist.
+
+    Parameters
+    ----------
+    path : Path
+        The FMU, for messages.
+    root : lxml.etree.Element
+        Root of its description.
+
+    Raises
+    ------
+    FmuFileError
+        If the description is refused.
+    """
+    variables = root.find("ModelVariables")
+    if variables is None:
+        raise FmuFileError(
+            f"the {DESCRIPTION} of {str(path)!r} has no variables (ModelVariables); expected some. Export it again.",
+            fault=FmuFault.DESCRIPTION,
+            subject=DESCRIPTION,
+        )
+    sized = root.xpath("ModelVariables/*/Dimension[@valueReference]")
+    known = {v.get("valueReference") for v in variables} if sized else set()
+    for dimension in sized:
+        reference = dimension.get("valueReference")
+        if reference not in known:
+            name = dimension.getparent().get("name")
+            raise FmuFileError(
+                f"the variable {name!r} of {str(path)!r} has the size of the variable with the value reference "
+                f"{reference}, which doesn't exist; expected a structural parameter. Export it again.",
+                fault=FmuFault.DIMENSION,
+                subject=name,
+            )
 
 
 def check_variables(path: Path, root: Any, model: Any, limits: ArchiveLimits) -> list[str]:

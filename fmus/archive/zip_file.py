@@ -15,6 +15,7 @@ from pathlib import Path
 from ...blocks.core import FmuFileError
 from .entries import check_entries
 from .faults import FmuFault, FmuFinding
+from .library import LFS_POINTER
 from .limits import ArchiveLimits
 from .xml_text import parse_xml
 
@@ -180,7 +181,7 @@ def _reading(path: Path) -> Iterator[None]:
         ) from None
     except Exception as error:  # zipfile raises many kinds of errors on damaged archives
         raise FmuFileError(
-            f"{str(path)!r} is no FMU: it is a damaged zip archive ({type(error).__name__}: {error}). Copy it "
+            f"{str(path)!r} is no FMU: it is a damaged zip archive ({str(error) or type(error).__name__}). Copy it "
             "again, or export it again.",
             fault=FmuFault.DAMAGED,
         ) from None
@@ -194,6 +195,10 @@ def _check_end(path: Path, data: bytes, limits: ArchiveLimits) -> None:
         cut = data.startswith(b"PK\3\4")
         kind = "a zip archive that is cut off: its table of contents is missing" if cut else f"no zip archive ({found})"
         step = "Copy or download it again." if cut else "Give the .fmu that the tool exported."
+        if data.startswith(LFS_POINTER):
+            kind, step = "a pointer of Git LFS in place of the file", "Get the file with 'git lfs pull'."
+        elif data[:200].lstrip()[:9].lower() in (b"<!doctype", b"<html>", b"<html lan"):
+            kind, step = "a web page", "Download the file itself, such as by the page's link to the raw file."
         raise FmuFileError(
             f"{str(path)!r} is no FMU: it is {kind}. {step}", fault=FmuFault.DAMAGED if cut else FmuFault.NO_ARCHIVE
         )

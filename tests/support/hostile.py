@@ -181,6 +181,9 @@ def machine(number):
 ARCHIVES = {
     "empty": Case(lambda files: b"", FmuFault.NO_ARCHIVE),
     "a web page": Case(lambda files: b"<!DOCTYPE html><html>404 Not Found</html>" * 99, FmuFault.NO_ARCHIVE),
+    "a pointer of Git LFS": Case(
+        lambda files: b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", FmuFault.NO_ARCHIVE
+    ),
     "a gzip file": Case(lambda files: b"\x1f\x8b\x08" + bytes(1000), FmuFault.NO_ARCHIVE),
     "cut off": Case(lambda files: packed(files)[:-200], FmuFault.DAMAGED),
     "cut off in the middle": Case(lambda files: packed(files)[:3000], FmuFault.DAMAGED),
@@ -288,7 +291,7 @@ DESCRIPTIONS = {
     ),
     "a dimension without a variable": Case(
         described((r"</ModelVariables>", (r'<Float64 name="v" valueReference="77" start="0"><Dimension '
-                   r'valueReference="999"/></Float64>\g<0>'))), FmuFault.DESCRIPTION
+                   r'valueReference="999"/></Float64>\g<0>'))), FmuFault.DIMENSION
     ),
     "an illegal combination": Case(
         described((r"</ModelVariables>", (r'<Float64 name="v" valueReference="77" causality="parameter" '
