@@ -72,6 +72,13 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
         raise ParameterError(
             f"found {value!r}; expected numbers of shape {variable.shape}.", block=label, port=port
         ) from None
+    if variable.is_integer and _too_large(numbers):  # before it is rounded
+        raise ParameterError(
+            f"found {value!r}; expected at most 2**53 in size, up to which a signal holds every integer of its type "
+            f"{variable.type}. Give another value.",
+            block=label,
+            port=port,
+        )
     if not np.all(np.isfinite(array)):
         raise ParameterError(f"found {value!r}; expected finite numbers{_unit_text(variable)}.", block=label, port=port)
     if reason := variable.complaint(array):
@@ -122,6 +129,12 @@ def _number_items(variable: FmuVariable, value: Any) -> Any:
     if isinstance(value, str) and value in variable.items:
         return variable.items[value]
     return value
+
+
+def _too_large(numbers: Any) -> bool:
+    """Whether an integer is among numbers that a float64 may not hold."""
+    found = np.ravel(np.array(numbers, dtype=object))
+    return any(isinstance(number, int | np.integer) and abs(int(number)) > 2**53 for number in found)
 
 
 def _unit_text(variable: FmuVariable) -> str:

@@ -171,6 +171,8 @@ def test_a_start_value_that_the_fmu_does_not_keep_is_an_error(folder):
     [
         ("u_Int8", 0.5, "found 0.5; expected an integer, as it is of type Int8"),
         ("u_UInt8", 201, "found 201; the FMU allows at most 200"),
+        ("u_Int64", 2**53 + 1, r"found 9007199254740993; expected at most 2\*\*53 in size"),
+        ("u_UInt64", -1, "found -1; expected 0 to 18446744073709551615"),
         ("u_UInt8", 256, "found 256; expected 0 to 255, as it is of type UInt8"),
         ("u_Boolean", 3, "found 3; expected 0 to 1"),
         ("u_Enumeration", "middle", "found 'middle'; expected numbers"),
