@@ -7,6 +7,7 @@ from .disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
 from .loop_class import loop_class
 from .loop_margins import margins
 from .margins_found import GainCrossover, Margins, PhaseCrossover
+from .measured_margins import Interval, MeasuredMargins, measured_margins, read_frequency_data
 from .number import MARK, Number
 from .nyquist import NyquistCount, nyquist_count
 from .one_thread import on_one_thread
@@ -27,7 +28,9 @@ __all__ = [
     "DiskMargin",
     "GainCrossover",
     "GangOfFour",
+    "Interval",
     "Margins",
+    "MeasuredMargins",
     "Number",
     "NyquistCount",
     "PeriodicMargins",
@@ -44,11 +47,13 @@ __all__ = [
     "loop_at",
     "loop_class",
     "margins",
+    "measured_margins",
     "mimo_disk_margin",
     "nyquist_count",
     "on_one_thread",
     "periodic_margins",
     "place",
+    "read_frequency_data",
     "read_matrices",
     "relative_difference",
     "sampled_gains",

@@ -21,6 +21,7 @@ from .review import review
 from .section_injection import injected
 from .section_limits import not_modelled
 from .section_loops import inner
+from .section_measured import measured_loops
 from .section_poles import closed_loops, memory
 from .section_steps import steps
 from .section_subject import operating_points, remarks, subject, versions
@@ -58,6 +59,7 @@ def analyse(
     decibels: bool = False,
     hertz: bool = False,
     progress: Callable[[str], None] | None = None,
+    measured: Mapping[str, Any] | None = None,
 ) -> Report:
     """Analyse a diagram, and return the content of its report.
 
@@ -90,6 +92,9 @@ def analyse(
         Lines of the heading: ``title``, ``author``, ``project``, ``date``, ``revision``, or any other.
     decibels, hertz : bool
         Whether magnitudes are drawn in dB, and over a frequency in Hz; without it plain, over rad/s.
+    measured : mapping of str to data, optional
+        Loops that were measured, by their wires: data as `measured_margins` takes them, or the path of a CSV file (see
+        `read_frequency_data`). Their margins, with intervals, stand beside the model's.
     progress : callable, optional
         Told the key of each section before it is made, and of the injection check each measurement, too.
 
@@ -112,13 +117,15 @@ def analyse(
     kind: MakesSections = diagram.report_kind if isinstance(diagram, HasReportKind) else ANY_DIAGRAM
     kind.check_keys(only or ())
     wires = None if loops is None else tuple([loops] if isinstance(loops, str) else loops)
-    for wire in wires or ():
+    for wire in (*(wires or ()), *(measured or ())):
         find_signal(diagram.flatten(None if diagram.has_clock else STEP), wire)
     tell = progress or (lambda key: None)
     asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(requirements)
     case, sections = kind.sections(
         diagram, point, experiment, wires, only, tell, stairs, asked, AxisUnits(decibels, hertz)
     )
+    if measured:
+        sections = (*sections, measured_loops(case, measured))
     made = Report("", sections).numbers()
     reviewed = None if asked is None else review(case, asked, made)
     if only is None or asked is not None:
