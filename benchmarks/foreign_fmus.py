@@ -13,6 +13,7 @@ import argparse
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -60,12 +61,14 @@ def read_facts(file: str) -> Facts:
     for element in root.find("ModelVariables") or ():
         v = element if fmi.startswith("3") else next(iter(element), element)
         name, causality, kind = element.get("name", ""), element.get("causality", "local"), v.tag
-        if kind in ("String", "Binary", "Clock") or element.get("alias", "noAlias") != "noAlias":
+        if kind in ("String", "Binary", "Clock"):
             continue
         if causality == "output":
             outputs.append(name)
         elif causality == "input":
             inputs[name] = v.get("start") or ("1" if kind == "Enumeration" else "0")
+        elif element.get("variability") in ("parameter", "constant", "fixed", "tunable"):
+            continue
         elif causality in ("local", "internal") and kind in ("Real", "Float64"):
             reals.append(name)
     return Facts(
@@ -229,7 +232,7 @@ def as_table(rows: list[dict[str, object]]) -> str:
             continue
         difference = "" if row["gap"] is None else f"{row['gap']:.1e} ({row['where']})"
         kind = {"CoSimulation": "CS", "ModelExchange": "ME"}.get(str(row["interface"]), "?")
-        said = (" ".join(str(row[k]).split()).replace("|", "\\|")[:160] for k in ("ours", "fmpy"))
+        said = (shorten(str(row[k])) for k in ("ours", "fmpy"))
         lines.append(f"| {row['source']}: {row['file']} | {short_name(str(row['tool']))} | {row['fmi']} {kind} "
                      f"| {' | '.join(said)} | {difference} |")  # fmt: skip
     return "\n".join(lines) + "\n"
@@ -240,15 +243,18 @@ def agrees(row: dict[str, object]) -> bool:
     return row["gap"] is not None and float(row["gap"]) <= (CLOSE if row["interface"] == "CoSimulation" else 1e-6)
 
 
+def shorten(reason: str) -> str:
+    """Return the beginning of an error, on one line and without this machine's paths."""
+    line = re.sub(r"'?/[^' ]*/([^/' ]+)'?", r"\1", " ".join(reason.split()))
+    return line.replace("|", "\\|")[:160]
+
+
 def short_name(tool: str) -> str:
     """Return a tool's name without its version."""
-    words = tool.replace("/", " ").replace(",", " ").split()
-    kept = [
-        word
-        for word in words
-        if not any(c.isdigit() for c in word) and word.lower() not in ("version", "-", "compiler")
-    ]
-    return " ".join(kept[:3]) or "not stated"
+    words = dict.fromkeys(re.split(r"[ /,:(]+", tool))
+    skipped = {"version", "-", "compiler", "requires", "development", "inline"}
+    kept = [word for word in words if word[-1:].isalpha() and word.lower() not in skipped and word[1:2] != "."]
+    return " ".join(kept[:2]) or "not stated"
 
 
 def main() -> None:

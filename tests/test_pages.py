@@ -93,10 +93,11 @@ def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_pat
     assert f"here {scope['sign'].frequency:.3f} rad/s" in text
 
 
-def test_the_page_on_coupling_runs(cache, tmp_path):
+@pytest.mark.parametrize("page", ["coupling", "other_tools"])
+def test_the_page_runs(cache, tmp_path, page):
     scope = {}
     with chdir(tmp_path):
-        for snippet in blocks_of_code((ROOT / "docs" / "coupling.md").read_text(encoding="utf-8")):
+        for snippet in blocks_of_code((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")):
             exec(snippet, scope)
 
 
