@@ -721,7 +721,7 @@ def test_a_reader_that_has_had_enough(lag):
     assert process.wait() == 1
 
 
-@pytest.mark.parametrize("command", ["build", "inspect", "validate"])
+@pytest.mark.parametrize("command", ["build", "inspect", "validate", "doctor"])
 def test_help(command, capsys):
     assert main([command, "--help"]) == 0
     out = capsys.readouterr().out

@@ -1,16 +1,17 @@
 """The doctor: verdicts, findings with next steps, trial runs that may crash, JSON; for good, broken and hostile FMUs."""
 
 import json
+import pickle
 import re
 import sys
 
 import numpy as np
 import pytest
 
-from loopwright.blocks import FmuFileError
+from loopwright.blocks import FmuFileError, ParameterError
 from loopwright.diagrams import Diagram
 from loopwright.diagrams.cli import main
-from loopwright.fmus import Fmu, FmuFault, FmuSeverity, FmuVerdict, doctor, mass_spring_damper
+from loopwright.fmus import ArchiveLimits, Fmu, FmuFault, FmuSeverity, FmuVerdict, doctor, mass_spring_damper
 from loopwright.fmus.platform import native_platform
 from support.hostile import CASES, XML, binaries, described, good_files, library, packed, without_library
 from support.zoo import zoo_fmu
@@ -279,6 +280,9 @@ def test_the_command(good, tmp_path, capsys):
     assert main(["doctor", str(path)]) == 1
     assert ": is refused: it is no FMU" in capsys.readouterr().out
     assert main(["doctor", str(path), "--max-size", "-1"]) == 2
+    path.write_bytes(packed(good))
+    assert main(["doctor", str(path), "--no-run", "--max-size", "0.00001"]) == 1
+    assert "bytes; expected at most 1e+04" in capsys.readouterr().out
     assert main(["doctor", str(tmp_path / "absent.fmu")]) == 2
 
 
@@ -295,3 +299,15 @@ def test_the_library_is_not_loaded_in_this_process(examine, good):
         with open("/proc/self/maps", encoding="utf-8") as maps:
             assert f"/{XML}" not in (text := maps.read())
             assert f"binaries/x86_64-linux/{name}" not in re.sub(r"unpacked/\S+", "", text)
+
+
+def test_a_block_takes_limits_of_its_file(good, tmp_path):
+    path = tmp_path / "plant.fmu"
+    path.write_bytes(packed(good))
+    with pytest.raises(FmuFileError, match=r"plant: .* expected at most 1e\+03") as caught:
+        Fmu(path, name="plant", limits=ArchiveLimits(size=1000))
+    assert caught.value.fault == FmuFault.TOO_LARGE
+    with pytest.raises(ParameterError, match=r"plant\.limits: found 1000; expected ArchiveLimits"):
+        Fmu(path, name="plant", limits=1000)
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert (str(again), again.fault) == (str(caught.value), FmuFault.TOO_LARGE)
