@@ -1,8 +1,8 @@
 """Communication points of plants: the ticks to which an FMU, or another stepped block, steps.
 
-A plant steps at the ticks of the sampled subsystems that it is wired to, directly or through blocks in continuous time;
-plants that are wired to one another in this way share their ticks. So a subsystem that has nothing to do with a plant
-never changes its communication points.
+A plant steps at the ticks of the sampled subsystem that it stands in, and of those that it is wired to, directly or
+through blocks in continuous time; plants that are wired to one another in this way share their ticks. So a subsystem
+that has nothing to do with a plant never changes its communication points.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ def _group(
         preceding.setdefault(reader, set()).add(source)
     groups: list[tuple[set[str], set[TickPattern]]] = []
     for plant in plants:
-        group, wired = {plant}, set[TickPattern]()
+        own = clocks.get(table.subsystem_of[plant])
+        group, wired = {plant}, set[TickPattern]() if own is None else {own}
         for neighbours in (following, preceding):
             todo, seen = [*neighbours.get(plant, ())], set[str]()
             while todo:

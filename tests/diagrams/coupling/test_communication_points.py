@@ -152,6 +152,18 @@ def test_an_fmu_of_one_step_length_goes_by_its_own_base_and_says_so(cache, steps
     assert not run.messages  # the fastest subsystem acts more often
 
 
+def test_an_fmu_in_a_sampled_subsystem_steps_at_its_ticks(cache, steps):
+    inner = plant()
+
+    @subsystem(sample_time=0.02)
+    def box(force):
+        inner(force=force)
+        return inner.position
+
+    Diagram("d", box(0.0), sampled(0.003, "fast")(Clock())).simulate(0.1, progress=False)
+    assert len(steps) == 5
+
+
 # --- communication steps of their own -----------------------------------------------------------------------------------
 
 

@@ -40,6 +40,7 @@ def error_of(made, **options):
     return np.abs(np.column_stack([run[name] for name in names]) - exactly(run.t)).max()
 
 
+@pytest.mark.drawn(3)
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("scheme", "order"), [("jacobi", 1), ("gauss_seidel", 1), ("iterated", 2)])
 def test_a_network_converges_with_the_order_of_the_scheme(seed, scheme, order):
@@ -47,12 +48,14 @@ def test_a_network_converges_with_the_order_of_the_scheme(seed, scheme, order):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.25)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("seed", range(3))
 def test_iteration_solves_a_network_with_feedthrough_in_every_loop(seed):
     errors = [error_of(network(seed, feedthrough=1.0), step=h, coupling="iterated") for h in (1 / 40, 1 / 80)]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.3)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("seed", range(2))
 def test_adaptive_steps_keep_to_the_error(seed):
     for error in (1e-3, 1e-5):

@@ -69,7 +69,8 @@ def test_blocks_in_continuous_time_take_part(cache, scheme, order):
     assert order_of(errors) == pytest.approx([order, order], abs=0.25)
 
 
-@pytest.mark.parametrize(("scheme", "order"), ORDERS)
+@pytest.mark.drawn(1)
+@pytest.mark.parametrize(("scheme", "order"), ORDERS[::-1])
 def test_an_fmu_in_model_exchange_beside_one_in_co_simulation(cache, monkeypatch, scheme, order):
     diagram = two_masses()
     diagram = diagram.replace({"b": diagram["b"].replace(interface="model_exchange")})
@@ -127,6 +128,7 @@ def test_adaptive_steps_follow_the_allowed_error(cache, scheme):
     assert fine < 100 * 1e-4
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("coupling", ["gauss_seidel", "iterated", Coupling(error=1e-6)], ids=str)
 def test_an_fmu_under_a_sampled_controller_needs_no_coupling(cache, monkeypatch, coupling):
     monkeypatch.setattr(Fmu, "can_save", property(lambda self: False))
@@ -148,7 +150,8 @@ def test_the_default_is_jacobi_to_the_last_bit(cache):
     assert np.array_equal(runs[0]["a.position"], runs[1]["a.position"])
 
 
-@pytest.mark.parametrize("coupling", ["gauss_seidel", "iterated", Coupling(scheme="iterated", error=1e-4)], ids=str)
+@pytest.mark.drawn(1)
+@pytest.mark.parametrize("coupling", [Coupling(scheme="iterated", error=1e-4), "gauss_seidel", "iterated"], ids=str)
 def test_a_run_goes_on_from_a_saved_state(cache, coupling):
     with mass_and_filter().simulation(step=0.02, coupling=coupling) as simulation:
         simulation.advance(0.2)
@@ -274,7 +277,8 @@ def test_a_linear_model_over_steps_of_another_coupling_is_refused(cache):
 # --- FMUs in processes of their own ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("coupling", ["jacobi", "gauss_seidel", "iterated"])
+@pytest.mark.drawn(1)
+@pytest.mark.parametrize("coupling", ["iterated", "jacobi", "gauss_seidel"])
 def test_fmus_in_processes_of_their_own_give_the_bits_of_those_in_this_one(cache, coupling):
     apart = two_masses().replace(
         {"a": two_masses()["a"].replace(isolate=True), "b": two_masses()["b"].replace(isolate=True)}
@@ -327,6 +331,7 @@ def test_a_step_that_has_begun_is_ended_where_another_one_fails(fails, calls_mad
 # --- events, stops and delays within a step ------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_events_within_a_repeated_step_happen_once(cache):
     """The relay switches within steps, by whose jump every scheme is of first order there; shorter steps find it."""
     fine = relay_and_mass().simulate(0.5, step=1e-3, progress=False, coupling="iterated")
@@ -338,8 +343,9 @@ def test_events_within_a_repeated_step_happen_once(cache):
         assert [e.t for e in run.events] == pytest.approx([e.t for e in fine.events], abs=off)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize(
-    "coupling", ["jacobi", "gauss_seidel", "iterated", Coupling(scheme="iterated", error=1e-4)], ids=str
+    "coupling", ["iterated", "jacobi", "gauss_seidel", Coupling(scheme="iterated", error=1e-4)], ids=str
 )
 def test_a_stop_condition_between_two_ticks_ends_the_run_in_any_coupling(cache, coupling):
     a, state = mass("a", 0.1), Integrator(name="filter")
@@ -353,7 +359,8 @@ def test_a_stop_condition_between_two_ticks_ends_the_run_in_any_coupling(cache, 
     assert run.t[-1] == run.stopped.t
 
 
-@pytest.mark.parametrize(("scheme", "order"), ORDERS)
+@pytest.mark.drawn(1)
+@pytest.mark.parametrize(("scheme", "order"), ORDERS[::-1])
 def test_a_transport_delay_between_two_fmus_keeps_the_order(cache, scheme, order):
     """The second mass feels the first one, which nothing drives, 0.1 s later."""
     a, b = mass("a", 0.1), mass("b")
