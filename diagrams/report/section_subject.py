@@ -133,6 +133,8 @@ def _shown(value: Any) -> str:
         return f"{float(value):.9g}"
     if isinstance(value, np.ndarray):
         return "(" + ", ".join(_shown(v) for v in value) + ")" if value.size <= 12 else f"array {value.shape}"
+    if callable(value):
+        return str(getattr(value, "__name__", type(value).__name__))  # no address in memory
     if hasattr(value, "items"):
         return ", ".join(f"{k} = {_shown(v)}" for k, v in value.items())
     return str(value)

@@ -322,3 +322,10 @@ def test_every_number_of_a_step_is_defined_and_has_the_units_of_its_signals():
     for path in numbers:
         term, _ = definition(path)
         assert term in ("overshoot", "settling", "rise", "peak", "final", "difference", "effort"), path
+
+
+def test_a_function_is_shown_by_its_name_and_not_by_its_place_in_memory():
+    (section,) = analyse(reviewed.tank(), only=("subject",)).sections
+    (parameters,) = [t for t in section.tables if t.title == "Parameters"]
+    assert ("outlet", "Function", "function", "<lambda>", "") in parameters.rows
+    assert not any(" at 0x" in str(cell) for row in parameters.rows for cell in row)
