@@ -156,6 +156,17 @@ class FmiCalls(ABC):
         """Return to the state before the initialization."""
         self.fmu.reset()
 
+    def renew(self, log: Log, running: bool) -> None:
+        """Free the instance, terminated if it is running, and make another one; its messages go to ``log``.
+
+        Calls that are bound to the old one can't be used any more.
+        """
+        if running:
+            self.terminate()
+        free = {"fmi1": "fmi1FreeSlaveInstance"}.get(self.prefix, f"{self.prefix}FreeInstance")
+        getattr(self.fmu, free)(self.fmu.component)
+        self.instantiate(log)
+
     def terminate(self) -> None:
         """End the run of the instance."""
         self.fmu.terminate()

@@ -13,6 +13,7 @@ import numpy as np
 from ...blocks.core import FmuError, FmuFileError, FmuProcessError, FmuRuntimeError, UnknownNameError, near
 from ..archive import FmuFault, FmuVariable, inexact, unpack
 from ..host_state import HostState, guard_host
+from ..platform import is_built_here
 from .fmi1 import Fmi1Calls
 from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
@@ -214,8 +215,15 @@ class LoadedFmu:
         )
 
     def reset(self) -> None:
-        """Return to the state before the initialization (FMI 2.0, 2.1.6; FMI 3.0, 2.3.1)."""
-        self.call("resetting it", self.fmi.reset)
+        """Return to the state before the initialization (FMI 2.0, 2.1.6; FMI 3.0, 2.3.1).
+
+        An FMU that Loopwright has not built gets a fresh instance: the resets of many leave something behind.
+        """
+        if is_built_here(self.description.digest):
+            self.call("resetting it", self.fmi.reset)
+        else:
+            self.call("making it anew", self.fmi.renew, self.log.take, self._running and not self.failed)
+            self._reading = SharedReading(self.fmi)
         self.failed = self._running = False
 
     def begin(self) -> None:

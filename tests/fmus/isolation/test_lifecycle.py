@@ -15,7 +15,8 @@ import pytest
 
 from loopwright.blocks import FmuError, FmuRuntimeError
 from loopwright.fmus import Fmu, Isolation
-from loopwright.fmus.isolation import count_processes, end_idle
+from loopwright.fmus.calls import LoadedFmu
+from loopwright.fmus.isolation import count_processes, end_idle, open_fmu
 from support.zoo import zoo_fmu
 
 ON_LINUX = pytest.mark.skipif(sys.platform != "linux", reason="looks at /proc")
@@ -237,3 +238,35 @@ def test_what_it_writes_into_its_resources_is_not_there_in_the_next_run(folder):
     run_once(plant)
     assert set(os.listdir()) == here
     end_idle()
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_a_foreign_fmu_is_not_reset_but_made_anew(folder, isolate):
+    """Its reset fails; a fresh instance begins at y = 0 again."""
+    plant = Fmu(zoo_fmu(folder, 3, "reset error"), name="plant", isolate=isolate)
+    one = open_fmu(LoadedFmu, plant)
+    try:
+        for _ in range(3):
+            one.initialize(None, values={"u": 1.0})
+            one.begin()
+            assert one.values(["y"]) == 0.0
+            one.fmi.do_step(0.0, 0.5, True)
+            assert one.values(["y"]) == 0.5
+            one.reset()
+    finally:
+        one.close()
+        end_idle()
+
+
+def test_an_own_build_is_reset(msd, monkeypatch):
+    one = open_fmu(LoadedFmu, Fmu(msd, name="plant"))
+    calls = []
+    try:
+        monkeypatch.setattr(one.fmi, "renew", lambda log, running: calls.append("renew"))
+        one.initialize(None)
+        one.begin()
+        one.reset()
+        one.initialize(None)
+        assert calls == []
+    finally:
+        one.close()
