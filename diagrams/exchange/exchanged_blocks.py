@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, NonFiniteError, SimulationError
+from ...blocks.core import FmuRuntimeError, LoopwrightError, SimulationError
 from ..flat import FlatDiagram
 from .evaluator import Exchangeable, ExchangedBlock, ExchangeEvaluator, Look
 
@@ -85,10 +85,10 @@ class ExchangedBlocks:
         return next((path for path, block in self.blocks.items() if block.ends_run), "")
 
     def explain(self, error: SimulationError) -> None:
-        """Add to the error of a value that is not finite what its block could not compute."""
+        """Add to the error of a solver what its block could not compute since the last step."""
         block = self.blocks.get(error.block or "")
-        if isinstance(error, NonFiniteError) and block is not None and block.discarded:
-            error.add(f" The last that it could not compute: {block.discarded}.")
+        if block is not None and block.discarded and not isinstance(error, FmuRuntimeError):
+            error.add(f" The FMU discards what the solver tries: {block.discarded}.")
 
     def nominals(self) -> np.ndarray:
         """Return the nominal value of each entry of x, 1 for those of other blocks."""

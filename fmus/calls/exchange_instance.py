@@ -329,7 +329,7 @@ class ExchangeInstance(SavedExchange):
         """Note an instant that the solver has reached; return whether the FMU wants an event there (step event)."""
         discrete = [port for port in self._wired if port not in self._smooth]
         kept = {port: self._u[self._places[port]].copy() for port in discrete}
-        self._u = u.copy()
+        self._u, self._discarded = u.copy(), ""
         changed = False
         for port, values in kept.items():  # they are taken over by an event alone
             changed |= not np.array_equal(values, u[self._places[port]])
@@ -341,7 +341,7 @@ class ExchangeInstance(SavedExchange):
             return changed
         if self._completion is None:
             self._completion = self._bind((), False, False, ((self._events.complete, "completing a step"),))
-        self._events.final.value, self._discarded = self._final, ""
+        self._events.final.value = self._final
         self._run(self._completion, t, x, u)
         self._check_computed(t)
         wants, terminate = self._events.completed()

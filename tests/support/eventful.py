@@ -99,8 +99,11 @@ _INTEGERS = (
 )
 
 
-def eventful_fmu(folder, fmi, *, derivatives=False):
-    """Build it into a folder, for a version of FMI, and return its path."""
+def eventful_fmu(folder, fmi, *, fault=""):
+    """Build it into a folder, for a version of FMI, and return its path.
+
+    ``fault`` is a statement in C ahead of the computation of the derivatives, such as ``if (c->t > 0.3) return 3;``.
+    """
     prefix = f"fmi{fmi}"
     names = {
         "RATES": "GetDerivatives" if fmi == 2 else "GetContinuousStateDerivatives",
@@ -108,7 +111,7 @@ def eventful_fmu(folder, fmi, *, derivatives=False):
         **{f"INT_{v.upper()}": f"{v}{'Integer' if fmi == 2 else 'Int32'}" for v in ("Get", "Set")},
     }
     head = f"#define FMI {fmi}\n#define PASTE(a, b) a##b\n#define NAME(end) PASTE({prefix}, end)\n"
-    source = head + _SOURCE
+    source = head + _SOURCE.replace("dx[0] = c->u", f"{fault} dx[0] = c->u")
     for key, end in names.items():
         source = source.replace(f"NAME({key})", f"{prefix}{end}")
     for end in ("EnterInitializationMode", "ExitInitializationMode"):  # small_fmu looks for the whole names

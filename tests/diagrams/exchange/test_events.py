@@ -127,3 +127,23 @@ def test_it_refuses_to_stand_in_an_enabled_subsystem(file):
         WiringError, match=r"box.plant: an FMU in model exchange can't stand in a subsystem that is enabled"
     ):
         Diagram("d", box(Constant(value=1.0), enable=Constant(value=1.0)).named("x"))
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("return 3;", "computing the derivatives of its states failed with fmi3Error at t = 0"),
+        ("return 2;", "The FMU discards what the solver tries: computing the derivatives of its states at t = 0"),
+        ("dx[0] = 0.0 / 0.0; return 0;", "the rate of plant.x = 0.2 is 1.5 there and is not finite just beyond"),
+    ],
+    ids=["error", "discard", "nan"],
+)
+def test_a_failure_names_fmu_call_and_time_and_keeps_the_samples(cache, tmp_path, fault, told):
+    file = eventful_fmu(tmp_path, 3, fault=f"if (c->t > 0.3) {{ {fault} }}")
+    diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    with pytest.raises(SimulationError, match=told) as error:
+        diagram.simulate(1.0, step=0.1, progress=False)
+    assert error.value.block == "plant"
+    assert error.value.t == pytest.approx(0.3, abs=0.1)
+    np.testing.assert_allclose(error.value.run["plant.x"], exact(error.value.run.t, 0.5), atol=1e-12)
+    assert error.value.run.t[-1] >= 0.2
