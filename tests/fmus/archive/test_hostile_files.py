@@ -11,6 +11,8 @@ from loopwright.fmus import ArchiveLimits, Fmu, FmuFault, mass_spring_damper, re
 from loopwright.fmus.archive import FmuArchive, unpack
 from support.hostile import ARCHIVES, CASES, XML, good_files, packed
 
+BOMB = "archive: bomb"  # 120 MB
+
 
 @pytest.fixture(scope="module")
 def good(cache):
@@ -35,7 +37,7 @@ def files_in(folder):
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == BOMB else n for n in CASES])
 def test_a_bad_file_is_told_by_its_fault(good, place, name):
     case, path = CASES[name], place / "plant.fmu"
     path.write_bytes(case.make(good))

@@ -74,7 +74,8 @@ def test_reading_takes_a_small_multiple_of_the_time_that_fmpy_alone_takes(tmp_pa
     assert took < 6.0 * alone + 0.1, (took, alone)
 
 
-@pytest.mark.parametrize("count", [500, pytest.param(20_000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [500, 20_000])
 def test_many_outputs_run(tmp_path, count):
     """Output k is k·t."""
     file = small_fmu(tmp_path, "fmi2", OUTPUTS, description(count, count))
