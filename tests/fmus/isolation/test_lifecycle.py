@@ -55,7 +55,7 @@ def count_resources(temporary):
     return memory, [len(os.listdir("/proc/self/fd")), threading.active_count(), len(children), files]
 
 
-def check_flat(cycle, temporary, count, warm=5, growth=8.0):
+def check_flat(cycle, temporary, count, warm=3, growth=8.0):
     """Run a cycle many times; all counts stay, and memory grows by some MB at most."""
     for k in range(warm):
         cycle(k)
@@ -77,7 +77,7 @@ def check_flat(cycle, temporary, count, warm=5, growth=8.0):
 @ON_LINUX
 @pytest.mark.parametrize(
     ("isolate", "count"),
-    [(False, 20), (True, 10), pytest.param(False, 2000, marks=pytest.mark.slow),
+    [(False, 5), (True, 5), pytest.param(False, 2000, marks=pytest.mark.slow),
      pytest.param(True, 2000, marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_cycles_of_one_fmu_leave_nothing_behind(folder, temporary, isolate, count):
@@ -116,7 +116,7 @@ def test_cycles_of_fifty_fmus_leave_nothing_behind(folder, temporary, isolate, t
 @pytest.mark.parametrize(
     "fault", ["step segfault 0.01", "enter exit", "load abort", "free segfault", "step error 0.01"]
 )
-@pytest.mark.drawn(2)
+@pytest.mark.drawn(1)
 def test_cycles_with_a_fault_leave_nothing_behind(folder, temporary, fault):
     plant = Fmu(zoo_fmu(folder, 3, fault), name="plant", isolate=True)
 
@@ -184,6 +184,7 @@ def is_there(pid):
 
 @ON_LINUX
 @pytest.mark.parametrize(("how", "kill"), [("end", False), ("wait", True), ("hang", True)])
+@pytest.mark.drawn(2)
 def test_the_child_ends_with_its_parent_and_removes_its_folder(folder, tmp_path, how, kill):
     """At the end of a script that closes nothing; and where the parent is killed, idle or in a call that hangs."""
     file = zoo_fmu(folder, 3, "step deaf_hang 0.01" if how == "hang" else "")

@@ -51,6 +51,7 @@ def test_a_sound_fmu_gives_the_integral_of_its_input(folder, fmi):
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn(1)
 def test_numbers_are_bit_for_bit_those_in_process(msd, fmi):
     from loopwright.fmus import build_fmu
 
@@ -127,6 +128,7 @@ def test_the_log_before_the_end_is_quoted(folder):
 
 
 @pytest.mark.parametrize("fault", ["chdir", "rounding", "traps", "sigmask", "sigint", "umask", "environment", "limits"])
+@pytest.mark.drawn(3)
 def test_what_an_fmu_changes_stays_in_its_process(folder, fault):
     here, mask = Path.cwd(), os.umask(0o022)
     os.umask(mask)
@@ -232,6 +234,7 @@ def test_saved_states_go_across_the_process(folder):
 
 
 @pytest.mark.parametrize("fmi", [2, 3])
+@pytest.mark.drawn(1)
 def test_model_exchange_and_linear_models_are_bit_for_bit_those_in_process(cache, fmi):
     from loopwright.fmus import build_fmu
 
