@@ -34,11 +34,11 @@ from .start_values import check_start, check_value, read_sized
 
 
 class Fmu(ExchangeMembers):
-    """Co-simulation FMU of FMI 2.0 or 3.0 as a block; its ports are the FMU's inputs and outputs.
+    """FMU of FMI 2.0 or 3.0 as a block, by co-simulation or model exchange; its ports are the FMU's inputs and outputs.
 
     Outputs are attributes (``plant.position``). A port whose name is no identifier is read by index
-    (``plant["axis.phi"]``), or gets another name by ``rename``. Between communication points the inputs are held, and
-    the outputs are those at the end of the last step. Wire each input, or give it a value in ``start``.
+    (``plant["axis.phi"]``), or gets another name by ``rename``. In co-simulation inputs are held between communication
+    points, and outputs are those at the end of the last step. Wire each input, or give it a value in ``start``.
 
     Scalars ``s[1]``, ``s[2]``, as FMI 2.0 writes an array, are one port ``s``, if they are complete from 0 or 1 and
     alike; ``plant["s[1]"]`` reads one of them, ``start`` takes both names, and scalars that ``rename`` or ``ports``
