@@ -303,7 +303,7 @@ class LoadedFmu:
             size, references = sum(v.size for v in alike), [r for v in alike for r in v.references]
             given = together[k] if together else self.call(purpose, self.fmi.get, alike[0].type, references, size)
             values = np.array(given)
-            if alike[0].is_integer and inexact(values):
+            if alike[0].is_integer and values.itemsize == 8 and inexact(values):
                 raise FmuRuntimeError(
                     f"{purpose}: found {values[[inexact(v) for v in values]][0]}; expected at most 2**53 in size, up "
                     "to which a signal holds every integer. Leave this variable out.",
