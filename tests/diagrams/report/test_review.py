@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Gain, Integrator, Quantizer, Saturation, UnknownNameError
-from loopwright.diagrams import Diagram, Requirements, Verdict, analyse, experiments, subsystem
+from loopwright.diagrams import Diagram, Number, Requirements, Verdict, analyse, experiments, subsystem
 from loopwright.diagrams.cli.command_line import main
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.content_hash import content_hash
+from loopwright.diagrams.report.review import review
 from loopwright.diagrams.report_writing.definitions import definition
 from loopwright.diagrams.report_writing.html import to_html
 from loopwright.diagrams.report_writing.json import to_json
@@ -329,3 +330,62 @@ def test_a_function_is_shown_by_its_name_and_not_by_its_place_in_memory():
     (parameters,) = [t for t in section.tables if t.title == "Parameters"]
     assert ("outlet", "Function", "function", "<lambda>", "") in parameters.rows
     assert not any(" at 0x" in str(cell) for row in parameters.rows for cell in row)
+
+
+def judged_with(asked, changes, drop=()):
+    """Return the verdicts on the loop's numbers, some of them changed or left out, by quantity."""
+    case = Case(loop())
+    case.requirements = asked
+    numbers = dict(analyse(loop(), only=PARTS).numbers())
+    numbers = {path: number for path, number in numbers.items() if path.rpartition(".")[2] not in drop}
+    return {r.quantity: r for r in review(case, asked, {**numbers, **changes}).results}
+
+
+def made(value, confirmed_by="a run"):
+    return Number(value, "1", 1e-9, confirmed_by)
+
+
+def test_a_measurement_that_contradicts_the_linear_model_leaves_its_margins_undecided():
+    start = "injection.u.sampled_d0"
+    for deviation, uncertainty, reason in ((0.2, 1e-3, Reason.REFUTED), (0.2, 0.1, Reason.COMPARED)):
+        changes = {f"{start}.deviation": made(deviation), f"{start}.uncertainty": made(uncertainty)}
+        found = judged_with(Requirements(phase_margin_deg=45), changes)["phase_margin_deg"]
+        assert found.reason is reason
+        assert (found.verdict is Verdict.PASSED) is (reason is Reason.COMPARED)
+
+
+def test_margins_with_slow_loops_open_do_not_count_and_those_with_all_loops_closed_do():
+    drop = ("delay_margin_samples", "phase_margin_deg")
+    asked = Requirements(phase_margin_deg=45, delay_margin_samples=2)
+    start = "inner.u.sampled_d0"
+    changes = {
+        f"{start}.slow_open.phase_margin_deg": made(80.0),
+        f"{start}.slow_open.delay_margin_samples": made(9.0),
+        f"{start}.periodic.delay_margin_samples": made(1.0),
+    }
+    found = judged_with(asked, changes, drop)
+    assert found["delay_margin_samples"].verdict is Verdict.FAILED
+    assert found["delay_margin_samples"].number.value == 1.0
+    assert (found["phase_margin_deg"].verdict, found["phase_margin_deg"].reason) == (
+        Verdict.UNDECIDED,
+        Reason.NO_NUMBER,
+    )
+
+
+def test_the_worst_of_several_places_is_judged_and_a_missing_one_decides_nothing():
+    start = "inner.u.sampled_d0"
+    places = {f"{start}.here.disk_margin": made(1.2), f"{start}.there.disk_margin": made(0.3)}
+    asked = Requirements(disk_margin=0.6)
+    assert judged_with(asked, places, ("disk_margin",))["disk_margin"].path == f"{start}.there.disk_margin"
+    unknown = {f"{start}.there.disk_margin": made(math.nan)}
+    assert judged_with(asked, {**places, **unknown}, ("disk_margin",))["disk_margin"].verdict is Verdict.UNDECIDED
+
+
+def test_general_limits_of_single_loops_do_not_apply_to_a_loop_with_channels_unless_it_is_named():
+    margins = ("phase_margin_deg", "disk_margin")
+    changes = {"inner.u.sampled_d0.disk_margin": made(1.0)}
+    found = judged_with(Requirements(phase_margin_deg=45, disk_margin=0.6), changes, margins)
+    assert "phase_margin_deg" not in found
+    assert found["disk_margin"].verdict is Verdict.PASSED
+    named = judged_with(Requirements(disk_margin=0.6, loops={"u": {"phase_margin_deg": 45}}), changes, margins)
+    assert named["phase_margin_deg"].verdict is Verdict.UNDECIDED
