@@ -40,7 +40,7 @@ CASES = [
 
 @pytest.mark.parametrize(
     ("name", "side", "delay", "vary", "held"),
-    [pytest.param(*case, marks=[] if i == 0 else [pytest.mark.slow]) for i, case in enumerate(CASES)],
+    [pytest.param(*case, marks=[pytest.mark.slow]) for case in CASES],
 )
 def test_a_limit_holds_in_the_nonlinear_run(name, side, delay, vary, held):
     here = contact(name, side, delay)
@@ -89,6 +89,7 @@ def test_a_continuous_diagram_around_an_fmu_is_refused():
         ideal.confirm(limit)
 
 
+@pytest.mark.slow
 def test_plants_of_the_library_are_known_by_their_models_and_parameters():
     assert set(LIBRARY) == {"gantry", "gantry_elastic", "gantry_stiction", "scara"}
     assert library_class(Fmu(gantry_elastic.build(), name="plant")) is LIBRARY["gantry_elastic"]
