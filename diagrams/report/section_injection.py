@@ -93,7 +93,9 @@ def _moving(v: Variant) -> dict[str, Any]:
 
 def _measured(case: Case, v: Variant, wire: str) -> tuple[FrequencyResponse, Linearization]:
     excited, frequencies, amplitude = case.excitation(v, wire)
-    found = frequency_response(excited.diagram, wire, frequencies, amplitude=amplitude, at=excited.point.t)
+    found = frequency_response(
+        excited.diagram, wire, frequencies, amplitude=amplitude, at=excited.point.t, compile=True
+    )
     return found, excited.model
 
 
