@@ -124,12 +124,20 @@ class RunOptions:
         Raises
         ------
         OptionError
-            A name that is no option of a run.
+            A name that is no option of a run; None for ``start``, which a run without a ``final_state`` has.
         """
         known = [f.name for f in fields(cls)]
         for name in options:
             if name not in known:
                 raise OptionError(f"it is no option of a run. {near(name, known)}", block=block, port=name)
+        if "start" in options and options["start"] is None:
+            raise OptionError(
+                "found None; expected a state or an operating point. A run has no final_state if it has ended between "
+                "two ticks, or an FMU can't turn its state into bytes (canSerializeFMUState). Leave out start to begin "
+                "at t = 0.",
+                block=block,
+                port="start",
+            )
         return cls(**options)
 
     def with_step(self, step: float | Fraction | None) -> Self:

@@ -271,6 +271,14 @@ def test_what_is_no_state_is_refused():
         thermostat().simulate(1.0, start=3, progress=False)
 
 
+def test_a_run_without_a_final_state_is_not_begun_anew():
+    diagram = Diagram("d", Integrator()(Constant(value=1.0)))
+    ended = diagram.simulate(0.25, step=0.1, progress=False)
+    assert ended.final_state is None
+    with pytest.raises(OptionError, match=r"^d\.start: found None; .*between two ticks, or an FMU"):
+        diagram.simulate(0.5, step=0.1, start=ended.final_state, progress=False)
+
+
 def test_a_state_that_was_stopped_stays_stopped_and_keeps_its_time():
     diagram = Diagram("d", StopCondition(name="stop")(Compare(">")(Integrator(name="i")(Constant(value=1.0)), 0.55)))
     first = diagram.simulate(1.0, step=0.1, progress=False)
