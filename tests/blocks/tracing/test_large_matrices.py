@@ -123,6 +123,7 @@ def test_matrices_on_both_sides_of_the_size_give_the_same(n):
     assert made == pytest.approx(A @ u, rel=1e-13, abs=1e-14)
 
 
+@pytest.mark.slow
 def test_a_small_block_beside_a_large_matrix_keeps_its_bits():
     def diagram(large):
         wave = StateSpace(A=[[0.0, 1.0], [-40.0, -0.4]], B=[0.0, 1.0], C=[1.0, 0.3], name="wave")(Constant(value=1.0))

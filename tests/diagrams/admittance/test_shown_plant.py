@@ -156,6 +156,7 @@ def true_limit(kind, side):
     return brentq(beyond, grid[first - 1], grid[first], rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", SIDES)
 def test_the_rigid_gantrys_limits_are_not_those_of_the_other_plants(side):
     rigid = true_limit("rigid", side)

@@ -122,6 +122,7 @@ def test_fig3_with_a_plant_in_model_exchange_is_fig3_with_the_plant_as_a_block(c
     np.testing.assert_allclose(linear[0].A, linear[1].A, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_co_simulation_tends_to_model_exchange_as_its_internal_step_goes_to_zero(cache, tmp_path):
     def positions(name, step, interface):
         path = mass_spring_damper.build(out=tmp_path / f"{name}.fmu", internal_step=step)

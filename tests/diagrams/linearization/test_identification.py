@@ -49,6 +49,7 @@ def test_a_mass_on_a_spring_is_found_with_its_poles_and_feedthrough(tmp_path, sa
     assert m.uncertainty <= 1e-9
 
 
+@pytest.mark.slow
 def test_a_motor_is_found_with_both_its_inputs(tmp_path):
     """Poles of 600 1/s and 180 1/s beside an integrator."""
     motor = dc_motor.build()
@@ -62,6 +63,7 @@ def test_a_motor_is_found_with_both_its_inputs(tmp_path):
     assert np.max(np.abs(got(m, 1000) - want) / np.where(scale > 0, scale, 1.0)) <= 1e-5
 
 
+@pytest.mark.slow
 def test_a_loop_around_it_is_that_around_the_open_one(tmp_path):
     def loop(file):
         plant = Fmu(file, name="plant", start={"position": 0.0})

@@ -45,6 +45,7 @@ def fig3_loop(xi=0.0, *, friction=True, **rig):
     return fig3(plant, PATH, par, perp, model=model, rig=Rig(**rig))
 
 
+@pytest.mark.slow
 def test_a_continuous_loop_has_its_closed_form():
     found = continuous_loop().frequency_response("u", [1.0, 7.0, 30.0], amplitude=0.1, outputs=["place.y"])
     s = 1j * found.omega

@@ -80,6 +80,7 @@ def speed_report():
 # --- Fig. 3 ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["par", "perp"])
 @pytest.mark.parametrize("suffix", ["", "_friction"])
 def test_continuous_margins_are_those_of_the_closed_form_whatever_the_pole(side, suffix):
@@ -138,6 +139,7 @@ def test_the_paths_of_poles_and_limits_exist(side, variant):
 PARTS = [fig3_loops, *(pytest.param(part, marks=pytest.mark.slow) for part in (fig3_poles, fig3_admittance))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("report", [*PARTS, speed_report])
 def test_every_number_is_complete(report):
     for path, number in report().numbers().items():

@@ -81,6 +81,7 @@ def test_tolerances_stay_where_derivatives_are_exact():
     assert "FMU" not in n.confirmed_by
 
 
+@pytest.mark.slow
 def test_the_tables_have_the_tolerances_of_the_numbers():
     part = moving_report().sections[2].sections[0]
     cells = {id(cell) for table in part.tables for row in table.rows for cell in row}

@@ -54,6 +54,7 @@ def test_an_entry_that_waits_for_itself_is_refused(entry):
         closed(feedthrough)
 
 
+@pytest.mark.slow
 def test_an_entry_that_waits_for_itself_is_solved():
     # y₀ = x₀ + 0.5 u₀ + u₁ and u₀ = −3 y₀: y₀ = (x₀ + 1)/2.5
     run = closed(np.array([[0.5, 1.0], [0.0, 0.0]]), loops="solve").simulate(1.0, rtol=1e-10, atol=1e-12)

@@ -191,6 +191,7 @@ def test_derivatives_of_zero_change_no_bit(driven2, instance, integrator):
     assert found[0] == found[1] == found[2]
 
 
+@pytest.mark.slow
 def test_an_input_that_goes_on_is_no_jump(instance):
     """It is set to where it has moved to, but for rounding: the adaptive step isn't chosen anew."""
     path, found = build_fmu(driven(), fmi=2), []

@@ -125,6 +125,7 @@ def test_a_cut_run_continues_bit_identically(instance, integrator):
     assert wavy(fresh, 23 * 0.07, 40) == expected
 
 
+@pytest.mark.slow
 def test_the_step_size_is_part_of_the_state(instance):
     """A run that starts anew at the cut, with a step size of its own, is another one: the test above can fail."""
     path = build_fmu(driven())

@@ -77,6 +77,7 @@ def test_outputs_follow_the_inputs_at_once(build, exchange):
     assert me.item["acceleration"] == pytest.approx((-2.0 - D * 0.5 - K * 0.2) / M, rel=1e-15)
 
 
+@pytest.mark.drawn(1)
 def test_derivatives_are_exact(build, exchange):
     spec = pendulums()
     me = exchange(build(spec)).start()
@@ -240,6 +241,7 @@ def test_reset_keeps_the_interface_type(build, exchange):
     assert me.start().x == [0.1, 0.0]
 
 
+@pytest.mark.slow
 def test_outside_of_its_domain_the_importer_may_try_again(build, exchange):
     """sqrt(x) at x < 0: Discard asks for a shorter step (FMI 2.0, 2.1.3; FMI 3.0, 2.2.3)."""
     t, x, u, p = ca.SX.sym("t"), ca.SX.sym("x"), ca.SX.sym("u", 0), ca.SX.sym("p", 0)
@@ -311,6 +313,7 @@ def test_a_state_is_read_into_a_pointer_that_holds_anything(build, exchange):
 # ---- events ----
 
 
+@pytest.mark.drawn(1)
 def test_event_iteration(build, exchange):
     """The bounce reverses the velocity; the echo fires at the same instant, in one more iteration."""
     me = exchange(build(echoing_ball())).start()
@@ -399,6 +402,7 @@ def test_casadi_imports_fmi_2(tmp_path):
     np.testing.assert_allclose(by_u, exact[2], rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.drawn(1)
 @pytest.mark.parametrize("interface", ["ModelExchange", "CoSimulation"])
 def test_fmpy_agrees_with_scipy(build, interface):
     """Nonlinear, with time in it: CVode outside, or dopri5 inside, to their tolerances."""

@@ -177,6 +177,7 @@ def state_of(item):
     return data
 
 
+@pytest.mark.slow
 def test_states_of_others_are_refused(fmi, msd, pendulum, instance):
     item = instance(msd)
     data = state_of(instance(pendulum))

@@ -112,6 +112,7 @@ def test_cycles_of_fifty_fmus_leave_nothing_behind(folder, temporary, isolate, t
     check_flat(cycle, temporary, 2000 if not isolate else 400, warm=50, growth=20.0)
 
 
+@pytest.mark.slow
 @ON_LINUX
 @pytest.mark.parametrize(
     "fault", ["step segfault 0.01", "enter exit", "load abort", "free segfault", "step error 0.01"]

@@ -126,6 +126,7 @@ def test_a_deflected_screw_rings_at_its_resonance(build):
     )
 
 
+@pytest.mark.slow
 def test_a_stiff_screw_is_the_gantry(build):
     T, n = 1e-3, 200
     motor, external = pushes(n, T, np.array([250.0, 140.0]))
@@ -167,6 +168,7 @@ def test_the_gantry_with_stiction_obeys_the_lugre_model(build, scales):
     assert np.abs(got["friction_force"] - forces).max() < 3e-5  # N, of 200
 
 
+@pytest.mark.slow
 def test_at_speed_the_bristles_are_stiff_and_the_implicit_integrator_holds(build):
     # at 20 m/s their rate is 6e5 1/s: the explicit method with steps of 50 us is far beyond its limit
     still = np.zeros((20, 2))
@@ -307,6 +309,7 @@ def test_the_scaras_velocity_and_acceleration_are_the_derivatives_of_its_positio
     assert np.abs(rate - got["acceleration"][3:-2]).max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("g", [0.0, 9.81])
 def test_a_free_scara_keeps_its_energy(build, g):
     T, n = 1e-3, 2000

@@ -71,6 +71,7 @@ def test_what_another_plant_costs_in_tracking(runs, plant, letter):
         assert np.abs(errors(run)).max() < 30.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("letter", "longest", "push"),
     [
@@ -125,6 +126,7 @@ class Sticking(Elastic):
         return np.concatenate([state, [0.0, 0.0]])
 
 
+@pytest.mark.slow
 @pytest.mark.drawn(1)
 @pytest.mark.parametrize(
     ("plant", "exact", "bound"), [(gantry_elastic, Elastic, 1e-9), (gantry_stiction, Sticking, 1e-8)]

@@ -193,6 +193,7 @@ def test_names_are_looked_up_among_texts_too(file3):
         Fmu(file3, name="plant", start={"pathh": "x"})
 
 
+@pytest.mark.drawn(1)
 def test_ports_of_integers_have_no_derivatives_and_the_model_says_so(file):
     plant = Fmu(file, name="plant", isolate=False)
     real = next(iter(plant.inputs))
