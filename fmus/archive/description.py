@@ -20,7 +20,7 @@ from .feedthrough import Feedthrough, feeds_through, read_feedthrough
 from .gathering import Elements, gather
 from .limits import ArchiveLimits
 from .model import read_model
-from .rules import check_dimensions
+from .rules import KNOWN_VERSIONS, check_dimensions, unknown_version
 from .sizes import resize
 from .states import find_states
 from .units import FmuUnits
@@ -214,13 +214,8 @@ def _read(
     entries, text = set(archive.files), archive.description()
     root = parse_xml(path, DESCRIPTION, text)
     version = root.get("fmiVersion", "2.0")  # without one, it is no description, as its reading says
-    if not re.fullmatch(r"1\.0|2\.0|3\.0(\.\d+)?", version):
-        raise FmuFileError(
-            f"{str(path)!r} is an FMU of FMI {version}; expected FMI 1.0, 2.0 or 3.0. Export it again with one of "
-            "them, for co-simulation or model exchange.",
-            fault=FmuFault.VERSION,
-            subject=version,
-        )
+    if not re.fullmatch(KNOWN_VERSIONS, version):
+        raise unknown_version(path, version)
     model, complaints = read_model(path, text, root, limits)
     interface = model.coSimulation or model.modelExchange
     if version == "1.0" and model.coSimulation is None:

@@ -11,7 +11,7 @@ from ...blocks.core import FmuFileError
 from .faults import FmuFault
 from .limits import ArchiveLimits
 from .repair import repair
-from .rules import check_schema, check_structure, check_variables
+from .rules import check_schema, check_structure, check_variables, check_version
 from .zip_file import DESCRIPTION
 
 
@@ -32,7 +32,7 @@ def read_model(path: Path, text: bytes, root: Any, limits: ArchiveLimits | None 
     Raises
     ------
     FmuFileError
-        If it can't be read, or is refused by `check_structure` or `check_variables`.
+        If it can't be read, or is refused by `check_version`, `check_structure` or `check_variables`.
     """
     from fmpy.validation import validate_model_description
     from lxml import etree
@@ -46,15 +46,10 @@ def read_model(path: Path, text: bytes, root: Any, limits: ArchiveLimits | None 
             fault=FmuFault.DESCRIPTION,
             subject=DESCRIPTION,
         )
-    if version not in ("1.0", "2.0") and not version.startswith("3."):
-        raise FmuFileError(
-            f"{str(path)!r} is an FMU of FMI {version}; expected FMI 1.0, 2.0 or 3.0. Export it again with one of "
-            "them.",
-            fault=FmuFault.VERSION,
-            subject=version,
-        )
+    check_version(path, root)
     check_structure(path, root)
     repaired: list[str] = []
+    schema: list[str] = []
     try:
         schema = check_schema(root)
         try:
@@ -69,8 +64,10 @@ def read_model(path: Path, text: bytes, root: Any, limits: ArchiveLimits | None 
     except FmuFileError:
         raise
     except Exception as error:
+        # FMPy words its own refusals; other exceptions are Python's, about lines of FMPy
+        found = str(error) if type(error) is Exception else (schema or ["it breaks the rules of the standard"])[0]
         raise FmuFileError(
-            f"the {DESCRIPTION} of {str(path)!r} can't be read: {error}. Export it again.",
+            f"the {DESCRIPTION} of {str(path)!r} can't be read: {found.rstrip('.')}. Export it again.",
             fault=FmuFault.DESCRIPTION,
             subject=DESCRIPTION,
         ) from error

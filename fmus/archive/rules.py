@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,60 @@ def _schema(major: str) -> Any:
     folder = Path(fmpy.__file__).parent / "schema"
     name = {"1": "fmiModelDescription", "2": "fmi2ModelDescription", "3": "fmi3ModelDescription"}[major]
     return etree.XMLSchema(file=str(folder / f"fmi{major}" / f"{name}.xsd"))
+
+
+def check_version(path: Path, root: Any) -> None:
+    """Refuse a description of an unknown version, or in the form of another version than it states.
+
+    A version 3.x in the form of FMI 3.0 passes, so that its content can be shown.
+
+    Parameters
+    ----------
+    path : Path
+        The FMU, for messages.
+    root : lxml.etree.Element
+        Root of its description, with an ``fmiVersion``.
+
+    Raises
+    ------
+    FmuFileError
+        If the description is refused.
+    """
+    version, form = root.get("fmiVersion"), _form(root)
+    if not re.fullmatch(KNOWN_VERSIONS, version) and not (version.startswith("3.") and form in ("", "3.0")):
+        raise unknown_version(path, version)
+    if form and form[0] != version[0]:
+        raise FmuFileError(
+            f"the {DESCRIPTION} of {str(path)!r} states fmiVersion {version!r}, but is in the form of FMI {form}; "
+            f"expected the form of FMI {version}. Export it again, or give it the version that it is written in.",
+            fault=FmuFault.DESCRIPTION,
+            subject="fmiVersion",
+        )
+
+
+KNOWN_VERSIONS = r"1\.0|2\.0|3\.0(\.\d+)?"
+
+
+def unknown_version(path: Path, version: str) -> FmuFileError:
+    """Return the error of a version of FMI that is not read here."""
+    return FmuFileError(
+        f"{str(path)!r} is an FMU of FMI {version}; expected FMI 1.0, 2.0 or 3.0. Export it again with one of them, "
+        "for co-simulation or model exchange.",
+        fault=FmuFault.VERSION,
+        subject=version,
+    )
+
+
+def _form(root: Any) -> str:
+    """Return the version of FMI in whose form a description is written; empty if nothing tells."""
+    variable = root.find("ModelVariables/*")
+    if variable is None:
+        return ""
+    if variable.tag != "ScalarVariable":
+        return "3.0"
+    if root.find("CoSimulation") is not None or root.find("ModelExchange") is not None:
+        return "2.0"
+    return "1.0" if "modelIdentifier" in root.attrib else ""
 
 
 def check_structure(path: Path, root: Any) -> None:

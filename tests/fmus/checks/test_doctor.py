@@ -11,7 +11,16 @@ import pytest
 from loopwright.blocks import FmuFileError, ParameterError
 from loopwright.diagrams import Diagram
 from loopwright.diagrams.cli import main
-from loopwright.fmus import ArchiveLimits, Fmu, FmuFault, FmuSeverity, FmuVerdict, doctor, mass_spring_damper
+from loopwright.fmus import (
+    ArchiveLimits,
+    Fmu,
+    FmuFault,
+    FmuSeverity,
+    FmuVerdict,
+    doctor,
+    mass_spring_damper,
+    read_description,
+)
 from loopwright.fmus.platform import native_platform
 from support.hostile import CASES, XML, binaries, described, good_files, library, packed, without_library
 from support.zoo import zoo_fmu
@@ -311,3 +320,28 @@ def test_a_block_takes_limits_of_its_file(good, tmp_path):
         Fmu(path, name="plant", limits=1000)
     again = pickle.loads(pickle.dumps(caught.value))
     assert (str(again), again.fault) == (str(caught.value), FmuFault.TOO_LARGE)
+
+
+# --- versions -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fmi", "states", "fault", "says"),
+    [
+        (2, "3.9", FmuFault.VERSION, "FMI 3.9; expected FMI 1.0, 2.0 or 3.0"),
+        (2, "3.0-beta.1", FmuFault.VERSION, "FMI 3.0-beta.1; expected FMI 1.0, 2.0 or 3.0"),
+        (2, "3.0.1", FmuFault.DESCRIPTION, "in the form of FMI 2.0; expected the form of FMI 3.0.1"),
+        (2, "1.0", FmuFault.DESCRIPTION, "in the form of FMI 2.0; expected the form of FMI 1.0"),
+        (3, "1.0", FmuFault.DESCRIPTION, "in the form of FMI 3.0; expected the form of FMI 1.0"),
+        (3, "2.0", FmuFault.DESCRIPTION, "in the form of FMI 3.0; expected the form of FMI 2.0"),
+    ],
+)
+def test_a_version_that_a_description_is_not_written_in(cache, tmp_path, fmi, states, fault, says):
+    files = good_files(mass_spring_damper.build(fmi=fmi))
+    path = tmp_path / "plant.fmu"
+    path.write_bytes(described((r'fmiVersion="[^"]*"', f'fmiVersion="{states}"'))(files))
+    with pytest.raises(FmuFileError, match=re.escape(says)) as refused:
+        read_description(path)
+    diagnosis = doctor(path, run=False)
+    assert refused.value.fault == diagnosis.findings[0].fault == fault
+    assert says in diagnosis.findings[0].found
