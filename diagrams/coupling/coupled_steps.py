@@ -15,6 +15,7 @@ from .options import Coupling, Scheme
 from .plant_steps import PlantSteps, step_all
 from .plants import Plant
 from .rest import Rest, Sample, never
+from .rollback import Rollback
 from .search import Search
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 4.0
@@ -91,6 +92,7 @@ class CoupledSteps:
         self._straight = {path: rows for path, rows in straight.items() if rows.any()}
         counts = coupling.scheme == Scheme.ITERATED or links.felt | ~passed.any(axis=1)
         self._counted = np.broadcast_to(counts, self._w.shape)[self._all_outputs]
+        self._rollback = Rollback(links, w)
         self.proposed: float | None = None
         """Length in s of the next communication step, with adaptive steps."""
 
@@ -324,7 +326,13 @@ class CoupledSteps:
     def _save(self) -> _Saved:
         plants = {path: save_plant(plant) for path, plant in self._plants.items()}
         texts = {path: {port: list(v) for port, v in _texts(plant).items()} for path, plant in self._plants.items()}
-        return _Saved(self._rest.save(), plants, texts, self._w.copy(), self._z.copy())
+        saved = _Saved(self._rest.save(), plants, texts, self._w.copy(), self._z.copy())
+        if self._rollback.is_open:
+            for path in self._plants:
+                self._restore_plant(path, saved)
+            saved.read = self._w.copy()
+            self._w[:] = saved.w
+        return saved
 
     def _restore(self, saved: _Saved) -> None:
         for path in self._plants:
@@ -335,7 +343,10 @@ class CoupledSteps:
     def _restore_plant(self, path: str, saved: _Saved) -> None:
         """Let a plant go back; its texts, whose record would begin anew, stay as they were there."""
         plant = self._plants[path]
+        before = self._w[self.links.outputs[path]].copy()
         plant.restore(saved.plants[path])
+        if saved.read is not None:
+            self._rollback.check(path, before, saved.read, getattr(saved.plants[path], "t", None))
         for port, changes in _texts(plant).items():
             changes[:] = saved.texts[path][port]
 
@@ -362,6 +373,8 @@ class _Saved:
     texts: dict[str, dict[str, list[Any]]]
     w: np.ndarray
     z: np.ndarray
+    read: np.ndarray | None = None
+    """Outputs as the plants give them when they are set back at once; None where that is not compared any more."""
 
 
 def save_plant(plant: Plant) -> Any:

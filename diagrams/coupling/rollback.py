@@ -1,0 +1,73 @@
+"""A check that plants which go back to the beginning of a step are there again."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...blocks.core import FmuRuntimeError
+from .links import Links
+
+ROUNDING = 1e-9
+"""Largest difference of an output that was restored, relative to its size."""
+
+
+class Rollback:
+    """Compare outputs after a step was taken back with those at its beginning.
+
+    Both are read after a restore, so that an FMU which computes its outputs anew then is compared with itself. An
+    output is compared until it has moved in a step and come back once.
+
+    Parameters
+    ----------
+    links : Links
+        Names and sizes of the outputs.
+    w : ndarray
+        Outputs of the plants in the run.
+    """
+
+    def __init__(self, links: Links, w: np.ndarray) -> None:
+        self._links, self._w = links, w
+        self._open = np.ones(len(w), dtype=bool)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether an output has not moved and come back yet."""
+        return bool(self._open.any())
+
+    def check(self, path: str, stepped: np.ndarray, begun: np.ndarray, t: float | None) -> None:
+        """Compare the outputs of a plant that has just been restored.
+
+        Parameters
+        ----------
+        path : str
+            Path of the plant.
+        stepped : ndarray
+            Its outputs before it was restored.
+        begun : ndarray
+            Outputs of all plants, read after a restore at the beginning of the step.
+        t : float or None
+            Time of the state in s.
+
+        Raises
+        ------
+        FmuRuntimeError
+            If an output is not that of the step's beginning.
+        """
+        mine = self._links.outputs[path]
+        found, expected = self._w[mine], begun[mine]
+        allowed = ROUNDING * (self._links.nominals[mine] + np.abs(expected))
+        open_ = self._open[mine]
+        off = np.where(open_ & np.isfinite(expected), np.abs(found - expected) / allowed, 0.0)
+        if not off.max(initial=0.0) <= 1.0:
+            worst = int(np.argmax(off))
+            port = self._links.name_of_output(mine.start + worst)[1]
+            raise FmuRuntimeError(
+                "the FMU does not restore its state, although its function for that reports success: after a step was "
+                f"taken back, found the output {found[worst]:.9g}; expected {expected[worst]:.9g}, its value at the "
+                "beginning of the step. Take coupling='gauss_seidel' or 'jacobi' without error=, which never go back, "
+                "with a smaller step, or an FMU whose canGetAndSetFMUState holds true.",
+                block=path,
+                port=port,
+                t=t,
+            )
+        self._open[mine] = open_ & ~(np.abs(stepped - expected) > allowed)
