@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
 
 from ...blocks.core import SimulationError
 from ..flat import FlatDiagram
-from .evaluator import INPUT_EVENT, Look
+from .evaluator import INPUT_EVENT, STEP_EVENT, TIME_EVENT, Look
 from .exchanged_blocks import ExchangedBlocks
 
 _ROUNDS = 100  # of events at one instant
+_MANY, _SPAN = 500, 1e-8  # so many instants within so many seconds (relative to 1 + |t|), as for those of indicators
 
 
 class OutsideEvents:
@@ -43,6 +45,8 @@ class OutsideEvents:
         self._evaluators, self._x, self._jump = blocks.evaluators, x, jump
         self._tell, self._follow = tell, follow
         self._nothing = np.zeros(len(self.flat.events))
+        self._recent = {path: deque[float](maxlen=_MANY) for path in self._evaluators}
+        """The last instants at which a block had an event of time or of a step."""
 
     def complete_step(self) -> bool:
         """Tell the blocks that the solver has accepted a step; return whether one wants an event, or the end, there."""
@@ -68,9 +72,31 @@ class OutsideEvents:
             found, where = True, self.flat.states.slices[path]
             if e.event and (e.event != INPUT_EVENT or not np.array_equal(before[where], self._x[where])):
                 self._tell(t, path, e.event, before)
+            if e.event in (TIME_EVENT, STEP_EVENT):
+                self._count(t, path, e.event)
         if found:
             self._follow()
         return found
+
+    def _count(self, t: float, path: str, name: str) -> None:
+        """Note an instant of a block's own events; refuse instants that pile up, for the run would not go on."""
+        recent = self._recent[path]
+        if recent and t <= recent[-1]:
+            if t == recent[-1]:
+                return
+            recent.clear()  # the run has gone back to a saved state
+        recent.append(t)
+        if len(recent) < _MANY or t - recent[0] >= _SPAN * (1.0 + abs(t)):
+            return
+        time = self._evaluators[path].block.next_time
+        told = f"the next time event is at t + {time - t:.2g} s" if np.isfinite(time) else "it has no time event ahead"
+        raise SimulationError(
+            f"its events pile up ({name}): they came at {_MANY} instants within {t - recent[0]:.2g} s, so the run "
+            f"would not go on; {told}. Look up in its documentation which input or parameter sets the time between "
+            "its events, or report it to its makers.",
+            block=path,
+            t=t,
+        )
 
     def settle(self, t: float) -> bool:
         """Let events of the blocks' own act until there are none; return whether there were any.

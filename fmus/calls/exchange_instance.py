@@ -17,7 +17,7 @@ from .bound_calls import DISCARD, ERROR, FATAL, WARNING, BoundCalls, Call
 from .evaluation import Evaluation, Vector
 from .exchange_states import SavedExchange
 from .fmi_calls import EventUpdate
-from .fmu_block import FmuBlock
+from .fmu_block import FmuBlock, check_next_time
 from .loaded_library import MakeCalls
 from .texts import Text, TextRecord
 from .transfer import Transfer, UnfitError
@@ -318,7 +318,7 @@ class ExchangeInstance(SavedExchange):
                 t=t,
             )
         assert made is not None
-        self.next_time = made.next_time
+        self.next_time = check_next_time(self.block, made.next_time, t)
         x = self._get("get_states", calls.leave)
         if nominals:
             self.nominals = self._read_nominals()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Protocol
 
+from ...blocks.core import FmuRuntimeError
 from ..archive import FmuDescription, FmuVariable, OtherVariable
 from .step_options import StepOptions
 
@@ -47,3 +49,15 @@ class FmuBlock(Protocol):
     @property
     def variable_step(self) -> bool:
         """Whether communication steps may differ in length."""
+
+
+def check_next_time(block: FmuBlock, found: float, t: float) -> float:
+    """Return the time of a next event in s, as an event at time t has set it; refuse one that is no number."""
+    if math.isnan(found):
+        raise FmuRuntimeError(
+            f"the event at t = {t:.9g} s sets the time of its next one (nextEventTime) to NaN; expected a time, or "
+            "nextEventTimeDefined = false. Look up its inputs and parameters there, or report it to its makers.",
+            block=block.label,
+            t=t,
+        )
+    return found

@@ -16,6 +16,7 @@ import numpy as np
 from ...blocks.core import FmuRuntimeError, Layout
 from ..archive import FmuDescription, FmuVariable, OtherVariable
 from .fmi_calls import DISCARD, MOST_ROUNDS, WARNING, StepCall
+from .fmu_block import check_next_time
 from .saved_state import FmuState, StepMemory
 from .step_options import StepOptions, StepTime, allows_early_return, uses_event_mode
 from .stepped_instance import SavedInstance, SteppedInstance
@@ -321,8 +322,8 @@ class CarefulSteps:
             found = instance.call("updating its discrete states", self.fmi.update_events)
             if found.terminate:
                 raise instance.termination(t, 0.0)
-            self.next_event = found.next_time
             if not found.again:
+                self.next_event = check_next_time(instance.block, found.next_time, t)
                 break
         else:
             raise FmuRuntimeError(

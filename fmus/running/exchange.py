@@ -85,9 +85,11 @@ class ExchangeMembers(Block):
 
     @property
     def interface_text(self) -> str:
-        """Text on an interface that was not asked for, and is the only one; else empty."""
-        only = self.interface is None and not self.description.co_simulation
-        return "by model exchange, its only interface" if only else ""
+        """Text on the interface that a run uses; empty for co-simulation where there is nothing else."""
+        about, by_steps = self.description, self.stepped
+        if not by_steps:
+            return "by model exchange" if about.co_simulation else "by model exchange, its only interface"
+        return "by co-simulation" if about.exchange is not None else ""
 
     @property
     def states(self) -> Mapping[str, State]:  # type: ignore[override]
@@ -117,8 +119,7 @@ class ExchangeMembers(Block):
         instance = open_fmu(ExchangeInstance, self, wired)
         try:
             instance.initialize(None, start_time=start_time)
-            if self.interface_text:
-                instance.add_note(f"it runs {self.interface_text}: the solver integrates it")
+            instance.add_note(f"it runs {self.interface_text}: the solver integrates it")
             yield instance
         finally:
             instance.close()

@@ -161,9 +161,10 @@ class Fmu(ExchangeMembers):
         text = super().__repr__()
         try:
             shown = [str(v) for v in self.description.other.values()]
+            text += f", {self.interface_text}" if self.interface_text else ""
         except FmuError:
             return text
-        more, text = f" and {len(shown) - 5} more" if len(shown) > 5 else "", f"{text} {self.interface_text}".rstrip()
+        more = f" and {len(shown) - 5} more" if len(shown) > 5 else ""
         return f"{text} without ports for {', '.join(shown[:5])}{more}" if shown else text
 
     @property

@@ -99,10 +99,11 @@ _INTEGERS = (
 )
 
 
-def eventful_fmu(folder, fmi, *, fault=""):
+def eventful_fmu(folder, fmi, *, fault="", following="0.25 * (c->k + 1)"):
     """Build it into a folder, for a version of FMI, and return its path.
 
     ``fault`` is a statement in C ahead of the computation of the derivatives, such as ``if (c->t > 0.3) return 3;``.
+    ``following`` is the time of its next time event, in C.
     """
     prefix = f"fmi{fmi}"
     names = {
@@ -112,6 +113,7 @@ def eventful_fmu(folder, fmi, *, fault=""):
     }
     head = f"#define FMI {fmi}\n#define PASTE(a, b) a##b\n#define NAME(end) PASTE({prefix}, end)\n"
     source = head + _SOURCE.replace("dx[0] = c->u", f"{fault} dx[0] = c->u")
+    source = source.replace("*next = 0.25 * (c->k + 1)", f"*next = {following}")
     for key, end in names.items():
         source = source.replace(f"NAME({key})", f"{prefix}{end}")
     for end in ("EnterInitializationMode", "ExitInitializationMode"):  # small_fmu looks for the whole names

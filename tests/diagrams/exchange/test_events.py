@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, Gain, Quantizer, SimulationError, Step, Sum, WiringError
+from loopwright.blocks import Constant, FmuRuntimeError, Gain, Quantizer, SimulationError, Step, Sum, WiringError
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu
 from support.eventful import eventful_fmu
@@ -147,3 +147,32 @@ def test_a_failure_names_fmu_call_and_time_and_keeps_the_samples(cache, tmp_path
     assert error.value.t == pytest.approx(0.3, abs=0.1)
     np.testing.assert_allclose(error.value.run["plant.x"], exact(error.value.run.t, 0.5), atol=1e-12)
     assert error.value.run.t[-1] >= 0.2
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_time_events_that_pile_up_are_an_error(cache, tmp_path, fmi):
+    file = eventful_fmu(tmp_path, fmi, following="c->t < 0.25 ? 0.25 : c->t + 1e-12")
+    diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    told = r"pile up \(time_event\): they came at 500 instants .* the next time event is at t \+ 1e-12 s"
+    with pytest.raises(SimulationError, match=told) as error:
+        diagram.simulate(1.0, step=0.1, progress=False)
+    assert error.value.block == "plant"
+    assert error.value.t == pytest.approx(0.25 + 499e-12, abs=1e-12)
+    assert error.value.run.t[-1] == 0.2
+
+
+def test_many_time_events_that_leave_the_run_its_way_are_none(cache, tmp_path):
+    file = eventful_fmu(tmp_path, 3, following="c->t + 1e-5")
+    diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    with diagram.simulation(step=1e-3, solver="euler") as simulation:
+        simulation.advance(6e-3)
+        assert len(named(simulation.run().events, "time_event")) == pytest.approx(600, abs=7)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_next_event_time_that_is_no_number_is_an_error(cache, tmp_path, fmi):
+    file = eventful_fmu(tmp_path, fmi, following="c->t < 0.25 ? 0.25 : 0.0 / 0.0")
+    diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    with pytest.raises(FmuRuntimeError, match=r"^plant, t = 0.25 s: .*nextEventTime.*NaN") as error:
+        diagram.simulate(1.0, step=0.1, progress=False)
+    assert error.value.run.t[-1] == 0.2

@@ -129,8 +129,16 @@ def test_it_refuses_to_stand_in_a_sampled_subsystem(files):
 
 
 def test_the_representation_says_which_interface_is_used(files):
-    assert "interface='model_exchange'" in repr(Fmu(files[mass_spring_damper, 3], interface="model_exchange"))
-    assert Fmu(files[mass_spring_damper, 3]).used_interface == "co_simulation"
+    steps = Fmu(files[mass_spring_damper, 3], name="plant")
+    solved = steps.replace(interface="model_exchange")
+    assert steps.used_interface == "co_simulation"
+    assert repr(steps).endswith(", by co-simulation")
+    assert repr(solved).endswith(", by model exchange")
+    told = [
+        [m for m in driven(p).simulate(0.1, progress=False, step=0.1).messages if "integrates it" in m]
+        for p in (steps, solved)
+    ]
+    assert told == [[], ["plant: it runs by model exchange: the solver integrates it"]]
 
 
 def test_an_evaluation_that_needs_nothing_of_the_fmu_leaves_it_out(files, fmi):
