@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import FmuError
+from ...blocks.core import FmuError, Layout
 from ...fmus.calls import LoadedFmu
 from ...fmus.isolation import open_fmu
 from ...fmus.running import Derivation, DerivativeMethod
@@ -36,6 +36,8 @@ PULSE = 1e-2
 """Size of a pulse, relative to the larger of an input's nominal value and its value."""
 STILL = 1e-10
 """Change over a step below which an output is constant, relative to 1 + its size."""
+WATCHED = 10
+"""Steps over which the outputs of an FMU without listed states are watched in a trim."""
 _NOISE = 1e-10
 """Smallest noise of the singular values, relative to the largest."""
 
@@ -114,6 +116,31 @@ def identify_step(
         Derivation(DerivativeMethod.IDENTIFIED, order=len(A)),
     )
     return IdentifiedStep(A, B, C, y0, states, sigma, derivation, error)
+
+
+def output_drift(block: Fmu, point: Mapping[str, Any], h: float) -> dict[str, float]:
+    """Return how far the outputs of an FMU move over `WATCHED` steps from its start with held inputs.
+
+    For an FMU that lists no states: outputs that move show that it has a memory.
+
+    Parameters
+    ----------
+    block, point, h
+        See `identify_step`.
+
+    Returns
+    -------
+    dict of str to float
+        Largest change after the first step, relative to 1 + the output's size, by output.
+    """
+    runner = _Runner(block, point, h)
+    try:
+        y = np.array([runner.step() for _ in range(WATCHED)])
+    finally:
+        runner.close()
+    moved = np.max(np.abs(y - y[0]) / (1.0 + np.abs(y[0])), axis=0, initial=0.0)
+    layout = Layout.of({port: spec.shape or () for port, spec in block.outputs.items()})
+    return {port: float(np.max(moved[where], initial=0.0)) for port, where in layout.slices.items()}
 
 
 class _Runner:

@@ -69,7 +69,7 @@ def capture(simulation: Simulation, how: PointOrigin = PointOrigin.RUN) -> Opera
 def with_residual(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) -> OperatingPoint:
     """Return an operating point with its residual, the largest relative change of a state, and that state's name."""
     from .exchanged import evaluators_at, pass_on
-    from .plant_models import plant_changes
+    from .plant_models import fmu_at, plant_changes, plant_paths
 
     x, found, who = point.x, 0.0, ""
     rates = np.zeros(flat.width)
@@ -86,7 +86,8 @@ def with_residual(flat: FlatDiagram, point: OperatingPoint, x_next: np.ndarray) 
             found, who = worst, name
         if np.isnan(found):
             break
-    return pass_on(point, replace(point, residual=found, largest=who))
+    unjudged = tuple(path for path in plant_paths(flat) if not fmu_at(flat, path).description.states)
+    return pass_on(point, replace(point, residual=found, largest=who, unjudged=unjudged))
 
 
 def check_options(diagram: WiredDiagram, options: Mapping[str, Any], caller: str) -> None:

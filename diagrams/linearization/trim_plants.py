@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ...blocks.core import FmuError, elements
+from ...blocks.core import FmuError, SimulationError, elements
 from ...fmus.running import FmuLinearization
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
+from .identification import WATCHED, output_drift
 from .plant_models import plant_entries, plant_layout
 
 if TYPE_CHECKING:
@@ -104,6 +105,15 @@ class Plants:
         """Return time, states and inputs of all FMUs by path; ``changed`` holds FMUs with other parameters."""
         return {path: self.point(path, changed.get(path, block), xp, z) for path, block in self.blocks.items()}
 
+    def drift(self, points: Mapping[str, Any], changed: Mapping[str, Fmu]) -> dict[str, float]:
+        """Return how far the outputs of FMUs without listed states move with held inputs, by the outputs' names."""
+        return {
+            f"{join(path, port)} over {WATCHED} steps": moved
+            for path, block in self.blocks.items()
+            if not block.description.states
+            for port, moved in output_drift(changed.get(path, block), points[path], self.h).items()
+        }
+
     def change_blocks(self, free: list[Free], q: list[np.ndarray]) -> dict[str, Fmu]:
         """Return the FMUs with free parameters, with these values of them, by path."""
         from ..wiring import change_parameter
@@ -164,3 +174,17 @@ class Plants:
             found.append((rates, m.y0))
         v.f_by_q[self.own[f.path], column] = (found[0][0] - found[1][0]) / (2 * d)
         v.y_by_q[plant_entries(self.flat, f.path)[1], column] = (found[0][1] - found[1][1]) / (2 * d)
+
+
+def check_drift(drift: Mapping[str, float], tolerance: float, name: str, t: float) -> None:
+    """Refuse a point at which an FMU that lists no states moves: nothing in the equations could let it rest."""
+    moved = {port: value for port, value in drift.items() if not value <= tolerance}
+    if moved:
+        shown = "; ".join(f"{port}: {value:.3g}" for port, value in moved.items())
+        raise SimulationError(
+            "no operating point was found: an FMU lists no states in its description, so a trim can't let them rest, "
+            f"and with its inputs held its outputs move, relative to 1 + their size, by {shown}; expected at most "
+            f"{tolerance:g}. Run to rest with operating_point(t), or export the FMU with its derivatives listed.",
+            block=name,
+            t=t,
+        )

@@ -33,7 +33,7 @@ from ..flat import (
 from ..results import FreeDirection, OperatingPoint, PointOrigin
 from .exchanged import evaluators_at
 from .operating_points import PointLike, operating_point, with_residual
-from .trim_plants import Plants
+from .trim_plants import Plants, check_drift
 from .trim_request import Free, Target, free_parameters, index_states, read_targets, set_states
 
 UNDETERMINED = 1e-10
@@ -360,12 +360,16 @@ def _solve_trim(
         )
     values = {f.name: f.shape_value(v) for f, v in zip(parameters, q, strict=True)}
     final = diagram.replace({**guess.parameters, **values})
-    plants = equations.plants.points(
-        xp, equations.residual_at(unknown)[2], equations.plants.change_blocks(parameters, q)
-    )
-    return _complete_point(final, guess, x, w, plants, {
+    changed = equations.plants.change_blocks(parameters, q)
+    plants = equations.plants.points(xp, equations.residual_at(unknown)[2], changed)
+    drift = equations.plants.drift(plants, changed) if how is PointOrigin.TRIM else {}
+    check_drift(drift, tolerance, diagram.name, guess.t)
+    residuals = dict(sorted((residuals | drift).items(), key=lambda r: -r[1]))
+    point = _complete_point(final, guess, x, w, plants, {
         "parameters": {**guess.parameters, **values}, "residuals": residuals, "how": how, "free": free,
     })  # fmt: skip
+    most = max(drift, key=drift.__getitem__, default="")
+    return replace(point, residual=drift[most], largest=most) if most and drift[most] > point.residual else point
 
 
 def _complete_point(

@@ -72,6 +72,9 @@ class OperatingPoint:
         of a trim's equations.
     largest : str
         The block with that residual, of an FMU its state; empty where nothing moves.
+    unjudged : tuple of str
+        Paths of the FMUs that list no states: ``residual`` leaves out what they may hide. A trim watches their outputs
+        for 10 steps from their start, with held inputs, and ``residuals`` has how far they move.
     how : PointOrigin
         Its origin: "run", "trim" or "given".
     """
@@ -85,6 +88,7 @@ class OperatingPoint:
     plants: Mapping[str, Any] = field(default_factory=dict, repr=False)
     residual: float = float("nan")
     largest: str = ""
+    unjudged: tuple[str, ...] = ()
     how: PointOrigin = PointOrigin.RUN
     exchanged: Mapping[str, Any] = field(default_factory=dict, repr=False)
     """Time, states and inputs of each FMU in model exchange by path; its continuous states stand in x, too."""

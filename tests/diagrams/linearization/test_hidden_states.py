@@ -1,0 +1,55 @@
+"""Trims of FMUs that list no states: some have a memory that they hide, and some have none."""
+
+import pytest
+
+from loopwright.blocks import Constant, SimulationError
+from loopwright.diagrams import Diagram
+from loopwright.fmus import Fmu
+from support.small_fmus import small_fmu, values
+
+SOURCE = (
+    """
+typedef struct { double t, u, y; } instance;
+int fmi2DoStep(void *p, double t, double h, int no) { instance *c = p; c->y = STEP; c->t = t + h; return 0; }
+"""
+    + values("fmi2", "Get", "Real", "double", {0: "c->u", 1: "c->y"})
+    + values("fmi2", "Set", "Real", "double", {0: "c->u"})
+)
+MODEL = """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="true"/><ModelVariables>
+<ScalarVariable name="u" valueReference="0" causality="input" variability="continuous"><Real start="0"/>
+</ScalarVariable>
+<ScalarVariable name="y" valueReference="1" causality="output" variability="continuous"><Real/></ScalarVariable>
+</ModelVariables><ModelStructure><Outputs><Unknown index="2"/></Outputs></ModelStructure>"""
+LAG = "c->u + (c->y - c->u) * exp(-h)"  # y' = u − y
+
+
+@pytest.fixture(scope="module")
+def make(tmp_path_factory):
+    def build(step, u=1.0):
+        file = small_fmu(tmp_path_factory.mktemp("hidden"), "fmi2", SOURCE.replace("STEP", step), MODEL)
+        return Diagram("open", Fmu(file, name="plant")(u=Constant(value=u, name="input")))
+
+    return build
+
+
+@pytest.mark.parametrize("step", [LAG, "c->y + h * c->u"], ids=["lag", "integrator"])
+def test_a_memory_that_is_not_listed_is_no_rest(cache, make, step):
+    """The lag rests at y = u = 1, and the integrator nowhere; both begin at 0."""
+    with pytest.raises(SimulationError, match=r"lists no states .* plant\.y over 10 steps: 0\.00\d+; .*expected at"):
+        make(step).trim()
+
+
+def test_with_a_tolerance_the_point_says_how_far_it_moves(cache, make):
+    point = make(LAG).trim(tolerance=0.1)
+    moved = (0.999000499833375 - 0.990049833749168) / (1 + 0.000999500166625)  # e^−h and e^−10h, h = 1 ms
+    assert point.residual == pytest.approx(moved, rel=1e-9)
+    assert (point.largest, point.unjudged) == ("plant.y over 10 steps", ("plant",))
+
+
+@pytest.mark.parametrize(("step", "u", "y"), [("2.0 * c->u", 1.0, 2.0), (LAG, 0.0, 0.0)], ids=["static", "at rest"])
+def test_an_fmu_that_stays_is_at_rest_and_says_that_its_states_are_not_judged(cache, make, step, u, y):
+    point = make(step, u).trim()
+    assert float(point.values["plant.y"]) == pytest.approx(y, abs=1e-12)
+    assert point.residual == 0.0
+    assert point.unjudged == ("plant",)
+    assert make(step, u).operating_point(0.01, step=0.01).unjudged == ("plant",)
