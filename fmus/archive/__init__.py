@@ -7,6 +7,7 @@ from .faults import FmuFault, FmuFinding, FmuSeverity
 from .library import SharedLibrary, read_library
 from .limits import ArchiveLimits
 from .model import read_model
+from .repair import repair
 from .unpacking import unpack, unpack_archive, write_files
 from .variables import FmuVariable, OtherVariable, inexact
 from .xml_text import parse_xml
@@ -33,6 +34,7 @@ __all__ = [
     "read_description",
     "read_library",
     "read_model",
+    "repair",
     "unpack",
     "unpack_archive",
     "write_files",

@@ -271,7 +271,14 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
         if v.causality == "independent" or v.name in scalars or v.name in other:  # a local of a name that is taken
             continue
         if fmi3_type(v.type) in WIRE_TYPES:
-            scalars[v.name] = read_variable(v, dropped.get(v.name, {}), units)
+            try:
+                scalars[v.name] = read_variable(v, dropped.get(v.name, {}), units)
+            except ValueError as error:
+                raise FmuFileError(
+                    f"the variable {v.name!r} of {str(path)!r} has {error}. Export it again.",
+                    fault=FmuFault.DESCRIPTION,
+                    subject=v.name,
+                ) from error
         else:
             other[v.name] = read_other(v, dropped.get(v.name, {}))
     variables, elements = gather(scalars, frozenset(other))

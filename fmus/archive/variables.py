@@ -206,9 +206,9 @@ def read_variable(v: Any, dropped: Mapping[str, str], units: FmuUnits) -> FmuVar
         units.find(attribute("unit"), relative=attribute("relativeQuantity") in (True, "true", "1")),
         None if v.start is None else _start(v.start, shape),
         v.description or (declared.description if declared is not None else None) or "",
-        _number(attribute("min")),
-        _number(attribute("max")),
-        _number(attribute("nominal")),
+        _number("min", attribute("min")),
+        _number("max", attribute("max")),
+        _number("nominal", attribute("nominal")),
         v.variability or "continuous",
         v.initial or ("calculated" if v.causality in ("output", "local", None) else "exact"),
         type_,
@@ -222,15 +222,25 @@ def fmi3_type(name: str) -> str:
     return _FMI2_TYPES.get(name, name)
 
 
-def _number(text: Any) -> float | None:
-    return None if text is None else float(text)
+def _number(name: str, text: Any) -> float | None:
+    """Return a number of an attribute; the ValueError of what is none names the attribute."""
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        raise ValueError(f"{name}={text!r}; expected a number") from None
 
 
 def _start(text: Any, shape: tuple[int, ...]) -> np.ndarray:
     words = {"true": 1.0, "false": 0.0}
-    if not shape and isinstance(text, str) and len(text.split()) == 1 and text not in words:
-        return np.array(float(text))  # most variables, of thousands
-    found = text.split() if isinstance(text, str) else np.ravel(text)
-    values = np.array([words[x] if x in words else float(x) for x in found])
-    full = np.broadcast_to(values, (int(np.prod(shape, dtype=int)),)) if values.size == 1 else values
+    try:
+        if not shape and isinstance(text, str) and len(text.split()) == 1 and text not in words:
+            return np.array(float(text))  # most variables, of thousands
+        found = text.split() if isinstance(text, str) else np.ravel(text)
+        values = np.array([words[x] if x in words else float(x) for x in found])
+    except ValueError:
+        raise ValueError(f"start={text!r}; expected {'numbers' if shape else 'a number'}") from None
+    n = int(np.prod(shape, dtype=int))
+    if values.size not in (1, n):
+        raise ValueError(f"{values.size} start values; expected {n}, as its dimensions say, or one")
+    full = np.broadcast_to(values, (n,)) if values.size == 1 else values
     return np.array(full).reshape(shape)

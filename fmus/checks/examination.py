@@ -31,6 +31,7 @@ from .validation import reason_not_to_run, validate
 
 _ABSENT = (FmuFault.NO_BINARY, FmuFault.OTHER_PLATFORM, FmuFault.VERSION, FmuFault.INTERFACE)
 """Errors of an FMU that may run elsewhere."""
+_FLOATS = ("Real", "Float64", "Float32")
 _RUNNERS = {
     "x86_64-windows": "64-bit Windows, or here in Wine with a Python for Windows",
     "x86-windows": "Windows, or here in Wine, with a 32-bit Python",
@@ -79,7 +80,12 @@ def doctor(
         return FmuDiagnosis(str(path), _decide([reason], [], []), (reason,))
     variables = summary.pop("variables")
     counts = Counter(v["causality"] for v in variables)
-    found = [*_judge_platform(archive, summary), *_judge_content(summary), *_judge_names(variables)]
+    found = [
+        *_judge_platform(archive, summary),
+        *_judge_content(summary),
+        *_judge_names(variables),
+        *_judge_numbers(variables),
+    ]
     found += _judge_rules(path, archive, found)
     errors = [a for a in found if a.severity == FmuSeverity.ERROR]
     trials: list[FmuTrial] = []
@@ -234,6 +240,26 @@ def _judge_names(variables: list[dict[str, Any]]) -> Iterator[FmuFinding]:
                 f"its {v['causality']} 'time' is a variable, and not the time of the simulation.",
                 "It is recorded under its block's name here; other tools may mix them up: rename it there.",
                 FmuSeverity.NOTE,
+            )
+
+
+def _judge_numbers(variables: list[dict[str, Any]]) -> Iterator[FmuFinding]:
+    """Yield start values that are NaN, and bounds between which nothing lies."""
+    for v in variables:
+        name, start, low, high = v["name"], v["start"], v["min"], v["max"]
+        if v["type"] in _FLOATS and "nan" in (str(x).lower() for x in (start if isinstance(start, list) else [start])):
+            yield FmuFinding(
+                FmuFault.STANDARD,
+                name,
+                f"its {v['causality']} {name!r} has the start value NaN; expected a number.",
+                f"Give it one here: start={{{name!r}: …}}, or a wire if it is an input.",
+            )
+        if isinstance(low, int | float) and isinstance(high, int | float) and low > high:
+            yield FmuFinding(
+                FmuFault.STANDARD,
+                name,
+                f"its {v['causality']} {name!r} has min = {low:g} above max = {high:g}; expected min <= max.",
+                "Export it again with other bounds, or report it to its makers.",
             )
 
 

@@ -10,12 +10,22 @@ import posixpath
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ...blocks.core import FmuFileError
-from ..archive import BUILD_DESCRIPTION, DESCRIPTION, ArchiveLimits, FmuArchive, FmuFault, parse_xml, read_library
+from ..archive import (
+    BUILD_DESCRIPTION,
+    DESCRIPTION,
+    ArchiveLimits,
+    FmuArchive,
+    FmuFault,
+    parse_xml,
+    read_library,
+    repair,
+)
 from ..platform import native_platform
 from .libraries import binaries_of, library_name, native_libraries, tuple_of
 from .summary import INTERFACES, open_fmu
@@ -120,7 +130,9 @@ def _description(archive: FmuArchive, root: Any, again: str) -> Iterator[FmuProb
     except ValidationError as error:
         problems += error.problems
     except Exception as error:  # FMPy raises bare exceptions
-        problems.append(str(error))
+        # other exceptions are Python's, about lines of FMPy
+        known = [str(error)] if type(error) is Exception else repair(deepcopy(root))
+        problems += known or ["the description breaks the rules of the standard, so that FMPy can't check the rest."]
     for found in problems:
         yield FmuProblem(_end_sentence(found), _next_step(found, again))
 

@@ -4,6 +4,7 @@ import json
 import pickle
 import re
 import sys
+import zipfile
 
 import numpy as np
 import pytest
@@ -345,3 +346,39 @@ def test_a_version_that_a_description_is_not_written_in(cache, tmp_path, fmi, st
     diagnosis = doctor(path, run=False)
     assert refused.value.fault == diagnosis.findings[0].fault == fault
     assert says in diagnosis.findings[0].found
+
+
+# --- values of the description ------------------------------------------------------------------------------------------
+
+
+FORCE = r'(name="force".*\n.*)start="0.0"'
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "subject", "says", "step"),
+    [
+        (FORCE, r'\1start="abc"', "force", "'abc'; expected a number", "Export it again."),
+        (FORCE, r'\1start="0.0" min="low"', "force", "'low'; expected a number", "Export it again."),
+        (FORCE, r'\1start="NaN"', "force", "'force' has the start value NaN; expected a number", "Give it one"),
+        (FORCE, r'\1start="0.0" min="5" max="1"', "force", "'force' has min = 5 above max = 1", "Export it"),
+        (r'<Unknown index="[0-9]*"', '<Unknown index="77"', "", "lists the index 77, which doesn't exist.", "Export"),
+    ],
+)
+def test_an_impossible_value_of_the_description_is_found_by_name(cache, tmp_path, before, after, subject, says, step):
+    with zipfile.ZipFile(mass_spring_damper.build(fmi=2)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    path = tmp_path / "plant.fmu"
+    path.write_bytes(described((before, after))(files))
+    found = [f for f in doctor(path, run=False).findings if says in f.found]
+    assert found
+    assert {f.subject for f in found} == {subject}
+    assert all(f.step.startswith(step) for f in found)
+
+
+def test_a_wrong_number_of_start_values_is_said(cache, tmp_path):
+    file = tmp_path / "plant.fmu"
+    array = (r'(<Float64 name="force"[^>]*)start="0.0"([^>]*)/>', r'\1start="1 2"\2><Dimension start="3"/></Float64>')
+    file.write_bytes(described(array)(good_files(mass_spring_damper.build(fmi=3))))
+    with pytest.raises(FmuFileError, match="has 2 start values; expected 3, as its dimensions say, or one") as refused:
+        read_description(file)
+    assert refused.value.subject == "force"
