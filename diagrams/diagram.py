@@ -126,8 +126,7 @@ class Diagram(SimulatedDiagram):
         Raises
         ------
         SimulationError
-            If no such point is found; the message has the largest residuals, and the parameters at a bound. Also if an
-            FMU that lists no states moves there: see `OperatingPoint`.
+            If no such point is found, or an FMU with hidden states moves there; the message has the largest residuals.
         UnknownNameError, OptionError, ParameterError, FmuError
             A name that isn't there, bounds or values that don't fit, a parameter that can't change; an FMU without a
             linear model.
