@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from pathlib import Path
 
 from ...fmus.archive import ArchiveLimits
 from ...fmus.checks import doctor
@@ -36,7 +37,10 @@ def add_doctor(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def run_doctor(arguments: argparse.Namespace) -> int:
     """Carry out ``loopwright doctor``."""
-    path = check_file(arguments.file)
+    path = Path(arguments.file).expanduser()
+    usable = path.is_file()
+    if not arguments.json:
+        check_file(arguments.file)
     limits = None
     if arguments.max_size is not None:
         limits = ArchiveLimits(size=arguments.max_size * 1e9, ratio=float("inf"))
@@ -49,4 +53,6 @@ def run_doctor(arguments: argparse.Namespace) -> int:
         print(json.dumps(diagnosis.as_dict(), indent=2))  # ASCII: it prints on any terminal
     else:
         say(str(diagnosis))
+    if not usable:
+        return 2
     return 0 if diagnosis.runs else 1

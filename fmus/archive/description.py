@@ -199,7 +199,8 @@ def read_description(
     """
     path = Path(file).expanduser()
     if not path.is_file():
-        raise FmuFileError(f"there is no file {str(path)!r}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
+        found = f"{str(path)!r} is a folder" if path.is_dir() else f"there is no file {str(path)!r}"
+        raise FmuFileError(f"{found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
     stat = path.stat()
     return _read(
         path.resolve(), stat.st_mtime_ns, stat.st_size, limits or ArchiveLimits(), tuple(sorted((sizes or {}).items()))

@@ -44,15 +44,18 @@ class FmuTrial:
     ran : bool
         Whether it ran without a fault.
     seconds : float
-        Duration in s, with the start of the process; 0 if it was not run.
+        Duration on the clock in s, with the start of the process; 0 if it was not run.
     left : str
         Reason for which it was not run; empty if it was.
+    step : float, optional
+        Simulated time of each of its steps in s, if it ran in co-simulation.
     """
 
     interface: str
     ran: bool
     seconds: float = 0.0
     left: str = ""
+    step: float | None = None
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,9 @@ class FmuDiagnosis:
             if trial.left:
                 yield "not tried", f"{name}: {trial.left}"
             else:
-                yield "tried", f"{name}: {RUNS[trial.interface] if trial.ran else 'failed'}, {trial.seconds:.1f} s"
+                steps = "" if trial.step is None else f" of {trial.step:.6g} s"
+                done = f"{RUNS[trial.interface]}{steps}" if trial.ran else "failed"
+                yield "tried", f"{name}: {done}; took {trial.seconds:.1f} s"
 
 
 def _first_sentence(text: str) -> str:

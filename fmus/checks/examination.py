@@ -26,7 +26,7 @@ from .diagnosis import FmuDiagnosis, FmuTrial, FmuVerdict
 from .functions import missing_promises
 from .libraries import binaries_of, native_libraries, tuple_of
 from .summary import INTERFACES, summarize
-from .trial import FmuProblem, split_step, try_out
+from .trial import FmuProblem, find_step, split_step, try_out
 from .validation import reason_not_to_run, validate
 
 _ABSENT = (FmuFault.NO_BINARY, FmuFault.OTHER_PLATFORM, FmuFault.VERSION, FmuFault.INTERFACE)
@@ -317,6 +317,9 @@ def _try(
     problem = try_out(path, kind, summary["default_experiment"], archive.limits)
     took = time.perf_counter() - began
     if problem is None:
-        return FmuTrial(kind, ran=True, seconds=took), None
+        step = None
+        if kind == "CoSimulation":
+            step = find_step(read_description(path, limits=archive.limits), summary["default_experiment"])
+        return FmuTrial(kind, ran=True, seconds=took, step=step), None
     finding = FmuFinding(FmuFault.TRIAL, kind, problem.found, problem.step, FmuSeverity.ERROR)
     return FmuTrial(kind, ran=False, seconds=took), finding

@@ -97,6 +97,11 @@ def try_out(
     return None
 
 
+def find_step(description: FmuDescription, experiment: dict[str, Any]) -> float:
+    """Return the communication step of a trial run in s."""
+    return _times(description, experiment)[2]
+
+
 def experiment_of(get: Callable[[str], str | None]) -> dict[str, Any]:
     """Return the times of a default experiment that are numbers, from a function that gets its attributes."""
     found = {}

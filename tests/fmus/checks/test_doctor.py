@@ -323,6 +323,32 @@ def test_a_block_takes_limits_of_its_file(good, tmp_path):
     assert (str(again), again.fault) == (str(caught.value), FmuFault.TOO_LARGE)
 
 
+# --- paths and words ----------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_is_said_to_be_one(tmp_path):
+    with pytest.raises(FmuFileError, match="is a folder; expected an FMU") as refused:
+        Fmu(tmp_path)
+    assert refused.value.fault == FmuFault.NO_FILE
+
+
+@pytest.mark.parametrize("name", ["absent.fmu", "."])
+def test_a_path_that_is_no_file_gives_json_too(tmp_path, capsys, name):
+    assert main(["doctor", str(tmp_path / name), "--json"]) == 2
+    found = json.loads(capsys.readouterr().out)
+    assert found["findings"][0]["fault"] == "no_file"
+    assert not found["runs"]
+
+
+@LINUX
+def test_a_trial_says_its_simulated_time_apart_from_that_of_the_clock(cache, tmp_path):
+    diagnosis = doctor(mass_spring_damper.build(), run=True)  # its default experiment has steps of 1 ms
+    (trial,) = (t for t in diagnosis.trials if t.interface == "CoSimulation")
+    assert trial.step == 1e-3
+    assert re.search(r"co-simulation: run for 10 steps of 0\.001 s; took \d+\.\d s\n", str(diagnosis))
+    assert re.search(r"model exchange: evaluated at its start; took \d+\.\d s\b", str(diagnosis))
+
+
 # --- versions -----------------------------------------------------------------------------------------------------------
 
 
