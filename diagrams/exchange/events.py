@@ -14,6 +14,7 @@ from .exchanged_blocks import ExchangedBlocks
 
 _ROUNDS = 100  # of events at one instant
 _MANY, _SPAN = 500, 1e-8  # so many instants within so many seconds (relative to 1 + |t|), as for those of indicators
+_PART = 1e-3  # and within so much of the time between two ticks: a run in picoseconds goes on
 
 
 class OutsideEvents:
@@ -86,7 +87,7 @@ class OutsideEvents:
                 return
             recent.clear()  # the run has gone back to a saved state
         recent.append(t)
-        if len(recent) < _MANY or t - recent[0] >= _SPAN * (1.0 + abs(t)):
+        if len(recent) < _MANY or t - recent[0] >= min(_SPAN * (1.0 + abs(t)), _PART * float(self.flat.base)):
             return
         time = self._evaluators[path].block.next_time
         told = f"the next time event is at t + {time - t:.2g} s" if np.isfinite(time) else "it has no time event ahead"

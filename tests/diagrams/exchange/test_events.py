@@ -1,5 +1,7 @@
 """Events of FMUs in model exchange: of time, of steps, of inputs, and the end that an FMU asks for."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
@@ -167,6 +169,14 @@ def test_many_time_events_that_leave_the_run_its_way_are_none(cache, tmp_path):
     with diagram.simulation(step=1e-3, solver="euler") as simulation:
         simulation.advance(6e-3)
         assert len(named(simulation.run().events, "time_event")) == pytest.approx(600, abs=7)
+
+
+def test_a_run_in_picoseconds_has_as_many_time_events_as_it_likes(cache, tmp_path):
+    file = eventful_fmu(tmp_path, 3, following="c->t + 1e-12")
+    diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    run = diagram.simulate(6e-10, step=Fraction(1, 10**11), solver="euler", progress=False)
+    assert len(named(run.events, "time_event")) == pytest.approx(600, abs=60)
+    assert run.t[-1] == 6e-10
 
 
 @pytest.mark.parametrize("fmi", [2, 3])

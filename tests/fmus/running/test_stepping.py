@@ -180,6 +180,13 @@ def test_events_that_never_settle_are_an_error(folder):
         simulate(Fmu(file, name="plant", stepping=StepOptions(event_mode=True)))
 
 
+def test_a_next_event_time_that_is_no_number_is_an_error(folder):
+    odd = EVENTS.replace("*next = 0.25;", "*next = 0.0 / 0.0;")
+    file = small_fmu(folder, "fmi3", odd, MODEL.format(clock="", outputs=OUTPUTS, variable="true"), name="odd")
+    with pytest.raises(FmuRuntimeError, match=r"^plant, t = 0 s: .*nextEventTime.* NaN"):
+        simulate(Fmu(file, name="plant", stepping=StepOptions(event_mode=True)))
+
+
 def test_events_and_clocks_are_those_of_a_restored_state(clocked):
     plant = Fmu(clocked, name="plant", start={"level": 0})
     u, y = np.ones(1), np.zeros(6)
