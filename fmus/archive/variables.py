@@ -75,6 +75,18 @@ class FmuVariable:
         return low, high
 
     @property
+    def range_text(self) -> str:
+        """Smallest and largest value with the unit, such as "0 to 5 in mm" or "at least 0"."""
+        low, high = self.limits
+        unit = f" in {self.unit}" if self.unit else ""
+        if np.ptp(np.nan_to_num(low)) or np.ptp(np.nan_to_num(high)):
+            return f"{low.tolist()} to {high.tolist()}{unit}"
+        least, most = float(np.max(low)), float(np.min(high))
+        if np.isfinite(least) and np.isfinite(most):
+            return f"{least:g} to {most:g}{unit}"
+        return f"at least {least:g}{unit}" if np.isfinite(least) else f"at most {most:g}{unit}"
+
+    @property
     def nominals(self) -> np.ndarray:
         """Size of the usual values of each element, 1 where the FMU states none."""
         given = 1.0 if self.nominal is None else self.nominal

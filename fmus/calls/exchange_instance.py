@@ -276,6 +276,10 @@ class ExchangeInstance(SavedExchange):
     def handle_event(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Go through Event Mode at an instant, and return the continuous states after it."""
         inputs = self._fill(u, t)
+        try:
+            inputs.check_limits()
+        except UnfitError as error:
+            raise self._unfit(error, t) from None
         if self._event is None:
             calls = self._events
             sets = [((group.function, group.arguments), "setting the inputs") for group in inputs.groups]

@@ -91,7 +91,7 @@ class FmuInstance(StepFailures):
         self._vector = inputs
         ins, outs = Transfer(self.fmi, "Set", self._inputs, inputs), Transfer(self.fmi, "Get", self._outputs, outputs)
         call = self.fmi.step_call(self._now, self._width, self._final)
-        plain = ins.is_plain and outs.is_plain
+        plain = ins.is_plain and outs.is_plain and not ins.has_limits
         if self.fmi.in_process:
             self.step, self.exchange, self.read = (self._bind_plain if plain else self._bind_typed)(ins, outs, call)
         else:
@@ -182,8 +182,10 @@ class FmuInstance(StepFailures):
     def _bind_typed(self, ins: Transfer, outs: Transfer, call: StepCall) -> _Bound:
         """Return step, exchange and reading where ports have several types."""
 
-        def write(t: float) -> None:
+        def write(t: float, *, in_step: bool = False) -> None:
             try:
+                if in_step and ins.has_limits:  # passes of the initialization may leave the range on their way
+                    ins.check_limits()
                 status = ins.set()
             except UnfitError as error:
                 raise self.refuse_input(error, t) from None
@@ -199,7 +201,7 @@ class FmuInstance(StepFailures):
                 raise self.report("reading the outputs", status, t)
 
         def step(t: float, h: float) -> None:
-            write(t)
+            write(t, in_step=True)
             self._now.value, self._width.value = t, h
             if (status := call.function(*call.arguments)) > 1:
                 self.end_step(status, t, h)

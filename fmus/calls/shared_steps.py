@@ -62,7 +62,7 @@ class SharedSteps:
     def bind_step(self) -> Callable[[float, float], None]:
         """Return `step`, for ports that are Float64 all as one function, which costs less."""
         instance, call, run = self.instance, self.call, self._step.run
-        if not (self.ins.is_whole and self.outs.is_whole):
+        if not (self.ins.is_whole and self.outs.is_whole) or self.ins.has_limits:
             return self.step
         filled, spread = self.ins.views, self.outs.views  # (from, to) each, in the sense of setting
         now, width, any_flag, reached = instance.now, instance.width, call.any_flag, call.reached
@@ -86,7 +86,7 @@ class SharedSteps:
     def start(self, t: float, h: float) -> None:
         """Set the inputs, and begin a step from a time over a length, both in s."""
         instance = self.instance
-        self._fill(t)
+        self._fill(t, in_step=True)
         instance.set_span(t, h)
         self._t, self._h = t, h
         instance.is_stepping = True
@@ -137,8 +137,10 @@ class SharedSteps:
             )
         self._spread(t)
 
-    def _fill(self, t: float) -> None:
+    def _fill(self, t: float, *, in_step: bool = False) -> None:
         try:
+            if in_step and self.ins.has_limits:
+                self.ins.check_limits()
             self.ins.fill()
         except UnfitError as error:
             raise self.instance.refuse_input(error, t) from None

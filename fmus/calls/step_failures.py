@@ -11,7 +11,7 @@ from ..archive import FmuVariable
 from .fmi_calls import DISCARD, ERROR, FATAL, PENDING, StepCall
 from .loaded_library import LoadedFmu
 from .stepping import retry_discarded
-from .transfer import UnfitError
+from .transfer import OutOfRangeError, UnfitError
 
 NEAR = 1e-6
 """Distance from the end of a step, in steps, within which a time is that end."""
@@ -43,7 +43,8 @@ class StepFailures(LoadedFmu):
 
     def refuse_input(self, error: UnfitError, t: float) -> FmuRuntimeError:
         """Return the error of an input that doesn't fit."""
-        return self._unfit(error, t, "Convert the signal before this input, with Quantizer, say.")
+        action, block = ("Limit", "Saturation") if isinstance(error, OutOfRangeError) else ("Convert", "Quantizer")
+        return self._unfit(error, t, f"{action} the signal before this input, with {block}, say.")
 
     def refuse_output(self, error: UnfitError, t: float) -> FmuRuntimeError:
         """Return the error of an output that doesn't fit."""

@@ -269,6 +269,7 @@ class CarefulSteps:
         if not part.index.size:
             return
         try:
+            part.transfer.check_limits()
             status = part.transfer.set()
         except UnfitError as error:
             raise self.instance.refuse_input(error, t) from None

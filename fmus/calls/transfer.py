@@ -13,6 +13,8 @@ from ..archive import FmuVariable, inexact
 from .bound_calls import Call
 from .fmi_calls import FmiCalls
 
+_ROUNDED = 1e-12
+
 
 class Transfer:
     """Calls that get or set the values of ports, all of one type in one call.
@@ -39,6 +41,15 @@ class Transfer:
             chosen = {port: v for port, v in ports.items() if v.type == type_}
             self.groups.append(TypeGroup(fmi, verb, type_, chosen, {p: places[p] for p in chosen}, vector))
         self.is_plain = all(group.direct for group in self.groups)
+        self._ports, self._places = ports, places
+        low, high = (
+            np.concatenate([np.zeros(0), *(np.ravel(v.limits[side]) for v in ports.values())]) for side in (0, 1)
+        )
+        self._bounded = np.flatnonzero(np.isfinite(low) | np.isfinite(high))
+        # A signal at its bound that was converted from another unit may be off by a rounding.
+        self._low, self._high = (
+            b[self._bounded] for b in (low - _ROUNDED * np.abs(low), high + _ROUNDED * np.abs(high))
+        )
 
     @property
     def plain_call(self) -> tuple[Callable[..., int], tuple[Any, ...]] | None:
@@ -59,6 +70,27 @@ class Transfer:
     def calls(self) -> list[Call]:
         """The calls, one for each type."""
         return [(group.function, group.arguments) for group in self.groups]
+
+    @property
+    def has_limits(self) -> bool:
+        """Whether a port has a smallest or largest value."""
+        return self._bounded.size > 0
+
+    def check_limits(self) -> None:
+        """Refuse values out of the ranges that the FMU's description states.
+
+        Raises
+        ------
+        OutOfRangeError
+            If a value is out of its port's range.
+        """
+        found = self.vector[self._bounded]
+        wrong = (found < self._low) | (found > self._high)
+        if wrong.any():
+            place = int(self._bounded[wrong][0])
+            port = next(port for port, where in self._places.items() if where.start <= place < where.stop)
+            value = float(self.vector[place])
+            raise OutOfRangeError(port, f"found {value:.9g}; expected {self._ports[port].range_text}")
 
     def fill(self) -> None:
         """Copy the values of the vector to where the calls read them.
@@ -117,6 +149,10 @@ class UnfitError(Exception):
     def __init__(self, port: str, reason: str):
         super().__init__(port, reason)
         self.port, self.reason = port, reason
+
+
+class OutOfRangeError(UnfitError):
+    """A value out of the range that the FMU's description states."""
 
 
 class TypeGroup:

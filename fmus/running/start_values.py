@@ -65,8 +65,10 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
             block=label,
             port=port,
         )
+    numbers = _number_items(variable, value)
+    if isinstance(numbers, str | bytes) or np.asarray(numbers).dtype.kind in "US":
+        raise _refuse_words(variable, value, label)
     try:
-        numbers = _number_items(variable, value)
         array = np.array(np.broadcast_to(np.asarray(numbers, dtype=float), variable.shape))
     except (TypeError, ValueError):
         raise ParameterError(
@@ -85,7 +87,7 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
         raise ParameterError(f"{reason}. Give another value.", block=label, port=port)
     low, high = variable.limits
     if np.any((array < low) | (array > high)):
-        raise ParameterError(f"found {value!r}; the FMU allows {_range_text(variable)}.", block=label, port=port)
+        raise ParameterError(f"found {value!r}; the FMU allows {variable.range_text}.", block=label, port=port)
     return array
 
 
@@ -131,6 +133,23 @@ def _number_items(variable: FmuVariable, value: Any) -> Any:
     return value
 
 
+def _refuse_words(variable: FmuVariable, value: Any, label: str) -> ParameterError:
+    """Return the error of a text in place of a number."""
+    port, expected = (
+        f"start.{variable.name}",
+        "a number" if not variable.shape else f"numbers of shape {variable.shape}",
+    )
+    if variable.items:
+        known = ", ".join(f"{number} for {name!r}" for name, number in variable.items.items())
+        text = f"found {value!r}; expected an item of its enumeration or its value, {known}."
+        return ParameterError(f"{text} {near(str(value), variable.items)}", block=label, port=port)
+    if variable.type == "Boolean":
+        expected = "True or False" if not variable.shape else f"True or False in the shape {variable.shape}"
+    return ParameterError(
+        f"found {value!r}; expected {expected}, no text. Leave out the quotes.", block=label, port=port
+    )
+
+
 def _too_large(numbers: Any) -> bool:
     """Whether an integer is among numbers that a float64 may not hold."""
     found = np.ravel(np.array(numbers, dtype=object))
@@ -139,18 +158,6 @@ def _too_large(numbers: Any) -> bool:
 
 def _unit_text(variable: FmuVariable) -> str:
     return f" in {variable.unit}" if variable.unit else ""
-
-
-def _range_text(variable: FmuVariable) -> str:
-    low, high = variable.limits
-    least, most = float(np.max(low)), float(np.min(high))
-    if np.ptp(np.nan_to_num(low)) or np.ptp(np.nan_to_num(high)):
-        return f"{low.tolist()} to {high.tolist()}{_unit_text(variable)}"
-    if np.isfinite(least) and np.isfinite(most):
-        return f"{least:g} to {most:g}{_unit_text(variable)}"
-    return (
-        f"at least {least:g}{_unit_text(variable)}" if np.isfinite(least) else f"at most {most:g}{_unit_text(variable)}"
-    )
 
 
 def _article(noun: str) -> str:

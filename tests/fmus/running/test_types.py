@@ -12,7 +12,7 @@ from loopwright.fmus import Fmu
 from support.typed_fmus import description2, description3, typed_fmu
 
 EXTREMES = {
-    "Float64": (-1e300, 0.1), "Float32": (-1.5, 0.1), "Int8": (-128, 127), "UInt8": (0, 255), "Int16": (-32768, 32767),
+    "Float64": (-1e300, 0.1), "Float32": (-1.5, 0.1), "Int8": (-128, 127), "UInt8": (0, 200), "Int16": (-32768, 32767),
     "UInt16": (0, 65535), "Int32": (-(2**31), 2**31 - 1), "UInt32": (0, 2**32 - 1), "Int64": (-(2**53), 2**53),
     "UInt64": (0, 2**53), "Boolean": (0, 1), "Enumeration": (1, 3), "vector": (-7, 9),
     "Real": (-1e300, 0.1), "Integer": (-(2**31), 2**31 - 1),
@@ -112,6 +112,25 @@ def test_an_input_refuses_what_is_no_value_of_its_type_with_port_and_time(file3,
     assert e.value.run["plant.y" + port[1:]].tolist() == [1.0, 1.0, 1.0]  # all that was right is kept
 
 
+@pytest.mark.parametrize("isolate", [None, False], ids=["isolated", "in process"])
+@pytest.mark.parametrize(
+    ("ports", "port", "most", "value", "text"),
+    [
+        (["u_UInt8", "y_UInt8"], "u_UInt8", 200.0, 201.0, "found 201; expected at most 200"),
+        (["u_Float64", "y_Float64"], "u_Float64", 5.0, 5.5, "found 5.5; expected 0 to 5"),
+        (["u_Float64", "gain", "y_Float64"], "gain", 1e300, -1.0, "found -1; expected at least 0"),
+    ],
+)
+def test_a_wire_refuses_what_is_out_of_the_stated_range(folder, ports, port, most, value, text, isolate):
+    old = 'variability="continuous" start="0"/>'
+    bounded = description3().replace(old, old.replace("start", 'min="0" max="5" start'), 1)
+    plant = Fmu(typed_fmu(folder, 3, bounded), name="plant", ports=ports, isolate=isolate)
+    Diagram("d", plant(**rest(plant, **{port: most}))).simulate(0.02, step=0.01, progress=False)
+    wired = Diagram("d", plant(**rest(plant, **{port: Late(value=value)})))
+    with pytest.raises(FmuRuntimeError, match=rf"^plant\.{port}, t = 0\.02 s: {text}\. Limit the signal"):
+        wired.simulate(0.05, step=0.01, progress=False)
+
+
 def test_an_integer_that_no_signal_holds_is_an_error_with_its_port(folder):
     huge = '<Int64 name="huge" valueReference="91" causality="output" variability="discrete"/>'
     text = description3(huge).replace('<Output valueReference="90"/>', '<Output valueReference="90"/>'
@@ -132,6 +151,20 @@ def test_arrays_of_integers_count_from_0_too(folder):
 
 
 # --- start values -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("u_Enumeration", "hig", r"found 'hig'; expected an item .*1 for 'low', 3 for 'high'\. Did you mean 'high'"),
+        ("u_Boolean", "true", "found 'true'; expected True or False"),
+        ("u_Float64", "1", "found '1'; expected a number, no text"),
+        ("u_vector", ["1", "2", "3"], r"expected numbers of shape \(3,\), no text"),
+    ],
+)
+def test_a_text_is_no_start_value_of_a_number(file3, name, value, text):
+    with pytest.raises(ParameterError, match=rf"start\.{name}: .*{text}"):
+        Fmu(file3, name="plant", start={name: value})
 
 
 def test_start_values_of_every_type_arrive(file, fmi):
@@ -175,7 +208,7 @@ def test_a_start_value_that_the_fmu_does_not_keep_is_an_error(folder):
         ("u_UInt64", -1, "found -1; expected 0 to 18446744073709551615"),
         ("u_UInt8", 256, "found 256; expected 0 to 255, as it is of type UInt8"),
         ("u_Boolean", 3, "found 3; expected 0 to 1"),
-        ("u_Enumeration", "middle", "found 'middle'; expected numbers"),
+        ("u_Enumeration", "middle", "found 'middle'; expected an item"),
         ("u_Enumeration", 2, "found 2; expected one of its enumeration"),
         ("path", 3, "found 3 for a variable of type String; expected a text"),
         ("blob", b"x", "found an output of type Binary, which the FMU computes"),
