@@ -23,13 +23,14 @@ from contextlib import suppress
 from typing import Any
 
 from . import wire
-from .surroundings import kill_group, limit, look_around, move, print_to, resident
+from .surroundings import has_room, kill_group, limit, look_around, move, print_to, resident
 from .wire import (
     CAUSE,
     CHILD_SLEEPS,
     MAIL,
     MEMORY,
     MESSAGES,
+    NO_ROOM,
     OUTPUT,
     PARENT_SLEEPS,
     PLACE,
@@ -307,16 +308,17 @@ class Child:
             if self.parent != os.getppid() and os.name == "posix":
                 self.leave()
             if resident() > most:
-                self._end(MEMORY)
+                self.end(MEMORY)
             with suppress(OSError):
                 size = os.fstat(1).st_size
                 if written + size > self.about["output"]:
-                    self._end(OUTPUT)
+                    self.end(OUTPUT)
                 if size > _KEPT_OUTPUT:
                     os.truncate(self.about["printed"], 0)
                     written += size
 
-    def _end(self, cause: int) -> None:
+    def end(self, cause: int) -> None:
+        """End the process, with the reason for its parent."""
         self.words[CAUSE] = cause
         kill_group()
 
@@ -337,7 +339,9 @@ def main() -> None:
     about = json.loads(sys.argv[-1])
     commands, replies = move(0), move(1)
     print_to(about["printed"])
-    limit(about["memory"])
     child = Child(commands, replies, about)
+    limit(about["memory"])
+    if not has_room():
+        child.end(NO_ROOM)
     threading.Thread(target=child.watch_over, daemon=True).start()
     child.serve()

@@ -8,7 +8,7 @@ import signal
 from pathlib import Path
 
 from ...blocks.core import FmuEnd
-from .wire import MEMORY, OUTPUT
+from .wire import MEMORY, NO_ROOM, OUTPUT
 
 _BY_US = -int(getattr(signal, "SIGKILL", signal.SIGTERM))
 _NEARLY = 0.8  # part of the memory that counts as all of it
@@ -21,6 +21,9 @@ def read_end(
     """Return cause and text for the way in which the process has ended."""
     if noted == MEMORY:
         return FmuEnd.MEMORY, f"it took more memory than {memory / 1e6:.6g} MB; its process was ended"
+    if noted == NO_ROOM:
+        limit = f"{memory / 1e6:.6g} MB"
+        return FmuEnd.MEMORY, f"its process, which takes some 20 MB by itself, can't start within the limit of {limit}"
     if noted == OUTPUT:
         return FmuEnd.OUTPUT, f"it wrote more than {output / 1e6:.6g} MB; its process was ended"
     if status is None or (status == _BY_US and error is not None):

@@ -9,6 +9,8 @@ import sys
 from contextlib import suppress
 from typing import Any
 
+_THREAD = 10 << 20  # bytes: the usual stack of a thread, and some more
+
 
 def look_around(folder: str) -> list[tuple[str, Any]]:
     """Return what an FMU may change in its process: its folder, rounding, signals, threads, children, files."""
@@ -92,6 +94,16 @@ def limit(memory: int) -> None:
     if sys.platform == "linux":
         with suppress(OSError, ValueError):
             resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
+
+
+def has_room() -> bool:
+    """Return whether a thread fits into the limit of memory: without room it may wait for its start for ever."""
+    if sys.platform == "linux":
+        try:
+            mmap.mmap(-1, _THREAD, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()
+        except (OSError, MemoryError):
+            return False
+    return True
 
 
 def move(descriptor: int) -> int:

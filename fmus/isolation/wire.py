@@ -23,7 +23,7 @@ MAIL = 1 << 32
 """Word `SEQUENCE` of a message."""
 MAILBOX, DATA = 512, 1 << 16
 """Bytes at which the message and the values begin."""
-MEMORY, OUTPUT = 1, 2
+MEMORY, OUTPUT, NO_ROOM = 1, 2, 3
 """Reasons in the word `CAUSE`, for which the child has ended itself."""
 WAKE = b"w"
 LOG_HEAD = struct.Struct("<iI")

@@ -113,6 +113,16 @@ def test_too_much_memory_ends_the_run(folder):
     assert "200 MB" in str(caught.value)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="the system enforces the limit on Linux")
+def test_a_limit_in_which_no_process_starts_is_said(folder):
+    with pytest.raises(
+        FmuProcessError, match=r"can't start within the limit of 0.001 MB .*isolate=Isolation"
+    ) as caught:
+        simulate(zoo_fmu(folder, 3, ""), Isolation(memory=1e3))
+    assert caught.value.cause is FmuEnd.MEMORY
+    assert "It wrote" not in str(caught.value)
+
+
 def test_a_flood_of_output_ends_the_run(folder):
     limits = Isolation(output=1e6, step_time=30.0)
     with pytest.raises(FmuProcessError, match="wrote more than 1 MB") as caught:
