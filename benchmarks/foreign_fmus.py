@@ -1,8 +1,8 @@
 """FMUs of other tools, run by Loopwright and by FMPy: python benchmarks/foreign_fmus.py FOLDER --table table.md.
 
-FOLDER has one folder for each source of FMUs. Each run has a process of its own, an empty working folder and a time
-limit. Both importers take the FMU's default stop time and step, at most `STEPS` steps, and its start values; inputs
-without one are 0. The table has one row for each FMU and interface.
+FOLDER has one folder for each source of FMUs; without one, two FMUs of the library stand in. Each run has a process of
+its own, an empty working folder and a time limit. Both importers take the FMU's default stop time and step, at most
+`STEPS` steps, and its start values; inputs without one are 0. The table has one row for each FMU and interface.
 
 An FMU is a program: run those of strangers without a network, `unshare -rn python benchmarks/foreign_fmus.py …`.
 """
@@ -10,10 +10,12 @@ An FMU is a program: run those of strangers without a network, `unshare -rn pyth
 from __future__ import annotations
 
 import argparse
+import atexit
 import json
 import math
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -24,6 +26,8 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+
+from loopwright.fmus import dc_motor
 
 STEPS = 200
 CLOSE = 1e-9
@@ -260,7 +264,7 @@ def short_name(tool: str) -> str:
 def main() -> None:
     """Run all FMUs of a folder, one after the other, and print the counts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", nargs="?", type=Path)
+    parser.add_argument("folder", nargs="?", type=Path, help="without one: some plants of the library")
     parser.add_argument("--seconds", type=float, default=60.0, help="limit of each run")
     parser.add_argument("--only", default="", help="part of the path of the FMUs to run")
     parser.add_argument("--table", type=Path, help="file of the table, in Markdown")
@@ -271,6 +275,12 @@ def main() -> None:
         return one(*given.one)
     os.nice(10)
     rows = []
+    if given.folder is None:
+        given.folder = Path(tempfile.mkdtemp(prefix="loopwright-"))
+        atexit.register(shutil.rmtree, given.folder, ignore_errors=True)
+        for fmi in (2, 3):
+            (given.folder / "loopwright+library").mkdir(exist_ok=True)
+            shutil.copy(dc_motor.build(fmi=fmi), given.folder / "loopwright+library" / f"dc_motor{fmi}.fmu")
     for file in sorted(path for path in given.folder.rglob("*.fmu") if given.only in str(path)):
         source = file.relative_to(given.folder).parts[0].replace("+", "/")
         for row in study(file, given.seconds):
