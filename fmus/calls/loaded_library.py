@@ -29,6 +29,7 @@ CALLS: dict[str, type[FmiCalls]] = {"1": Fmi1Calls, "2": Fmi2Calls, "3": Fmi3Cal
 """Functions by the major version of FMI."""
 MakeCalls = Callable[..., FmiCalls]
 R = TypeVar("R")
+_SET = ("parameter", "input", "structuralParameter")
 _OPEN: WeakSet[LoadedFmu] = WeakSet()
 """Open instances of FMUs of which a process can have one only."""
 
@@ -44,7 +45,7 @@ class LoadedFmu:
         self.model_exchange, self.failed, self.fatal = model_exchange, False, False
         self.log = MessageLog(block.label, list_limits(block.label, self.description))
         self._open = self._running = False
-        self._began = 0.0
+        self._began, self._given = 0.0, dict[str, Any]()
         description, self.host = self.description, HostState(self.add_note)
         if make_calls is None:
             self._refuse_second()
@@ -155,7 +156,7 @@ class LoadedFmu:
             Further start values, by the FMU's names; they override the block's.
         """
         self._began = start_time
-        given = {**self.block.start, **(values or {})}
+        given = self._given = {**self.block.start, **(values or {})}
         try:
             self._configure(given)
             tolerance = self.block.stepping.tolerance
@@ -168,13 +169,16 @@ class LoadedFmu:
                 lost = self._find_lost(lost)
         except Exception as error:
             raise self._initialization_error(error) from error
+        self._refuse_lost(lost, "")
+
+    def _refuse_lost(self, lost: Mapping[str, Any], moment: str) -> None:
         for name, value in lost.items():
             text = self.description.texts.get(name)
             kept = self.values([name]).tolist() if text is None else read_text(self.fmi, text)
             put = value if text is not None else np.ravel(value).tolist()
             raise FmuRuntimeError(
-                f"its start value was set to {put!r}, but is {kept!r}: the FMU does not keep it. Leave it out, or set "
-                "the parameters that it depends on.",
+                f"its start value was set to {put!r}, but is {kept!r}{moment}: the FMU does not keep it. "
+                "Leave it out, or set the parameters that it depends on.",
                 block=self.block.label,
                 port=f"start.{name}",
                 t=self._began,
@@ -190,18 +194,18 @@ class LoadedFmu:
 
     def _find_lost(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return those of the given parameters and inputs that the FMU has not kept."""
-        lost = {}
-        for name, value in given.items():
-            if name in self.description.texts:
-                text = self.description.texts[name]
-                if is_readable(self.fmi, text) and read_text(self.fmi, text) != value:
-                    lost[name] = value
-                continue
-            variable = self.description.find(name)
-            if variable.causality in ("parameter", "input", "structuralParameter"):
-                found, kept = self.read_variables([variable]), np.ravel(value).astype(float)
-                if not np.allclose(found, kept, rtol=1e-6 if variable.type == "Float32" else 1e-12, atol=0.0):
-                    lost[name] = value
+        about, lost, at = self.description, {}, 0
+        for name in (n for n in given if n in about.texts and is_readable(self.fmi, about.texts[n])):
+            if read_text(self.fmi, about.texts[name]) != given[name]:
+                lost[name] = given[name]
+        numbers = {n: v for n in given if n not in about.texts and (v := about.find(n)).causality in _SET}
+        numbers = dict(sorted(numbers.items(), key=lambda item: item[1].type))  # those of a type are read in one call
+        found = self.read_variables(numbers.values())
+        for name, v in numbers.items():
+            tolerance = 1e-6 if v.type == "Float32" else 1e-12
+            if not np.allclose(found[at : at + v.size], np.ravel(given[name]).astype(float), rtol=tolerance, atol=0.0):
+                lost[name] = given[name]
+            at += v.size
         return lost
 
     def _initialization_error(self, error: Exception) -> FmuRuntimeError:
@@ -233,6 +237,11 @@ class LoadedFmu:
         except Exception as error:
             raise self._initialization_error(error) from error
         self._running = True
+        others = {*self.description.texts, *(v.name for v in self.block.input_variables.values())}  # set anew, in part
+        kept = {
+            n: v for n, v in self._given.items() if n not in others and self.description.find(n).causality != "input"
+        }
+        self._refuse_lost(self._find_lost(kept), " after its initialization")
         if self.fmi.event_mode_used:
             self._settle_start()
 
@@ -316,18 +325,14 @@ class LoadedFmu:
     def directional_derivative(
         self, unknowns: Sequence[str], knowns: Sequence[str], seed: Sequence[float]
     ) -> np.ndarray:
-        """Return the change of outputs and state derivatives for a change of knowns.
-
-        Clauses are FMI 2.0, 2.1.9, and FMI 3.0, 2.2.11.
+        """Return the change of outputs and state derivatives for a change of knowns (FMI 2.0, 2.1.9; 3.0, 2.2.11).
 
         The derivative is taken at the present time, states and inputs, with discrete states frozen.
 
         Parameters
         ----------
-        unknowns : sequence of str
-            Outputs and derivatives of states, by the FMU's names.
-        knowns : sequence of str
-            Inputs and continuous states, by the FMU's names.
+        unknowns, knowns : sequence of str
+            Outputs and derivatives of states; inputs and continuous states; by the FMU's names.
         seed : array_like
             Change of each element of the knowns.
 
@@ -338,12 +343,8 @@ class LoadedFmu:
 
         Raises
         ------
-        FmuError
-            If the FMU has no directional derivatives.
-        FmuRuntimeError
-            If the FMU's function fails.
-        UnknownNameError
-            For an unknown variable.
+        FmuError, FmuRuntimeError, UnknownNameError
+            If the FMU has no directional derivatives, if its function fails, and for an unknown variable.
         """
         about = self.description
         if not (about.model_exchange_has_derivatives if self.model_exchange else about.has_derivatives):
@@ -354,9 +355,8 @@ class LoadedFmu:
             )
         for name in (*unknowns, *knowns):
             if name not in about.names:
-                raise UnknownNameError(
-                    f"it has no variable {name!r}. {near(name, about.names)}", block=self.block.label
-                )
+                text = f"it has no variable {name!r}. {near(name, about.names)}"
+                raise UnknownNameError(text, block=self.block.label)
         of, by = ([about.find(name) for name in names] for names in (unknowns, knowns))
         n = sum(v.size for v in of)
         if not n:

@@ -153,6 +153,18 @@ def test_arrays_of_integers_count_from_0_too(folder):
     assert repr(plant["y_vector[2]"]) == "<signal plant.y_vector[2]>"
 
 
+@pytest.mark.parametrize("name", ["gain", "fixed"])
+@pytest.mark.parametrize("isolate", [None, False], ids=["isolated", "in process"])
+def test_a_parameter_that_is_lost_when_initialization_ends_is_an_error(folder, name, isolate):
+    place = {"gain": 30, "fixed": 31}[name]
+    leave = "((instance *)p)->running = 1;"
+    file = typed_fmu(folder, 3, change=(leave, f"{leave} ((instance *)p)->vFloat64[{place}] = 2.0;"))
+    plant = Fmu(file, name="plant", start={name: 5.0, "u_Int8": 3}, isolate=isolate)
+    text = rf"plant\.start\.{name}, t = 0 s: its start value was set to \[5\.0\], but is \[2\.0\] after its initial"
+    with pytest.raises(FmuRuntimeError, match=text):
+        Diagram("d", plant(**rest(plant))).simulate(0.02, step=0.01, progress=False)
+
+
 # --- start values -------------------------------------------------------------------------------------------------------
 
 
