@@ -179,6 +179,10 @@ class FmiCalls(ABC):
         """Return the last lines that the FMU has written to its standard output, where nobody sees them."""
         return []
 
+    def describe_memory(self) -> str:
+        """Return a sentence if the FMU's memory is nearly used up, else an empty text."""
+        return ""
+
     def end(self) -> None:  # noqa: B027 (in process there is nothing else)
         """Give up everything else, at the end of the instance and after an error, too."""
 

@@ -66,7 +66,8 @@ class StepFailures(LoadedFmu):
         return FmuRuntimeError(
             f"{action} failed with {self.fmi.status_name(status)}{self._quote_messages()} The inputs "
             f"({', '.join(v.name for v in self._inputs.values())}) were {self._vector.tolist()}. "
-            f"{advice or 'Look at the last samples of error.run, or take a smaller step.'}",
+            f"{advice or 'Look at the last samples of error.run, or take a smaller step.'}"
+            f"{self.fmi.describe_memory()}",
             block=self.block.label,
             t=t,
         )

@@ -43,6 +43,21 @@ def read_end(
     return FmuEnd.EXIT, f"it ended its process with exit status {status}"
 
 
+def describe_memory(pid: int | None, limit: int) -> str:
+    """Return a sentence if a process has nearly as much memory as it may have; it is known on Linux."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text()
+        used = 1024 * int(status.split("VmData:")[1].split()[0])
+    except (OSError, ValueError, IndexError):
+        return ""
+    if used < _NEARLY * limit:
+        return ""
+    return (
+        f" Its process has {used / 1e6:.6g} of {limit / 1e6:.6g} MB of memory, so that it may have got no more: raise "
+        "the limit by isolate=Isolation(memory=…)."
+    )
+
+
 def count_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

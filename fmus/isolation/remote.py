@@ -12,6 +12,7 @@ import numpy as np
 
 from ...blocks.core import FmuError
 from ..calls import CALLS, ERROR, WARNING, BoundCalls, Call, FmiCalls, Log, exported_name
+from .endings import describe_memory
 from .library import RemoteLibrary, describe_call, seconds_for
 from .limits import Isolation
 from .pool import give_back
@@ -144,6 +145,10 @@ class RemoteCalls(FmiCalls):
     def read_printed(self) -> list[str]:
         """Return the last lines that the FMU has written to its standard output in this process's hold of it."""
         return self.process.read_printed()
+
+    def describe_memory(self) -> str:
+        """Return a sentence if the process has nearly as much memory as it may have, else an empty text."""
+        return describe_memory(self.process.pid, self.process.memory_limit)
 
     def end(self) -> None:
         """Keep the process for another instance, or end it."""

@@ -74,6 +74,7 @@ static int act(const char *here, instance *c, double t) {
     if (IS("print")) puts("step by 0.01");
     if (IS("log_hang")) { log_a_little(c); for (;;) pause(); }
     if (IS("memory")) for (;;) sink = memset(malloc(1 << 24), 1, 1 << 24);
+    if (IS("no_memory")) for (;;) { void *m = malloc(1 << 20); if (!m) return 3; sink = m; }
     if (IS("leak")) sink = memset(malloc(1 << 20), 1, 1 << 20);
     if (IS("handles")) open("/dev/null", O_RDONLY);
     if (IS("fork") && !fork()) { for (;;) pause(); }

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from loopwright.blocks import FmuEnd, FmuProcessError, ParameterError
+from loopwright.blocks import FmuEnd, FmuProcessError, FmuRuntimeError, ParameterError
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, Isolation
 from loopwright.fmus.isolation import count_processes, end_idle, find_limits
@@ -121,6 +121,16 @@ def test_a_limit_in_which_no_process_starts_is_said(folder):
         simulate(zoo_fmu(folder, 3, ""), Isolation(memory=1e3))
     assert caught.value.cause is FmuEnd.MEMORY
     assert "It wrote" not in str(caught.value)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the system enforces the limit on Linux")
+@pytest.mark.parametrize(("fault", "said"), [("no_memory", True), ("discard", False)])
+def test_a_step_that_fails_for_want_of_memory_names_the_limit(folder, fault, said):
+    file = zoo_fmu(folder, 3, f"step {fault} 0.05")
+    with pytest.raises(FmuRuntimeError) as caught:
+        simulate(file, Isolation(memory=200e6, step_time=30.0))
+    assert ("of 200 MB of memory" in str(caught.value)) == said
+    assert ("isolate=Isolation(memory=…)" in str(caught.value)) == said
 
 
 def test_a_flood_of_output_ends_the_run(folder):
