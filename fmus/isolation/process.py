@@ -329,8 +329,9 @@ class ChildProcess:
             time.sleep(0.01)
         self.fetch_messages()
         printed = self._output.read_printed()
-        noted = int(self._words[CAUSE])
+        noted, by_itself = int(self._words[CAUSE]), self.has_ended()
         status = self._finish_process()
+        error = None if by_itself else error
         if cause is None:
             cause, text = read_end(status, noted, error, self._peak, self.memory_limit, self.output_limit)
         else:

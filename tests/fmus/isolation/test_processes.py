@@ -275,7 +275,8 @@ def test_model_exchange_and_linear_models_are_bit_for_bit_those_in_process(cache
         assert np.array_equal(x[f"plant.{port}"], y[f"plant.{port}"]), port
 
 
-def test_a_crash_in_model_exchange_names_the_time(msd):
+@pytest.mark.parametrize("wait", [0.0, 0.05])
+def test_a_crash_in_model_exchange_names_the_time(msd, wait):
     """The library's process is ended between two evaluations, as by a system that is out of memory."""
     file = msd
     plant = Fmu(file, name="plant", interface="model_exchange", isolate=True)
@@ -284,6 +285,7 @@ def test_a_crash_in_model_exchange_names_the_time(msd):
         evaluate = one.evaluation([*plant.outputs], rates=True)
         evaluate(0.25, np.zeros(2), np.ones(1))
         os.kill(one.fmi.process.pid, signal.SIGKILL)
+        time.sleep(wait)  # its pipe is closed, or it has ended
         with pytest.raises(FmuProcessError, match="SIGKILL") as caught:
             evaluate(0.5, np.zeros(2), np.ones(1))
     assert caught.value.block == "plant"
