@@ -106,10 +106,51 @@ static int64_t read_plant(const plant *p, double now, double width, double near,
     return DONE;
 }
 
+/* Step all FMUs, one after the other. */
+static int64_t step_plants(const loop *l, double now, double width, outcome *out) {
+    for (int64_t j = 0; j < l->plants; j++) {
+        const plant *p = l->fmus + j;
+        int64_t reason;
+        out->plant = j;
+        if ((reason = step_plant(p, now, width, out)) != DONE ||
+            (reason = read_plant(p, now, width, l->near, out)) != DONE)
+            return reason;
+    }
+    return DONE;
+}
+
+static int call(const tick *f) { return f->evaluate(f->arguments, f->results, f->iw, f->w, 0); }
+
+/* Evaluate a tick at which clocks of some kind act; return DONE, or why its results are not to be taken over. */
+static int64_t evaluate(const loop *l, int64_t kind) {
+    return call(l->ticks + kind) || l->ok[0] == 0.0 ? NOT_OK : DONE;
+}
+
+/* Record a sample if it is one that is kept: into the row after the `written` ones; return how many are then. */
+static int64_t record(loop *l, double t, double *rows, int64_t written) {
+    if (l->skip) {
+        l->skip--;
+        return written;
+    }
+    l->skip = l->every - 1;
+    double *row = rows + written * (l->row + 1);
+    row[0] = t;
+    if (l->columns)
+        for (int64_t j = 0; j < l->row; j++) row[1 + j] = l->log[l->columns[j]];
+    else
+        memcpy(row + 1, l->log, (size_t)l->row * sizeof(double));
+    return written + 1;
+}
+
+static bool is_stopped(const loop *l) {
+    for (int64_t j = 0; j < l->stops; j++)
+        if (l->log[l->stop[j]] > l->truth) return true;
+    return false;
+}
+
 /* Go through ticks, one after the other; times[i] is where tick i begins, times[i + 1] where it ends. */
-VISIBLE void loopwright_run(loop *l, int64_t count, const double *times,
-                                                           const double *widths, const int32_t *kinds, double *rows,
-                                                           outcome *out) {
+VISIBLE void loopwright_run(loop *l, int64_t count, const double *times, const double *widths, const int32_t *kinds,
+                            double *rows, outcome *out) {
     int64_t i;
     out->rows = 0;
     out->reason = DONE;
@@ -118,40 +159,16 @@ VISIBLE void loopwright_run(loop *l, int64_t count, const double *times,
             out->reason = HALTED;
             break;
         }
-        for (int64_t j = 0; j < l->plants; j++) {
-            const plant *p = l->fmus + j;
-            out->plant = j;
-            if ((out->reason = step_plant(p, times[i], widths[i], out)) != DONE ||
-                (out->reason = read_plant(p, times[i], widths[i], l->near, out)) != DONE) {
-                out->ticks = i;
-                return;
-            }
-        }
+        if ((out->reason = step_plants(l, times[i], widths[i], out)) != DONE) break;
         *l->t = times[i + 1];
-        const tick *now = l->ticks + kinds[i];
-        if (now->evaluate(now->arguments, now->results, now->iw, now->w, 0) || l->ok[0] == 0.0) {
-            out->ticks = i;
-            out->reason = NOT_OK;
-            return;
-        }
+        if ((out->reason = evaluate(l, kinds[i])) != DONE) break;
         memcpy(l->x, l->x_next, (size_t)l->states * sizeof(double));
-        if (l->skip) {
-            l->skip--;
-        } else {
-            l->skip = l->every - 1;
-            double *row = rows + out->rows++ * (l->row + 1);
-            row[0] = times[i + 1];
-            if (l->columns)
-                for (int64_t j = 0; j < l->row; j++) row[1 + j] = l->log[l->columns[j]];
-            else
-                memcpy(row + 1, l->log, (size_t)l->row * sizeof(double));
+        out->rows = record(l, times[i + 1], rows, out->rows);
+        if (is_stopped(l)) {
+            out->reason = STOPPED;
+            i++;
+            break;
         }
-        for (int64_t j = 0; j < l->stops; j++)
-            if (l->log[l->stop[j]] > l->truth) {
-                out->ticks = i + 1;
-                out->reason = STOPPED;
-                return;
-            }
     }
     out->ticks = i;
 }

@@ -1,6 +1,7 @@
 """A whole diagram as functions of (t, x, w, p)."""
 
 from ...blocks.core import Layout
+from .announced import Announcer, Times, announcers
 from .clocks import EVERY, NONE, TickPattern
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator
 from .flat_diagram import FlatDiagram
@@ -20,6 +21,7 @@ __all__ = [
     "JUMP",
     "NONE",
     "TRUE",
+    "Announcer",
     "Apart",
     "Bound",
     "Derivative",
@@ -31,8 +33,10 @@ __all__ = [
     "Schedule",
     "StateLayout",
     "TickPattern",
+    "Times",
     "Vectors",
     "WiredDiagram",
+    "announcers",
     "bind_function",
     "evaluate",
     "evaluate_apart",

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ...blocks.core import left_of
-from ..flat import NONE, FlatDiagram
-from ..simulation import announcers
+from ..flat import NONE, FlatDiagram, announcers
 from .derivatives import LocalDerivatives
 
 EQUILIBRIUM = 1e-9

@@ -1,6 +1,5 @@
 """The loop over ticks, and between them."""
 
-from .announced import announcers
 from .progress import Interrupted
 from .run_options import RunKeywords, RunOptions
 from .simulated_diagram import SimulatedDiagram
@@ -17,7 +16,6 @@ __all__ = [
     "Simulation",
     "SimulationView",
     "Workspace",
-    "announcers",
     "apply_point",
     "copy_states",
     "simulate",

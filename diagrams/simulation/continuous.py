@@ -11,9 +11,9 @@ import numpy as np
 from ...blocks.core import OptionError, SimulationError, is_before, left_of
 from ..events import Domains, ManyInstants, Sliding
 from ..exchange import ExchangedBlocks, OutsideEvents
+from ..flat import Times, announcers
 from ..results import Occurrence
 from ..solvers import AcceptedStep, Problem, make_solver
-from .announced import Times, announcers
 from .diagnosis import forget_trials, opaque_failure, state_values
 from .left_of_start import domains_from_left
 from .solver_setup import absolute_tolerances, longest_step, next_instant, time_scale_of

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import SimulationError
-from ..flat import FlatDiagram
-from .announced import Announcer
+from ..flat import Announcer, FlatDiagram
 
 
 def time_scale_of(flat: FlatDiagram) -> float:

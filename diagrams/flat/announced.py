@@ -17,7 +17,7 @@ import numpy as np
 from ...blocks.core import Block, Constant, Gain, Sum, move_earlier, right_of
 from ...blocks.library import Clock
 from ...blocks.tracing import Line, size, switching_times
-from ..flat import FlatDiagram
+from .flat_diagram import FlatDiagram
 
 
 class Announcer(Protocol):
