@@ -213,7 +213,15 @@ class PathDomainError(GuardError):
 
 
 class FmuRuntimeError(SimulationError):
-    """A function of an FMU returned an error; its own log lines are in the message."""
+    """A function of an FMU returned an error; its own log lines are in the message.
+
+    Attributes
+    ----------
+    ends_at : float or None
+        Time in s at which the FMU has asked to end the simulation; None for a failure.
+    """
+
+    ends_at: float | None = None
 
 
 class FmuEnd(Enum):

@@ -15,7 +15,7 @@ from .options import Coupling, Scheme
 from .plant_steps import PlantSteps, step_all
 from .plants import Plant
 from .rest import Rest, Sample, never
-from .rollback import Rollback
+from .rollback import Beginning, Rollback, save_plant, texts_of
 from .search import Search
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 4.0
@@ -236,7 +236,7 @@ class CoupledSteps:
             t=t,
         )
 
-    def _pass_over(self, t: float, end: float, h: float, inputs: np.ndarray, start: _Saved) -> None:
+    def _pass_over(self, t: float, end: float, h: float, inputs: np.ndarray, start: Beginning) -> None:
         """Step all plants with the inputs that follow from w at the end of the step.
 
         The states come of the mean of the inputs at the beginning and at the end: held over the step, it has their
@@ -288,6 +288,7 @@ class CoupledSteps:
             taken = last - now
             if estimate <= 1.0:
                 self._rest.accept()
+                self._end_before(now, last, end)
                 self._count(taken / 2)
                 self._count(taken / 2)
                 self.proposed = max(taken * min(GROW, factor), self.coupling.shortest)
@@ -305,9 +306,17 @@ class CoupledSteps:
         ended = self._step(t, middle, middle - t)
         if ended is not None:
             return ended
+        self._end_before(t, middle, end)
         moving = self.links.moving
         self._z[moving] = self._exchange(left_of(middle))[moving]
         return self._step(middle, end, end - middle)
+
+    def _end_before(self, t: float, now: float, end: float) -> None:
+        """End the run where a plant has asked for that at a time before the tick's."""
+        for plant in self._plants.values():
+            if now < end and getattr(plant, "ends_run", False):
+                made: Any = plant
+                raise made.termination(t, now - t, now)
 
     def _too_short(self, off: np.ndarray, estimate: float, t: float, h: float) -> SimulationError:
         path, port = self.links.name_of_output(int(self._all_outputs[int(np.argmax(off))]))
@@ -323,10 +332,10 @@ class CoupledSteps:
 
     # --- going back ---------------------------------------------------------------------------------------------------
 
-    def _save(self) -> _Saved:
+    def _save(self) -> Beginning:
         plants = {path: save_plant(plant) for path, plant in self._plants.items()}
-        texts = {path: {port: list(v) for port, v in _texts(plant).items()} for path, plant in self._plants.items()}
-        saved = _Saved(self._rest.save(), plants, texts, self._w.copy(), self._z.copy())
+        texts = {path: {port: list(v) for port, v in texts_of(plant).items()} for path, plant in self._plants.items()}
+        saved = Beginning(self._rest.save(), plants, texts, self._w.copy(), self._z.copy())
         if self._rollback.is_open:
             for path in self._plants:
                 self._restore_plant(path, saved)
@@ -334,20 +343,20 @@ class CoupledSteps:
             self._w[:] = saved.w
         return saved
 
-    def _restore(self, saved: _Saved) -> None:
+    def _restore(self, saved: Beginning) -> None:
         for path in self._plants:
             self._restore_plant(path, saved)
         self._rest.restore(saved.rest)
         self._w[:], self._z[:] = saved.w, saved.z
 
-    def _restore_plant(self, path: str, saved: _Saved) -> None:
+    def _restore_plant(self, path: str, saved: Beginning) -> None:
         """Let a plant go back; its texts, whose record would begin anew, stay as they were there."""
         plant = self._plants[path]
         before = self._w[self.links.outputs[path]].copy()
         plant.restore(saved.plants[path])
         if saved.read is not None:
             self._rollback.check(path, before, saved.read, getattr(saved.plants[path], "t", None))
-        for port, changes in _texts(plant).items():
+        for port, changes in texts_of(plant).items():
             changes[:] = saved.texts[path][port]
 
     @property
@@ -362,31 +371,6 @@ class CoupledSteps:
         if effort.passes:
             text += f", {effort.passes} passes"
         return (f"{text}.",)
-
-
-@dataclass
-class _Saved:
-    """The beginning of a communication step."""
-
-    rest: Any
-    plants: dict[str, Any]
-    texts: dict[str, dict[str, list[Any]]]
-    w: np.ndarray
-    z: np.ndarray
-    read: np.ndarray | None = None
-    """Outputs as the plants give them when they are set back at once; None where that is not compared any more."""
-
-
-def save_plant(plant: Plant) -> Any:
-    """Return the state of a plant, for its ``restore``."""
-    save = getattr(plant, "save", None)
-    return plant.deserialize(plant.serialize()) if save is None else save()
-
-
-def _texts(plant: Plant) -> Mapping[str, list[Any]]:
-    """Return the record of a plant's texts by port."""
-    found: Mapping[str, list[Any]] = getattr(plant, "texts", {})
-    return found
 
 
 def tells_slopes(block: Any) -> bool:

@@ -137,10 +137,16 @@ def runs_apart(plant: Any) -> bool:
     return not getattr(getattr(plant, "fmi", None), "in_process", True)
 
 
+def asks_to_end(error: SimulationError) -> bool:
+    """Whether an error is the request of a plant to end the run, and no failure."""
+    return getattr(error, "ends_at", None) is not None
+
+
 def step_all(plants: Iterable[Plant], t: float, h: float) -> None:
     """Let plants step from t over h, both in s; those in processes of their own step at the same time.
 
-    Every step that has begun is ended, also where one fails; then the first error is raised.
+    Every step that has begun is ended, also where one fails; then the first error is raised, and a plant's request to
+    end the run only where nothing else has failed.
     """
     begun: list[Any] = []
     failure: SimulationError | None = None
@@ -159,6 +165,6 @@ def step_all(plants: Iterable[Plant], t: float, h: float) -> None:
         try:
             plant.finish_step()
         except SimulationError as error:
-            failure = failure or error
+            failure = error if failure is None or asks_to_end(failure) else failure
     if failure is not None:
         raise failure from failure.__cause__

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
 from ...blocks.core import FmuRuntimeError
 from .links import Links
+from .plants import Plant
 
 ROUNDING = 1e-9
 """Largest difference of an output that was restored, relative to its size."""
@@ -71,3 +76,28 @@ class Rollback:
                 t=t,
             )
         self._open[mine] = open_ & ~(np.abs(stepped - expected) > allowed)
+
+
+@dataclass
+class Beginning:
+    """The beginning of a communication step."""
+
+    rest: Any
+    plants: dict[str, Any]
+    texts: dict[str, dict[str, list[Any]]]
+    w: np.ndarray
+    z: np.ndarray
+    read: np.ndarray | None = None
+    """Outputs as the plants give them when they are set back at once; None where that is not compared any more."""
+
+
+def save_plant(plant: Plant) -> Any:
+    """Return the state of a plant, for its ``restore``."""
+    save = getattr(plant, "save", None)
+    return plant.deserialize(plant.serialize()) if save is None else save()
+
+
+def texts_of(plant: Plant) -> Mapping[str, list[Any]]:
+    """Return the record of a plant's texts by port."""
+    found: Mapping[str, list[Any]] = getattr(plant, "texts", {})
+    return found

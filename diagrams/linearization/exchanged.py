@@ -105,6 +105,11 @@ def _load(flat: FlatDiagram, at: OperatingPoint) -> Mapping[str, PointEvaluator]
             instance = stack.enter_context(made.exchange(evaluator._wired, start_time=at.t))
             instance.exchange(_inputs_at(flat, at, path))
             instance.begin_exchange()
+            if instance.ends_run:
+                raise FmuError(
+                    f"the FMU asks to end the simulation (terminateSimulation) at t = {at.t:.9g} s, so it has no "
+                    "linear model there. Choose another operating point."
+                )
         except FmuError as error:
             error.at(block=path)
             raise

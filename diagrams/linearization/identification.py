@@ -176,7 +176,8 @@ class _Runner:
         t, final = self.t0 + self._k * self.h, not self.about.can_save
         if self.instance.call(f"a step by {self.h:g} s", self.instance.fmi.do_step, t, self.h, final):
             raise FmuError(
-                f"found a step of {self.h:g} s that it ends early; expected whole steps. Take a smaller step.",
+                f"found a step of {self.h:g} s from t = {t:.9g} s that it ends early, or in which it asks to end the "
+                "simulation (terminateSimulation); expected whole steps. Take a smaller step, or another point.",
                 block=self.block.label,
             )
         self._k += 1

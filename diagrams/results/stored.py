@@ -51,7 +51,15 @@ class Occurrence:
 
 @dataclass(frozen=True)
 class Stopped:
-    """The end of a run by a stop condition before its duration was over: time in s, and the path of the block."""
+    """The end of a run before its duration was over, by a stop condition, or by an FMU that has asked for it.
+
+    Attributes
+    ----------
+    t : float
+        Time in s.
+    block : str
+        Path of the block or FMU.
+    """
 
     t: float
     block: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from ...blocks.core import Block, SimulationError, UnknownNameError, near
 from ..coupling import CoupledSteps, Links, Plant, PlantSteps, load_plants, refuse_exchanged, to_coupling
 from ..exchange import ExchangedBlock, ExchangedBlocks
 from ..flat import FlatDiagram
-from ..results import Occurrence, OperatingPoint, Recorder, TextSignal
+from ..results import Occurrence, OperatingPoint, Recorder, Stopped, TextSignal
 from ..solvers import solver_name
 from .continuous import Continuous
 from .continuous_part import ContinuousPart
@@ -65,13 +65,12 @@ class Engine:
             self.workspace, MappingProxyType(self.plants), MappingProxyType(self.exchanged.blocks), self.position
         )
         self.continuous: Continuous | None = None
-        asking = self.exchanged.ends_run if self.exchanged else None
-        self._stops = StopConditions(flat, self.workspace.log, asking)
+        self._stops = StopConditions(flat, self.workspace.log, self._find_asking)
         self._passes_on = check_start_exchange(options.start_exchange)
         self._compile = options.compile
         self._compiled: CompiledTicks | None = None
         self.messages: tuple[str, ...] = ()
-        self._can_stop = self._stops.exist
+        self._can_stop = self._stops.exist or bool(self.exchanged)
         self._tell = on_event
         if flat.hybrid:
             self.continuous = Continuous(
@@ -117,6 +116,8 @@ class Engine:
         """Load the plants for a run from a time in s on; ``stack`` unloads them."""
         for path, plant in load_plants(self.flat, stack, start_time):
             self.plants[path] = plant
+            if hasattr(plant, "on_end"):
+                plant.on_end = self._look_for_ends
         self.exchanged.load(stack, start_time)
 
     @property
@@ -197,8 +198,9 @@ class Engine:
             if ended is not None:
                 position.stopped = self._stops.met_at(ended)
         except SimulationError as error:
-            culprit = self.blame(error)
-            raise culprit from culprit.__cause__
+            if not self._end_within_step(error):
+                culprit = self.blame(error)
+                raise culprit from culprit.__cause__
 
     def end_between_ticks(self, end: float, row: Row, progress: Progress) -> None:
         """Go on from a tick to the end of the run, before the next tick, and record it; see `go`."""
@@ -214,8 +216,9 @@ class Engine:
                 self._is_over()
             progress(position.t)
         except SimulationError as error:
-            culprit = self.blame(error)
-            raise culprit from culprit.__cause__
+            if not self._end_within_step(error):
+                culprit = self.blame(error)
+                raise culprit from culprit.__cause__
 
     def take_texts(self) -> dict[str, TextSignal]:
         """Return texts and binary data of the plants by dotted path; their record begins anew with the last ones."""
@@ -235,7 +238,56 @@ class Engine:
         position = self.position
         if position.stopped is None and self._stops.is_met():
             position.stopped = self._stops.met_at(position.t)
+            self._note_end(position.t)
         return position.stopped is not None
+
+    # --- ends that FMUs ask for ---------------------------------------------------------------------------------------
+
+    @property
+    def ended_by(self) -> str:
+        """Path of the FMU that has asked for the end of the run; empty if none has."""
+        return "" if self.position.stopped is None else self._find_asking()
+
+    def _find_asking(self) -> str:
+        """Return the path of an FMU that asks for the end of the run; empty if none does."""
+        plants = (path for path, plant in self.plants.items() if getattr(plant, "ends_run", False))
+        return next(plants, "") or self.exchanged.ends_run()
+
+    def _look_for_ends(self) -> None:
+        self._can_stop = True
+
+    def _end_within_step(self, error: SimulationError) -> bool:
+        """End the run where an FMU has asked for that within a step; return whether the error is such a request.
+
+        Where nothing moves between ticks, the run ends at the FMU's time with its last outputs, else at the last tick.
+        """
+        at, path, position = getattr(error, "ends_at", None), self._find_asking(), self.position
+        plant: Any = self.plants.get(path)
+        if at is None or plant is None:
+            return False
+        end = position.t
+        if self.continuous is None and self.coupled is None and at > end:
+            try:
+                plant.read(at)
+            except SimulationError:
+                pass  # an FMU that has ended need not give its outputs any more
+            else:
+                end, flat = at, self.flat
+                for name, where in flat.plant_outputs.slices.items():
+                    if flat.ports[name][0] == path:
+                        self.workspace.log[flat.log.slices[name]] = self.workspace.here.w[where]
+        position.stopped = Stopped(end, path)
+        self._note_end(at)
+        return True
+
+    def _note_end(self, t: float) -> None:
+        """Tell of an FMU in co-simulation that has ended the run; one in model exchange tells it itself."""
+        position = self.position
+        plant: Any = None if position.stopped is None else self.plants.get(position.stopped.block)
+        if plant is not None and position.stopped is not None and getattr(plant, "ends_run", False):
+            end = position.stopped.t
+            last = "" if end == t else f"; the run ends at its last communication point, t = {end:.9g} s"
+            plant.add_note(f"it asks to end the simulation at t = {t:.9g} s (terminateSimulation){last}")
 
     def _on_event(self, event: Occurrence) -> None:
         self.position.note_event(event)

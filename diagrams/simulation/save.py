@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from ...blocks.core import FmuError, OptionError
 from ..results import RunState, layout_of
 from .engine import Engine
 
 
 def can_save(engine: Engine) -> bool:
-    """Whether every plant can turn its state into bytes."""
-    return all(plant.can_serialize and not plant.failed for plant in engine.loaded.values())
+    """Whether the run is at a tick, none of its FMUs has ended it, and every one can turn its state into bytes."""
+    able = all(plant.can_serialize and not plant.failed for plant in engine.loaded.values())
+    return able and engine.position.end is None and not engine.ended_by
 
 
 def save_state(engine: Engine) -> RunState:
@@ -17,9 +19,22 @@ def save_state(engine: Engine) -> RunState:
     Raises
     ------
     FmuError
-        An FMU that can't save its state, or can't turn it into bytes.
+        An FMU that can't save its state, or can't turn it into bytes, or has asked for the end of the run.
+    OptionError
+        A run that has ended between two ticks.
     """
     workspace, position = engine.workspace, engine.position
+    if engine.ended_by:
+        raise FmuError(
+            f"the FMU has asked to end the simulation (terminateSimulation) at t = {position.t:.9g} s, so that "
+            "no run can go on from there; expected a state before that time. Save the run at an earlier tick.",
+            block=engine.ended_by,
+        )
+    if position.end is not None:
+        raise OptionError(
+            f"the run has ended at t = {position.t:g} s, between two ticks, and is not saved there. Save it at a tick.",
+            block=engine.name,
+        )
     return RunState(
         t=position.t,
         tick=position.tick,

@@ -174,7 +174,7 @@ class Simulation:
 
     @property
     def stopped(self) -> Stopped | None:
-        """The stop condition that has ended the run."""
+        """The stop condition or FMU that has ended the run."""
         return self._engine.position.stopped
 
     @property
@@ -339,10 +339,9 @@ class Simulation:
 
     @property
     def can_save(self) -> bool:
-        """Whether the complete state can be saved: every FMU can turn its state into bytes."""
-        between = self._engine.position.end is not None
+        """Whether the complete state can be saved: every FMU can turn its state into bytes, and none has ended it."""
         alive = bool(self._open or not self._engine.has_plants)
-        return self._begun and not between and alive and can_save(self._engine)
+        return self._begun and alive and can_save(self._engine)
 
     def save(self) -> RunState:
         """Return the complete state at this tick, that of the FMUs included.
@@ -350,15 +349,10 @@ class Simulation:
         Raises
         ------
         FmuError
-            If an FMU can't save its state, or can't turn it into bytes.
+            If an FMU can't save its state, can't turn it into bytes, or has asked for the end of the run.
         OptionError
-            If the run has not begun, or has ended and its FMUs are freed.
+            If the run has not begun, or has ended and its FMUs are freed, or has ended between two ticks.
         """
-        if self._engine.position.end is not None:
-            raise OptionError(
-                f"the run has ended at t = {self.t:g} s, between two ticks, and is not saved there. Save it at a tick.",
-                block=self.diagram.name,
-            )
         if not self._begun or (self._engine.has_plants and not self._open):
             raise not_open_error(self._open, self.diagram.name)
         return save_state(self._engine)

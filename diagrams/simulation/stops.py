@@ -20,11 +20,11 @@ class StopConditions:
         The diagram.
     log : ndarray
         The outputs of all blocks: the run's own vector, which it evaluates into.
-    asking : callable, optional
-        Returns the path of a block that asks for the end of the run; empty if none does.
+    asking : callable
+        Returns the path of an FMU that asks for the end of the run; empty if none does.
     """
 
-    def __init__(self, flat: FlatDiagram, log: np.ndarray, asking: Callable[[], str] | None = None):
+    def __init__(self, flat: FlatDiagram, log: np.ndarray, asking: Callable[[], str]):
         self._log, self._asking = log, asking
         self._entries: list[tuple[int, str]] = []
         for path in sorted(flat.checked.traced):
@@ -35,7 +35,7 @@ class StopConditions:
     @property
     def exist(self) -> bool:
         """Whether the diagram has any."""
-        return bool(self._entries) or self._asking is not None
+        return bool(self._entries)
 
     @property
     def entries(self) -> list[int]:
@@ -44,10 +44,9 @@ class StopConditions:
 
     def is_met(self) -> bool:
         """Whether any is true."""
-        met = any(self._log[i] > TRUE for i, _ in self._entries)
-        return met or (self._asking is not None and bool(self._asking()))
+        return any(self._log[i] > TRUE for i, _ in self._entries) or bool(self._asking())
 
     def met_at(self, t: float) -> Stopped:
         """Return the first one that is true, by path, with the time in s at which it was met."""
         path = next((path for i, path in self._entries if self._log[i] > TRUE), None)
-        return Stopped(t, path if path is not None else self._asking() if self._asking is not None else "")
+        return Stopped(t, self._asking() if path is None else path)

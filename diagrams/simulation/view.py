@@ -22,7 +22,7 @@ class Position:
     """Seconds between two ticks."""
     tick: int = 0
     stopped: Stopped | None = None
-    """The stop condition that has ended the run, which may be between two ticks."""
+    """The stop condition, or the FMU, that has ended the run, which may be between two ticks."""
     end: float | None = None
     """Time in s between two ticks at which the run has ended, because its duration has."""
     fired: list[Occurrence] = field(default_factory=list)

@@ -354,7 +354,7 @@ class ExchangeInstance(SavedExchange):
         return wants or changed
 
     def _note_end(self, t: float, place: str) -> None:
-        """Note that the FMU asks for the end of the run; it is told once."""
+        """Note that the FMU asks to end the simulation; it is told once."""
         if not self.ends_run:
             self.ends_run = True
             self.add_note(f"it asks to end the simulation at t = {t:.9g} s, {place} (terminateSimulation)")

@@ -66,6 +66,7 @@ class SavedExchange(LoadedFmu):
 
     about: ExchangeInfo
     next_time: float
+    ends_run: bool
     _ports: dict[str, FmuVariable]
     _u: np.ndarray
     _time: ctypes.c_double
@@ -125,7 +126,7 @@ class SavedExchange(LoadedFmu):
             self.call("restoring its state", self.fmi.set_state, handle)
         finally:
             self.free_state(handle)
-        self.failed, self._running, self._final = False, True, False
+        self.failed, self._running, self._final, self.ends_run = False, True, False, False
         self._u, self.next_time, self._time.value = u, next_time, t
 
     def _check_can(self) -> None:

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from ...blocks.core import FmuError
-from .fmi_calls import PENDING, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
+from .fmi_calls import DISCARD, PENDING, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
 from .printf import Logger, format_message
 
 _LONGEST_WAIT = 0.01  # s between two looks at a step that is pending
-_STEP_STATUS, _LAST_SUCCESSFUL_TIME = 0, 2  # fmiStatusKind
+_STEP_STATUS, _LAST_SUCCESSFUL_TIME, _TERMINATED = 0, 2, 3  # fmiStatusKind
 _REQUIRED = ("GetVersion", "InstantiateSlave", "InitializeSlave", "FreeSlaveInstance", "DoStep")
 
 
@@ -111,13 +111,23 @@ class Fmi1Calls(FmiCalls):
         return StepCall(self._function("fmi1DoStep"), arguments, any_flag, flags, reached)
 
     def end_step(self, status: int) -> tuple[int, bool]:
-        """Wait for a step that is pending (3.4); FMI 1.0 has no request to end the simulation."""
+        """Wait for a step that is pending (3.4), and look whether a discarded one asks to end the simulation.
+
+        That request, fmiTerminated, came with FMI 1.0.1; an FMU that does not know it discards the question.
+        """
+        from fmpy.fmi1 import FMICallException
+
         wait = 1e-5
         while status == PENDING:
             time.sleep(wait)
             wait = min(2 * wait, _LONGEST_WAIT)
             status = self.fmu.getStatus(_STEP_STATUS).value
-        return status, False
+        if status != DISCARD:
+            return status, False
+        try:
+            return status, self.fmu.getBooleanStatus(_TERMINATED).value != b"\x00"
+        except (FMICallException, KeyError):
+            return status, False
 
     def time_after_discard(self, t: float, h: float) -> float | None:
         """Return the FMU's lastSuccessfulTime (3.6); None if it does not say one within the step."""
@@ -130,13 +140,15 @@ class Fmi1Calls(FmiCalls):
         return min(max(found, t), t + h) if t - 1e-9 * h <= found <= t + h * (1.0 + 1e-9) else None
 
     def do_step(self, t: float, h: float, final: bool) -> bool:
-        """Take a step; it neither ends early nor asks to end the simulation."""
+        """Take a step; return whether it asks to end the simulation."""
         from fmpy.fmi1 import FMICallException
 
         try:
             self.fmu.doStep(t, h)
         except FMICallException as error:
-            status, _ = self.end_step(error.status)
+            status, ends = self.end_step(error.status)
+            if ends:
+                return True
             if status > 1:
                 raise FMICallException(function=error.function, status=status) from None
         return False

@@ -20,7 +20,8 @@ from .native_step import NativeStep, native_step
 from .saved_state import FmuState, StepMemory, pack_state, unpack_state
 from .shared_steps import SharedSteps
 from .step_failures import NEAR, StepFailures
-from .stepping import CarefulSteps, needs_care
+from .step_options import needs_care
+from .stepping import CarefulSteps
 from .texts import Text, TextRecord
 from .transfer import Transfer, UnfitError
 
@@ -265,6 +266,7 @@ class FmuInstance(StepFailures):
 
     def go_back(self, state: FmuState) -> None:
         """Set the FMU back to a state, without its outputs; for steps that are taken again."""
+        self.ends_run = False
         self.call("restoring its state", self.fmi.set_state, state._handle)
 
     def restore(self, state: FmuState) -> None:
@@ -279,7 +281,7 @@ class FmuInstance(StepFailures):
         """
         self._check_state(state)
         self.call("restoring its state", self.fmi.set_state, state._handle)
-        self.failed, self._running = False, state.running
+        self.failed, self._running, self.ends_run = False, state.running, False
         self._now.value, self._width.value = state.t, 0.0
         if self._careful is not None:
             self._careful.return_to(state.t, state.steps)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ctypes
+import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -10,11 +12,13 @@ from ...blocks.core import FmuRuntimeError
 from ..archive import FmuVariable
 from .fmi_calls import DISCARD, ERROR, FATAL, PENDING, StepCall
 from .loaded_library import LoadedFmu
-from .stepping import retry_discarded
+from .stepped_instance import SteppedInstance
 from .transfer import OutOfRangeError, UnfitError
 
 NEAR = 1e-6
 """Distance from the end of a step, in steps, within which a time is that end."""
+ROUNDED = 1e-9
+"""Part of a step within which two times are one."""
 
 
 class StepFailures(LoadedFmu):
@@ -26,6 +30,10 @@ class StepFailures(LoadedFmu):
     _width: ctypes.c_double
     _call: StepCall | None = None
     _has_retried = _has_been_off = False
+    ends_run = False
+    """Whether the FMU has asked to end the simulation."""
+    on_end: Callable[[], None] | None = None
+    """Told when the FMU asks to end the simulation at the end of its step; without it the request is an error."""
 
     @property
     def now(self) -> ctypes.c_double:
@@ -62,6 +70,8 @@ class StepFailures(LoadedFmu):
 
     def report(self, action: str, status: int, t: float, advice: str = "") -> FmuRuntimeError:
         """Return the error of an action that has failed with a status."""
+        if self.ends_run:  # an FMU that has ended need not give its outputs any more
+            return self.termination(self._now.value, self._width.value, t)
         self._mark_failure(status)
         return FmuRuntimeError(
             f"{action} failed with {self.fmi.status_name(status)}{self._quote_messages()} The inputs "
@@ -76,8 +86,9 @@ class StepFailures(LoadedFmu):
         """Wait for the end of a step that is pending, and raise the error of one that has failed."""
         status, ends = self.fmi.end_step(status)
         if ends:
-            self._width.value = 0.0
-            raise self.termination(t, h)
+            reached = self.fmi.time_after_discard(t, h)
+            self.take_end(t, h, t if reached is None else reached)
+            return
         again = status == DISCARD and self._call is not None and not self.block.stepping.rollback
         if again and self._call is not None and retry_discarded(self, self._call, t, h):
             return
@@ -99,20 +110,44 @@ class StepFailures(LoadedFmu):
             f"Take a smaller step{steps}, or check the FMU's inputs there.",
         )
 
-    def termination(self, t: float, h: float) -> FmuRuntimeError:
-        """Return the error of an FMU that asks to end the simulation."""
-        return FmuRuntimeError(
-            f"the FMU asks to end the simulation (terminateSimulation) in the step from t = {t:.9g} s by {h:g} s"
-            f"{self._quote_messages()} End the run there, or look up the reason in the FMU's documentation.",
+    def take_end(self, t: float, h: float, reached: float) -> None:
+        """Note that the FMU asks to end the simulation, at a time in s within a step from t over h.
+
+        Raises
+        ------
+        FmuRuntimeError
+            If the step has not come to its end, and where nobody is told of ends; its ``ends_at`` is the time.
+        """
+        self.ends_run = True
+        reached = t + h if math.isnan(reached) else min(max(reached, t), t + h)
+        if self.on_end is None or reached < t + h - h * NEAR:
+            raise self.termination(t, h, reached)
+        self.on_end()
+
+    def check_end(self, t: float, h: float, reached: float) -> None:
+        """Raise the error of an FMU that has asked to end the simulation in a part of a step, before the step's end."""
+        if self.ends_run and reached < t + h - h * NEAR:
+            raise self.termination(t, h, reached)
+
+    def termination(self, t: float, h: float, reached: float) -> FmuRuntimeError:
+        """Return the error of an FMU that asks to end the simulation at a time in a step from t over h, all in s."""
+        self._now.value, self._width.value = reached, 0.0  # the instance stays there
+        error = FmuRuntimeError(
+            f"the FMU asks to end the simulation (terminateSimulation) at {reached:.9g} s, in the step from "
+            f"t = {t:.9g} s by {h:g} s{self._quote_messages()} End before, or look up the reason in the FMU's "
+            "documentation.",
             block=self.block.label,
             t=t,
         )
+        error.ends_at = reached
+        return error
 
     def check_flags(self, call: StepCall, t: float, h: float) -> None:
-        """Raise the error of a step that has ended early, elsewhere, or asks for the end of the simulation."""
+        """Raise the error of a step that has ended early or elsewhere; see `take_end` for one that ends the run."""
         _, terminate, early, _ = call.flags
         if terminate:
-            raise self.termination(t, h)
+            self.take_end(t, h, call.reached.value)
+            return
         if early:
             raise FmuRuntimeError(
                 f"the step from t = {t:.9g} s by {h:g} s returned early, at {call.reached.value:.9g} s (earlyReturn), "
@@ -167,3 +202,52 @@ class StepFailures(LoadedFmu):
                 f"t = {t:.9g} s: the FMU discarded a step of {h:g} s; it was taken in {count} parts, and so are later "
                 "ones that it discards"
             )
+
+
+def retry_discarded(instance: SteppedInstance, call: StepCall, t: float, h: float) -> bool:
+    """Take a step that was discarded in smaller ones; return whether that has worked.
+
+    In FMI 3.0 the FMU is where it was before (4.2.1); in FMI 2.0 it is where its lastSuccessfulTime says (4.2.2), and
+    where it says nothing, the step is not taken again.
+
+    Parameters
+    ----------
+    instance : SteppedInstance
+        The instance.
+    call : StepCall
+        The FMU's step.
+    t, h : float
+        Start and length of the step in s.
+    """
+    options, about = instance.block.stepping, instance.description
+    smallest = h * 0.5**options.retries
+    if not options.retries or not about.variable_step:
+        return False
+    end, now, part, count = t + h, t, h, 0
+    status = DISCARD
+    while True:
+        if status == DISCARD:
+            known = instance.fmi.time_after_discard(now, part)
+            if known is None or part <= smallest * (1.0 + ROUNDED):
+                return False
+            now = min(max(known, now), end)
+            part = min(0.5 * part, end - now)
+        elif status > 1:
+            return False
+        else:
+            now, count = now + part, count + 1
+        if end - now <= ROUNDED * smallest:
+            break
+        part = min(part, end - now)
+        instance.set_span(now, part)
+        status, ends = instance.fmi.end_step(call.function(*call.arguments))
+        if ends or (status > 1 and status != DISCARD):
+            instance.end_step(status, now, part)
+            status = 0
+        elif status <= 1 and call.any_flag.value:
+            instance.check_flags(call, now, part)
+        if status <= 1:
+            instance.check_end(t, h, now + part)
+    instance.set_span(t, h)
+    instance.note_retry(t, h, count)
+    return True

@@ -165,3 +165,14 @@ def choose_modes(fmi: FmiCalls, about: FmuDescription, options: StepOptions) -> 
 
 def _slopes_flag(about: FmuDescription) -> str:
     return "providesIntermediateUpdate" if about.fmi.startswith("3") else "canInterpolateInputs"
+
+
+def needs_care(about: FmuDescription, options: StepOptions) -> bool:
+    """Whether an FMU's steps are more than setting, stepping and getting."""
+    return (
+        uses_event_mode(about, options)
+        or allows_early_return(about, options)
+        or options.input_derivatives
+        or options.rollback
+        or options.time is StepTime.ADDED
+    )

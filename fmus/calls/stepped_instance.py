@@ -19,6 +19,8 @@ class SteppedInstance(Protocol):
     """Members of an instance that its steps need."""
 
     fmi: FmiCalls
+    ends_run: bool
+    """Whether the FMU has asked to end the simulation."""
 
     @property
     def block(self) -> FmuBlock:
@@ -43,8 +45,11 @@ class SteppedInstance(Protocol):
     def report(self, action: str, status: int, t: float, advice: str = "") -> FmuRuntimeError:
         """Return the error of an action that has failed."""
 
-    def termination(self, t: float, h: float) -> FmuRuntimeError:
-        """Return the error of an FMU that asks to end the simulation."""
+    def take_end(self, t: float, h: float, reached: float) -> None:
+        """Note that the FMU asks to end the simulation, or raise its error."""
+
+    def check_end(self, t: float, h: float, reached: float) -> None:
+        """Raise the error of an FMU that has asked to end the simulation before the end of a step."""
 
     def refuse_input(self, error: UnfitError, t: float) -> FmuRuntimeError:
         """Return the error of an input that doesn't fit."""

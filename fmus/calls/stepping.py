@@ -14,11 +14,11 @@ from typing import TypeVar
 import numpy as np
 
 from ...blocks.core import FmuRuntimeError, Layout
-from ..archive import FmuDescription, FmuVariable, OtherVariable
+from ..archive import FmuVariable, OtherVariable
 from .fmi_calls import DISCARD, MOST_ROUNDS, WARNING, StepCall
 from .fmu_block import check_next_time
 from .saved_state import FmuState, StepMemory
-from .step_options import StepOptions, StepTime, allows_early_return, uses_event_mode
+from .step_options import StepTime, allows_early_return, uses_event_mode
 from .stepped_instance import SavedInstance, SteppedInstance
 from .transfer import Transfer, UnfitError
 
@@ -27,17 +27,6 @@ _ROUNDED = 1e-9
 R = TypeVar("R")
 _CHANGED = 2
 """Qualifier of an interval that the FMU has set anew (fmi3IntervalChanged)."""
-
-
-def needs_care(about: FmuDescription, options: StepOptions) -> bool:
-    """Whether an FMU's steps are more than setting, stepping and getting."""
-    return (
-        uses_event_mode(about, options)
-        or allows_early_return(about, options)
-        or options.input_derivatives
-        or options.rollback
-        or options.time is StepTime.ADDED
-    )
 
 
 @dataclass
@@ -180,7 +169,8 @@ class CarefulSteps:
         changed = self.jumping.take()
         due = [c for c in self.clocks if c.next <= start + _ROUNDED * h]
         if self.has_events and (changed or self._fresh or due or self.next_event <= start + _ROUNDED * h):
-            self._handle_events(start, h, due, set_inputs=True)
+            self._handle_events(start, due, set_inputs=True)
+            instance.check_end(start, h, start)
         self._fresh = False
         self.smooth.take()
         self._set(self.smooth, start)
@@ -208,9 +198,18 @@ class CarefulSteps:
                     t=t,
                 )
             now = end if end - reached <= _ROUNDED * h else reached
+            if self._check_end(t, h, now):
+                return
             due = [c for c in self.clocks if c.next <= now + _ROUNDED * h and now < end]
             if self.has_events and (event or due or self.next_event <= now + _ROUNDED * h):
-                self._handle_events(now, h, due, set_inputs=False)
+                self._handle_events(now, due, set_inputs=False)
+                if self._check_end(t, h, now):
+                    return
+
+    def _check_end(self, t: float, h: float, now: float) -> bool:
+        """Return whether the FMU asks to end the simulation now; raise its error before the end of the step."""
+        self.instance.check_end(t, h, now)
+        return self.instance.ends_run
 
     def _check_even(self, now: float, end: float, target: float, h: float) -> float:
         """Return the end of the step of an FMU that takes steps of one length only; refuse clocks within it."""
@@ -254,9 +253,14 @@ class CarefulSteps:
             else:
                 state, part = instance.save(), end - now
             instance.set_span(now, part)
-            status, _ = self.fmi.end_step(call.function(*call.arguments))
+            status, ends = self.fmi.end_step(call.function(*call.arguments))
+            if ends:
+                return False
             if status <= WARNING:
                 now, count = now + part, count + 1
+                if call.any_flag.value:
+                    instance.check_flags(call, now - part, part)
+                    instance.check_end(t, h, now)
             elif status != DISCARD:
                 return False
         instance.set_span(t, h)
@@ -300,7 +304,7 @@ class CarefulSteps:
 
     # ---- events ----
 
-    def _handle_events(self, t: float, h: float, due: list[_Clock], *, set_inputs: bool) -> None:
+    def _handle_events(self, t: float, due: list[_Clock], *, set_inputs: bool) -> None:
         """Enter Event Mode, let clocks tick, and settle (FMI 3.0, 2.3.5 and 4.2.1)."""
         instance = self.instance
         instance.call("entering Event Mode", self.fmi.enter_event_mode)
@@ -321,8 +325,9 @@ class CarefulSteps:
         instance = self.instance
         for _ in range(MOST_ROUNDS):
             found = instance.call("updating its discrete states", self.fmi.update_events)
-            if found.terminate:
-                raise instance.termination(t, 0.0)
+            if found.terminate:  # it stays in Event Mode, in which outputs can be read
+                instance.take_end(t, 0.0, t)
+                return
             if not found.again:
                 self.next_event = check_next_time(instance.block, found.next_time, t)
                 break
@@ -347,49 +352,3 @@ class CarefulSteps:
                 clock.start(t, interval, clock.variable.shift)
             elif qualifier == _CHANGED:
                 clock.start(t, math.inf, interval)
-
-
-def retry_discarded(instance: SteppedInstance, call: StepCall, t: float, h: float) -> bool:
-    """Take a step that was discarded in smaller ones; return whether that has worked.
-
-    In FMI 3.0 the FMU is where it was before (4.2.1); in FMI 2.0 it is where its lastSuccessfulTime says (4.2.2), and
-    where it says nothing, the step is not taken again.
-
-    Parameters
-    ----------
-    instance : SteppedInstance
-        The instance.
-    call : StepCall
-        The FMU's step.
-    t, h : float
-        Start and length of the step in s.
-    """
-    options, about = instance.block.stepping, instance.description
-    smallest = h * 0.5**options.retries
-    if not options.retries or not about.variable_step:
-        return False
-    end, now, part, count = t + h, t, h, 0
-    status = DISCARD
-    while True:
-        if status == DISCARD:
-            known = instance.fmi.time_after_discard(now, part)
-            if known is None or part <= smallest * (1.0 + _ROUNDED):
-                return False
-            now = min(max(known, now), end)
-            part = min(0.5 * part, end - now)
-        elif status > 1:
-            return False
-        else:
-            now, count = now + part, count + 1
-        if end - now <= _ROUNDED * smallest:
-            break
-        part = min(part, end - now)
-        instance.set_span(now, part)
-        status = call.function(*call.arguments)
-        if status > 1 and status != DISCARD:
-            instance.end_step(status, now, part)
-        elif status <= 1 and call.any_flag.value:
-            instance.check_flags(call, now, part)
-    instance.set_span(t, h)
-    instance.note_retry(t, h, count)
-    return True

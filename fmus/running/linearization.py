@@ -212,7 +212,10 @@ def _enter_continuous_time(point: _OperatingPoint, instance: LoadedFmu) -> None:
     """Settle the events at the start, then set the states without an exact start value (FMI 3.0, 3.2)."""
     instance.begin()
     for _ in range(100):
-        if not instance.call("the events at the start", instance.fmi.update_discrete_states):
+        found = instance.call("the events at the start", instance.fmi.update_events)
+        if found.terminate:
+            raise _end_error(point, "in an event there")
+        if not found.again:
             break
     else:
         raise FmuError(
@@ -227,6 +230,14 @@ def _enter_continuous_time(point: _OperatingPoint, instance: LoadedFmu) -> None:
         for name in guessed:
             x[where[name]] = np.ravel(point.given[name])
         instance.set_continuous_states(x)
+
+
+def _end_error(point: _OperatingPoint, place: str) -> FmuError:
+    return FmuError(
+        f"the FMU asks to end the simulation (terminateSimulation) at t = {point.t:.9g} s, {place}, so it has no "
+        "linear model there. Choose another operating point.",
+        block=point.block.label,
+    )
 
 
 def _values(point: _OperatingPoint, instance: LoadedFmu) -> np.ndarray:
@@ -345,8 +356,8 @@ def _linearize_step(point: _OperatingPoint, instance: LoadedFmu, h: float, relat
         instance.set_values(set_after)
         if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, saved is None):
             raise FmuError(
-                f"it ends its step from t = {point.t:.9g} s by {h:g} s early, so the step has no derivative. Take a "
-                "smaller h.",
+                f"it ends its step from t = {point.t:.9g} s by {h:g} s early, or asks to end the simulation in it "
+                "(terminateSimulation), so the step has no derivative. Take a smaller h, or another operating point.",
                 block=point.block.label,
             )
         return instance.values([*point.states, *point.outputs])

@@ -409,7 +409,7 @@ def test_an_error_and_a_fatal_one_are_told_apart(ending, monkeypatch):
 def test_an_fmu_that_asks_to_end_is_named(ending):
     with pytest.raises(
         FmuRuntimeError,
-        match=r"^plant, t = 0 s: the FMU asks to end the simulation \(terminateSimulation\) in the step from t = 0 s",
+        match=r"^plant, t = 0 s: the FMU asks to end the simulation \(terminateSimulation\) at 0 s, in the step from ",
     ):
         ending(terminate=True).instance.step(0.0, T)
 
