@@ -23,7 +23,8 @@ def first_example() -> str:
 def bode() -> Figure:
     """Return the Bode diagram of Fig. 3's loop across the path, with its margins marked."""
     from loopwright.diagrams import experiments, margins
-    from loopwright.diagrams.report.plots import bode
+    from loopwright.diagrams.report.variant import look_of
+    from loopwright.diagrams.report_figures import AxisUnits, bode
 
     robot = experiments.compliance().diagram
     variants = {"continuous": robot.continuous(), "sampled_d0": robot}
@@ -32,7 +33,8 @@ def bode() -> Figure:
     found = {key: margins(loop) for key, loop in loops.items()}
     names = {"continuous": "continuous", "sampled_d0": "1 kHz", "sampled_d1": "1 kHz, one sample of delay"}
     titles = {key: f"{name}: phase margin {found[key].phase_margin_deg.value:.1f}°" for key, name in names.items()}
-    return bode("frequency", "v_perp", loops, found, titles).figure
+    looks = {key: look_of(key, i) for i, key in enumerate(loops, 1)}
+    return bode("frequency", "v_perp", loops, found, titles, AxisUnits(), looks).figure
 
 
 def main(folder: Path) -> None:

@@ -93,7 +93,7 @@ def confirm_crossing(r: Realization, c: Crossing, factor: complex, name: str) ->
         p = complex(r.point(np.array(1j * c.omega)))
         distance = np.min(np.abs(r.eigenvalues(factor) - p), initial=np.inf)
         ok = distance <= 1e-5 * abs(p) + 1e-7 * r.scale
-        where = "a closed-loop eigenvalue lies there with this factor"
+        where = "a closed-loop eigenvalue that lies there with this factor"
     if not ok:
         raise ConfirmationError(
             f"found a crossing at {c.omega:.12g} rad/s, but no closed-loop eigenvalue there with the factor "
@@ -168,7 +168,7 @@ def confirm_peak(r: Realization, a: float, b: float, value: float, name: str) ->
             "at the first only. Look at closed_loop_poles for a very narrow resonance, which a scan may miss.",
             block=name,
         )
-    return f"Hamiltonian eigenvalues: level reached at {1 - LEVEL:g}, not at {1 + LEVEL:g} of it"
+    return f"Hamiltonian eigenvalues: the peak reaches {1 - LEVEL:g} of this value, and not {1 + LEVEL:g}"
 
 
 def confirm_delay(r: Realization, features: Features, value: float, others: Sequence[float]) -> str:

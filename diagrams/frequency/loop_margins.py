@@ -292,7 +292,7 @@ class _MarginFinder:
                 block="bandwidth",
             )
         else:
-            how = "Hamiltonian eigenvalues: |T| has this level there, to 0.1 %"
+            how = "Hamiltonian eigenvalues: |T| falls to 1/√2 of its low-frequency value within 0.1 % of this"
         return Number(omega, "rad/s", 1e-10 * omega, how)
 
 

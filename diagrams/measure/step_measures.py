@@ -45,7 +45,7 @@ def measure_step(t: np.ndarray, r: np.ndarray, *, held: bool, target: float | No
     -------
     dict of str to Measured
         All but the peak are NaN where the response has no final value, or goes back to zero. With a target, the times
-        of a response that does not come to it are infinite.
+        of a response that does not come to it are infinite. An overshoot within its tolerance is 0.
 
     Examples
     --------
@@ -70,13 +70,14 @@ def measure_step(t: np.ndarray, r: np.ndarray, *, held: bool, target: float | No
     y = r / final
     off = spread / abs(final)
     over = max(0.0, float(np.max(y)) - 1.0)
+    over_error = off * (1.0 + over) + bend / abs(final) + 1e-9
     outside = np.flatnonzero(np.abs(y - 1.0) > BAND)
     last = int(outside[-1]) if len(outside) else -1
     settling = 0.0 if last < 0 else float(t[last + 1]) if held or last + 1 >= len(t) else _inside(t, y, last)
     rise = _crossing(t, y, 0.9, held=held) - _crossing(t, y, 0.1, held=held)
     return found | {
         "final": Measured(final, spread + 1e-9 * abs(final)),
-        "overshoot": Measured(over, off * (1.0 + over) + bend / abs(final) + 1e-9),
+        "overshoot": Measured(over if over > over_error else 0.0, over_error),
         "settling": Measured(settling, dt + _slack(t, y, off, settling)),
         "rise": Measured(rise, dt),
     }

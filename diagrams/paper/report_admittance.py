@@ -24,7 +24,7 @@ from ..report_writing import Plot, Section, Table, Texts
 from .reduced_loops import FRICTION, OPTIONS, ReducedLoops, each_implementation
 from .report_case import Fig3Case
 from .report_contact import DAMPINGS, SPRING, again, contact_sections, find_contacts
-from .report_figures import RULE, TARGET, WITH_FRICTION, draw_admittances, draw_stability
+from .report_figures import RULE, TARGET, draw_admittances, draw_stability
 
 TEXTS = Texts(__package__, "admittance")
 TITLE = "Admittance and coupled stability"
@@ -55,7 +55,7 @@ def admittance(case: Fig3Case) -> Section:
             return Section("admittance", TITLE, (*not_shown(case), str(error)))
         return Section("admittance", TITLE, (*TEXTS.paragraphs("contacts"), str(case.reduced)), sections=parts)
     titles = {key: v.title for key, v in case.variants.items()}
-    parts = tuple(_side(case.reduced, side, titles) for side in SIDES)
+    parts = tuple(_side(case.reduced, side, titles, case.looks) for side in SIDES)
     return Section("admittance", TITLE, TEXTS.paragraphs("limits"), sections=parts)
 
 
@@ -64,7 +64,7 @@ def not_shown(case: Fig3Case) -> tuple[str, ...]:
     return (*TEXTS.paragraphs("not_shown"), str(case.reduced))
 
 
-def _side(loops: ReducedLoops, side: str, titles: Mapping[str, str]) -> Section:
+def _side(loops: ReducedLoops, side: str, titles: Mapping[str, str], looks: Mapping[str, dict[str, Any]]) -> Section:
     loop = loops.plain[side]
     numbers: dict[str, Number] = {}
     a = loop.admittance
@@ -79,7 +79,7 @@ def _side(loops: ReducedLoops, side: str, titles: Mapping[str, str]) -> Section:
         *_limits(loops, side, numbers, titles),
         *_masses(loops, side, numbers, titles),
     ]
-    plots = (_rendered(loops, side, titles), _map(loops, side, titles))
+    plots = (_rendered(loops, side, titles, looks), _map(loops, side, titles, looks))
     symbol = "along the path, ∥" if side == "par" else "across the path, ⊥"
     text = (*TEXTS.paragraphs("asked", loop=loop), passivity(loop).caveat)
     return Section(side, f"Direction {symbol}", text, tuple(tables), plots, numbers)
@@ -145,7 +145,7 @@ def _masses(loops: ReducedLoops, side: str, numbers: dict[str, Number], titles: 
     yield Table(f"Largest masses, {how}", columns, tuple(rows))
 
 
-def _rendered(loops: ReducedLoops, side: str, titles: Mapping[str, str]) -> Plot:
+def _rendered(loops: ReducedLoops, side: str, titles: Mapping[str, str], looks: Mapping[str, dict[str, Any]]) -> Plot:
     loop = loops.plain[side]
     a = loop.admittance
     centre = math.sqrt(a.stiffness / a.mass) if a.stiffness > 0 else float(a.effective_damping) / a.mass
@@ -154,11 +154,11 @@ def _rendered(loops: ReducedLoops, side: str, titles: Mapping[str, str]) -> Plot
     for name, variant in each_implementation(loop).items():
         curves[name] = (titles.get(name, name), rendered_admittance(variant, w))
     if side in loops.rough:
-        curves[WITH_FRICTION] = (titles.get(ROUGH, ROUGH), rendered_admittance(loops.rough[side], w))
-    return draw_admittances(f"admittance_{side}", w, curves, along=side == "par")
+        curves[ROUGH] = (titles.get(ROUGH, ROUGH), rendered_admittance(loops.rough[side], w))
+    return draw_admittances(f"admittance_{side}", w, curves, looks, along=side == "par")
 
 
-def _map(loops: ReducedLoops, side: str, titles: Mapping[str, str]) -> Plot:
+def _map(loops: ReducedLoops, side: str, titles: Mapping[str, str], looks: Mapping[str, dict[str, Any]]) -> Plot:
     loop = loops.plain[side]
     k, b = np.geomspace(10.0, 1e6, 120), np.geomspace(0.1, 1e3, 41)
 
@@ -171,10 +171,10 @@ def _map(loops: ReducedLoops, side: str, titles: Mapping[str, str]) -> Plot:
         Implementation.DELAYED: (titles.get(DELAYED, DELAYED), _first(k, growth(loop.replace(delay=1)))),
     }
     if side in loops.rough:
-        lines[WITH_FRICTION] = (titles.get(ROUGH, ROUGH), _first(k, growth(loops.rough[side])))
+        lines[ROUGH] = (titles.get(ROUGH, ROUGH), _first(k, growth(loops.rough[side])))
     d = float(loop.admittance.effective_damping) / loop.scale
     lines[RULE] = ("rule of thumb, no delay", (d + b) / (0.5 * loop.sample_time))
-    return draw_stability(f"stability_{side}", k, b, shown, lines, along=side == "par")
+    return draw_stability(f"stability_{side}", k, b, shown, lines, looks, along=side == "par")
 
 
 def _first(k: np.ndarray, growth: np.ndarray) -> np.ndarray:

@@ -235,6 +235,11 @@ class Fig3Case(Case):
                 known[eta, xi] = found if found.rests else None
         return known[eta, xi]
 
+    def name_place(self, place: str) -> str:
+        """Return the name of a point beside the path, by its part of dotted paths."""
+        found = {key: f"η = {1000 * eta:.0f} mm, ξ = {1000 * xi:.0f} mm" for key, eta, xi in self.places()}
+        return found.get(place) or super().name_place(place)
+
     def places(self) -> list[tuple[str, float, float]]:
         """Return points beside the path, η and ξ in m, with the names they have in dotted paths."""
         length = self.path.length

@@ -202,7 +202,7 @@ def _rendered(variants: Mapping[Implementation, Contact], side: str, titles: Map
     assert target is not None  # as there is a filter
     curves: dict[str, tuple[str, np.ndarray]] = {TARGET: ("target", target)}
     curves |= {n: (titles.get(n, n), c.admittance(w).rendered) for n, c in variants.items()}
-    return draw_admittances(f"admittance_{side}", w, curves, along=side == "par")
+    return draw_admittances(f"admittance_{side}", w, curves, {}, along=side == "par")
 
 
 def again(found: StabilityLimit | ContactLimit) -> str:

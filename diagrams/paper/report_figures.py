@@ -7,16 +7,24 @@ from typing import Any
 
 import numpy as np
 
-from ..report import Implementation, look_of
+from ..report import look_of
 from ..report_writing import Plot, Texts
-from ..results import BLUE, DARK, GREEN, VERMILION, new_figure, style
+from ..results import DARK, VERMILION, new_figure, style
 
 TEXTS = Texts(__package__, "admittance")
-TARGET, WITH_FRICTION, RULE = "target", "friction", "rule_of_thumb"
-"""Curves besides those of implementations."""
+TARGET, RULE = "target", "rule_of_thumb"
+"""Curves besides those of variants."""
+DOTTED: Mapping[str, Any] = {"color": DARK, "linestyle": (0, (1, 1.5)), "linewidth": 1.6}
 
 
-def draw_admittances(key: str, w: np.ndarray, curves: Mapping[str, tuple[str, np.ndarray]], *, along: bool) -> Plot:
+def draw_admittances(
+    key: str,
+    w: np.ndarray,
+    curves: Mapping[str, tuple[str, np.ndarray]],
+    looks: Mapping[str, dict[str, Any]],
+    *,
+    along: bool,
+) -> Plot:
     """Draw target and rendered admittances: magnitude, phase, and where the real part is negative.
 
     Parameters
@@ -26,19 +34,17 @@ def draw_admittances(key: str, w: np.ndarray, curves: Mapping[str, tuple[str, np
     w : ndarray
         Frequencies in rad/s.
     curves : mapping of str to (str, ndarray)
-        Title and values of each: of `TARGET`, of implementations, and `WITH_FRICTION`.
+        Title and values of each: of `TARGET`, and of variants by their keys.
+    looks : mapping of str to dict
+        Color and line of each variant, as of `Case.looks`.
     along : bool
         Whether it is the direction along the path.
     """
-    looks: dict[str, dict[str, Any]] = {
-        TARGET: {"color": DARK, "linestyle": (0, (1, 1.5)), "linewidth": 1.6},
-        WITH_FRICTION: {"color": GREEN, "linestyle": "-"},
-    }
     with style():
-        figure = new_figure(4.2)
+        figure = new_figure(3.9)
         top, bottom = figure.subplots(2, 1, sharex=True)
         for i, (name, (title, Y)) in enumerate(curves.items()):
-            look = looks.get(name) or look_of(name, i)
+            look = DOTTED if name == TARGET else looks.get(name) or look_of(name, i)
             top.loglog(w, np.abs(Y), label=title, **look)
             bottom.semilogx(w, np.degrees(np.angle(Y)), **look)
         for y in (-90, 90):
@@ -60,6 +66,7 @@ def draw_stability(
     b: np.ndarray,
     growth: np.ndarray,
     lines: Mapping[str, tuple[str, np.ndarray]],
+    looks: Mapping[str, dict[str, Any]],
     *,
     along: bool,
 ) -> Plot:
@@ -74,16 +81,12 @@ def draw_stability(
     growth : ndarray
         Growth rates in 1/s, for each damping and stiffness.
     lines : mapping of str to (str, ndarray)
-        Title and stiffness of each limit: of implementations, `WITH_FRICTION`, and the `RULE` of thumb.
+        Title and stiffness of each limit: of variants by their keys, and the `RULE` of thumb.
+    looks : mapping of str to dict
+        Color and line of each variant, as of `Case.looks`.
     along : bool
         Whether it is the direction along the path.
     """
-    looks: dict[str, dict[str, Any]] = {
-        Implementation.SAMPLED: {"color": BLUE, "linewidth": 1.6},
-        Implementation.DELAYED: {"color": VERMILION, "linestyle": (0, (4, 2))},
-        WITH_FRICTION: {"color": GREEN},
-        RULE: {"color": DARK, "linestyle": (0, (1, 1.5))},
-    }
     with style():
         figure = new_figure(3.4)
         ax = figure.subplots()
@@ -101,13 +104,13 @@ def draw_stability(
             norm=SymLogNorm(linthresh=0.1, vmin=-1000, vmax=1000),
         )
         for name, (title, x) in lines.items():
-            ax.plot(x, b, label=title, **looks.get(name, {}))
+            ax.plot(x, b, label=title, **(DOTTED if name == RULE else looks.get(name, {})))
         ax.set_xscale("log")
         ax.set_yscale("log")
         ax.set_xlim(k[0], k[-1])
         ax.set_ylim(b[0], b[-1])
         ax.set_xlabel("stiffness k$_e$ of the environment [N/m]")
         ax.set_ylabel("damping b$_e$ [N s/m]")
-        figure.colorbar(filled, ax=ax, label="growth rate σ, sampled d0 [1/s]", ticks=levels, format="%g")
+        figure.colorbar(filled, ax=ax, label="growth rate σ [1/s]", ticks=levels, format="%g")
         ax.legend(loc="upper left")
     return Plot(key, TEXTS.line("map", along=along), figure)

@@ -62,16 +62,19 @@ def limits_tried(case: Fig3Case) -> Section:
         if not math.isfinite(limit.value) or limit.value <= 0.0:
             continue
         loop = each_implementation(loops.kinds(side)[key].loop)[implementation]
+        variant = implementation + loops.kinds(side)[key].suffix
+        title = case.variants[variant].title if variant in case.variants else variant
+        said = TEXTS.line("limit", along=side == "par", tracking="." in key, damping=damping, variant=title)
         try:
             for where, number, predicted in _tried(loop, limit, damping, path):
                 numbers[f"{path}.{where}.growth_rate"] = number
                 k = FACTORS[where] * limit.value
-                rows.append((path, f"{FACTORS[where]:g}", f"{k:.6g} N/m", number, f"{predicted:.6g} 1/s"))
+                rows.append((said, FACTORS[where], k, number, predicted))
         except ConfirmationError:
             raise
         except LoopwrightError as error:
             text.append(f"{path}: {error}")
-    columns = ("limit", "of it", "k_e", "growth rate, measured", "predicted")
+    columns = ("limit", "share of it", "k_e [N/m]", "growth rate, measured", "predicted [1/s]")
     return Section("time_domain", TITLE, tuple(text), (Table("Growth", columns, tuple(rows)),), (), numbers)
 
 

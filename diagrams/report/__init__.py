@@ -1,5 +1,6 @@
 """The general design report."""
 
+from ..report_figures import with_drawing
 from .analysis import (
     ANY_DIAGRAM,
     CLOSED_LOOPS,
@@ -15,16 +16,14 @@ from .analysis import (
 )
 from .case import Basis, Case, InjectionPlan
 from .disks import disk_numbers, disk_range
-from .drawings import with_drawing
 from .parts import MakesSections, ReportKind, ReportPart
-from .plots import look_of
 from .points import point_of
 from .pole_texts import list_poles
 from .section_limits import LIMITS_TITLE
 from .section_poles import POLES_TITLE
 from .section_subject import SUBJECT_TITLE
 from .stability import scatter, without_memory
-from .variant import Implementation, Variant, in_s
+from .variant import Implementation, Variant, in_s, look_of
 
 __all__ = [
     "ANY_DIAGRAM",

@@ -11,9 +11,10 @@ from ...fmus.running import Fmu
 from ..flat import WiredDiagram
 from ..frequency import on_one_thread
 from ..linearization import find_signal
+from ..report_figures import AxisUnits
 from ..report_writing import DEFINITIONS, Report
 from ..requirements import Requirements, read_requirements
-from .case import AxisUnits, Case, ReportedExperiment
+from .case import Case, ReportedExperiment
 from .content_hash import content_hash
 from .parts import HasReportKind, MakesSections, ReportKind, ReportPart
 from .points import STEP

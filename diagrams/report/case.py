@@ -7,12 +7,13 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError
+from ...blocks.core import LoopwrightError, SampleTimeError
 from ..flat import WiredDiagram
 from ..linearization import UnusualStart
+from ..report_figures import AxisUnits
 from ..report_writing import Texts
 from ..requirements import Requirements
-from .variant import Implementation, Variant, in_s
+from .variant import Implementation, Variant, in_s, look_of
 from .wires import wires_on_loops
 
 TEXTS = Texts(__package__, "subject")
@@ -51,32 +52,6 @@ class Basis(NamedTuple):
     suffix: str = ""
     lacks: str = ""
     is_design: bool = True
-
-
-class AxisUnits(NamedTuple):
-    """Units of the axes of frequency responses: plain or in dB, over rad/s or Hz."""
-
-    decibels: bool = False
-    hertz: bool = False
-
-    def magnitude(self, value: Any) -> np.ndarray:
-        """Return magnitudes in the unit of their axis."""
-        data = np.asarray(value, dtype=float)
-        with np.errstate(divide="ignore"):
-            return np.asarray(20 * np.log10(data)) if self.decibels else data
-
-    def frequency(self, omega: Any) -> np.ndarray:
-        """Return frequencies, which are in rad/s, in the unit of their axis."""
-        return np.asarray(omega, dtype=float) / (2 * np.pi if self.hertz else 1.0)
-
-    @property
-    def frequency_label(self) -> str:
-        """Label of the frequency axis."""
-        return "frequency [Hz]" if self.hertz else "ω [rad/s]"
-
-    def magnitude_label(self, name: str) -> str:
-        """Return the label of a magnitude's axis."""
-        return f"{name} [dB]" if self.decibels else name
 
 
 class InjectionPlan(NamedTuple):
@@ -161,6 +136,10 @@ class Case:
         """Return the keys of loops that a part of its own adds to those at the wires."""
         return ()
 
+    def name_place(self, place: str) -> str:
+        """Return the name of a point at which a loop is looked at, by its part of dotted paths."""
+        return place.replace("_", " ")
+
     def own_delay(self) -> int | None:
         """Return the samples of computational delay that the diagram has; None where its subsystems' differ."""
         settings = self.diagram.subsystems
@@ -171,6 +150,13 @@ class Case:
     def actual(self) -> Variant | None:
         """The diagram as it is; None where no variant is."""
         return next((v for v in self.variants.values() if v.is_actual), None)
+
+    @property
+    def looks(self) -> dict[str, dict[str, Any]]:
+        """The color and line of each variant by its key, in all figures."""
+        actual = {key: look_of(key, 0) for key, v in self.variants.items() if v.is_actual}
+        others = (key for key, v in self.variants.items() if not v.is_actual)
+        return actual | {key: look_of(key, i) for i, key in enumerate(others, 1)}
 
     def judged(self) -> Iterator[Variant]:
         """Yield the variants that are held against the requirements, those that can't be analysed as well."""
@@ -233,7 +219,8 @@ class Case:
                 found = variant(found.diagram, LATER * found.model.dt)
             _ = found.model
         except LoopwrightError as error:
-            found.problem = str(error)
+            sampled_only = implementation is Implementation.CONTINUOUS and isinstance(error, SampleTimeError)
+            found.problem = TEXTS.line("sampled_only", block=error.block) if sampled_only else str(error)
             self.notes.append(TEXTS.line("left_out", variant=found.title, problem=found.problem))
         self.variants[found.key] = found
 

@@ -13,9 +13,10 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from ...blocks.core import OptionError
 from ..flat import WiredDiagram
+from ..report_figures import AxisUnits
 from ..report_writing import Section
 from ..requirements import Requirements
-from .case import AxisUnits, Case, ReportedExperiment
+from .case import Case, ReportedExperiment
 from .review import check_names
 
 RADIANS = AxisUnits()

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import LoopwrightError
+from .. import report_figures as figures
 from ..frequency import Number
 from ..linearization import Linearization
 from ..measure import FrequencyResponse, frequency_response
-from ..report_writing import Plot, Section, Table, Texts
-from . import plots as figures
+from ..report_writing import Section, Table, Texts
 from .case import Case
 from .stability import Stability
 from .variant import Implementation, Variant
@@ -67,9 +67,9 @@ def injected(case: Case) -> Section | None:
             shown = (numbers[f"{where}.{n}"] for n in ("deviation", "uncertainty"))
             verdict = "yes" if worst <= CONFIRMED and own <= CONFIRMED else "no"
             rows.append((wire, v.title, span, *shown, verdict))
-            measured[v.title] = (found, L)
+            measured[v.key] = _curve(v.title, found, L)
         if measured:
-            plots.append(_plot(key, wire, measured))
+            plots.append(figures.injected(wire, measured, case.axes, case.looks, f"injection_{key}"))
     if not rows:
         return Section("injection", "Injection check", tuple(text)) if text else None
     text = [*TEXTS.paragraphs("measurement"), *text]
@@ -99,11 +99,8 @@ def _measured(case: Case, v: Variant, wire: str) -> tuple[FrequencyResponse, Lin
     return found, excited.model
 
 
-def _plot(key: str, wire: str, measured: dict[str, tuple[Any, Any]]) -> Plot:
-    """Draw the measured points over the linear model's L."""
-    curves = {}
-    for title, (found, L) in measured.items():
-        w = np.geomspace(found.omega[0], found.omega[-1], 200)
-        points = np.array([complex(np.ravel(v)[0]) for v in np.moveaxis(np.atleast_1d(found.L.frdata), -1, 0)])
-        curves[title] = (w, figures.response(L, w), found.omega, points)
-    return figures.injected(f"injection_{key}", wire, curves)
+def _curve(title: str, found: FrequencyResponse, L: Linearization) -> figures.Measured:
+    """Return the measured points with the linear model's L."""
+    w = np.geomspace(found.omega[0], found.omega[-1], 200)
+    points = np.array([complex(np.ravel(v)[0]) for v in np.moveaxis(np.atleast_1d(found.L.frdata), -1, 0)])
+    return figures.Measured(title, w, figures.response(L, w), found.omega, points)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import LoopwrightError, PeriodicLoopError
+from .. import report_figures as figures
 from ..frequency import (
     Comparison,
     Margins,
@@ -21,7 +22,6 @@ from ..frequency import (
     with_findings,
 )
 from ..report_writing import Section, Table, Texts
-from . import plots as figures
 from .case import Case
 from .disks import several
 from .gang import gang_of_four
@@ -155,10 +155,11 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
         title = f"Margins at {wire} beside python-control's own values"
         tables.append(Table(title, columns, tuple(beside), details=True))
     plain = {at: loops[at] for at in designs}
+    looks = {at: case.looks[at.partition(".")[0]] for at in designs}
     plots = (
-        figures.bode(f"inner_{key}_bode", wire, plain, found, titles, case.axes),
-        figures.nyquist(f"inner_{key}_nyquist", wire, plain, found, titles),
-        figures.sensitivities(f"inner_{key}_sensitivities", wire, plain, found, titles, case.axes),
+        figures.bode(f"inner_{key}_bode", wire, plain, found, titles, case.axes, looks),
+        figures.nyquist(f"inner_{key}_nyquist", wire, plain, found, titles, looks),
+        figures.sensitivities(f"inner_{key}_sensitivities", wire, plain, found, titles, case.axes, looks),
         *gang_of_four(case, key, wire),
     )
     return LoopPart(Section(key, f"Loop at {wire}", tuple(notes), tuple(tables), plots, numbers), own)

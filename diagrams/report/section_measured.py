@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError
+from .. import report_figures as figures
 from ..frequency import Interval, Number, Realization, margins, measured_margins, read_frequency_data
 from ..report_writing import Plot, Section, Table, Texts
-from . import plots as figures
 from .case import Case
 from .variant import Variant
 
@@ -58,8 +58,8 @@ def measured_loops(case: Case, measured: Mapping[str, Any]) -> Section:
             inside = "" if model is None else "yes" if float(model) in interval else "no"
             span = f"{interval.low:.4g} … {interval.high:.4g}"
             rows.append((wire, name.replace("_", " "), numbers[key], span, "" if model is None else model, inside))
+        plots.append(_plot(case, wire, data, L, variant.title))
         if L is not None:
-            plots.append(_plot(wire, data, L))
             values = np.ravel(data.frdata)
             ours = Realization.of(L).response(np.asarray(data.omega, dtype=float))[0]
             far = np.abs(values - ours) / np.abs(ours)
@@ -80,9 +80,12 @@ def _model(variant: Variant, wire: str, text: list[str]) -> tuple[Any, Any]:
         return None, None
 
 
-def _plot(wire: str, data: Any, L: Any) -> Plot:
-    """Draw the measured points over the model's L."""
+def _plot(case: Case, wire: str, data: Any, L: Any, title: str) -> Plot:
+    """Draw the measured points, and the model's L where there is one."""
     omega = np.asarray(data.omega, dtype=float)
-    w = np.geomspace(omega[0], omega[-1], 300)
-    curve = (w, figures.response(L, w), omega, np.ravel(data.frdata))
-    return figures.injected(f"measured_{wire.replace('.', '_')}", wire, {"measured, and the model": curve})
+    w = np.geomspace(omega[0], omega[-1], 300) if L is not None else np.empty(0)
+    model = figures.response(L, w) if L is not None else np.empty(0)
+    own = getattr(data, "uncertainty", None)
+    known = None if own is None else np.broadcast_to(np.abs(np.asarray(own, dtype=float)), omega.shape)
+    curve = figures.Measured(f"model, {title}", w, model, omega, np.ravel(data.frdata), known)
+    return figures.measured(f"measured_{wire.replace('.', '_')}", wire, curve, case.axes)

@@ -25,8 +25,8 @@ def closed_loops(case: Case) -> Section:
             number = Number(slowest, "1/s", scatter(v), "eigenvalues; tolerance by perturbing the matrix")
             number = with_findings(number, v.model.findings_on_loops)
             numbers[f"{v.key}.slowest"] = number
-            rows.append((v.title, len(s), Stability.of(v), number, f"{fastest:.6g} 1/s"))
-    columns = ("variant", "poles", "stable", "largest Re s", "smallest Re s")
+            rows.append((v.title, len(s), Stability.of(v), number, fastest))
+    columns = ("variant", "poles", "stable", "largest Re s", "smallest Re s [1/s]")
     table = Table("Closed loop", columns, tuple(rows), TEXTS.line("closed_loop", limit=ON_THE_LIMIT))
     return Section("poles", POLES_TITLE, (), (table,), (), numbers)
 

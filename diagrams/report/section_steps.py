@@ -11,12 +11,12 @@ import numpy as np
 
 from ...blocks import Saturation
 from ...blocks.core import LoopwrightError
+from .. import report_figures as figures
 from ..flat import WiredDiagram
 from ..frequency import Number, Realization
 from ..measure import StepResponse, measure_step, step_response
 from ..report_writing import Plot, Section, Table, Texts
 from ..requirements import StepLimits
-from . import plots as figures
 from .case import Case
 from .stability import Stability
 from .variant import Variant, in_s
@@ -103,13 +103,13 @@ def steps(case: Case) -> Section | None:
             text += [TEXTS.line("saturated", variant=v.title, wire=test.wire, blocks=saturated)] if saturated else []
             if got.moved > 1e-6:
                 text.append(TEXTS.line("moved", variant=v.title, wire=test.wire, moved=got.moved))
-            found.setdefault(replace(test, limits=None), {})[v.title] = got
+            found.setdefault(replace(test, limits=None), {})[v.key] = got
     if not found:
         return Section("steps", TITLE, tuple(dict.fromkeys(text))) if text else None
     tables = [Table("Step responses", ("step", "variant", "number", "co-simulation", "linear"), tuple(rows))]
     if effort:
         tables.append(Table("Effort", ("step", "variant", "signal", "before", "largest change"), tuple(effort)))
-    plots = [_plot(test, curves) for test, curves in found.items()]
+    plots = [_plot(case, test, curves) for test, curves in found.items()]
     whole = (*TEXTS.paragraphs("responses"), *dict.fromkeys(text))
     return Section("steps", TITLE, whole, tuple(tables), tuple(plots), numbers)
 
@@ -259,7 +259,9 @@ def _how(got: StepResponse) -> str:
     )
 
 
-def _plot(test: StepTest, curves: Mapping[str, StepResponse]) -> Plot:
-    said = _said(test)
+def _plot(case: Case, test: StepTest, curves: Mapping[str, StepResponse]) -> Plot:
+    said, titles = _said(test), {key: case.variants[key].title for key in curves}
     caption = TEXTS.line("figure_to", said=said) if test.output else TEXTS.line("figure", said=said)
-    return Plot(f"steps_{test.key}", caption, figures.step_responses(curves, to_output=bool(test.output)))
+    return Plot(
+        f"steps_{test.key}", caption, figures.step_responses(curves, titles, case.looks, to_output=bool(test.output))
+    )

@@ -11,7 +11,7 @@ import numpy as np
 from ...blocks.core import Block
 from ...fmus.running import Fmu
 from ..frequency import Number
-from ..report_writing import Section, Table, Texts, symbol
+from ..report_writing import Section, Table, Texts, plain, symbol
 from ..results import PointOrigin
 from ..wiring import Wire
 from .case import Case
@@ -23,8 +23,10 @@ CONFIRMED = {PointOrigin.RUN: "the run's own next tick and rates", PointOrigin.T
 """Confirmation of the residual of an operating point."""
 VALUES = frozenset({"value", "values", "initial_value", "final_value", "amplitude", "bias"})
 """Parameters of a source that are in the unit of its signal."""
-MANY = 12
+MANY = 36
 """Entries up to which a parameter is shown."""
+FEW = 4
+"""Entries up to which a parameter is shown with nine digits, else with six."""
 SUBJECT_TITLE = "What was analysed"
 PACKAGES = ("loopwright", "numpy", "scipy", "casadi", "control", "fmpy", "matplotlib")
 
@@ -56,8 +58,8 @@ def subject(case: Case) -> Section:
                 name,
                 rated,
                 subsystem.method if rate is not None else "",
-                subsystem.delay,
-                f"{float(subsystem.offset):g} s",
+                subsystem.delay if rate is not None else "–",
+                f"{float(subsystem.offset):g} s" if rate is not None else "–",
             )
         )
     for path, block in sorted(diagram.blocks.items()):
@@ -130,9 +132,14 @@ def _variants(case: Case) -> Table:
 
 def _shown(value: Any) -> str:
     if isinstance(value, float | np.ndarray) and np.ndim(value) == 0:
-        return f"{float(value):.9g}"
+        return plain(float(value), 9)
     if isinstance(value, np.ndarray):
-        return "(" + ", ".join(_shown(v) for v in value) + ")" if value.size <= 12 else f"array {value.shape}"
+        if value.size > MANY:
+            return "array of " + " × ".join(map(str, value.shape))
+        digits = 9 if value.size <= FEW else 6
+        if value.ndim == 2:
+            return "(" + "; ".join(", ".join(plain(float(v), digits) for v in row) for row in value) + ")"
+        return "(" + ", ".join(plain(float(v), digits) if np.ndim(v) == 0 else _shown(v) for v in value) + ")"
     if callable(value):
         return str(getattr(value, "__name__", type(value).__name__))  # no address in memory
     if hasattr(value, "items"):
@@ -145,9 +152,9 @@ def _plant(path: str, block: Fmu) -> tuple[Any, ...]:
     given = [
         name
         for name, has in (
-            ("directional, co-simulation", d.has_derivatives),
-            ("directional, model exchange", d.model_exchange_has_derivatives),
-            ("states to save", d.can_save),
+            ("derivatives in co-simulation", d.has_derivatives),
+            ("derivatives in model exchange", d.model_exchange_has_derivatives),
+            ("saving of its state", d.can_save),
         )
         if has
     ]

@@ -9,7 +9,7 @@ from typing import Any
 from ...blocks.core import LoopwrightError
 from ..frequency import Number
 from ..linearization import Linearization
-from ..report_writing import Section, Table, Texts, symbol
+from ..report_writing import Judged, Section, Table, Texts, symbol
 from ..requirements import Limit, RequirementResult, Review, Verdict
 from .case import Case
 from .review import weakest
@@ -24,6 +24,8 @@ LOOP_NUMBERS = (
     "phase_margin_deg", "gain_margin_low", "gain_margin_high", "delay_margin_s", "disk_margin", "ms", "bandwidth",
 )  # fmt: skip
 """Numbers of the loops that stand on the first page."""
+DIGITS = 4
+"""Significant digits on the first page; the appendix has more."""
 ALIKE = 0.05
 """Relative difference up to which a margin is hardly changed."""
 ORDER = (Verdict.FAILED, Verdict.UNDECIDED, Verdict.PASSED)
@@ -48,7 +50,8 @@ def summary(case: Case, reviewed: Review | None, numbers: Mapping[str, Number]) 
         text.append(TEXTS.line("no_requirements"))
     else:
         counts = {verdict.name.lower(): len(reviewed.of(verdict)) for verdict in Verdict}
-        text.append(TEXTS.line("verdict", verdict=reviewed.verdict.name, total=len(reviewed.results), **counts))
+        said = TEXTS.line("verdict", verdict=reviewed.verdict.name, total=len(reviewed.results), **counts)
+        text.append(Judged(said, reviewed.verdict))
         tables.append(_requirements(case, reviewed))
     text += _weakest(case, numbers)
     loops = _loops(case, numbers)
@@ -64,7 +67,7 @@ def _requirements(case: Case, reviewed: Review) -> Table:
     ranked = sorted(reviewed.results, key=lambda r: (ORDER.index(r.verdict), _relative(r)))
     rows = tuple(_row(case, result) for result in ranked)
     columns = ("verdict", "requirement", "at", "variant", "required", "found", "distance")
-    return Table("Requirements", columns, rows, TEXTS.line("distance"))
+    return Table("Requirements", columns, rows, TEXTS.line("distance"), digits=DIGITS)
 
 
 def _relative(result: RequirementResult) -> float:
@@ -80,8 +83,9 @@ def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
         number = result.number
         distance = Number(result.distance, number.unit, number.tolerance, number.confirmed_by, findings=number.findings)
     place = case.loop_wires().get(result.loop, result.loop) or (result.detail if result.quantity[:5] == "step." else "")
+    title = variant.title if variant else "–"
     return (
-        said, words_of(result.quantity), place or "whole diagram", variant.title if variant else "–",
+        Judged(said, result.verdict), words_of(result.quantity), place or "whole diagram", title,
         _required(result.limit, unit), result.number if result.number is not None else "–", distance,
     )  # fmt: skip
 
@@ -110,7 +114,7 @@ def _weakest(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
         return
     path, number = found
     alpha = number.value
-    facts: dict[str, Any] = {"wire": _wire(case, path), "alpha": alpha, "place": _place(path)}
+    facts: dict[str, Any] = {"wire": _wire(case, path), "alpha": alpha, "place": case.name_place(_place(path))}
     if path.rpartition(".")[2] != "disk_margin":
         yield TEXTS.line("weakest_modulus", **facts)
         return
@@ -148,7 +152,7 @@ def _wire(case: Case, path: str) -> str:
 
 def _place(path: str) -> str:
     """Return the part of a path between the variant and the number, such as a point of the path."""
-    return " ".join(path.split(".")[3:-1]).replace("_", " ")
+    return ".".join(path.split(".")[3:-1])
 
 
 def _loops(case: Case, numbers: Mapping[str, Number]) -> Table | None:
@@ -165,7 +169,7 @@ def _loops(case: Case, numbers: Mapping[str, Number]) -> Table | None:
     if not found:
         return None
     rows = tuple((ROWS[name], *(values[i] for values in found.values())) for i, name in enumerate(LOOP_NUMBERS))
-    return Table(TEXTS.line("loops"), ("", *found), rows)
+    return Table(TEXTS.line("loops"), ("", *found), rows, digits=DIGITS)
 
 
 def _not_analysed(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:

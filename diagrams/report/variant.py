@@ -13,7 +13,7 @@ import numpy as np
 from ...blocks.core import Finding, LoopwrightError
 from ..flat import WiredDiagram
 from ..linearization import Linearization, linearize
-from ..results import OperatingPoint
+from ..results import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, OperatingPoint
 from .points import point_of
 
 AT_REST = 1e-6
@@ -36,6 +36,22 @@ class Implementation(StrEnum):
     def delay(self) -> int:
         """Samples of computational delay."""
         return 1 if self is Implementation.DELAYED else 0
+
+
+LOOKS: Mapping[str, tuple[str, Any]] = {
+    Implementation.CONTINUOUS: (GREY, "-"),
+    Implementation.SAMPLED: (GREEN, "-"),
+    Implementation.DELAYED: (VERMILION, (0, (4, 2))),
+}
+OTHER = ((ORANGE, (0, (4, 2))), (PURPLE, (0, (1, 1.5))), (DARK, (0, (1, 1.5))))
+
+
+def look_of(key: str, i: int) -> dict[str, Any]:
+    """Return the color and line of the i-th variant of a report; the first, the diagram as it is, is blue."""
+    if i == 0:
+        return {"color": BLUE, "linestyle": "-", "linewidth": 1.7, "zorder": 3}
+    color, line = LOOKS.get(key) or OTHER[i % len(OTHER)]
+    return {"color": color, "linestyle": line}
 
 
 class Cut(StrEnum):

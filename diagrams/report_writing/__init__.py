@@ -2,19 +2,21 @@
 
 from .definitions import DEFINITIONS, read_definitions
 from .files import check_files, write_report
-from .model import Plot, Section, Table
+from .model import Judged, Plot, Section, Table
 from .report import Report
 from .templating import Texts
-from .values import symbol
+from .values import plain, symbol
 
 __all__ = [
     "DEFINITIONS",
+    "Judged",
     "Plot",
     "Report",
     "Section",
     "Table",
     "Texts",
     "check_files",
+    "plain",
     "read_definitions",
     "symbol",
     "write_report",

@@ -7,18 +7,35 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..frequency import Number
-from ..requirements import Review
+from ..requirements import Review, Verdict
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table: a title, column headings, and rows of texts or numbers; one of ``details`` stands in the appendix."""
+    """A table: a title, column headings, and rows of texts or numbers.
+
+    One of ``details`` stands in the appendix. Numbers have ``digits`` significant digits at most, fewer where their
+    tolerance bears no more. Columns without a single entry are not shown.
+    """
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[Any, ...], ...]
     note: str = ""
     details: bool = False
+    digits: int = 6
+
+
+class Judged(str):
+    """A text that is shown in the color of its verdict: a cell of a table, or a paragraph."""
+
+    verdict: Verdict
+
+    def __new__(cls, text: str, verdict: Verdict) -> Judged:
+        """Make a text with its verdict."""
+        made = super().__new__(cls, text)
+        made.verdict = verdict
+        return made
 
 
 @dataclass(frozen=True, eq=False)

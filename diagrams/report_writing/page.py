@@ -209,7 +209,7 @@ def _term(path: str, more: Mapping[str, str]) -> TermView | None:
 def _grouped(texts: Sequence[str]) -> Any:
     """Yield paragraphs and the lists among them, told apart by True, without the marks of their items."""
     for listed, group in groupby(texts, lambda text: text.startswith(ITEM)):
-        yield listed, [text.removeprefix(ITEM) for text in group]
+        yield listed, [text.removeprefix(ITEM) if listed else text for text in group]
 
 
 def _about(meta: Mapping[str, Any]) -> Any:

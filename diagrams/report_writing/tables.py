@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ..frequency import MARK, Number
-from .model import Table
+from .model import Judged, Table
 from .values import cell, is_numeric, mark, quantity, reason, symbol, tolerance_text, value_text
 
-LONG = 30
-"""Rows above which a table may go over to the next page."""
+LONG, LONG_DETAILS = 30, 8
+"""Rows above which a table, or one in the appendix, may go over to the next page."""
 WIDE = 6
 """Columns above which a table is set small."""
 NO_VALUE = "no value"
@@ -63,11 +63,8 @@ class TableView:
     rows: tuple[tuple[CellView, ...], ...]
     note: str
     confirmations: tuple[Confirmation, ...]
-
-    @property
-    def is_long(self) -> bool:
-        """Whether it may go over to the next page."""
-        return len(self.rows) > LONG
+    is_long: bool
+    """Whether it may go over to the next page."""
 
     @property
     def is_wide(self) -> bool:
@@ -95,6 +92,7 @@ class Numbered:
     def view(self, table: Table) -> TableView:
         """Return the next table."""
         self.count += 1
+        table = _without_empty_columns(table)
         columns = range(len(table.columns))
         units = [_common_unit(table, i) for i in columns]
         right = [is_numeric([row[i] for row in table.rows if i < len(row)]) for i in columns]
@@ -106,23 +104,44 @@ class Numbered:
         for above, row in zip([(), *table.rows], table.rows, strict=False):
             cells = []
             for i, value in enumerate(row):
-                again = not right[i] and i < len(columns) - 1 and above[: i + 1] == row[: i + 1]
+                again = (
+                    not right[i]
+                    and not isinstance(value, Judged)
+                    and i < len(columns) - 1
+                    and above[: i + 1] == row[: i + 1]
+                )
                 kind = "again" if again else "right" if right[i] else ""
-                cells.append(self._cell(value, kind, letters, first=i == 0, with_unit=units[i] is None))
+                kind = value.verdict.name.lower() if isinstance(value, Judged) else kind
+                unit = units[i] is None
+                cells.append(self._cell(value, kind, letters, table.digits, first=i == 0, with_unit=unit))
             rows.append(tuple(cells))
         said = tuple(Confirmation(letters.get(kind, ""), _said(*why)) for kind, why in reasons.items() if why[1])
         said += tuple(Confirmation(MARK, text) for text in _left_out(table))
-        return TableView(self.count, table.title, tuple(headings), tuple(rows), table.note, said)
+        is_long = len(rows) > (LONG_DETAILS if table.details else LONG)
+        return TableView(self.count, table.title, tuple(headings), tuple(rows), table.note, said, is_long)
 
-    def _cell(self, value: Any, kind: str, letters: Mapping[str, str], *, first: bool, with_unit: bool) -> CellView:
+    def _cell(
+        self, value: Any, kind: str, letters: Mapping[str, str], digits: int, *, first: bool, with_unit: bool
+    ) -> CellView:
         if not isinstance(value, Number):
             return CellView(cell(value), kind, first)
         path = self.paths.get(id(value)) or self.equal.get(value)
-        text = quantity(value) if with_unit else value_text(value) + mark(value)
+        text = quantity(value, digits) if with_unit else value_text(value, digits) + mark(value)
         why = reason(value) if value.given else f"confirmed by {reason(value)}"
         about = f"{path + ': ' if path else ''}{tolerance_text(value)}; {why}"
         letter = letters.get(_kind(_reason(value)), "")
         return CellView(text, kind, False, True, anchor("n", path) if path else "", about, letter)
+
+
+def _without_empty_columns(table: Table) -> Table:
+    """Return a table without columns that have no entry; the first one stays."""
+    kept = [0] + [
+        i for i in range(1, len(table.columns)) if any(row[i] not in (None, "") for row in table.rows if i < len(row))
+    ]
+    if len(kept) == len(table.columns) or not table.rows:
+        return table
+    rows = tuple(tuple(row[i] for i in kept if i < len(row)) for row in table.rows)
+    return replace(table, columns=tuple(table.columns[i] for i in kept), rows=rows)
 
 
 def anchor(kind: str, key: str) -> str:
@@ -132,7 +151,8 @@ def anchor(kind: str, key: str) -> str:
 
 def _kind(reason: str) -> str:
     """Return how a number was confirmed without the numbers in it."""
-    return re.sub(r"[-−]?\d[\d.]*(?:e[-+]?\d+)?(?:, [-−]?\d[\d.]*(?:e[-+]?\d+)?)*", "…", reason)
+    number = r"[-−]?\d[\d.]*(?:e[-+]?\d+)?(?![\d/])"
+    return re.sub(rf"{number}(?:, {number})*", "…", reason)
 
 
 def _grouped(numbers: Iterable[Number]) -> dict[str, tuple[Number, str]]:

@@ -63,7 +63,7 @@ class Texts:
 
     Examples
     --------
-    >>> Texts("loopwright.diagrams.report", "figures").line("sensitivities", wire="u")
+    >>> Texts("loopwright.diagrams.report_figures", "figures").line("sensitivities", wire="u")
     'Sensitivity S and complementary sensitivity T at u. ○: M_s and M_t.'
     """
 

@@ -55,9 +55,9 @@ def value_text(number: Number, most: int = 6) -> str:
     return plain(value, min(max(digits, 2), most))
 
 
-def quantity(number: Number) -> str:
-    """Return a number with its unit."""
-    text, unit = value_text(number), symbol(number.unit)
+def quantity(number: Number, most: int = 6) -> str:
+    """Return a number with its unit, with so many significant digits at most."""
+    text, unit = value_text(number, most), symbol(number.unit)
     if not unit or text == "–":
         return text + mark(number)
     return text + ("" if unit == "°" else "\u202f") + unit + mark(number)

@@ -301,7 +301,7 @@ def test_a_wrong_limit_is_not_confirmed():
 @pytest.mark.parametrize("wrong", [0.99, 1.01])
 def test_a_wrong_peak_is_not_confirmed(wrong):
     r = Realization.of(triple(20.0))
-    assert "level reached" in confirm.confirm_peak(r, 0.0, 1.0, 9 / 7, "mt")
+    assert "the peak reaches 0.999" in confirm.confirm_peak(r, 0.0, 1.0, 9 / 7, "mt")
     with pytest.raises(ConfirmationError, match="found the peak"):
         confirm.confirm_peak(r, 0.0, 1.0, 9 / 7 * wrong, "mt")
 

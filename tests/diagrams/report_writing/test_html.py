@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from loopwright.blocks import DefinitionError, Gain, OptionError, Sine
 from loopwright.diagrams import Diagram, experiments
 from loopwright.diagrams.frequency.number import Number
-from loopwright.diagrams.report.drawings import with_drawing
+from loopwright.diagrams.report_figures.drawings import with_drawing
 from loopwright.diagrams.report_writing.definitions import definition
 from loopwright.diagrams.report_writing.files import check_files, write_report
 from loopwright.diagrams.report_writing.html import to_html

@@ -33,7 +33,7 @@ def test_every_text_is_used(package, file, macro):
     assert re.search(rf'\.(line|paragraphs)\(\s*"{macro}"', code)
 
 
-@pytest.mark.parametrize("package", ["paper", "report"])
+@pytest.mark.parametrize("package", ["paper", "report", "report_figures"])
 def test_every_text_that_is_asked_for_is_there(package):
     known = {name for of, _, name in macros() if of == package}
     assert set(re.findall(r'TEXTS\.(?:line|paragraphs)\(\s*"(\w+)"', sources(package))) <= known
@@ -60,7 +60,7 @@ def test_a_template_that_asks_for_what_nobody_gave_is_an_error():
     with pytest.raises(jinja2.UndefinedError, match="'nothing' is undefined"):
         environment("loopwright.diagrams.report").from_string("{{ nothing }}").render()
     with pytest.raises(jinja2.UndefinedError, match="'wire'"):
-        Texts("loopwright.diagrams.report", "figures").line("bode")
+        Texts("loopwright.diagrams.report_figures", "figures").line("bode")
 
 
 def test_blank_lines_part_paragraphs_and_ends_of_lines_are_spaces(tmp_path, monkeypatch):

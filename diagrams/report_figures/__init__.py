@@ -1,0 +1,21 @@
+"""Figures of a design report, drawn without pyplot."""
+
+from .axes import AxisUnits
+from .drawings import with_drawing
+from .loop_figures import bode, gang, nyquist, response, sensitivities
+from .measured_figures import Measured, injected, measured
+from .step_figures import step_responses
+
+__all__ = [
+    "AxisUnits",
+    "Measured",
+    "bode",
+    "gang",
+    "injected",
+    "measured",
+    "nyquist",
+    "response",
+    "sensitivities",
+    "step_responses",
+    "with_drawing",
+]

@@ -1,0 +1,71 @@
+"""Axes of a report's figures: their units, and ticks that don't overlap."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+
+DECADES = 2.0
+"""Decades from which on the ticks of a logarithmic axis are powers of ten."""
+
+
+class AxisUnits(NamedTuple):
+    """Units of the axes of frequency responses: plain or in dB, over rad/s or Hz."""
+
+    decibels: bool = False
+    hertz: bool = False
+
+    def magnitude(self, value: Any) -> np.ndarray:
+        """Return magnitudes in the unit of their axis."""
+        data = np.asarray(value, dtype=float)
+        with np.errstate(divide="ignore"):
+            return np.asarray(20 * np.log10(data)) if self.decibels else data
+
+    def frequency(self, omega: Any) -> np.ndarray:
+        """Return frequencies, which are in rad/s, in the unit of their axis."""
+        return np.asarray(omega, dtype=float) / (2 * np.pi if self.hertz else 1.0)
+
+    @property
+    def frequency_label(self) -> str:
+        """Label of the frequency axis."""
+        return "frequency [Hz]" if self.hertz else "ω [rad/s]"
+
+    def magnitude_label(self, name: str) -> str:
+        """Return the label of a magnitude's axis."""
+        return f"{name} [dB]" if self.decibels else name
+
+
+def set_magnitudes(ax: Axes, axes: AxisUnits) -> None:
+    """Set the scale of a magnitude's axis, with few ticks."""
+    from matplotlib.ticker import MaxNLocator
+
+    if axes.decibels:
+        ax.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 4, 5, 10]))
+    else:
+        ax.set_yscale("log")
+        set_powers(ax.yaxis, ax.get_ylim(), 6)
+
+
+def set_powers(axis: Axis, ends: tuple[float, float], most: int) -> None:
+    """Set ticks of a logarithmic axis: powers of ten, and over few decades 1, 2 and 5 times them, as plain numbers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_minor_formatter(NullFormatter())
+    decades = abs(math.log10(ends[1] / ends[0])) if min(ends) > 0 else DECADES
+    if decades >= DECADES:
+        axis.set_major_locator(LogLocator(numticks=most))
+        return
+    subs = (1.0, 2.0, 5.0) if decades > 0.5 else (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
+    axis.set_major_locator(LogLocator(subs=subs, numticks=10 * most))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def set_frequencies(ax: Axes) -> None:
+    """Set few ticks on the frequency axis of a narrow figure, so that none overlap."""
+    set_powers(ax.xaxis, ax.get_xlim(), 5)

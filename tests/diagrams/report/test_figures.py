@@ -1,0 +1,141 @@
+"""Figures and tables of a report: one color for a variant, resonances in full, ticks apart, no empty columns."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Constant, Gain, Integrator, StateSpace, TransferFunction
+from loopwright.diagrams import Diagram, Number, Report, Section, Table, Verdict
+from loopwright.diagrams.report.case import Case
+from loopwright.diagrams.report.gang import gang_of_four
+from loopwright.diagrams.report_figures import AxisUnits, Measured, measured
+from loopwright.diagrams.report_figures.loop_figures import bode, nyquist
+from loopwright.diagrams.report_writing import Judged
+from loopwright.diagrams.report_writing.html import to_html
+from loopwright.diagrams.results import BLUE
+from tests.support import reviewed
+
+
+def resonant(damping=1e-3):
+    """L = 0.2/(s² + 2 ζ s + 1) + 1/s, by its closed form."""
+    body = StateSpace(A=[[0.0, 1.0], [-1.0, -2 * damping]], B=[0.0, 1.0], C=[0.2, 0.0], name="body")
+    sway, drift = Integrator(name="drift"), body
+    error = (Constant(value=0.0, name="r") - (sway.y + drift.y)).named("e")
+    return Diagram("resonant", sway(error), drift(error))
+
+
+def drawn(diagram, wire, kind=bode):
+    """Return the lines of a loop's figure."""
+    case = Case(diagram)
+    (v,) = case.usable()
+    L = v.loop(wire)
+    from loopwright.diagrams import margins
+
+    args = ("k", wire, {v.key: L}, {v.key: margins(L)}, {v.key: v.title})
+    return (kind(*args, AxisUnits(), case.looks) if kind is bode else kind(*args, case.looks)).figure
+
+
+def test_a_resonance_is_drawn_to_its_peak():
+    lines = drawn(resonant(), "e").axes[0].get_lines()
+    w, size = lines[0].get_data()
+    peak = np.abs(0.2 / (2j * 1e-3 + 0.0) + 1 / 1j)  # at ω = 1
+    assert np.max(size) == pytest.approx(peak, rel=1e-2)
+    exact = np.abs(0.2 / (1 - w**2 + 2e-3j * w) + 1 / (1j * w))
+    np.testing.assert_allclose(size, exact, rtol=1e-9)
+    near = w[(w > 0.99) & (w < 1.01)]
+    assert len(near) > 40
+
+
+def test_a_nyquist_curve_has_no_chord_across_an_undamped_resonance():
+    lines = drawn(resonant(0.0), "e", nyquist).axes[-1].get_lines()
+    curve = max(lines, key=lambda line: len(line.get_xdata()))
+    x, y = curve.get_data()
+    assert np.any(np.isnan(x))
+    jumps = np.abs(np.diff(x + 1j * y))
+    size = np.maximum(np.abs(x[:-1]), np.abs(x[1:])) + np.abs(y[:-1])
+    assert np.nanmax(jumps / np.maximum(size, 1.0)) < 1.0  # a chord across would be twice the size
+
+
+def test_a_variant_has_one_color_in_all_figures():
+    for name in ("tank", "crane"):
+        case = Case(getattr(reviewed, name)())
+        looks = case.looks
+        assert looks[case.actual.key]["color"] == BLUE
+        assert len({str(look["color"]) + str(look["linestyle"]) for look in looks.values()}) == len(looks)
+    delayed = Case(reviewed.tank(delay=1))
+    assert delayed.looks["sampled_d1"]["color"] == BLUE  # the diagram as it is
+    assert delayed.looks["sampled_d0"]["color"] != BLUE
+
+
+def test_the_gang_of_four_is_drawn_where_the_whole_loop_goes_through_the_other_wire():
+    assert gang_of_four(Case(reviewed.drive()), "voltage", "controller.voltage") == ()  # the speed loop bypasses it
+    lag, place = TransferFunction(numerator=[2.0], denominator=[0.1, 1.0], name="lag"), Integrator(name="place")
+    u = Gain(gain=3.0, name="gain")(Constant(value=0.0, name="r") - place.y).named("u")
+    (plot,) = gang_of_four(Case(Diagram("single", place(lag(u).named("v")))), "u", "u")
+    left, right = plot.figure.axes
+    w, there = left.get_lines()[0].get_data()
+    s = 1j * w
+    L = 6.0 / (s * (0.1 * s + 1))
+    np.testing.assert_allclose(there, np.abs(2.0 / (0.1 * s + 1) / (1 + L)), rtol=1e-9)
+    np.testing.assert_allclose(right.get_lines()[0].get_ydata(), np.abs(3.0 / s / (1 + L)), rtol=1e-9)
+
+
+@pytest.mark.parametrize("span", [(30.0, 450.0), (1.0, 1.9)])
+def test_ticks_of_frequencies_do_not_overlap(span):
+    w = np.geomspace(*span, 50)
+    figure = measured("m", "u", Measured("model", w, 1 / (1j * w), w, 1 / (1j * w)), AxisUnits()).figure
+    renderer = figure.canvas.get_renderer()
+    figure.draw(renderer)
+    for ax in figure.axes:
+        for axis, side in ((ax.xaxis, "x"), (ax.yaxis, "y")):
+            low, high = sorted(getattr(ax, f"get_{side}lim")())
+            texts = [t for t in axis.get_ticklabels() if t.get_text() and low <= t.get_position()[side == "y"] <= high]
+            boxes = sorted(
+                (getattr(t.get_window_extent(renderer), f"interval{side}") for t in texts), key=lambda b: b[0]
+            )
+            assert len(boxes) >= 2
+            assert all(a[1] < b[0] for a, b in pairwise(boxes)), span
+
+
+def test_measured_points_and_the_model_have_two_colors_and_bars_of_their_uncertainty():
+    w = np.geomspace(0.1, 10.0, 20)
+    data = Measured("model", w, 1 / (1j * w), w, 1.1 / (1j * w), np.full(20, 0.2))
+    left, right = measured("m", "u", data, AxisUnits()).figure.axes
+    model, points = left.get_lines()
+    assert model.get_color() != points.get_color()
+    assert {text.get_text() for text in left.get_legend().get_texts()} == {"model", "measured"}
+    (bars,) = right.collections
+    ends = np.array([segment[:, 1] for segment in bars.get_segments()])
+    np.testing.assert_allclose(ends - -90.0, np.degrees(np.arcsin(0.2)) * np.array([[-1, 1]] * 20), atol=1e-9)
+
+
+def test_a_column_without_entries_is_not_shown():
+    table = Table("t", ("name", "empty", "of"), (("a", "", 1.0), ("b", None, 2.0)))
+    page = to_html(Report("r", (Section("s", "S", (), (table,)),)))
+    assert "empty" not in page
+    assert ">of<" in page.replace("</th>", "<")
+
+
+def test_a_number_has_the_digits_of_its_table():
+    number = Number(84.62914, "deg", 1e-9, "x")
+    for digits, text in ((6, "84.6291°"), (4, "84.63°")):
+        page = to_html(Report("r", (Section("s", "S", (), (Table("t", ("", "v"), (("a", number),), digits=digits),)),)))
+        assert f">{text.rstrip('°')}<" in page
+
+
+def test_verdicts_are_marked_in_the_text_and_in_each_row():
+    row = (Judged("failed", Verdict.FAILED), "x")
+    other = (Judged("failed", Verdict.FAILED), "y")
+    section = Section(
+        "s", "S", (Judged("Verdict: failed.", Verdict.FAILED),), (Table("t", ("verdict", "of"), (row, other)),)
+    )
+    page = to_html(Report("r", (section,)))
+    assert '<p class="verdict failed">Verdict: failed.</p>' in page
+    assert page.count('class="failed"') == 2
+
+
+def test_a_block_that_is_defined_at_samples_has_no_continuous_variant_and_the_report_says_so():
+    case = Case(reviewed.crane())
+    assert case.variants["continuous"].problem.startswith("controller.observer is defined at samples only")
+    assert "sample_time=" not in case.variants["continuous"].problem
