@@ -15,7 +15,7 @@ from .options import Coupling, Scheme
 from .plant_steps import PlantSteps, step_all
 from .plants import Plant
 from .rest import Rest, Sample, never
-from .rollback import Beginning, Rollback, save_plant, texts_of
+from .rollback import Beginning, Rollback, accept_steps, save_plant, texts_of, try_steps
 from .search import Search
 
 SAFETY, SHRINK, GROW = 0.9, 0.2, 4.0
@@ -171,12 +171,18 @@ class CoupledSteps:
             If an iteration does not converge, a communication step gets too short, or a plant fails.
         """
         self._rest.sample = sample
+        if self.coupling.error is not None or self.coupling.scheme == Scheme.ITERATED:
+            try_steps(self._plants.values())
         if self.coupling.error is not None:
             return self._go_adaptively(t, end)
         ended = self._step(t, end, h)
-        self._rest.accept()
+        self._accept()
         self._count(h)
         return ended
+
+    def _accept(self) -> None:
+        self._rest.accept()
+        accept_steps(self._plants.values())
 
     def _count(self, h: float) -> None:
         self.effort.steps += 1
@@ -278,7 +284,7 @@ class CoupledSteps:
                 self._restore(start)
                 ended = self._take_two(now, last)
             if ended is not None:
-                self._rest.accept()
+                self._accept()
                 return ended
             fine = self._w[outs]
             size = self.coupling.error * (links.nominals[outs] + np.abs(fine))
@@ -287,7 +293,7 @@ class CoupledSteps:
             factor = SAFETY * max(estimate, 1e-12) ** (-1.0 / (order + 1))
             taken = last - now
             if estimate <= 1.0:
-                self._rest.accept()
+                self._accept()
                 self._end_before(now, last, end)
                 self._count(taken / 2)
                 self._count(taken / 2)
@@ -335,7 +341,8 @@ class CoupledSteps:
     def _save(self) -> Beginning:
         plants = {path: save_plant(plant) for path, plant in self._plants.items()}
         texts = {path: {port: list(v) for port, v in texts_of(plant).items()} for path, plant in self._plants.items()}
-        saved = Beginning(self._rest.save(), plants, texts, self._w.copy(), self._z.copy())
+        refused = {path: getattr(plant, "refused", None) for path, plant in self._plants.items()}
+        saved = Beginning(self._rest.save(), plants, texts, refused, self._w.copy(), self._z.copy())
         if self._rollback.is_open:
             for path in self._plants:
                 self._restore_plant(path, saved)
@@ -356,6 +363,9 @@ class CoupledSteps:
         plant.restore(saved.plants[path])
         if saved.read is not None:
             self._rollback.check(path, before, saved.read, getattr(saved.plants[path], "t", None))
+        if saved.refused.get(path) is not None:
+            refusing: Any = plant
+            refusing.refused = saved.refused[path]
         for port, changes in texts_of(plant).items():
             changes[:] = saved.texts[path][port]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -85,6 +85,8 @@ class Beginning:
     rest: Any
     plants: dict[str, Any]
     texts: dict[str, dict[str, list[Any]]]
+    refused: dict[str, FmuRuntimeError | None]
+    """Inputs out of their range in earlier steps that are tried with it, by path."""
     w: np.ndarray
     z: np.ndarray
     read: np.ndarray | None = None
@@ -95,6 +97,23 @@ def save_plant(plant: Plant) -> Any:
     """Return the state of a plant, for its ``restore``."""
     save = getattr(plant, "save", None)
     return plant.deserialize(plant.serialize()) if save is None else save()
+
+
+def try_steps(plants: Iterable[Any]) -> None:
+    """Tell plants that the next steps may be taken back, so that a value of an input is not refused before it counts.
+
+    A plant that refuses none has no ``is_trial``.
+    """
+    for plant in plants:
+        if hasattr(plant, "is_trial"):
+            plant.is_trial = True
+
+
+def accept_steps(plants: Iterable[Any]) -> None:
+    """Raise the error of an input that was out of its range in steps that are accepted."""
+    for plant in plants:
+        if getattr(plant, "refused", None) is not None:
+            raise plant.refused
 
 
 def texts_of(plant: Plant) -> Mapping[str, list[Any]]:

@@ -184,9 +184,9 @@ class FmuInstance(StepFailures):
         """Return step, exchange and reading where ports have several types."""
 
         def write(t: float, *, in_step: bool = False) -> None:
+            if in_step and ins.has_limits:  # passes of the initialization may leave the range on their way
+                self.check_limits(ins, t)
             try:
-                if in_step and ins.has_limits:  # passes of the initialization may leave the range on their way
-                    ins.check_limits()
                 status = ins.set()
             except UnfitError as error:
                 raise self.refuse_input(error, t) from None
@@ -281,7 +281,7 @@ class FmuInstance(StepFailures):
         """
         self._check_state(state)
         self.call("restoring its state", self.fmi.set_state, state._handle)
-        self.failed, self._running, self.ends_run = False, state.running, False
+        self.failed, self._running, self.ends_run, self.refused = False, state.running, False, None
         self._now.value, self._width.value = state.t, 0.0
         if self._careful is not None:
             self._careful.return_to(state.t, state.steps)

@@ -138,9 +138,9 @@ class SharedSteps:
         self._spread(t)
 
     def _fill(self, t: float, *, in_step: bool = False) -> None:
+        if in_step and self.ins.has_limits:
+            self.instance.check_limits(self.ins, t)
         try:
-            if in_step and self.ins.has_limits:
-                self.ins.check_limits()
             self.ins.fill()
         except UnfitError as error:
             raise self.instance.refuse_input(error, t) from None

@@ -13,7 +13,7 @@ from ..archive import FmuVariable
 from .fmi_calls import DISCARD, ERROR, FATAL, PENDING, StepCall
 from .loaded_library import LoadedFmu
 from .stepped_instance import SteppedInstance
-from .transfer import OutOfRangeError, UnfitError
+from .transfer import OutOfRangeError, Transfer, UnfitError
 
 NEAR = 1e-6
 """Distance from the end of a step, in steps, within which a time is that end."""
@@ -32,6 +32,10 @@ class StepFailures(LoadedFmu):
     _has_retried = _has_been_off = False
     ends_run = False
     """Whether the FMU has asked to end the simulation."""
+    is_trial = False
+    """Whether a step may be taken back; an input out of its range is then kept in `refused`, and no error yet."""
+    refused: FmuRuntimeError | None = None
+    """Error of an input that was out of its range in a trial step; `restore` takes it back."""
     on_end: Callable[[], None] | None = None
     """Told when the FMU asks to end the simulation at the end of its step; without it the request is an error."""
 
@@ -53,6 +57,16 @@ class StepFailures(LoadedFmu):
         """Return the error of an input that doesn't fit."""
         action, block = ("Limit", "Saturation") if isinstance(error, OutOfRangeError) else ("Convert", "Quantizer")
         return self._unfit(error, t, f"{action} the signal before this input, with {block}, say.")
+
+    def check_limits(self, inputs: Transfer, t: float) -> None:
+        """Refuse inputs out of the range that the FMU states, in a trial step only if it is accepted."""
+        try:
+            inputs.check_limits()
+        except UnfitError as error:
+            refused = self.refuse_input(error, t)
+            if not self.is_trial:
+                raise refused from None
+            self.refused = self.refused or refused
 
     def refuse_output(self, error: UnfitError, t: float) -> FmuRuntimeError:
         """Return the error of an output that doesn't fit."""

@@ -10,7 +10,7 @@ from ..archive import FmuDescription
 from .fmi_calls import FmiCalls, StepCall
 from .fmu_block import FmuBlock
 from .saved_state import FmuState
-from .transfer import UnfitError
+from .transfer import Transfer, UnfitError
 
 R = TypeVar("R")
 
@@ -50,6 +50,9 @@ class SteppedInstance(Protocol):
 
     def check_end(self, t: float, h: float, reached: float) -> None:
         """Raise the error of an FMU that has asked to end the simulation before the end of a step."""
+
+    def check_limits(self, inputs: Transfer, t: float) -> None:
+        """Refuse inputs out of the range that the FMU states."""
 
     def refuse_input(self, error: UnfitError, t: float) -> FmuRuntimeError:
         """Return the error of an input that doesn't fit."""

@@ -272,8 +272,8 @@ class CarefulSteps:
     def _set(self, part: _Part, t: float) -> None:
         if not part.index.size:
             return
+        self.instance.check_limits(part.transfer, t)
         try:
-            part.transfer.check_limits()
             status = part.transfer.set()
         except UnfitError as error:
             raise self.instance.refuse_input(error, t) from None

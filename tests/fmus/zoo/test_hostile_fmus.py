@@ -308,7 +308,8 @@ def test_an_output_that_is_no_number_names_the_port(host, place, fmi, value):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("fmi", "flag", "words"),
-    [(2, "terminate", "terminateSimulation"), (3, "terminate", "terminateSimulation"), (3, "early", "earlyReturn"), (3, "beyond", "lastSuccessfulTime"), (3, "negative", "lastSuccessfulTime"), (3, "nan", "lastSuccessfulTime")],
+    [(2, "terminate", "terminateSimulation"), (3, "terminate", "terminateSimulation"), (3, "early", "earlyReturn"),
+     (3, "beyond", "lastSuccessfulTime"), (3, "negative", "lastSuccessfulTime"), (3, "nan", "lastSuccessfulTime")],
 )  # fmt: skip
 def test_a_step_that_does_not_end_where_it_should_is_told(host, place, fmi, flag, words):
     answer = host.run(zoo_fmu(place, fmi, f"flags {flag} {T}"))
