@@ -1,13 +1,23 @@
-"""The compiled loop: C code of a diagram's ticks, and the master that goes over them."""
+"""The compiled loop: C code of a diagram's ticks and of what happens between them, and the masters that run it."""
 
 from .code import TickCode, compile_ticks, find_obstacle
+from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
+from .hybrid_code import compile_hybrid, find_hybrid_obstacle
 from .loop import CompiledLoop, Outcome, Reason
 
 __all__ = [
+    "FIXED",
+    "CompiledHybrid",
     "CompiledLoop",
+    "HybridOutcome",
+    "HybridReason",
+    "MethodOptions",
     "Outcome",
     "Reason",
+    "Span",
     "TickCode",
+    "compile_hybrid",
     "compile_ticks",
+    "find_hybrid_obstacle",
     "find_obstacle",
 ]

@@ -17,10 +17,13 @@ from ..flat import FlatDiagram, TickPattern
 from ..results import Recorder
 from .workspace import Workspace
 
-_FIRST, _LARGEST = 1000, 2**20  # ticks of a chunk
-_WISHED = 0.05  # s that a chunk takes at least; Ctrl-C and the progress bar have their turn after it
+FIRST, LARGEST_CHUNK = 1000, 2**20
+"""Ticks of a chunk: the first one, and at most."""
+WISHED = 0.05
+"""Seconds that a chunk takes at least; Ctrl-C and the progress bar have their turn after it."""
 _EXACT = 2**53  # up to which every integer is a float64
-_CLOCKS = 16  # up to which sets of clocks are numbered by their bits
+CLOCKS = 16
+"""Clocks up to which sets of them are numbered by their bits."""
 _SIGNS = (
     "Compiled: it has tables or large matrix products, in which signs of zeros may differ from those of an interpreted "
     "run."
@@ -56,7 +59,7 @@ class CompiledTicks:
         self._kind_of = np.full(1 << len(flat.distinct), -1, dtype=np.int32)
         for kind, clocks in enumerate(self._code.functions):
             self._kind_of[sum(1 << i for i, clock in enumerate(flat.distinct) if clock in clocks)] = kind
-        self._chunk = _FIRST
+        self._chunk = FIRST
 
     @property
     def exact(self) -> bool:
@@ -65,8 +68,7 @@ class CompiledTicks:
 
     def reaches(self, last: int) -> bool:
         """Whether times up to a tick are quotients of integers that a float64 holds."""
-        base = self._flat.base
-        return max(base.denominator, last * base.numerator) < _EXACT
+        return is_exact(self._flat, last)
 
     def run(
         self,
@@ -111,8 +113,8 @@ class CompiledTicks:
                 k, rest = following, rest[1:]
                 if arrived(k):
                     return
-            elif perf_counter() - started < _WISHED:
-                self._chunk = min(2 * self._chunk, _LARGEST)
+            elif perf_counter() - started < WISHED:
+                self._chunk = min(2 * self._chunk, LARGEST_CHUNK)
             progress(k * n / d)
 
     def _bind(self, recorder: Recorder) -> CompiledLoop:
@@ -140,7 +142,7 @@ class CompiledTicks:
         """Return the clocks that act at ticks, as places among the compiled functions; −1 where none is."""
         bits = np.zeros(len(ticks), dtype=np.int64)
         for i, clock in enumerate(self._flat.distinct):
-            bits |= _acts(clock, ticks).astype(np.int64) << i
+            bits |= acts(clock, ticks).astype(np.int64) << i
         found: np.ndarray = self._kind_of[bits]
         return found
 
@@ -167,7 +169,13 @@ class CompiledTicks:
         recorder.row(t, workspace.log)
 
 
-def _acts(clock: TickPattern, ticks: np.ndarray) -> np.ndarray:
+def is_exact(flat: FlatDiagram, last: int) -> bool:
+    """Whether times up to a tick are quotients of integers that a float64 holds."""
+    return max(flat.base.denominator, last * flat.base.numerator) < _EXACT
+
+
+def acts(clock: TickPattern, ticks: np.ndarray) -> np.ndarray:
+    """Return at which of some ticks a clock acts."""
     return np.asarray((ticks >= clock.offset) & ((ticks - clock.offset) % clock.every == 0))
 
 
@@ -175,10 +183,10 @@ def kinds_of(flat: FlatDiagram, *, every: bool) -> list[frozenset[TickPattern]]:
     """Return the sets of clocks that act together at some tick, as far as they are found in the first million."""
     clocks = flat.distinct
     period = int(np.lcm.reduce([1, *(clock.every for clock in clocks)]))
-    ticks = np.arange(min(max((clock.offset for clock in clocks), default=0) + period + 1, _LARGEST))
+    ticks = np.arange(min(max((clock.offset for clock in clocks), default=0) + period + 1, LARGEST_CHUNK))
     bits = np.zeros(len(ticks), dtype=np.int64)
     for i, clock in enumerate(clocks):
-        bits |= _acts(clock, ticks).astype(np.int64) << i
+        bits |= acts(clock, ticks).astype(np.int64) << i
     found = [frozenset(c for i, c in enumerate(clocks) if mask >> i & 1) for mask in np.unique(bits).tolist()]
     return [acting for acting in found if acting or every or not clocks]
 
@@ -212,8 +220,8 @@ def _find_run_obstacle(
 ) -> str | None:
     if (found := find_obstacle(flat)) is not None:
         return found
-    if len(flat.distinct) > _CLOCKS:
-        return f"it has {len(flat.distinct)} different clocks, and at most {_CLOCKS} are compiled"
+    if len(flat.distinct) > CLOCKS:
+        return f"it has {len(flat.distinct)} different clocks, and at most {CLOCKS} are compiled"
     if not regular:
         return "an FMU takes longer steps than from one tick to the next, or a coupling is asked for that iterates"
     for path in plants:

@@ -111,7 +111,8 @@ class Continuous(Trials):
             self._driven = np.zeros(flat.plant_inputs.total)
             self._drive = workspace.plain(flat.driven, [self._driven], workspace.trial)
         self.sources = [*announcers(flat), *(exchanged.evaluators.items() if exchanged else ())]
-        self._late = {t: after for _, one in self.sources if isinstance(one, Times) for t, after in one.late.items()}
+        self.late = {t: after for _, one in self.sources if isinstance(one, Times) for t, after in one.late.items()}
+        """Instants at which sources are seen at a time just after."""
 
     # --- the instant that is reached ---------------------------------------------------------------------------------
 

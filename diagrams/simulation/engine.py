@@ -27,6 +27,7 @@ from .view import Position, SimulationView
 from .workspace import Workspace
 
 if TYPE_CHECKING:
+    from .compiled_hybrid import HybridTicks
     from .compiled_ticks import CompiledTicks
 
 
@@ -68,7 +69,7 @@ class Engine:
         self._stops = StopConditions(flat, self.workspace.log, self._find_asking)
         self._passes_on = check_start_exchange(options.start_exchange)
         self._compile = options.compile
-        self._compiled: CompiledTicks | None = None
+        self._compiled: CompiledTicks | HybridTicks | None = None
         self.messages: tuple[str, ...] = ()
         self._can_stop = self._stops.exist or bool(self.exchanged)
         self._tell = on_event
@@ -142,11 +143,19 @@ class Engine:
         if self._compile:
             self._compiled = self._make_compiled()
 
-    def _make_compiled(self) -> CompiledTicks | None:
+    def _make_compiled(self) -> CompiledTicks | HybridTicks | None:
         """Return the ticks in C; None, with a message, where they can't be had."""
+        from .compiled_hybrid import make_hybrid
         from .compiled_ticks import make_compiled
 
         regular = self.steps.regular and self.coupled is None
+        if self.continuous is not None:
+            ticks, message = make_hybrid(
+                self.workspace, self.continuous, self.plants, self.steps, self._stops.entries,
+                every=self.every_tick, regular=regular,
+            )  # fmt: skip
+            self.messages += message
+            return ticks
         found, message = make_compiled(
             self.workspace, self.plants, self._stops.entries, every=self.every_tick, regular=regular
         )
@@ -183,7 +192,9 @@ class Engine:
         workspace, plants, position, row = self.workspace, self.plants, self.position, recorder.row
         try:
             if self._compiled is not None and self._compiled.reaches(last):
-                self._compiled.run(position.tick, last, recorder, arrived=self._arrive, progress=progress)
+                ended = self._compiled.run(position.tick, last, recorder, arrived=self._arrive, progress=progress)
+                if ended is not None:
+                    position.stopped = self._stops.met_at(ended)
                 return
             if self.continuous is None:
                 run_ticks(

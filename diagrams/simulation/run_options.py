@@ -90,9 +90,10 @@ class RunOptions:
         Exchange of values with FMUs while they initialize: until inputs and outputs agree, one pass, or none, where
         inputs keep their start values until the first step. Tools differ in this.
     compile : bool
-        Go from tick to tick in C, with the same results to the last bit: it needs a compiler (the extra ``build``), and
-        a diagram of sampled subsystems and FMUs in this process, without continuous states, algebraic loops and blocks
-        of Python. Where one of these fails, the run is interpreted, and ``run.messages`` says why.
+        Go from tick to tick in C, with the same results to the last bit; with continuous states, within the
+        tolerances. It needs a compiler (the extra ``build``), and a diagram without algebraic loops, blocks of Python,
+        transport delays and FMUs in processes of their own. Where one of these fails, the run is interpreted, and
+        ``run.messages`` says why.
     """
 
     step: float | Fraction | None = None

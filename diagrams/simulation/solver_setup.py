@@ -24,6 +24,12 @@ def remembers(flat: FlatDiagram) -> bool:
     return any(table.blocks[p].memory and not table.is_sampled(table.subsystem_of[p]) for p in flat.checked.traced)
 
 
+def has_guards(flat: FlatDiagram) -> bool:
+    """Whether a block in a continuous subsystem has guards, which are looked at after every step."""
+    table, traced = flat.table, flat.checked.traced
+    return any(traced[p].guards and not table.is_sampled(table.subsystem_of[p]) for p in traced)
+
+
 def absolute_tolerances(flat: FlatDiagram, atol: float, nominals: np.ndarray | None = None) -> Any:
     """Return the absolute tolerance of each continuous state: ``atol`` times its nominal value.
 

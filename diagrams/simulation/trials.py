@@ -26,7 +26,7 @@ class Trials:
     """Next discontinuity in time, infinite without one."""
     _left: float
     """Last time before it."""
-    _late: Mapping[float, float]
+    late: Mapping[float, float]
     _loops: list[int]
     _flow: Callable[[float, np.ndarray], np.ndarray]
     _jacobian: Callable[[float, np.ndarray], np.ndarray] | None
@@ -38,7 +38,7 @@ class Trials:
     """The last trial of the solver at which a rate was not finite."""
 
     def _time(self, t: float) -> float:
-        t = self._left if t >= self._edge else self._late.get(t, t)
+        t = self._left if t >= self._edge else self.late.get(t, t)
         if self.delays is not None:
             self.delays.outputs_at(t, self.workspace.trial.w)
         if self._loops:  # whatever was tried in between: Newton's method starts from the last accepted solution

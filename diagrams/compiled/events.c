@@ -1,0 +1,376 @@
+/* Events between ticks: the domains of indicators, and the search for their changes within a step.
+
+   The rules are those of diagrams/events, which says why: an indicator leaves its domain beyond its hysteresis; one that
+   has just crossed zero has some slack for rounding errors; one that comes close to zero between two instants is followed
+   to where it is closest. A contact, Zeno behaviour, chattering and an indicator that is not finite are left to Python. */
+
+enum { QUIET, EVENT, LOST };
+enum { HALVINGS = 40, BLOCK = 63, MOST = 1024, LATEST = 9, RECENT = 500, SLIDES = 10, ROUNDS = 100 };
+
+static const double CLOSE_TO_END = 1e-3, ROUNDING = 1e-13, SCATTER = 8.0, CLOSE = 1e-11, CONTINUOUS = 1e-9;
+
+typedef struct {
+    int64_t m;                    /* events */
+    tick indicators, jump;        /* at the trial, and at the instant that is reached */
+    double *z, *open, *fired;     /* results of the indicators, argument of the jump */
+    const uint8_t *rising, *falling, *hysteretic, *asks; /* asks: Python lets it fire */
+    const double *hysteresis;
+    const int64_t *own, *own_first; /* integrated states of the event's block: own[own_first[i]] and so on */
+    double spacing, finest, step; /* step: of a method of fixed step, else NaN */
+    int64_t state_size;
+    double *state;                /* the next ones, one after the other */
+    double *domain, *low, *high, *slack, *size, *rounding, *largest, *counts, *latest, *fresh;
+    double *recent;               /* a ring of times at which events fired */
+    int64_t fired_times;
+    double *kept;                 /* copy of state */
+    int64_t kept_times, kept_log;
+    double *log;                  /* time, event, states before and after it */
+    int64_t logged, capacity;
+    double *times, *seen, *gates, *domains; /* of a block of instants */
+    double *x, *x_before, *now, *strict, *values, *motion, *later;
+    uint8_t *fires, *following;
+} watch;
+
+static void keep(watch *w) {
+    memcpy(w->kept, w->state, (size_t)w->state_size * sizeof(double));
+    w->kept_times = w->fired_times;
+    w->kept_log = w->logged;
+}
+
+static void go_back(watch *w) {
+    memcpy(w->state, w->kept, (size_t)w->state_size * sizeof(double));
+    w->fired_times = w->kept_times;
+    w->logged = w->kept_log;
+}
+
+static inline double lowest(const watch *w, int64_t i, double domain, double slack) {
+    if (domain < 0.0) return -INFINITY;
+    return domain > 0.0 ? nextafter(-w->hysteresis[i], INFINITY) - slack : w->low[i] - w->rounding[i];
+}
+
+static inline double highest(const watch *w, int64_t i, double domain, double slack) {
+    if (domain > 0.0) return INFINITY;
+    return domain < 0.0 ? w->hysteresis[i] + slack : w->high[i] + w->rounding[i];
+}
+
+static inline double domain_of(const watch *w, int64_t i, double z, double open, double before, double slack) {
+    if (!(open > 0.5)) return before;
+    return z > highest(w, i, before, slack) ? 1.0 : z < lowest(w, i, before, slack) ? -1.0 : before;
+}
+
+static inline bool fires_at(const watch *w, int64_t i, double before, double now) {
+    return (now > before && w->rising[i]) || (now < before && w->falling[i]);
+}
+
+/* Evaluate the indicators; false if one in an open subsystem is not finite. */
+static bool indicate(watch *w, problem *p, double t, const double *x) {
+    look(p, t, x);
+    call(&w->indicators);
+    for (int64_t i = 0; i < w->m; i++)
+        if (!isfinite(w->z[i]) && w->open[i] > 0.5) return false;
+    return true;
+}
+
+static bool indicate_in(watch *w, problem *p, method *m, double t) {
+    interpolate(m, t, w->x);
+    return indicate(w, p, t, w->x);
+}
+
+/* Write the domains at an instant from those before; where events fire, no slack hides another indicator's change. */
+static bool take_domains(watch *w, const double *before, double *now, uint8_t *fires) {
+    bool any = false, slackens = false;
+    for (int64_t i = 0; i < w->m; i++) {
+        now[i] = domain_of(w, i, w->z[i], w->open[i], before[i], w->slack[i]);
+        fires[i] = fires_at(w, i, before[i], now[i]);
+        any |= fires[i];
+        slackens |= w->slack[i] != 0.0;
+    }
+    if (any && slackens)
+        for (int64_t i = 0; i < w->m; i++) {
+            const double strict = domain_of(w, i, w->z[i], w->open[i], before[i], 0.0);
+            if (!fires[i] && !fires_at(w, i, before[i], strict)) now[i] = strict;
+            fires[i] = fires_at(w, i, before[i], now[i]);
+        }
+    return any;
+}
+
+/* --- within a step ------------------------------------------------------------------------------------------------ */
+
+/* Return the distance of an indicator beyond the border of its domain at a time; `level` is the border that it left. */
+static double value_at(watch *w, problem *p, method *m, int64_t i, double t, bool *lost) {
+    if (!indicate_in(w, p, m, t)) *lost = true;
+    return w->z[i];
+}
+
+/* Return an instant at or just behind a root, on the side of b; Chandrupatla (1997). See events/bracket.py. */
+static double find_root(watch *w, problem *p, method *m, int64_t i, double level, double a, double fa, double b, double fb,
+                        double resolution, bool *lost) {
+    const bool up = fa < 0.0;
+    double part = fa / (fa - fb), x1 = a, f1 = fa, x2 = b, f2 = fb, x3, f3, least = 0.5 * resolution / fabs(b - a);
+    for (int rounds = 0; rounds < 1000 && !*lost; rounds++) {
+        part = fmin(fmax(part, least), 1.0 - least);
+        const double x = x1 + part * (x2 - x1), fx = value_at(w, p, m, i, x, lost) - level;
+        if ((up ? fx >= 0.0 : fx <= 0.0) == (up ? f1 >= 0.0 : f1 <= 0.0)) {
+            x3 = x1, f3 = f1;
+        } else {
+            x3 = x2, f3 = f2;
+            x2 = x1, f2 = f1;
+        }
+        x1 = x, f1 = fx;
+        least = 0.5 * resolution / fabs(x2 - x1);
+        if (!(least < 0.5)) return (up ? f1 >= 0.0 : f1 <= 0.0) ? x1 : x2;
+        const double xi = (x1 - x2) / (x3 - x2), phi = f3 != f2 ? (f1 - f2) / (f3 - f2) : 2.0;
+        if (phi * phi < xi && (1.0 - phi) * (1.0 - phi) < 1.0 - xi)
+            part = f1 / (f2 - f1) * f3 / (f2 - f3) + (x3 - x1) / (x2 - x1) * f1 / (f3 - f1) * f2 / (f3 - f2);
+        else
+            part = 0.5;
+    }
+    *lost = true;
+    return b;
+}
+
+/* Return when an indicator has just left its domain, between a and b, where it has; write how far it is on both sides. */
+static double find_change(watch *w, problem *p, method *m, int64_t i, double a, double b, double domain, double *distance,
+                          bool *lost) {
+    const double low = lowest(w, i, domain, w->slack[i]), high = highest(w, i, domain, w->slack[i]);
+    const double value_a = value_at(w, p, m, i, a, lost), value_b = value_at(w, p, m, i, b, lost);
+    *distance = 0.0;
+    if (!(low <= value_a && value_a <= high)) return a; /* it was taken over at a already; the step begins beyond */
+    const double level = value_b > high ? high : low, za = value_a - level, zb = value_b - level;
+    double t = b, value;
+    if (za == 0.0 || !(za * zb < 0.0)) {
+        while (t - a > fmax(4 * ulp(t), w->finest) && !*lost) {
+            const double middle = 0.5 * (a + t);
+            value = value_at(w, p, m, i, middle, lost);
+            if (low <= value && value <= high)
+                a = middle;
+            else
+                t = middle;
+        }
+    } else {
+        t = find_root(w, p, m, i, level, a, za, b, zb, fmax(4 * ulp(fmax(fabs(a), fabs(b))), w->finest), lost);
+        double ahead = fmax(ulp(t), w->finest);
+        while (t < b && !*lost) {
+            value = value_at(w, p, m, i, t, lost);
+            if (!(low <= value && value <= high)) break;
+            t = fmin(b, t + ahead);
+            ahead *= 2;
+        }
+    }
+    const double below = fmax(a, t - fmax(4 * ulp(t), w->finest));
+    const double here = fabs(value_at(w, p, m, i, t, lost) - level);
+    *distance = fmax(here, fabs(value_at(w, p, m, i, below, lost) - level));
+    return t;
+}
+
+/* Return when an indicator is closest to the other domain, by Brent's method (Algorithms for Minimization, 1973, 5.8). */
+static double find_closest(watch *w, problem *p, method *m, int64_t i, double side, double a, double b, bool *lost) {
+    const double golden = 0.5 * (3.0 - sqrt(5.0)), relative = 1.5e-8;
+    double x = a + golden * (b - a), v = x, u = x, e = 0.0, d = 0.0;
+    double fx = side * value_at(w, p, m, i, x, lost), fv = fx, fu = fx;
+    for (int rounds = 0; rounds < 200 && !*lost; rounds++) {
+        const double middle = 0.5 * (a + b), least = relative * fabs(x) + 1e-300, twice = 2.0 * least;
+        if (fabs(x - middle) <= twice - 0.5 * (b - a)) break;
+        bool section = true;
+        if (fabs(e) > least) {
+            double r = (x - u) * (fx - fv), q = (x - v) * (fx - fu), part = (x - v) * q - (x - u) * r;
+            q = 2.0 * (q - r);
+            if (q > 0.0) part = -part;
+            q = fabs(q);
+            r = e;
+            e = d;
+            if (fabs(part) < fabs(0.5 * q * r) && part > q * (a - x) && part < q * (b - x)) {
+                d = part / q;
+                const double at = x + d;
+                if (at - a < twice || b - at < twice) d = x < middle ? least : -least;
+                section = false;
+            }
+        }
+        if (section) {
+            e = x < middle ? b - x : a - x;
+            d = golden * e;
+        }
+        const double at = fabs(d) >= least ? x + d : x + (d > 0.0 ? least : -least);
+        const double found = side * value_at(w, p, m, i, at, lost);
+        if (found <= fx) {
+            if (at < x)
+                b = x;
+            else
+                a = x;
+            v = u, fv = fu;
+            u = x, fu = fx;
+            x = at, fx = found;
+        } else {
+            if (at < x)
+                a = at;
+            else
+                b = at;
+            if (found <= fu || u == x) {
+                v = u, fv = fu;
+                u = at, fu = found;
+            } else if (found <= fv || v == x || v == u) {
+                v = at, fv = found;
+            }
+        }
+    }
+    return x;
+}
+
+/* Whether an indicator may have been in the other domain between three instants, of which k is the last one. */
+static bool may_dip(const watch *w, int64_t i, int64_t k) {
+    const int64_t m = w->m;
+    const double z0 = w->seen[(k - 2) * m + i], z1 = w->seen[(k - 1) * m + i], z2 = w->seen[k * m + i];
+    if (!(fabs(z1) <= fabs(z0) && fabs(z1) <= fabs(z2)) || (z1 == z0 && z1 == z2)) return false;
+    if (!w->hysteretic[i] && !((z1 > 0.0) == (z0 > 0.0) && (z1 > 0.0) == (z2 > 0.0))) return false;
+    const double h0 = w->times[k - 1] - w->times[k - 2], h1 = w->times[k] - w->times[k - 1];
+    const double slope0 = (z1 - z0) / h0, slope1 = (z2 - z1) / h1, bend = (slope1 - slope0) / (h0 + h1);
+    const double tangent = slope0 + bend * h0, least = z1 - tangent * tangent / (4.0 * bend);
+    if (!isfinite(bend) || bend == 0.0) return false;
+    return !((least > 0.0) == (z1 > 0.0) && fabs(least) > 0.3 * fmax(fabs(z0), fabs(z2)));
+}
+
+/* Note a change that fires between two instants if it is the first one of its kind. */
+static void note_change(watch *w, problem *p, method *m, int64_t i, double a, double b, double *first, bool *lost) {
+    int64_t at = 0;
+    for (int64_t k = 0; w->times[k] <= a; k++) at = k;
+    const double t = find_change(w, p, m, i, a, b, w->domains[at * w->m + i], w->values + i, lost);
+    w->following[i] = 1;
+    *first = fmin(*first, t);
+}
+
+/* Return whether events fire among instants `k` to `n` of a block; write the first time at which some do. */
+static int first_among(watch *w, problem *p, method *method, int64_t k, int64_t n, double *found) {
+    const int64_t m = w->m;
+    for (int64_t j = k; j < n; j++) {
+        double *before = w->domains + (j - 1) * m, *now = w->domains + j * m, *z = w->seen + j * m, first = INFINITY;
+        bool out = false, lost = false;
+        memcpy(now, before, (size_t)m * sizeof(double));
+        for (int64_t i = 0; i < m; i++)
+            out |= domain_of(w, i, z[i], w->gates[j * m + i], before[i], w->slack[i]) != before[i];
+        if (out) { /* as the run will see it, to the last bit */
+            if (!indicate_in(w, p, method, w->times[j])) return LOST;
+            memcpy(z, w->z, (size_t)m * sizeof(double));
+            for (int64_t i = 0; i < m; i++) now[i] = domain_of(w, i, z[i], w->open[i], before[i], w->slack[i]);
+        } else {
+            for (int64_t i = 0; i < m; i++)
+                if (w->slack[i] > 0.0 && fabs(z[i]) > w->slack[i]) w->slack[i] = 0.0;
+        }
+        memset(w->values, 0, (size_t)m * sizeof(double));
+        for (int64_t i = 0; i < m; i++)
+            if (fires_at(w, i, before[i], now[i]))
+                note_change(w, p, method, i, w->times[j - 1], w->times[j], &first, &lost);
+        for (int64_t i = 0; j >= 2 && i < m; i++) {
+            const double side = w->domains[(j - 2) * m + i];
+            if (side == 0.0 || side != before[i] || side != now[i] || !may_dip(w, i, j)) continue;
+            const double t = find_closest(w, p, method, i, side, w->times[j - 2], w->times[j], &lost);
+            if (lost || !indicate_in(w, p, method, t)) return LOST;
+            const double there = domain_of(w, i, w->z[i], w->open[i], side, w->slack[i]);
+            if (there != side && w->times[j - 2] < t && t < w->times[j] && fires_at(w, i, side, there))
+                note_change(w, p, method, i, w->times[j - 2], t, &first, &lost);
+        }
+        if (lost) return LOST;
+        if (first == INFINITY) continue;
+        int64_t at = j - 1;
+        while (at > 0 && w->times[at] > first) at--;
+        if (!indicate_in(w, p, method, first)) return LOST;
+        memcpy(w->domain, w->domains + at * m, (size_t)m * sizeof(double));
+        if (!take_domains(w, w->domain, w->now, w->fires)) return LOST;
+        memcpy(w->domain, w->now, (size_t)m * sizeof(double));
+        for (int64_t i = 0; i < m; i++)
+            if (w->fires[i]) w->slack[i] = fmin(SCATTER * w->values[i], CONTINUOUS * w->size[i]);
+        *found = first;
+        return EVENT;
+    }
+    memcpy(w->domain, w->domains + (n - 1) * m, (size_t)m * sizeof(double));
+    return QUIET;
+}
+
+/* Take notes of the largest values in a block, and of rounding errors where a step begins behind an event. */
+static void note_sizes(watch *w, int64_t n, bool begins) {
+    const int64_t m = w->m, third = HALVINGS / 3;
+    bool clear = begins && n > 1;
+    for (int64_t i = 0; i < m; i++) {
+        double largest = 0.0;
+        for (int64_t j = 0; j < n; j++) largest = fmax(largest, fabs(w->seen[j * m + i]));
+        w->size[i] = largest;
+        w->rounding[i] = ROUNDING * largest;
+        clear = clear && w->domain[i] != 0.0;
+    }
+    if (!begins) return;
+    if (clear) { /* whether all slack is gone before anything is outside: then it makes no difference */
+        int64_t first = n;
+        for (int64_t j = 1; j < n && first == n; j++)
+            for (int64_t i = 0; i < m; i++)
+                if (w->seen[j * m + i] > highest(w, i, w->domain[i], 0.0) ||
+                    w->seen[j * m + i] < lowest(w, i, w->domain[i], 0.0))
+                    first = j;
+        clear = first > 1;
+        for (int64_t i = 0; i < m && clear; i++) {
+            double distance = 0.0;
+            for (int64_t j = 1; j < first; j++) distance = fmax(distance, fabs(w->seen[j * m + i]));
+            clear = distance > fmax(w->slack[i], CONTINUOUS * w->size[i]);
+        }
+    }
+    for (int64_t i = 0; i < m; i++) {
+        if (clear) {
+            w->slack[i] = 0.0;
+            continue;
+        }
+        if (n <= third + 1) continue;
+        double scatter = 0.0;
+        const double z0 = w->seen[i], rise = w->seen[third * m + i] - z0, span = w->times[third] - w->times[0];
+        for (int64_t j = 1; j < third; j++)
+            scatter = fmax(scatter, fabs(w->seen[j * m + i] - z0 - (w->times[j] - w->times[0]) / span * rise));
+        w->slack[i] = fmax(w->slack[i], fmin(SCATTER * scatter, CONTINUOUS * w->size[i]));
+    }
+}
+
+/* Find the first instant in the last step at which events fire: they stand in w->fires then, the domains are new. */
+static int locate(watch *w, problem *p, method *method, double *found) {
+    const double a = method->t_old, b = method->t;
+    const int64_t m = w->m, parts = (int64_t)fmax(4.0, ceil((b - a) / w->spacing));
+    const double h = (b - a) / (double)parts;
+    double head[HALVINGS + 2];
+    int64_t heads = 1, begun = 0, done = 1;
+    const bool fresh = *w->fresh != 0.0;
+    head[0] = a;
+    if (fresh) {
+        for (int k = HALVINGS; k > 0; k--) {
+            const double t = a + h * ldexp(1.0, -k);
+            if (t > head[heads - 1]) head[heads++] = t;
+        }
+    } else if (a + h * CLOSE_TO_END > a) {
+        head[heads++] = a + h * CLOSE_TO_END;
+    }
+    const int64_t total = heads + parts + 1;
+    int64_t width = BLOCK;
+    while (done < total) { /* a block of instants, from the two before them on */
+        const int64_t first = done >= 2 ? done - 2 : 0, end = done + width < total ? done + width : total;
+        for (int64_t j = 0, k = first; k < end; j++, k++) {
+            const int64_t part = k - heads + 1;
+            w->times[j] = k < heads ? head[k] : part < parts ? a + h * (double)part : part == parts ? b - CLOSE_TO_END * h : b;
+            if (begun && j < 2) continue; /* moved there below */
+            if (!indicate_in(w, p, method, w->times[j])) return LOST;
+            memcpy(w->seen + j * m, w->z, (size_t)m * sizeof(double));
+            memcpy(w->gates + j * m, w->open, (size_t)m * sizeof(double));
+        }
+        const int64_t n = end - first, k = done - first;
+        if (!begun)
+            for (int64_t j = 0; j < k; j++) memcpy(w->domains + j * m, w->domain, (size_t)m * sizeof(double));
+        note_sizes(w, n, fresh && !begun);
+        const int result = first_among(w, p, method, k, n, found);
+        if (result != QUIET) return result;
+        if (end < total) {
+            for (int64_t j = 0; j < 2; j++) {
+                memcpy(w->seen + j * m, w->seen + (n - 2 + j) * m, (size_t)m * sizeof(double));
+                memcpy(w->gates + j * m, w->gates + (n - 2 + j) * m, (size_t)m * sizeof(double));
+                memcpy(w->domains + j * m, w->domains + (n - 2 + j) * m, (size_t)m * sizeof(double));
+            }
+            begun = 1;
+        }
+        done = end;
+        width = width < MOST / 2 ? 2 * width : MOST;
+    }
+    *w->fresh = 0.0;
+    return QUIET;
+}

@@ -1,0 +1,126 @@
+/* The loop over ticks with continuous states between them: a method goes from one discontinuity to the next, events are
+   located within its steps, samples between ticks come from its dense output.
+
+   It goes as far as it can and returns at the last point of which everything is known: the states of `l.x` at the time
+   `t`. Python, with the same numbers before it, does the rest of the way to the next tick and says what has happened. */
+
+/* Begin a stretch that ends at a discontinuity, or at the next tick. */
+static double begin_stretch(hybrid *h, progress *g, double end) {
+    problem *p = &h->p;
+    const span *s = g->s;
+    method *m = h->methods[h->active];
+    enter(h, g, h->t);
+    int64_t e = g->e;
+    while (e < s->edges && !is_before(h->t, s->edge[e])) e++;
+    const double edge = e < s->edges && is_before(s->edge[e], end) ? s->edge[e] : end;
+    p->edge = p->stop = edge;
+    p->left = fmax(h->t, left_of(edge));
+    for (int64_t i = 0; i < p->n; i++) m->x[i] = h->l.x[p->where[i]];
+    restart(m, h->t);
+    h->begun = 1;
+    return edge;
+}
+
+/* Go on to the next tick that is landed on; DONE: it is reached. */
+static int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
+    const span *s = g->s;
+    problem *p = &h->p;
+    const int64_t landing = landing_of(g);
+    const double end = landing < s->count ? s->times[landing + 1] : s->beyond;
+    while (h->t < end) {
+        if (!h->begun) begin_stretch(h, g, end);
+        const double edge = p->edge;
+        method *m = h->methods[h->active];
+        if (!h->stepped) {
+            if ((*steps)++ > h->budget || (h->w.m && h->w.logged > h->w.capacity / 2)) return SUSPENDED;
+            keep_instant(h);
+            if (take_step(m) != PASSED) return ask(h, ASK_BETWEEN);
+            if (h->automatic) look_for_stiffness(h, m);
+            h->to = m->t;
+            h->found = 0;
+            if (h->w.m) {
+                const int where = locate(&h->w, p, m, &h->to);
+                if (where == LOST) return ask(h, ASK_BETWEEN);
+                h->found = where == EVENT;
+                if (h->found && m->t == end && end - h->to <= 4 * ulp(end)) h->to = end;
+            }
+            h->stepped = 1;
+        }
+        while (g->i < s->count && !s->lands[g->i]) {
+            const double t = s->times[g->i + 1];
+            if (!(t < h->to || (t == h->to && t < edge && !h->found))) break;
+            if (!has_room(h, g)) return SUSPENDED;
+            interpolate(m, t, m->y);
+            put_states(h, m->y);
+            *h->l.t = t;
+            if (evaluate(&h->l, h->between) != DONE) return ask(h, ASK_BETWEEN);
+            g->out->rows = record(&h->l, t, g->rows, g->out->rows);
+            g->i++;
+            if (is_stopped(&h->l)) {
+                h->t = t;
+                h->inside = 0;
+                return ENDED;
+            }
+        }
+        if (g->i == s->count && landing == s->count) return SUSPENDED;
+        if (!has_room(h, g)) return SUSPENDED; /* the instant itself may be a sample */
+        if (h->found)
+            interpolate(m, h->to, m->y);
+        else
+            memcpy(m->y, m->x, (size_t)m->n * sizeof(double));
+        put_states(h, m->y);
+        *h->l.t = h->to >= edge ? p->left : h->to;
+        if (h->accepts && accept(h) != DONE) return ask(h, ASK_BETWEEN);
+        const double t = h->to;
+        bool happened = h->found;
+        h->stepped = 0;
+        if (h->found && fire(h, t, t) == LOST) return ask(h, ASK_BETWEEN);
+        h->t = t;
+        if (t == edge && edge < end) { /* a discontinuity of a source */
+            keep_instant(h);
+            enter(h, g, t);
+            if (h->w.m) {
+                const int result = settle(h, t, false);
+                if (result == LOST) return ask(h, ASK_BETWEEN);
+                happened |= result == EVENT;
+            }
+            if (evaluate(&h->l, h->between) != DONE) return ask(h, ASK_BETWEEN);
+        }
+        if (t == edge || h->found) h->begun = 0;
+        if (g->i < s->count && !s->lands[g->i] && s->times[g->i + 1] == t && t < end) {
+            g->out->rows = record(&h->l, t, g->rows, g->out->rows);
+            g->i++;
+            if (is_stopped(&h->l)) return h->inside = 0, ENDED;
+        } else if (happened && is_stopped(&h->l)) {
+            g->out->rows = record(&h->l, t, g->rows, g->out->rows);
+            return h->inside = 0, ENDED;
+        }
+        if (h->switched) return LOOK;
+    }
+    return DONE;
+}
+
+/* Go through ticks and the instants between them, as far as it goes. */
+VISIBLE void loopwright_go(hybrid *h, const span *s, double *rows, outcome *out) {
+    progress g = {s, rows, out, 0, 0, -1};
+    int64_t steps = 0;
+    out->rows = 0;
+    out->reason = DONE;
+    while (g.i < s->count) {
+        if (h->l.halt) {
+            out->reason = HALTED;
+            break;
+        }
+        if (!h->inside) {
+            h->inside = 1;
+            h->begun = h->stepped = 0;
+        }
+        if ((out->reason = go_between(h, &g, &steps)) != DONE) break;
+        if (!has_room(h, &g)) {
+            out->reason = SUSPENDED;
+            break;
+        }
+        if ((out->reason = land(h, &g)) != DONE) break;
+    }
+    out->ticks = g.i;
+}

@@ -1,0 +1,321 @@
+"""The compiled loop with continuous states: a method of integration, events and ticks, gone through in C."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..flat import NONE, FlatDiagram, TickPattern
+from .bound import BoundFunction, address
+from .hybrid_code import Compiled, HybridCode, hybrid_master
+from .loop import CompiledLoop, _Loop, _Outcome, _Tick
+
+FIXED = ("euler", "heun", "rk4")
+_KINDS = {"euler": 0, "heun": 1, "rk4": 2, "RK23": 3, "RK45": 3, "DOP853": 4, "Radau": 5}
+_BUDGET = 200_000  # steps of a call, after which Ctrl-C has its turn
+_LOGGED = 2**22  # bytes of events in a call
+_BLOCK = 2100  # instants of a step that are looked at together, and more
+_LATEST, _RECENT = 9, 500
+
+
+class HybridReason(IntEnum):
+    """Reasons for which the loop returns: those of `Reason`, and more."""
+
+    DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED, SUSPENDED, ASK_BETWEEN, ASK_TICK, ENDED, LOOK = range(11)
+
+
+def _fields(kind: Any, names: str) -> list[tuple[str, Any]]:
+    return [(name, kind) for name in names.split()]
+
+
+_INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+
+
+class _Problem(ctypes.Structure):
+    _fields_ = [
+        *_fields(_INT, "n width"), ("where", _AT), ("flow", _Tick), ("slope", _Tick),
+        *_fields(_AT, "t x slopes"), *_fields(_REAL, "stop edge left at late"), *_fields(_INT, "rates jacobians"),
+    ]  # fmt: skip
+
+
+class _Method(ctypes.Structure):
+    _fields_ = [
+        *_fields(_INT, "kind n stages order extra"),
+        *_fields(_AT, "A B C E E3 P A_extra C_extra atol"),
+        *_fields(_REAL, "rtol longest exponent"),
+        ("of", _AT),
+        *_fields(_REAL, "planned t t_old h start"),
+        *_fields(_INT, "count done steps rejected segment"),
+        ("mark", _REAL),
+        *_fields(ctypes.c_int32, "sliver prepared"),
+        *_fields(_AT, "x x_old f y g K D J lu lu_complex Z W F error scale pivots pivots_complex"),
+        *_fields(_REAL, "h_of_lu h_before error_before tolerance"),
+        *_fields(ctypes.c_int32, "has_lu has_slope slope_is_new predicts"),
+    ]
+
+
+class _Watch(ctypes.Structure):
+    _fields_ = [
+        ("m", _INT), ("indicators", _Tick), ("jump", _Tick),
+        *_fields(_AT, "z open fired rising falling hysteretic asks hysteresis own own_first"),
+        *_fields(_REAL, "spacing finest step"), ("state_size", _INT), ("state", _AT),
+        *_fields(_AT, "domain low high slack size rounding largest counts latest fresh recent"), ("fired_times", _INT),
+        ("kept", _AT), *_fields(_INT, "kept_times kept_log"), ("log", _AT), *_fields(_INT, "logged capacity"),
+        *_fields(_AT, "times seen gates domains x x_before now strict values motion later fires following"),
+    ]  # fmt: skip
+
+
+class _Hybrid(ctypes.Structure):
+    _fields_ = [
+        ("l", _Loop), ("p", _Problem), ("w", _Watch), ("methods", _AT * 2),
+        *_fields(_INT, "active automatic accepts between budget inside begun stepped"), *_fields(_REAL, "t to"),
+        *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
+        *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT),
+    ]  # fmt: skip
+
+
+class _Span(ctypes.Structure):
+    _fields_ = [
+        ("count", _INT), *_fields(_AT, "times widths kinds lands"), ("beyond", _REAL), ("edges", _INT),
+        *_fields(_AT, "edge late"), ("room", _INT),
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class MethodOptions:
+    """A method of integration.
+
+    Attributes
+    ----------
+    name : str
+        Its name: "euler", "heun", "rk4", "RK23", "RK45", "DOP853" or "Radau".
+    rtol : float
+        Relative tolerance.
+    atol : ndarray, shape (n,)
+        Absolute tolerances.
+    longest : float
+        Longest step in s; of a method of fixed step, its step.
+    """
+
+    name: str
+    rtol: float
+    atol: np.ndarray
+    longest: float
+
+
+class Span(NamedTuple):
+    """Ticks and instants that are gone through in one call.
+
+    Attributes
+    ----------
+    times : ndarray, shape (n + 1,)
+        Time from which they go, and of each of them, in s.
+    widths : ndarray, shape (n,)
+        Length of each, in s.
+    kinds : ndarray, shape (n,), of int32
+        Clocks that act at each of them, as places in `CompiledHybrid.kinds`.
+    lands : ndarray, shape (n,), of uint8
+        0 where the instant is recorded from a step beyond it.
+    beyond : float
+        Time of the first one after them that is landed on, in s.
+    edges, late : ndarray
+        Discontinuities of sources in s, and when they are seen at the instant itself.
+    """
+
+    times: np.ndarray
+    widths: np.ndarray
+    kinds: np.ndarray
+    lands: np.ndarray
+    beyond: float
+    edges: np.ndarray
+    late: np.ndarray
+
+
+class HybridOutcome(NamedTuple):
+    """Where and why the loop has returned; see `Outcome`.
+
+    ``t`` is the time in s that the states have reached.
+    """
+
+    ticks: int
+    rows: int
+    reason: HybridReason
+    plant: int
+    stage: int
+    status: int
+    t: float
+
+
+class CompiledHybrid:
+    """The loop over ticks with continuous states, bound to the numbers of a run.
+
+    Parameters
+    ----------
+    code : HybridCode
+        The functions.
+    flat : FlatDiagram
+        The diagram.
+    loop : CompiledLoop
+        Its ticks, bound to the run.
+    arguments : sequence of ndarray
+        The vectors (t, x, w, p) of the run.
+    x_next : ndarray
+        Where jumps write the next states.
+    methods : sequence of MethodOptions
+        The method, and, where it may be changed for one that is made for stiff problems, that one.
+    accepts : bool
+        Whether blocks are to be evaluated after every step: they remember something, have guards, or FMUs read them.
+    """
+
+    def __init__(
+        self,
+        code: HybridCode,
+        flat: FlatDiagram,
+        loop: CompiledLoop,
+        arguments: Sequence[np.ndarray],
+        x_next: np.ndarray,
+        methods: Sequence[MethodOptions],
+        *,
+        accepts: bool,
+    ):
+        self._kept: list[Any] = [code, loop, arguments, x_next]
+        self.kinds: Mapping[frozenset[TickPattern], int] = loop.kinds
+        n, width = flat.continuous.size, flat.width
+        _, x, w, p = arguments
+        trial = [np.zeros(1), x.copy(), w, p]
+        where = self._own(flat.continuous.astype(np.int64))
+        slopes = np.zeros(n * n if "slope" in code.between else 0)
+        self._hybrid = hybrid = _Hybrid(l=loop._loop, automatic=len(methods) > 1, accepts=accepts, budget=_BUDGET)
+        hybrid.between = self.kinds[NONE]
+        hybrid.p = _Problem(
+            n=n,
+            width=width,
+            where=where,
+            flow=self._bind(code.between["flow"], trial, [np.zeros(n)]),
+            t=self._own(trial[0]),
+            x=self._own(trial[1]),
+            slopes=self._own(slopes),
+        )
+        if slopes.size:
+            hybrid.p.slope = self._bind(code.between["slope"], trial, [slopes])
+        of = ctypes.addressof(hybrid) + _Hybrid.p.offset
+        self.methods = [self._method(options, n, of) for options in methods]
+        for i, method in enumerate(self.methods):
+            hybrid.methods[i] = ctypes.addressof(method)
+        hybrid.before = self._own(np.zeros(width))
+        hybrid.outputs = flat.log.total
+        taken = [flat.taken_at(clocks) for clocks in self.kinds]
+        hybrid.taken = self._own(np.concatenate([np.zeros(0), *taken]).astype(np.int64))
+        hybrid.taken_first = self._own(np.cumsum([0, *map(len, taken)]).astype(np.int64))
+        hybrid.taken_states = self._own(np.zeros(width))
+        self._outcome = _Outcome()
+        self._run = hybrid_master()["loopwright_go"]
+        self._run.restype = None
+
+    def _own(self, values: np.ndarray) -> int | None:
+        self._kept.append(values)
+        return address(values)
+
+    def _bind(self, function: Compiled, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Any:
+        bound = BoundFunction(function.function, function.address, arguments, results)
+        self._kept.append(bound)
+        return bound.structure
+
+    def _method(self, options: MethodOptions, n: int, of: int) -> _Method:
+        import scipy.integrate
+
+        name = options.name
+        made = _Method(kind=_KINDS[name], n=n, of=of, rtol=options.rtol, longest=options.longest, planned=np.nan)
+        made.atol = self._own(np.ascontiguousarray(np.broadcast_to(options.atol, (n,)), dtype=float))
+        if name in ("RK23", "RK45", "DOP853"):
+            of_scipy = getattr(scipy.integrate, name)
+            stages = made.stages = of_scipy.n_stages
+            made.exponent = of_scipy.error_estimator_order
+            A = np.zeros((stages, stages))
+            A[:, : of_scipy.A.shape[1]] = of_scipy.A
+            made.A, made.B, made.C = (self._own(np.array(a, dtype=float)) for a in (A, of_scipy.B, of_scipy.C))
+            if name == "DOP853":
+                made.extra, made.order = len(of_scipy.C_EXTRA), 7
+                made.E, made.E3, made.P = (
+                    self._own(np.array(a, dtype=float)) for a in (of_scipy.E5, of_scipy.E3, of_scipy.D)
+                )
+                made.A_extra, made.C_extra = (
+                    self._own(np.array(a, dtype=float)) for a in (of_scipy.A_EXTRA, of_scipy.C_EXTRA)
+                )
+            else:
+                made.order = of_scipy.P.shape[1]
+                made.E, made.P = (self._own(np.array(a, dtype=float)) for a in (of_scipy.E, of_scipy.P))
+        elif name == "Radau":
+            made.order, made.exponent = 3, 3
+            made.tolerance = max(10 * np.finfo(float).eps / options.rtol, min(0.03, options.rtol**0.5))
+            made.J, made.lu, made.lu_complex = (self._own(np.zeros(k * n * n)) for k in (1, 1, 2))
+            made.Z, made.W, made.F = (self._own(np.zeros(3 * n)) for _ in range(3))
+            made.error, made.scale = (self._own(np.zeros(n)) for _ in range(2))
+            made.pivots, made.pivots_complex = (self._own(np.zeros(n, dtype=np.int64)) for _ in range(2))
+        for field in ("x", "x_old", "f", "y", "g"):
+            setattr(made, field, self._own(np.zeros(n)))
+        made.K, made.D = self._own(np.zeros(17 * n)), self._own(np.zeros(7 * n))
+        return made
+
+    # --- going on ----------------------------------------------------------------------------------------------------
+
+    def begin(self, t: float) -> None:
+        """Begin an interval at a tick, or at any instant between two, that the run has reached."""
+        self._hybrid.inside, self._hybrid.t = 0, t
+
+    def plan(self, steps: Sequence[float | None]) -> None:
+        """Let the methods take steps of some lengths in s next; None: they choose their first step."""
+        for method, step in zip(self.methods, steps, strict=True):
+            method.planned = np.nan if step is None else step
+
+    @property
+    def planned(self) -> list[float | None]:
+        """Steps in s that the methods would take next."""
+        return [None if np.isnan(method.planned) else float(method.planned) for method in self.methods]
+
+    @property
+    def skip(self) -> int:
+        """Samples to leave out before the next one that is kept."""
+        return int(self._hybrid.l.skip)
+
+    @skip.setter
+    def skip(self, count: int) -> None:
+        self._hybrid.l.skip = count
+
+    @property
+    def counts(self) -> tuple[int, int, int, int]:
+        """Steps that were taken and rejected, and evaluations of the rates and of their derivative."""
+        steps, rejected = (sum(getattr(m, name) for m in self.methods) for name in ("steps", "rejected"))
+        return steps, rejected, self._hybrid.p.rates, self._hybrid.p.jacobians
+
+    def run(self, span: Span, rows: np.ndarray) -> HybridOutcome:
+        """Go through ticks and instants between them, at most as many as there are rows to be written.
+
+        Parameters
+        ----------
+        rows : ndarray, shape (m, 1 + width)
+            Samples: their time in s, then their values.
+        """
+        given = _Span(
+            count=len(span.widths),
+            times=address(span.times),
+            widths=address(span.widths),
+            kinds=address(span.kinds),
+            lands=address(span.lands),
+            beyond=span.beyond,
+            edges=len(span.edges),
+            edge=address(span.edges),
+            late=address(span.late),
+            room=len(rows),
+        )
+        at = ctypes.byref
+        self._run(at(self._hybrid), at(given), ctypes.c_void_p(address(rows)), at(self._outcome))
+        found = self._outcome
+        return HybridOutcome(
+            found.ticks, found.rows, HybridReason(found.reason), found.plant, found.stage, found.status, self._hybrid.t
+        )

@@ -1,0 +1,280 @@
+/* One instant of a run with continuous states: its values from the right, the events that fire there, the tick. */
+
+/* Reasons, after those of the loop over ticks. */
+enum { SUSPENDED = HALTED + 1, ASK_BETWEEN, ASK_TICK, ENDED, LOOK };
+
+/* Ticks and instants to be recorded. */
+typedef struct {
+    int64_t count;
+    const double *times, *widths; /* times[0] is where they begin; widths in s since the tick before */
+    const int32_t *kinds;
+    const uint8_t *lands;         /* 0: an instant that is recorded from the dense output */
+    double beyond;                /* first tick after them that is landed on */
+    int64_t edges;
+    const double *edge, *late;    /* discontinuities of sources; when they are seen at the time itself */
+    int64_t room;                 /* rows that can be written */
+} span;
+
+typedef struct hybrid {
+    loop l;
+    problem p;
+    watch w;
+    method *methods[2]; /* one that is not stiff, and one that is for where it is */
+    int64_t active, automatic, accepts, between, budget;
+    int64_t inside;     /* whether an interval between two ticks has begun */
+    int64_t begun, stepped;
+    double t;           /* time that the states have reached */
+    double to;          /* end of the step that is taken, at an event perhaps */
+    int64_t found;
+    int64_t hits, misses, easy;
+    double *before;     /* states that can be gone back to */
+    int64_t outputs;    /* entries of the log before those of the states */
+    const int64_t *taken, *taken_first; /* states that a tick of each kind renews */
+    double *taken_states;
+    int64_t switched;   /* 1: stiff, it seems; 2: no longer */
+} hybrid;
+
+typedef struct {
+    const span *s;
+    double *rows;
+    outcome *out;
+    int64_t i, e, landing;
+} progress;
+
+/* Return the tick that is landed on next, behind the instants of the span if it is not among them. */
+static int64_t landing_of(progress *g) {
+    if (g->landing < g->i)
+        for (g->landing = g->i; g->landing < g->s->count && !g->s->lands[g->landing];) g->landing++;
+    return g->landing;
+}
+
+/* Stand at an instant, beyond any discontinuity there. */
+static void enter(hybrid *h, progress *g, double t) {
+    problem *p = &h->p;
+    const span *s = g->s;
+    p->edge = p->left = INFINITY;
+    while (g->e < s->edges && s->edge[g->e] < t) g->e++;
+    p->at = NAN;
+    if (g->e < s->edges && s->edge[g->e] == t) p->at = t, p->late = s->late[g->e];
+    *h->l.t = t;
+    memcpy(p->x, h->l.x, (size_t)h->l.states * sizeof(double));
+}
+
+static void put_states(hybrid *h, const double *x) {
+    for (int64_t i = 0; i < h->p.n; i++) h->l.x[h->p.where[i]] = x[i];
+}
+
+/* Evaluate everything at the present instant between ticks; take over what blocks remember, if asked for. */
+static int64_t accept(hybrid *h) {
+    if (evaluate(&h->l, h->between) != DONE) return NOT_OK;
+    memcpy(h->l.x, h->l.x_next, (size_t)h->l.states * sizeof(double));
+    memcpy(h->p.x, h->l.x, (size_t)h->l.states * sizeof(double));
+    return DONE;
+}
+
+static bool has_room(const hybrid *h, const progress *g) { return h->l.skip || g->out->rows < g->s->room; }
+
+
+static void look_for_stiffness(hybrid *h, const method *m) {
+    (void)h;
+    (void)m;
+}
+
+/* --- events that fire ---------------------------------------------------------------------------------------------- */
+
+static double *here_states(hybrid *h, double *x) {
+    for (int64_t i = 0; i < h->p.n; i++) x[i] = h->l.x[h->p.where[i]];
+    return x;
+}
+
+/* Write the indicators at an instant, and their changes in one and in two steps of Euler's method. */
+static bool move_on(hybrid *h, double t, double *out) {
+    watch *w = &h->w;
+    problem *p = &h->p;
+    method *m = h->methods[h->active];
+    const int64_t n = p->n, count = w->m;
+    double *x = here_states(h, w->x);
+    for (int k = 0; k < 3; k++) {
+        if (!indicate(w, p, t, x)) return false;
+        for (int64_t i = 0; i < count; i++) out[k * count + i] = k ? w->z[i] - out[i] : w->z[i];
+        if (k == 2) break;
+        rate(p, t, x, m->K);
+        for (int64_t i = 0; i < n; i++) x[i] += w->spacing * m->K[i];
+    }
+    return true;
+}
+
+/* Whether a jump has left an indicator in contact, or might have: its motion then leads on beyond. */
+static bool is_contact(const watch *w, const problem *p, const double *x, const double *before, int64_t i) {
+    const int64_t m = w->m;
+    const double *old = w->motion, *new = w->motion + 3 * m, side = w->domain[i];
+    if (side * new[i] < 0.0 || fabs(new[i]) > fabs(old[i]) || !(side * new[2 * m + i] > 0.0)) return false;
+    bool moved = false;
+    for (int64_t j = w->own_first[i]; j < w->own_first[i + 1]; j++) moved |= x[w->own[j]] != before[w->own[j]];
+    return moved && new[m + i] != old[m + i];
+}
+
+/* Note that an event fires; false if they pile up: chattering, Zeno behaviour, or a sliding mode of a fixed step. */
+static bool count_event(watch *w, int64_t i, double t) {
+    double *latest = w->latest + LATEST * i;
+    int64_t count = (int64_t)w->counts[i];
+    if (count) w->largest[i] = fmax(w->largest[i], t - latest[count - 1]);
+    if (count == LATEST)
+        memmove(latest, latest + 1, (LATEST - 1) * sizeof(double));
+    else
+        w->counts[i] = (double)++count;
+    latest[count - 1] = t;
+    if (count < LATEST || t - latest[LATEST - 2] > 1e-6 * w->largest[i]) return true;
+    bool shrinks = true;
+    for (int k = 1; k < LATEST; k++) {
+        const double span = latest[k] - latest[k - 1];
+        shrinks &= span > 1e3 * ulp(t) && (k < 2 || span < 1.5 * (latest[k - 1] - latest[k - 2]));
+    }
+    return !shrinks;
+}
+
+static bool count_instant(watch *w, double t) {
+    w->recent[w->fired_times++ % RECENT] = t;
+    if (w->fired_times >= RECENT && t - w->recent[w->fired_times % RECENT] < 1e-8 * (1.0 + fabs(t))) return false;
+    if (isnan(w->step) || w->fired_times < SLIDES) return true;
+    return t - w->recent[(w->fired_times - SLIDES) % RECENT] > 1e-9 * w->step;
+}
+
+/* Let the events in w->fires fire at t, and those that they make fire; jumps are evaluated at `at`, a few ulps later
+   perhaps. LOST: Python has to; nothing that has happened here counts then. */
+static int fire(hybrid *h, double t, double at) {
+    watch *w = &h->w;
+    problem *p = &h->p;
+    const int64_t width = h->l.states, row = 2 + 2 * width;
+    for (int round = 0; round < ROUNDS; round++) {
+        bool moves = false;
+        int64_t count = 0;
+        for (int64_t i = 0; i < w->m; i++) {
+            w->fired[i] = w->fires[i];
+            if (!w->fires[i]) continue;
+            if (w->asks[i]) return LOST;
+            moves |= w->own_first[i] < w->own_first[i + 1];
+            count++;
+        }
+        if (w->logged + count > w->capacity) return LOST;
+        memcpy(w->following, w->fires, (size_t)w->m);
+        here_states(h, w->x_before);
+        if (moves && !move_on(h, at, w->motion)) return LOST;
+        double *log = w->log + w->logged * row;
+        for (int64_t i = 0; i < w->m; i++) {
+            if (!w->fires[i]) continue;
+            log[0] = t;
+            log[1] = (double)i;
+            memcpy(log + 2, h->l.x, (size_t)width * sizeof(double));
+            log += row;
+        }
+        call(&w->jump);
+        memcpy(h->l.x, h->l.x_next, (size_t)width * sizeof(double));
+        memcpy(p->x, h->l.x, (size_t)width * sizeof(double));
+        *w->fresh = 1.0;
+        for (int64_t i = 0; i < w->m; i++) {
+            if (!w->fires[i]) continue;
+            memcpy(w->log + w->logged++ * row + 2 + width, h->l.x, (size_t)width * sizeof(double));
+            if (!count_event(w, i, t)) return LOST;
+        }
+        if (!count_instant(w, t)) return LOST;
+        if (moves) {
+            if (!move_on(h, at, w->motion + 3 * w->m)) return LOST;
+            here_states(h, w->x);
+            for (int64_t i = 0; i < w->m; i++)
+                if (w->fires[i] && is_contact(w, p, w->x, w->x_before, i)) return LOST;
+        }
+        if (!indicate(w, p, at, here_states(h, w->x))) return LOST;
+        const bool again = take_domains(w, w->domain, w->now, w->fires);
+        memcpy(w->domain, w->now, (size_t)w->m * sizeof(double));
+        if (!again) return accept(h) == DONE ? EVENT : LOST;
+    }
+    return LOST;
+}
+
+/* Fire at a tick what changes its domain within a few ulps of time. */
+static int fire_ahead(hybrid *h, double t) {
+    watch *w = &h->w;
+    problem *p = &h->p;
+    method *m = h->methods[h->active];
+    bool near = false, any = false;
+    for (int64_t i = 0; i < w->m; i++) near |= w->size[i] > 0.0 && fabs(w->later[i]) <= CLOSE * w->size[i];
+    if (!near || !(t > 0.0)) return QUIET;
+    const double later = t + 4 * ulp(t);
+    double *x = here_states(h, w->x);
+    rate(p, t, x, m->K);
+    for (int64_t i = 0; i < p->n; i++) x[i] += (later - t) * m->K[i];
+    if (!indicate(w, p, later, x)) return LOST;
+    for (int64_t i = 0; i < w->m; i++) {
+        w->now[i] = domain_of(w, i, w->z[i], w->open[i], w->domain[i], w->slack[i]);
+        any |= w->fires[i] = fires_at(w, i, w->domain[i], w->now[i]);
+    }
+    if (!any) return QUIET;
+    for (int64_t i = 0; i < w->m; i++) {
+        if (!w->fires[i]) continue;
+        w->domain[i] = w->now[i];
+        w->slack[i] = fmin(SCATTER * fmax(fabs(w->z[i]), fabs(w->later[i])), CONTINUOUS * w->size[i]);
+    }
+    *h->l.t = later;
+    put_states(h, x);
+    memcpy(p->x, h->l.x, (size_t)h->l.states * sizeof(double));
+    const int result = fire(h, t, later);
+    *h->l.t = t;
+    return result;
+}
+
+/* Fire what has changed its domain at an instant; ahead: at a tick, to which events belong that are a few ulps later. */
+static int settle(hybrid *h, double t, bool ahead) {
+    watch *w = &h->w;
+    if (!indicate(w, &h->p, t, here_states(h, w->x))) return LOST;
+    memcpy(w->later, w->z, (size_t)w->m * sizeof(double));
+    const bool any = take_domains(w, w->domain, w->now, w->fires);
+    memcpy(w->domain, w->now, (size_t)w->m * sizeof(double));
+    if (any) return fire(h, t, t);
+    return ahead ? fire_ahead(h, t) : QUIET;
+}
+
+/* --- a tick -------------------------------------------------------------------------------------------------------- */
+
+static void keep_instant(hybrid *h) {
+    memcpy(h->before, h->l.x, (size_t)h->l.states * sizeof(double));
+    if (h->w.m) keep(&h->w);
+}
+
+/* Go back to the last instant that was kept, from which Python goes on. */
+static int64_t ask(hybrid *h, int64_t reason) {
+    memcpy(h->l.x, h->before, (size_t)h->l.states * sizeof(double));
+    *h->l.t = h->t;
+    if (h->w.m) go_back(&h->w);
+    h->inside = 0;
+    return reason;
+}
+
+/* Go through a tick that the continuous states have reached: FMUs, events before and after it, a sample. */
+static int64_t land(hybrid *h, progress *g) {
+    const span *s = g->s;
+    loop *l = &h->l;
+    const int64_t i = g->i, kind = s->kinds[i];
+    const double t = s->times[i + 1];
+    const int64_t reason = step_plants(l, s->times[i], s->widths[i], g->out);
+    if (reason != DONE) return h->inside = 0, reason;
+    keep_instant(h);
+    enter(h, g, t);
+    if (h->w.m && kind != h->between && settle(h, t, true) == LOST) return ask(h, ASK_TICK);
+    if (evaluate(l, kind) != DONE) return ask(h, ASK_TICK);
+    memcpy(l->x, l->x_next, (size_t)l->states * sizeof(double));
+    if (h->w.m) {
+        enter(h, g, t);
+        double *states = (double *)l->log + h->outputs;
+        memcpy(h->taken_states, states, (size_t)l->states * sizeof(double));
+        const int result = settle(h, t, false);
+        if (result == LOST) return ask(h, ASK_TICK);
+        if (result == EVENT)
+            for (int64_t j = h->taken_first[kind]; j < h->taken_first[kind + 1]; j++)
+                states[h->taken[j]] = h->taken_states[h->taken[j]];
+    }
+    h->inside = 0;
+    g->out->rows = record(l, t, g->rows, g->out->rows);
+    g->i++;
+    return is_stopped(l) ? STOPPED : DONE;
+}

@@ -1,0 +1,390 @@
+"""From tick to tick in C with continuous states between them, and by Python where something is out of the ordinary."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import CompilerError, SimulationError
+from ...fmus.calls import FmuInstance, NativeStep
+from ..compiled import (
+    CompiledHybrid,
+    CompiledLoop,
+    HybridOutcome,
+    HybridReason,
+    MethodOptions,
+    Span,
+    compile_hybrid,
+    find_hybrid_obstacle,
+)
+from ..coupling import Plant, PlantSteps
+from ..flat import EVERY, FlatDiagram
+from ..results import Recorder
+from .compiled_ticks import CLOCKS, FIRST, LARGEST_CHUNK, WISHED, acts, is_exact, kinds_of
+from .continuous import Continuous
+from .solver_setup import has_guards, next_instant, remembers
+from .ticks import take_tick
+from .workspace import Workspace
+
+_MOST_EDGES = 100_000  # discontinuities of sources in a call
+_METHODS = {"euler": "Euler", "heun": "Heun", "rk4": "Runge-Kutta 4", "RK23": "Bogacki-Shampine 3(2)",
+            "RK45": "Dormand-Prince 5(4)", "DOP853": "Dormand-Prince 8(5,3)", "Radau": "Radau IIA 5"}  # fmt: skip
+
+
+class HybridTicks:
+    """The ticks of a run with continuous states, gone through in C.
+
+    Parameters
+    ----------
+    workspace : Workspace
+        The run's numbers.
+    continuous : Continuous
+        Its solver and events.
+    plants : mapping of str to FmuInstance
+        The plants by path, bound, in this process.
+    steps : PlantSteps
+        Their steps, as Python takes them.
+    stops : sequence of int
+        Entries of the log that end the run where they are true.
+    every : bool
+        Visit every tick, not only those at which something acts.
+
+    Raises
+    ------
+    CompilerError
+        If there is no compiler, or it fails.
+    """
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        continuous: Continuous,
+        plants: Mapping[str, FmuInstance],
+        steps: PlantSteps,
+        stops: Sequence[int],
+        *,
+        every: bool,
+    ):
+        flat = self._flat = workspace.flat
+        self._workspace, self._continuous, self._plants, self._steps = workspace, continuous, plants, steps
+        self._stops = stops
+        self._methods = methods_of(continuous)
+        stiff = any(method.name == "Radau" for method in self._methods)
+        self._code = compile_hybrid(flat, kinds_of(flat, every=every), stiff=stiff)
+        self._clocks = flat.visited if plants else flat.distinct
+        self._sampled = every or not self._clocks or EVERY in self._clocks
+        lands = continuous.fixed or bool(plants) or continuous.lands
+        self._lands = lands or not self._sampled
+        self._loop: CompiledHybrid | None = None
+        self._recorder: Recorder | None = None
+        self._chunk = FIRST
+
+    @property
+    def solver(self) -> str:
+        """The methods in words."""
+        return ", and where it is stiff ".join(f"{_METHODS[m.name]} ({m.name})" for m in self._methods)
+
+    def reaches(self, last: int) -> bool:
+        """Whether times up to a tick are quotients of integers that a float64 holds."""
+        return is_exact(self._flat, last)
+
+    # --- going on ----------------------------------------------------------------------------------------------------
+
+    def run(
+        self,
+        k: int,
+        last: int,
+        recorder: Recorder,
+        *,
+        arrived: Callable[[int], bool],
+        progress: Callable[[float], Any],
+    ) -> float | None:
+        """Run the ticks after tick ``k`` up to ``last`` and record them; see `CompiledTicks.run`.
+
+        Returns
+        -------
+        float or None
+            Time in s at which a stop condition has ended the run between two ticks.
+        """
+        loop = self._bind(recorder)
+        self._hand_over(loop, self._time_of(k))
+        try:
+            return self._run(loop, k, last, recorder, arrived, progress)
+        finally:
+            self._take_back(loop)
+
+    def _run(
+        self,
+        loop: CompiledHybrid,
+        k: int,
+        last: int,
+        recorder: Recorder,
+        arrived: Callable[[int], bool],
+        progress: Callable[[float], Any],
+    ) -> float | None:
+        visited, rest = self._visited(k, last), np.zeros(0, dtype=np.int64)
+        t = self._time_of(k)
+        while rest.size or (rest := np.fromiter(islice(visited, self._chunk), dtype=np.int64)).size:
+            rows = recorder.room(t)
+            loop.skip = recorder.skip
+            started = perf_counter()
+            span, lands = self._span(k, rest, last, t)
+            found = loop.run(span, rows)
+            recorder.took(found.rows, loop.skip)
+            t = found.t
+            done, rest = rest[: found.ticks], rest[found.ticks :]
+            if found.ticks:
+                k = int(done[-1])
+                landed = np.flatnonzero(lands[: found.ticks])
+                if landed.size and arrived(int(done[landed[-1]])):
+                    return None
+            if found.reason is HybridReason.ENDED:
+                return t
+            if found.reason in _ASKING:
+                following = int(rest[0])
+                ended = self._take_interval(loop, k, following, last, found, recorder)
+                if ended is not None:
+                    return ended
+                k, rest, t = following, rest[1:], self._time_of(following)
+                if arrived(k):
+                    return None
+            elif perf_counter() - started < WISHED and found.ticks == len(span.widths):
+                self._chunk = min(2 * self._chunk, LARGEST_CHUNK)
+            progress(t)
+        return None
+
+    def _time_of(self, k: int) -> float:
+        base = self._flat.base
+        return k * base.numerator / base.denominator
+
+    def _visited(self, k: int, last: int) -> Iterator[int]:
+        if self._sampled:
+            return iter(range(k + 1, last + 1))
+        return self._following(k, last)
+
+    def _following(self, k: int, last: int) -> Iterator[int]:
+        while k < last:
+            k = min([*(clock.after(k) for clock in self._clocks), last])
+            yield k
+
+    def _span(self, k: int, ticks: np.ndarray, last: int, t: float) -> tuple[Span, np.ndarray]:
+        """Return the ticks of a call, from tick ``k`` on, where the states have come to t; and which are landed on."""
+        base = self._flat.base
+        edges = self._edges(t, self._time_of(int(ticks[-1])))
+        while edges is None:
+            ticks = ticks[: max(1, len(ticks) // 2)]
+            edges = self._edges(t, self._time_of(int(ticks[-1])), limited=len(ticks) > 1)
+        kinds = self._kinds(ticks)
+        lands = np.ones(len(ticks), dtype=np.uint8)
+        if not self._lands:
+            lands[:] = ticks == last
+            for clock in self._clocks:
+                lands |= acts(clock, ticks).astype(np.uint8)
+        end = int(ticks[-1])
+        beyond = min([*(clock.after(end) for clock in self._clocks), last]) if not lands[-1] else end
+        ends = np.concatenate([[k], ticks])
+        n, d = base.numerator, base.denominator
+        return Span(ends * n / d, np.diff(ends) * n / d, kinds, lands, self._time_of(beyond), *edges), lands
+
+    def _edges(self, t: float, end: float, *, limited: bool = True) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the discontinuities of sources from t on, up to the first one of each after the end."""
+        continuous, found = self._continuous, set[float]()
+        late = continuous.late
+        for path, source in continuous.sources:
+            edge = t
+            while edge <= end and (edge := next_instant(path, source, edge)) < math.inf:
+                found.add(edge)
+                if limited and len(found) > _MOST_EDGES:
+                    return None
+        if t in late:
+            found.add(t)
+        edges = np.array(sorted(found))
+        return edges, np.array([late.get(float(edge), float(edge)) for edge in edges])
+
+    def _kinds(self, ticks: np.ndarray) -> np.ndarray:
+        """Return the clocks that act at ticks, as places among the compiled functions."""
+        bits = np.zeros(len(ticks), dtype=np.int64)
+        for i, clock in enumerate(self._flat.distinct):
+            bits |= acts(clock, ticks).astype(np.int64) << i
+        found: np.ndarray = self._kind_of[bits]
+        return found
+
+    # --- by Python ---------------------------------------------------------------------------------------------------
+
+    def _take_interval(
+        self, loop: CompiledHybrid, k: int, following: int, last: int, found: HybridOutcome, recorder: Recorder
+    ) -> float | None:
+        """Go on to the next tick from the point at which the loop has returned; see `run`."""
+        workspace, continuous, flat = self._workspace, self._continuous, self._flat
+        self._take_back(loop)
+        end, ended = self._time_of(following), None
+        try:
+            if found.reason is HybridReason.ASK_BETWEEN:
+
+                def sample(t: float) -> bool:
+                    recorder.row(t, workspace.log)
+                    return continuous.is_stopped()
+
+                ended = continuous.advance(found.t, end, (), sample)
+                if ended is None:
+                    self._steps.go(k, following, last=following == last)
+            elif found.reason in (HybridReason.FMU_FAILED, HybridReason.FMU_FLAGS):
+                self._judge(found, self._time_of(k), float(flat.base * (following - k)))
+        except SimulationError as error:
+            raise error.at(t=end) from error.__cause__
+        if ended is None:
+            take_tick(workspace, continuous, self._plants, end, flat.acting(following))
+            recorder.row(end, workspace.log)
+        self._hand_over(loop, end if ended is None else ended)
+        return ended
+
+    def _judge(self, found: HybridOutcome, now: float, h: float) -> None:
+        """Go on from the call of an FMU that the loop could not go beyond."""
+        plants = [*self._plants.values()]
+        plant = plants[found.plant]
+        plant.judge_native(found.stage, found.status if found.reason is HybridReason.FMU_FAILED else 0, now, h)
+        plant.read(now + h)
+        for other in plants[found.plant + 1 :]:
+            other.step(now, h)
+
+    # --- between Python and C ----------------------------------------------------------------------------------------
+
+    def _bind(self, recorder: Recorder) -> CompiledHybrid:
+        if self._loop is None or recorder is not self._recorder:
+            workspace, entries, steps = self._workspace, recorder.entries, list[NativeStep]()
+            here = workspace.here
+            for plant in self._plants.values():
+                native = plant.native
+                assert native is not None
+                steps.append(native)
+            arguments = [here.t, here.x, here.w, here.p]
+            ticks = CompiledLoop(
+                self._code.ticks,
+                arguments,
+                [workspace.x_next, workspace.z, workspace.log, workspace.ok],
+                steps,
+                columns=entries,
+                width=workspace.log.size if entries is None else len(entries),
+                every=recorder.every,
+                stops=self._stops,
+            )
+            self._recorder = recorder
+            accepts = bool(self._plants) or remembers(self._flat) or has_guards(self._flat)
+            self._loop = CompiledHybrid(
+                self._code, self._flat, ticks, arguments, workspace.x_next, self._methods, accepts=accepts
+            )
+            self._kind_of = np.zeros(1 << len(self._flat.distinct), dtype=np.int32)
+            for clocks, kind in self._loop.kinds.items():
+                self._kind_of[sum(1 << i for i, clock in enumerate(self._flat.distinct) if clock in clocks)] = kind
+        return self._loop
+
+    def _hand_over(self, loop: CompiledHybrid, t: float) -> None:
+        """Let C go on from an instant that Python has come to."""
+        loop.begin(t)
+        loop.plan(planned_steps(self._continuous, self._methods))
+
+    def _take_back(self, loop: CompiledHybrid) -> None:
+        """Let Python go on from where C has come to."""
+        restore_plans(self._continuous, self._methods, loop.planned)
+
+
+_ASKING = frozenset(
+    {
+        HybridReason.ASK_BETWEEN,
+        HybridReason.ASK_TICK,
+        HybridReason.FMU_FAILED,
+        HybridReason.FMU_FLAGS,
+        HybridReason.NOT_OK,
+    }
+)
+
+
+def methods_of(continuous: Continuous) -> list[MethodOptions]:
+    """Return the methods in C that do what a run's solver does."""
+    solver, n = continuous.solver, continuous.where.size
+    if not n:
+        return [MethodOptions("euler", 1.0, np.zeros(0), solver.max_step)]
+    if solver.fixed:
+        return [MethodOptions(solver.name, 1.0, np.zeros(n), solver.max_step)]
+    atol = np.broadcast_to(np.asarray(solver.atol, dtype=float), (n,)).copy()
+    names = [solver.name] if solver.name != "auto" else ["RK45" if solver.rtol >= 1e-8 else "DOP853", "Radau"]
+    return [MethodOptions(name, solver.rtol, atol, solver.max_step) for name in names]
+
+
+def planned_steps(continuous: Continuous, methods: Sequence[MethodOptions]) -> list[float | None]:
+    """Return the steps in s that a run's solver would take next, by its methods."""
+    saved = continuous.solver.save()
+    each = saved.get("methods", {})
+    return [each.get(m.name, saved).get("planned") for m in methods]
+
+
+def restore_plans(continuous: Continuous, methods: Sequence[MethodOptions], steps: Sequence[float | None]) -> None:
+    """Let a run's solver take steps of some lengths in s next."""
+    saved = continuous.solver.save()
+    if "methods" in saved:
+        saved["methods"] = {m.name: {"planned": step} for m, step in zip(methods, steps, strict=True)}
+        continuous.solver.restore(saved)
+    elif "planned" in saved:
+        continuous.solver.restore({"planned": steps[0]})
+
+
+def make_hybrid(
+    workspace: Workspace,
+    continuous: Continuous,
+    plants: Mapping[str, Plant],
+    steps: PlantSteps,
+    stops: Sequence[int],
+    *,
+    every: bool,
+    regular: bool,
+) -> tuple[HybridTicks | None, tuple[str, ...]]:
+    """Return the ticks of a run with continuous states in C, None where they can't be had, and messages about them.
+
+    Parameters
+    ----------
+    regular : bool
+        Whether every plant steps once from each tick to the next.
+    """
+    native = {
+        path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance) and plant.native is not None
+    }
+    reason = _find_obstacle(workspace.flat, continuous, plants, native, regular=regular)
+    if reason is None:
+        try:
+            found = HybridTicks(workspace, continuous, native, steps, stops, every=every)
+        except CompilerError as error:
+            reason = str(error)
+        else:
+            told = (
+                f"Compiled: {found.solver} runs in C, with the step control of solver={continuous.solver.name!r}; its "
+                "values differ from those of an interpreted run within the tolerances."
+            )
+            return found, (told,) if continuous.where.size else ()
+    return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)
+
+
+def _find_obstacle(
+    flat: FlatDiagram,
+    continuous: Continuous,
+    plants: Mapping[str, Plant],
+    native: Mapping[str, FmuInstance],
+    *,
+    regular: bool,
+) -> str | None:
+    if (found := find_hybrid_obstacle(flat, continuous.solver.name)) is not None:
+        return found
+    if flat.events:
+        return "it has events between ticks"
+    if len(flat.distinct) > CLOCKS:
+        return f"it has {len(flat.distinct)} different clocks, and at most {CLOCKS} are compiled"
+    if not regular:
+        return "an FMU takes longer steps than from one tick to the next, or a coupling is asked for that iterates"
+    for path in plants:
+        if path not in native:
+            return f"the FMU {path!r} runs in a process of its own, or has ports that are no Float64, or options"
+    return None
