@@ -9,7 +9,7 @@ from ..flat import NONE, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from .derivatives import LocalDerivatives
 from .over_a_period import Model
-from .plant_models import join_matrices, model_equations, states_of
+from .plant_models import join_matrices, states_of
 
 
 def model_continuous(
@@ -17,7 +17,7 @@ def model_continuous(
 ) -> Model:
     """Return the model of a diagram without sampling."""
     J = local.differentiate(NONE, at.t, at.x, at.w)
-    models = model_equations(flat, at, plants)
+    models = local.model_equations(at, plants)
     xc = flat.continuous
     Ap, Bp, Cp, Dp = (join_matrices(flat, models, which) for which in "ABCD")
     # w = Cp xp + Dp z, z = Zx x + Zw w + Zd d

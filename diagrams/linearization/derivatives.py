@@ -27,11 +27,14 @@ from ..flat import (
     rates,
     trace_schedule,
 )
-from ..results import index_of, resolve, split_entry
+from ..results import OperatingPoint, index_of, resolve, split_entry
 from ..simulation import Workspace
 from ..wiring import Wire, join
 from .mean_stairs import NO_STAIRS, Stairs
+from .plant_models import PlantModel, model_equations, model_step
 
+SLOPE = 2.0**-140
+"""Factor of the slopes that imaginary parts carry: so small that its square vanishes beside any value."""
 _RESULTS, _ARGUMENTS = ("x", "z", "y", "dx", "v", "r"), ("x", "w", "d", "e")
 Numbers: TypeAlias = dict[str | tuple[str, str], np.ndarray]
 """Values by name, ``found["z"]``, and derivatives by name and argument, ``found["z", "w"]``."""
@@ -205,6 +208,18 @@ class LocalDerivatives:
             self._derivatives[acting] = Derivative(schedule, [(name, None) for name in _ARGUMENTS])
         return self._derivatives[acting]
 
+    def model_step(self, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None) -> PlantModel:
+        """Return the linear model of one communication step of an FMU; see `plant_models.model_step`."""
+        return model_step(self.flat, at, path, z, h, way)
+
+    def model_equations(self, at: OperatingPoint, way: str | None) -> list[PlantModel]:
+        """Return the linear models of the equations of all FMUs; see `plant_models.model_equations`."""
+        return model_equations(self.flat, at, way)
+
+    def parts(self, change: np.ndarray, state: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the pairs of a change and a state that both are small where nothing moves."""
+        return [(change, state)]
+
     def _solve_loops(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> np.ndarray:
         """Return x with the algebraic loops solved at an instant."""
         return x if self._workspace is None else self._workspace.solve_loops(acting, t, x, w)
@@ -226,12 +241,21 @@ class LocalDerivatives:
         c = self._trace_closed(acting)(*at, evaluators=self.evaluators)[0] if self.cut else np.zeros(0)
         zeros = np.zeros(self.n_inputs), np.zeros(self.stairs.e.total)
         numbers = self._trace_derivative(acting)(*at, *zeros, c, evaluators=self.evaluators)
+        return self._eliminate_loops(numbers, acting, t)
+
+    def _eliminate_loops(
+        self, numbers: Sequence[np.ndarray], acting: frozenset[TickPattern], t: float
+    ) -> Numbers:
+        """Return values and derivatives by name, without algebraic loops and the stairs that are replaced.
+
+        Loops are eliminated by the implicit function theorem.
+        """
         names, arguments = _RESULTS, _ARGUMENTS
         keys = [(n, a) for n in names for a in arguments]
         found: Numbers = dict(zip([*names, *keys], numbers, strict=True))
-        _check_finite([found[key] for key in keys], t)
+        _check_finite([found[n, a] for n in names for a in arguments], t)
         if found["r"].size:
-            where = flat.active_loops(acting)
+            where = self.flat.active_loops(acting)
             through_all = np.linalg.solve(
                 found["r", "x"][:, where].T, np.vstack([found[n, "x"][:, where] for n in names[:-1]]).T
             ).T

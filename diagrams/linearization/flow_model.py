@@ -39,15 +39,15 @@ def differentiate_flow(
     start, end = x1[xc], t + h
     F, f0 = differentiate(t, start)
     final = x1.copy()
-    if not local.varies and np.max(np.abs(f0) / (1.0 + np.abs(start)), initial=0.0) <= EQUILIBRIUM:
-        big = np.zeros((nc + many, nc + many))
+    if not local.varies and all(size_of_change(*part) <= EQUILIBRIUM for part in local.parts(f0, start)):
+        big = np.zeros((nc + many, nc + many), dtype=F.dtype)
         big[:nc] = F
         whole = np.asarray(expm(big * h))[:nc]
         final[xc] = start + f0 * h
     else:
         from scipy.integrate import solve_ivp
 
-        s = np.concatenate([start, np.hstack([np.eye(nc), np.zeros((nc, many))]).ravel()])
+        s = np.concatenate([start, np.hstack([np.eye(nc), np.zeros((nc, many))]).ravel()]).astype(F.dtype)
         for begin, edge in _split_at_discontinuities(flat, t, end):
             left = left_of(edge) if edge < end else edge
 
@@ -62,11 +62,16 @@ def differentiate_flow(
             s = np.asarray(found.y)[:, -1]
         final[xc] = s[:nc]
         whole = s[nc:].reshape(nc, nc + many)
-    E, Ew, Ed = np.eye(nx), np.zeros((nx, nw)), np.zeros((nx, m))
+    E, Ew, Ed = (np.asarray(M, dtype=F.dtype) for M in (np.eye(nx), np.zeros((nx, nw)), np.zeros((nx, m))))
     E[np.ix_(xc, xc)] = whole[:, :nc]
     E[xc] += whole[:, nc : nc + nx]
     Ew[xc], Ed[xc] = whole[:, nc + nx : nc + nx + nw], whole[:, nc + nx + nw :]
     return E, Ew, Ed, final
+
+
+def size_of_change(change: np.ndarray, state: np.ndarray) -> float:
+    """Return the largest change, relative to 1 + the size of the state."""
+    return float(np.max(np.abs(change) / (1.0 + np.abs(state)), initial=0.0))
 
 
 def _split_at_discontinuities(flat: FlatDiagram, t: float, end: float) -> Iterator[tuple[float, float]]:

@@ -105,11 +105,13 @@ def _readers(flat: FlatDiagram, port: tuple[str, str]) -> list[str]:
     return [block for (block, _), w in flat.table.wires.items() if (w.block, w.port) == port]
 
 
-def advance_point(flat: FlatDiagram, at: OperatingPoint, way: str | None, count: int) -> OperatingPoint:
+def advance_point(
+    flat: FlatDiagram, at: OperatingPoint, way: str | None, count: int, local: LocalDerivatives | None = None
+) -> OperatingPoint:
     """Return the operating point ``count`` ticks later."""
     if not count:
         return at
-    chain = Chain(flat, LocalDerivatives(flat, (), (), (), evaluators_at(flat, at)), at, way, count)
+    chain = Chain(flat, local or LocalDerivatives(flat, (), (), (), evaluators_at(flat, at)), at, way, count)
     chain.go_on()
     return chain.here
 
@@ -190,7 +192,7 @@ def _find_renewals(flat: FlatDiagram, signals: Sequence[Tap], ticks: Sequence[in
 def _model_each_tick(chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the matrices over all steps of a chain, with the inputs and outputs of each tick one after the other."""
     n, count, m = len(chain.M), len(chain.steps), chain.N.shape[1]
-    X, U = np.eye(n), np.zeros((n, count * m))
+    X, U = np.eye(n), np.zeros((n, count * m), dtype=chain.N.dtype)
     C, D = [], []
     for k, (M, N, Cy, Dy) in enumerate(chain.steps):
         by_d = Cy @ U

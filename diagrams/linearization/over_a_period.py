@@ -20,7 +20,7 @@ from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
 from .coupled_plants import check_coupling
-from .derivatives import LocalDerivatives, Numbers, Tap
+from .derivatives import SLOPE, LocalDerivatives, Numbers, Tap
 from .findings import EventWithinPeriod, MemoryActs, UnusualStart
 from .flow_model import EQUILIBRIUM, differentiate_flow
 from .plant_models import (
@@ -29,7 +29,6 @@ from .plant_models import (
     fmu_at,
     inputs_before,
     join_matrices,
-    model_step,
     plant_paths,
     states_of,
 )
@@ -160,7 +159,7 @@ class Chain:
         Ap, Bp, Cp, Dp = (join_matrices(flat, models, which) for which in "ABCD")
         nx, nz, n_p, nw = flat.width, flat.plant_inputs.total, len(Ap), flat.plant_outputs.total
         n = nx + n_p + nz + (nw if self._holds else 0)
-        W = np.zeros((nw, n))  # the FMUs' outputs before the tick
+        W = np.zeros((nw, n), dtype=Cp.dtype)  # the FMUs' outputs before the tick
         W[:, nx : nx + n_p], W[:, nx + n_p : nx + n_p + nz] = Cp, Dp
         for path in mid_step:
             mine = self._models[path].outputs
@@ -220,7 +219,7 @@ class Chain:
         before, known = inputs_before(self.flat, self.here), self._known_plants.get(path)
         if known is not None and known[0] == h and _are_same(known[1], z) and _are_same(known[2], before):
             return replace(known[3], next={**known[3].next, "t": self.here.plants[path]["t"] + h})
-        model = model_step(self.flat, self.here, path, z, h, self.way)
+        model = self.local.model_step(self.here, path, z, h, self.way)
         self.derivations[path] = model.derivation
         self.uncertainty = max(self.uncertainty, model.uncertainty)
         if _are_same(model.f, model.x0):  # at rest: the same inputs give the same model
@@ -245,7 +244,7 @@ class Chain:
             return
         evaluators = self.local.evaluators
         (g0, _), (g1, opened) = (
-            flat.indicators(t, x, here.w, flat.p, evaluators=evaluators)
+            flat.indicators(t, np.real(x), np.real(here.w), flat.p, evaluators=evaluators)
             for t, x in ((here.t, here.x), (here.t + h, x_end))
         )
         for event, a, b, now in zip(flat.events, g0 > 0, g1 > 0, opened > 0.5, strict=True):
@@ -254,7 +253,8 @@ class Chain:
 
     def _move(self, k: int, h: float, x: np.ndarray, z: np.ndarray) -> None:
         """Move the operating point to tick k."""
-        w, plants = self.here.w.copy(), dict(self.here.plants)
+        kind = np.result_type(self.here.w, *(m.y_next for m in self.models))
+        w, plants = self.here.w.astype(kind), dict(self.here.plants)
         for m in self.models:
             if self._until[m.path] == k:
                 w[m.outputs] = m.y_next
@@ -302,6 +302,8 @@ def _plant_states(flat: FlatDiagram, point: OperatingPoint, models: Sequence[Pla
 
 
 def _are_same(a: np.ndarray, b: np.ndarray) -> bool:
+    if np.iscomplexobj(a) or np.iscomplexobj(b):  # values with slopes
+        return _are_same(np.real(a), np.real(b)) and _are_same(np.imag(a) / SLOPE, np.imag(b) / SLOPE)
     return bool(np.all(np.abs(a - b) <= SAME * (1.0 + np.abs(a))))
 
 

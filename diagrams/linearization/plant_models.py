@@ -83,7 +83,8 @@ def plant_entries(flat: FlatDiagram, path: str) -> tuple[list[int], list[int], l
 
 def inputs_before(flat: FlatDiagram, at: OperatingPoint) -> np.ndarray:
     """Return the inputs z that have acted until the operating point."""
-    z = np.zeros(flat.plant_inputs.total)
+    every = [value for path in plant_paths(flat) for value in at.plants[path]["inputs"].values()]
+    z = np.zeros(flat.plant_inputs.total, dtype=complex if any(map(np.iscomplexobj, every)) else float)
     for path in plant_paths(flat):
         for port, value in at.plants[path]["inputs"].items():
             where = flat.plant_inputs.slices.get(join(path, port))
@@ -97,7 +98,7 @@ def join_matrices(flat: FlatDiagram, models: Sequence[PlantModel], which: str) -
     states = Layout.of({m.path: (len(m.A),) for m in models})
     many = {"x": states.total, "z": flat.plant_inputs.total, "w": flat.plant_outputs.total}
     row_of, column_of = {"A": ("x", "x"), "B": ("x", "z"), "C": ("w", "x"), "D": ("w", "z")}[which]
-    M = np.zeros((many[row_of], many[column_of]))
+    M = np.zeros((many[row_of], many[column_of]), dtype=np.result_type(float, *(m.A for m in models)))
     for m in models:
         own = {"x": states.entries([m.path]), "z": m.inputs, "w": m.outputs}
         M[np.ix_(own[row_of], own[column_of])] = {"A": m.A, "B": m.B, "C": m.C, "D": m.D}[which]

@@ -1,0 +1,184 @@
+"""Derivatives of a diagram's functions, with their slopes along a direction of the parameters.
+
+A number and its slope travel together, as one complex number: the imaginary part is the slope, times a factor so small
+that its square vanishes. Sums, products, solutions of linear systems and matrix exponentials of such numbers have the
+slopes of their results as imaginary parts, to rounding. So the linear models over a period are made by the functions
+that make them anyway.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, cast
+
+import casadi as ca
+import numpy as np
+
+from ..flat import Apart, Derivative, FlatDiagram, Schedule, TickPattern, evaluate, loop_mismatch, trace_schedule
+from ..results import OperatingPoint
+from .derivatives import SLOPE, LocalDerivatives, Numbers
+from .flow_model import EQUILIBRIUM
+from .plant_models import PlantModel, model_equations, model_step
+
+STEP = 2.0**-9
+"""Step of a difference of fourth order between models of an FMU, relative to 1 + the size of what moves."""
+STILL = 1e3 * EQUILIBRIUM
+"""Largest slope of an FMU's rates at which it stays at rest."""
+
+
+def join_slope(value: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Return numbers that carry slopes."""
+    return np.asarray(value + 1j * SLOPE * np.asarray(slope))
+
+
+def slope_of(numbers: np.ndarray) -> np.ndarray:
+    """Return the slopes that numbers carry."""
+    return np.asarray(np.imag(numbers) / SLOPE)
+
+
+class DerivativesAlong(LocalDerivatives):
+    """Local derivatives whose results carry slopes along a direction of the parameters.
+
+    Attributes
+    ----------
+    direction : ndarray
+        Direction of the diagram's vector of parameters p.
+    error : float
+        Largest estimated error of a slope that is made of differences; 0 if all are exact.
+    """
+
+    def __init__(self, flat: FlatDiagram, *taps: Any):
+        super().__init__(flat, *taps)
+        self.direction = np.zeros(flat.p.size)
+        self.error = 0.0
+        self._closed_slopes: dict[frozenset[TickPattern], Derivative] = {}
+
+    def _trace_closed_slopes(self, acting: frozenset[TickPattern]) -> Derivative:
+        """Return ``(t, x, w, p) -> (c, r)`` of the closed diagram, and the derivative by x.
+
+        c are the values of the cut ports, r is the mismatch of the algebraic loops.
+        """
+        if acting not in self._closed_slopes:
+            flat, symbols = self.flat, self.flat.symbols()
+
+            def results(apart: Apart) -> Mapping[str, Any]:
+                instant = evaluate(flat, flat.blocks, acting, **symbols, apart=apart)
+                columns = [ca.densify(ca.MX(instant.values[port])) for port in self.cut]
+                return {"c": ca.vertcat(*columns) if columns else ca.MX(0, 1), "r": loop_mismatch(instant)}
+
+            schedule: Schedule = trace_schedule("closed", symbols, results)
+            self._closed_slopes[acting] = Derivative(schedule, [("x", None)])
+        return self._closed_slopes[acting]
+
+    def differentiate(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> Numbers:
+        """Return the numbers of `LocalDerivatives.differentiate`, with their slopes."""
+        flat, dx, dw = self.flat, slope_of(x), slope_of(w)
+        x, w = self._solve_loops(acting, t, np.real(x).copy(), np.real(w).copy()), np.real(w).copy()
+        at = [np.array([t]), x, w, flat.p]
+        c = dc = np.zeros(0)
+        if self.cut or flat.loops.slices:
+            closed = self._trace_closed_slopes(acting)
+            loops = flat.active_loops(acting)
+
+            def follow() -> tuple[Sequence[np.ndarray], Sequence[np.ndarray]]:
+                values, slopes, error = closed.along(at, [np.zeros(1), dx, dw, self.direction], self.evaluators)
+                self.error = max(self.error, error)
+                return values, slopes
+
+            (c, r, _, by_x), (dc, dr, *_) = follow()
+            if r.size:
+                dx[loops] -= np.linalg.solve(by_x[:, loops], dr)
+                (c, *_), (dc, *_) = follow()
+        zeros = [np.zeros(self.n_inputs), np.zeros(self.stairs.e.total)]
+        values, slopes, error = self._trace_derivative(acting).along(
+            [*at, *zeros, c], [np.zeros(1), dx, dw, self.direction, *zeros, dc], self.evaluators
+        )
+        self.error = max(self.error, error)
+        both = [join_slope(v, s) for v, s in zip(values, slopes, strict=True)]
+        return self._eliminate_loops(both, acting, t)
+
+    def parts(self, change: np.ndarray, state: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the pairs of a change and a state that both are small where nothing moves, slopes included."""
+        return [(np.real(change), np.real(state)), (slope_of(change), slope_of(state))]
+
+    def model_step(self, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None) -> PlantModel:
+        """Return the linear model of one communication step of an FMU, with its slopes."""
+        middle = model_step(self.flat, _without_slopes(at), path, np.real(z), h, way)
+
+        def model(point: OperatingPoint, inputs: np.ndarray, held: bool) -> PlantModel:
+            how = "identified" if middle.identified else "equations" if held else "step"
+            return model_step(self.flat, point, path, inputs, h, how)
+
+        held = middle.derivation.held
+        made = self._follow(middle, at, z, path, lambda point, inputs: model(point, inputs, held))
+        if held and np.max(np.abs(slope_of(made.f - made.x0)), initial=0.0) > STILL:
+            made = self._follow(middle, at, z, path, lambda point, inputs: model(point, inputs, False))
+        return made
+
+    def model_equations(self, at: OperatingPoint, way: str | None) -> list[PlantModel]:
+        """Return the linear models of the equations of all FMUs, with their slopes."""
+        found = model_equations(self.flat, _without_slopes(at), way)
+
+        def model(point: OperatingPoint, z: np.ndarray, place: int) -> PlantModel:
+            return model_equations(self.flat, replace(point, z=z), way)[place]
+
+        return [
+            self._follow(middle, at, at.z, middle.path, lambda point, z, i=i: model(point, z, i))
+            for i, middle in enumerate(found)
+        ]
+
+    def _follow(
+        self,
+        middle: PlantModel,
+        at: OperatingPoint,
+        z: np.ndarray,
+        path: str,
+        model: Callable[[OperatingPoint, np.ndarray], PlantModel],
+    ) -> PlantModel:
+        """Return an FMU's model with its slopes, by differences along those of its states and inputs."""
+        point = at.plants[path]
+        moving = [*point["state"].values(), *point["inputs"].values(), z[middle.inputs], at.z[middle.inputs]]
+        moving.append(at.w[middle.outputs])
+        sizes = [np.max(np.abs(slope_of(v)) / (1.0 + np.abs(v)), initial=0.0) for v in moving]
+        size = float(max(sizes, default=0.0))
+        if size == 0.0:
+            return middle
+
+        def shift(s: float) -> PlantModel:
+            return model(_moved(at, s / size), np.real(z) + s / size * slope_of(z))
+
+        pairs = [(shift(s), shift(-s)) for s in (STEP, 2.0 * STEP)]
+
+        def slope(read: Callable[[PlantModel], Any]) -> Any:
+            value = read(middle)
+            if isinstance(value, Mapping):
+                return {key: slope(lambda m, key=key: read(m)[key]) for key in value}
+            if isinstance(value, str) or np.asarray(value).dtype.kind not in "fc":
+                return value
+            near, far = (
+                (np.asarray(read(a)) - np.asarray(read(b))) * (size / (2.0 * s))
+                for (a, b), s in zip(pairs, (STEP, 2.0 * STEP), strict=True)
+            )
+            self.error = max(self.error, float(np.max(np.abs(near - far), initial=0.0)))
+            return join_slope(np.asarray(value), (4.0 * near - far) / 3.0)
+
+        numbers = {name: slope(lambda m, name=name: getattr(m, name)) for name in ("A", "B", "C", "D", "x0", "f")}
+        following = {key: v if key == "t" else slope(lambda m, key=key: m.next[key]) for key, v in middle.next.items()}
+        return replace(middle, **numbers, y_next=slope(lambda m: m.y_next), next=following)
+
+
+def _moved(at: OperatingPoint, s: float) -> OperatingPoint:
+    """Return an operating point that has moved by ``s`` along its slopes."""
+
+    def move(value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {key: move(inner) for key, inner in value.items()}
+        return np.real(value) + s * slope_of(value) if np.iscomplexobj(value) else value
+
+    x, w, z = (move(v) for v in (at.x, at.w, at.z))
+    return replace(at, x=x, w=w, z=z, plants=cast("dict[str, Any]", move(at.plants)))
+
+
+def _without_slopes(at: OperatingPoint) -> OperatingPoint:
+    return _moved(at, 0.0)

@@ -1,0 +1,336 @@
+"""Slopes of a loop's linear model: derivatives of its A, B, C, D by parameters of the diagram.
+
+A parameter of traced equations is a symbol in them: CasADi differentiates the Jacobians once more, along the parameter,
+and hold, delay and the time between ticks carry the slopes on (`derivatives_along`). An FMU's parameter is none: the
+linear models of diagrams with changed start values are differenced, with an estimate of the error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import ParameterError, elements
+from ..flat import NONE, FlatDiagram, WiredDiagram
+from ..results import OperatingPoint
+from ..wiring import join
+from .checks import replace_stairs
+from .continuous_model import model_continuous
+from .derivatives import find_signal
+from .derivatives_along import DerivativesAlong, join_slope, slope_of
+from .exchanged import evaluators_at
+from .linear_model import Linearization, linearize
+from .loops_over_a_period import advance_point, find_slower_clocks, model_loop, ticks_to_renewal
+from .over_a_period import Chain, Four, model_period, period_of
+from .plant_models import join_matrices, plant_layout
+from .trim_request import Free, difference, free_parameters, locate, read_value, spread_nodes
+
+STEP = 2.0**-8
+"""Step of a difference of fourth order between models or points, relative to the parameter's size."""
+LOST = 1e-6
+"""Largest remainder, relative to 1 + the size of the change, with which an equilibrium follows a parameter."""
+PointFinder = Callable[[WiredDiagram], OperatingPoint]
+"""Function from a diagram to its operating point."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoopSlope:
+    """A loop's matrices, and their derivatives by one number of a parameter.
+
+    Attributes
+    ----------
+    parameter : str
+        Path of the parameter as `Diagram.replace` takes it, with the entry of an array: ``"pid.poles[2]"``.
+    value : float
+        Value of that number.
+    matrices, slopes : tuple of ndarray
+        A, B, C, D of L, and their derivatives by the number.
+    error : float
+        Largest estimated error of an entry of the slopes; 0 where all are exact.
+    rest_lost : bool
+        Whether the operating point was an equilibrium that no longer is one when the parameter changes: the states are
+        held then.
+    """
+
+    parameter: str
+    value: float
+    matrices: Four
+    slopes: Four
+    error: float = 0.0
+    rest_lost: bool = False
+
+
+def differentiate_loop(
+    model: Linearization,
+    wires: Iterable[str],
+    parameters: Iterable[str],
+    *,
+    find: PointFinder | None = None,
+    slow: str = "closed",
+) -> list[LoopSlope]:
+    """Return the derivatives of a loop's matrices by parameters, one result for each of their numbers.
+
+    Parameters
+    ----------
+    model : Linearization
+        Linear model of the diagram.
+    wires : iterable of str
+        Wires that the loop is cut at, as of `Linearization.loop`.
+    parameters : iterable of str
+        Paths, as `Diagram.trim` frees them: of numbers in traced equations, or start values of FMUs.
+    find : callable, optional
+        How the operating point is found: a changed diagram's point is found anew, and the derivatives count its change.
+        Without it, an equilibrium follows the parameter, and any other point keeps its states.
+    slow : {"closed", "open"}
+        As of `Linearization.loop`.
+
+    Raises
+    ------
+    UnknownNameError, ParameterError
+        A parameter that isn't there, isn't a number, or that the equations do not contain.
+    """
+    cut = _Cut(model, tuple(wires), slow)
+    found = []
+    for name in dict.fromkeys(parameters):
+        (free,), diagram = free_parameters(model.diagram, {name: None})
+        kind = _StartValues if free.where is None else _Traced
+        found += kind(cut, free, diagram, find).slopes()
+    return found
+
+
+class _Cut:
+    """A loop cut at wires, as a function of the diagram and its operating point."""
+
+    def __init__(self, model: Linearization, wires: tuple[str, ...], slow: str):
+        self.model, self.wires, self.slow = model, wires, slow
+        self.flat = model.diagram.flatten_like(model.point)
+        self._known: dict[int, tuple[FlatDiagram, OperatingPoint, DerivativesAlong, DerivativesAlong]] = {}
+
+    def derivatives(self, flat: FlatDiagram, diagram: WiredDiagram) -> tuple[DerivativesAlong, DerivativesAlong]:
+        """Return the derivatives with the loop cut, and with all closed; their traces are kept."""
+        key, at = id(flat), self.model.point
+        if key not in self._known:
+            taps = [find_signal(flat, w) for w in self.wires]
+            outside, means = evaluators_at(flat, at), replace_stairs(diagram, flat, at, self.model.stairs)
+            made = [DerivativesAlong(flat, t, t, t, outside, means) for t in (taps, [])]
+            self._known[key] = (flat, at, made[0], made[1])
+        return self._known[key][2:]
+
+    def loop(self, flat: FlatDiagram, diagram: WiredDiagram, at: OperatingPoint, direction: np.ndarray) -> Four:
+        """Return A, B, C, D of L with slopes along a direction of the parameters, at a point with slopes."""
+        model = self.model
+        local, closed = self.derivatives(flat, diagram)
+        local.direction = closed.direction = direction
+        ports, frozen = [tap.port for tap in local.inputs], NONE
+        if model.dt:
+            if self.slow == "open":
+                frozen = find_slower_clocks(flat, ports, diagram.name)
+            many = period_of(flat) > 1
+            if many:
+                shift = ticks_to_renewal(flat, ports, at.tick)
+                at = advance_point(flat, at, model.plants, shift, closed)
+            if many:
+                made, _ = model_loop(flat, local, at, model.plants, lifted=False, frozen=frozen)
+            else:
+                made = model_period(flat, local, at, model.plants, frozen)
+        else:
+            made = model_continuous(diagram, flat, local, at, model.plants)
+        A, B, C, D = made.matrices
+        return A, B, -C, -D
+
+    def rest(self, flat: FlatDiagram, diagram: WiredDiagram, direction: np.ndarray) -> OperatingPoint | None:
+        """Return the point with the slopes of the equilibrium that follows a parameter; None if none follows.
+
+        The equations are x = f(x, p) over a period, so that (1 − ∂f/∂x) x′ = ∂f/∂p. The smallest solution is taken:
+        states that nothing determines, as those of an integrator at rest, stay.
+        """
+        at, model = self.model.point, self.model
+        closed = self.derivatives(flat, diagram)[1]
+        closed.direction = direction
+        start = replace(at, x=join_slope(at.x, np.zeros(at.x.size)))
+        if not model.dt:
+            made = model_continuous(diagram, flat, closed, start, model.plants)
+            if at.plants:  # the outputs of FMUs in continuous time are not followed
+                return start if np.max(np.abs(slope_of(made.affine)), initial=0.0) <= LOST else None
+            moved = _smallest(np.real(made.matrices[0]), -slope_of(made.affine))
+            if moved is None:
+                return None
+            x = np.zeros(at.x.size)
+            x[flat.continuous] = moved
+            return replace(at, x=join_slope(at.x, x))
+        chain = Chain(flat, closed, start, model.plants, period_of(flat))
+        chain.go_on()
+        M = np.real(chain.M)
+        moved = _smallest(M - np.eye(len(M)), -slope_of(chain.affine()))
+        if moved is None:
+            return None
+        x, of_plants, z = np.split(moved, np.cumsum([flat.width, chain.n_p]))
+        z = z[: flat.plant_inputs.total]
+        C, D = (np.real(join_matrices(flat, chain.models, which)) for which in "CD")
+        return _with_slopes(flat, at, x, C @ of_plants + D @ z, of_plants, z, chain)
+
+
+def _smallest(M: np.ndarray, right: np.ndarray) -> np.ndarray | None:
+    """Return the smallest solution of M x = right; None if there is none."""
+    if not np.any(right):
+        return np.zeros(M.shape[1])
+    found = np.linalg.lstsq(M, right, rcond=1e-12)[0]
+    left = np.max(np.abs(M @ found - right), initial=0.0)
+    return found if left <= LOST * (np.max(np.abs(right)) + np.max(np.abs(M), initial=0.0)) else None
+
+
+def _with_slopes(
+    flat: FlatDiagram, at: OperatingPoint, x: np.ndarray, w: np.ndarray, of_plants: np.ndarray, z: np.ndarray, chain: Chain
+) -> OperatingPoint:
+    """Return an operating point with the slopes of its vectors, and of the states and inputs of FMUs."""
+    plants, first = dict(at.plants), 0
+    layouts = plant_layout(flat.table.blocks, at.plants).of_block
+    for m in chain.models:
+        point = at.plants[m.path]
+        own, first = of_plants[first : first + len(m.A)], first + len(m.A)
+        state, inputs = dict(point["state"]), dict(point["inputs"])
+        if not m.identified:
+            for name, slope in layouts[m.path].split(own).items():
+                state[name] = join_slope(np.asarray(state[name]), slope)
+        for port, value in inputs.items():
+            where = flat.plant_inputs.slices.get(join(m.path, port))
+            if where is not None:
+                inputs[port] = join_slope(np.asarray(value), z[where].reshape(np.shape(value)))
+        plants[m.path] = {**point, "state": state, "inputs": inputs}
+    return replace(at, x=join_slope(at.x, x), w=join_slope(at.w, w), z=join_slope(at.z, z), plants=plants)
+
+
+@dataclass(frozen=True)
+class _Changed:
+    """Diagrams with changed values of one number of a parameter, for `difference`."""
+
+    h: float
+    nodes: tuple[float, ...]
+    diagrams: list[WiredDiagram]
+
+    @classmethod
+    def of(cls, free: Free, value: np.ndarray, i: int, diagram: WiredDiagram) -> _Changed:
+        middle = float(value[i])
+        h, nodes = spread_nodes(middle, STEP * (abs(middle) or 1.0), free.low[i], free.high[i])
+        changed = []
+        for place in nodes:
+            moved = value.copy()
+            moved[i] = middle + place * h
+            changed.append(diagram.replace({free.name: free.shape_value(moved)}))
+        return cls(h, nodes, changed)
+
+    def slope(self, middle: Any, others: Iterable[Any]) -> tuple[np.ndarray, float]:
+        """Return the slope of a value of the diagram and its error, from its values in the changed diagrams."""
+        return difference([middle, *others], self.h, self.nodes)
+
+
+def _with_differences(
+    at: OperatingPoint, points: Sequence[OperatingPoint], changed: _Changed
+) -> tuple[OperatingPoint, float]:
+    """Return an operating point with its slopes, from those of changed diagrams, and their largest error."""
+    worst = 0.0
+
+    def slope(here: Any, others: Sequence[Any]) -> Any:
+        nonlocal worst
+        if isinstance(here, Mapping):
+            return {key: value if key == "t" else slope(value, [o[key] for o in others]) for key, value in here.items()}
+        if isinstance(here, str) or np.asarray(here).dtype.kind != "f":
+            return here
+        found, error = changed.slope(here, others)
+        worst = max(worst, error)
+        return join_slope(np.asarray(here), found)
+
+    parts = {name: slope(getattr(at, name), [getattr(p, name) for p in points]) for name in ("x", "w", "z", "plants")}
+    return replace(at, **parts), worst
+
+
+class _StartValues:
+    """Slopes along an FMU's parameter, a start value: differences of linear models."""
+
+    def __init__(self, cut: _Cut, free: Free, diagram: WiredDiagram, find: PointFinder | None):
+        self.cut, self.free, self.find = cut, free, find
+
+    def slopes(self) -> list[LoopSlope]:
+        free, cut, model = self.free, self.cut, self.cut.model
+        found, value = [], free.start
+        middle = self._loop(model.diagram, model.point)[0]
+        for i, name in enumerate(elements(free.name, free.shape)):
+            changed = _Changed.of(free, value, i, model.diagram)
+            made = [self._loop(d, model.point if self.find is None else self.find(d)) for d in changed.diagrams]
+            if any([np.shape(M) for M in four] != [np.shape(M) for M in middle] for four, _ in made):
+                raise ParameterError(
+                    "found a value that changes the number of states of the loop; expected the same states. Try "
+                    "values with diagram.replace(…), one after the other.", block=free.path, port=name,
+                )  # fmt: skip
+            both = [changed.slope(M, [four[k] for four, _ in made]) for k, M in enumerate(middle)]
+            A, B, C, D = (slope for slope, _ in both)
+            lost = model.is_equilibrium and not all(rests for _, rests in made)
+            worst = max(error for _, error in both)
+            found.append(LoopSlope(name, float(value[i]), middle, (A, B, C, D), worst, lost))
+        return found
+
+    def _loop(self, diagram: WiredDiagram, at: OperatingPoint) -> tuple[Four, bool]:
+        """Return A, B, C, D of the loop of a diagram, and whether its point is an equilibrium."""
+        model = self.cut.model
+        made = linearize(diagram, at, plants=model.plants, stairs=model.stairs, step=model.step)
+        L = made.loop(*self.cut.wires, slow=self.cut.slow)
+        return (L.A, L.B, L.C, L.D), made.is_equilibrium
+
+
+class _Traced:
+    """Slopes along the numbers of a parameter of traced equations."""
+
+    def __init__(self, cut: _Cut, free: Free, diagram: WiredDiagram, find: PointFinder | None):
+        self.cut, self.free, self.find = cut, free, find
+        model = cut.model
+        _, keys = free.path, free.keys
+        self.value = np.ravel(np.asarray(read_value(model.diagram.structure.blocks[free.path], keys, free.path), dtype=float))
+        self.shape = free.shape
+        if np.array_equal(self.value, free.start):  # no zero, which a trace takes for structure
+            self.diagram, self.flat = model.diagram, cut.flat
+            free.where, free.pack = None, None
+            locate(free, self.diagram, self.flat)
+        else:
+            self.diagram, flat = diagram, diagram.flatten_like(model.point)
+            p = flat.p.copy()
+            locate(free, diagram, flat)
+            assert free.where is not None
+            p[free.where] = free.pack_value(self.value)
+            self.flat = replace(flat, p=p)
+            model.point.check_fits(self.flat, model.diagram.name)
+
+    def slopes(self) -> list[LoopSlope]:
+        free, cut, model = self.free, self.cut, self.cut.model
+        found = []
+        packed, error = free.slope_with_error(self.value)
+        for i, name in enumerate(elements(free.name, self.shape)):
+            direction = np.zeros(self.flat.p.size)
+            direction[free.where] = packed[:, i]
+            at, own, lost = self._point(direction, i)
+            local, closed = cut.derivatives(self.flat, self.diagram)
+            local.error = closed.error = 0.0
+            four = cut.loop(self.flat, self.diagram, at, direction)
+            if not all(np.isfinite(np.concatenate([np.ravel(M) for M in four]))):
+                raise ParameterError(
+                    f"found a derivative that is not finite at the value {self.value[i]:g}; expected a smooth "
+                    "dependence. Take another value, with diagram.replace(…).", block=free.path, port=name,
+                )  # fmt: skip
+            (A, B, C, D), (dA, dB, dC, dD) = map(np.real, four), map(slope_of, four)
+            worst = max(local.error, closed.error, own, float(error[i]))
+            found.append(LoopSlope(name, float(self.value[i]), (A, B, C, D), (dA, dB, dC, dD), worst, lost))
+        return found
+
+    def _point(self, direction: np.ndarray, i: int) -> tuple[OperatingPoint, float, bool]:
+        """Return the point with slopes, the error of the slopes, and whether an equilibrium is lost."""
+        at = self.cut.model.point
+        still = replace(at, x=join_slope(at.x, np.zeros(at.x.size)))
+        if self.find is not None:
+            changed = _Changed.of(self.free, self.value, i, self.cut.model.diagram)
+            return (*_with_differences(at, [self.find(d) for d in changed.diagrams], changed), False)
+        if self.cut.model.is_equilibrium:
+            moved = self.cut.rest(self.flat, self.diagram, direction)
+            return (still, 0.0, True) if moved is None else (moved, 0.0, False)
+        return still, 0.0, False
