@@ -6,6 +6,7 @@ from .carried import with_findings
 from .disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
 from .loop_class import loop_class
 from .loop_margins import margins
+from .margin_slopes import MarginSlope, margin_slopes
 from .margins_found import GainCrossover, Margins, PhaseCrossover
 from .measured_margins import Interval, MeasuredMargins, measured_margins, read_frequency_data
 from .number import MARK, Number
@@ -29,6 +30,7 @@ __all__ = [
     "GainCrossover",
     "GangOfFour",
     "Interval",
+    "MarginSlope",
     "Margins",
     "MeasuredMargins",
     "Number",
@@ -46,6 +48,7 @@ __all__ = [
     "gang_of_four",
     "loop_at",
     "loop_class",
+    "margin_slopes",
     "margins",
     "measured_margins",
     "mimo_disk_margin",

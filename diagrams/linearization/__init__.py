@@ -17,6 +17,7 @@ from .kinks import find_kinks_between
 from .linear_model import Linearization, linearize, linearize_batch
 from .loops_over_a_period import ticks_to_renewal
 from .operating_points import PointLike, capture, check_options, operating_point, run_to
+from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop
 from .plant_equations import PlantEquations, linearize_plant, moves_between_ticks
 from .trim_search import point_from_states, trim
 
@@ -28,8 +29,10 @@ __all__ = [
     "InertConsumer",
     "Kink",
     "Linearization",
+    "LoopSlope",
     "MeanSlope",
     "PlantEquations",
+    "PointFinder",
     "PointLike",
     "StepsOnly",
     "Tap",
@@ -37,6 +40,7 @@ __all__ = [
     "ZeroSlope",
     "capture",
     "check_options",
+    "differentiate_loop",
     "find_kinks_between",
     "find_signal",
     "linearize",

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ...blocks.core import OptionError, WiringError
-from ..flat import FlatDiagram, WiredDiagram
+from ..coupling import Links, tells_slopes
+from ..flat import NONE, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from .derivatives import LocalDerivatives, Tap
 from .mean_stairs import NO_STAIRS, Stairs
-from .over_a_period import find_moving
 
 
 def replace_stairs(diagram: WiredDiagram, flat: FlatDiagram, at: OperatingPoint, stairs: str | None) -> Stairs:
@@ -55,3 +57,53 @@ def check_opening(flat: FlatDiagram, signal: Tap) -> None:
         block=signal.port[0],
         port=signal.port[1],
     )
+
+
+def check_coupling(flat: FlatDiagram, at: OperatingPoint) -> None:
+    """Refuse a model over communication steps whose FMUs a run couples in another way than the model.
+
+    The model holds the FMUs' inputs from the beginning of a step, as the default coupling does. Where every input
+    comes from sampled subsystems, it is held by every scheme.
+
+    Raises
+    ------
+    OptionError
+        If an input changes within a step, and the coupling is not the default; if the run tells an FMU slopes.
+    """
+    for path, inputs in Links(flat).inputs.items():
+        if inputs.stop > inputs.start and tells_slopes(flat.table.blocks[path]):
+            raise OptionError(
+                "found input_derivatives among its options: its inputs are ramps over a communication step; expected "
+                "held inputs, which a linear model over communication steps has. Linearize the diagram with "
+                f"replace({{{path!r}: …}}), the FMU without this option.",
+                block=path,
+                port="stepping",
+            )
+    if not at.coupling:
+        return
+    links = Links(flat)
+    found = [path for path in links.paths if links.moving[links.inputs[path]].any()]
+    if found:
+        raise OptionError(
+            f"found an operating point of a run with coupling {at.coupling!r}, in which inputs of {', '.join(found)} "
+            "are not held from the beginning of a communication step; expected coupling 'jacobi', which a linear model "
+            "over communication steps follows. Linearize at a point of a run with that coupling, or, without sampled "
+            "subsystems, in continuous time: linearize(t) without step=, which all couplings approach with shorter "
+            "steps.",
+            block=found[0],
+            port="coupling",
+        )
+
+
+def find_moving(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> tuple[str, ...]:
+    """Return the names of injected signals that change between ticks and that continuous blocks use there."""
+    if not flat.continuous.size:
+        return ()
+    by_d = local.differentiate(NONE, at.t, at.x, at.w)["dx", "d"]
+    injected = zip(local.inputs, local.injected, strict=True)
+    return tuple(signal.name for signal, where in injected if np.any(by_d[:, where]) and is_moving(flat, signal))
+
+
+def is_moving(flat: FlatDiagram, signal: Tap) -> bool:
+    """Whether a signal follows continuous states between two ticks."""
+    return bool(flat.output(signal.port).depends("y", "x")[:, flat.continuous].any())

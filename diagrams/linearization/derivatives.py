@@ -243,9 +243,7 @@ class LocalDerivatives:
         numbers = self._trace_derivative(acting)(*at, *zeros, c, evaluators=self.evaluators)
         return self._eliminate_loops(numbers, acting, t)
 
-    def _eliminate_loops(
-        self, numbers: Sequence[np.ndarray], acting: frozenset[TickPattern], t: float
-    ) -> Numbers:
+    def _eliminate_loops(self, numbers: Sequence[np.ndarray], acting: frozenset[TickPattern], t: float) -> Numbers:
         """Return values and derivatives by name, without algebraic loops and the stairs that are replaced.
 
         Loops are eliminated by the implicit function theorem.

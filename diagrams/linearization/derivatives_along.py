@@ -106,27 +106,29 @@ class DerivativesAlong(LocalDerivatives):
         """Return the linear model of one communication step of an FMU, with its slopes."""
         middle = model_step(self.flat, _without_slopes(at), path, np.real(z), h, way)
 
-        def model(point: OperatingPoint, inputs: np.ndarray, held: bool) -> PlantModel:
-            how = "identified" if middle.identified else "equations" if held else "step"
-            return model_step(self.flat, point, path, inputs, h, how)
+        def follow(way: str) -> PlantModel:
+            def model(point: OperatingPoint, inputs: np.ndarray) -> PlantModel:
+                return model_step(self.flat, point, path, inputs, h, way)
 
-        held = middle.derivation.held
-        made = self._follow(middle, at, z, path, lambda point, inputs: model(point, inputs, held))
-        if held and np.max(np.abs(slope_of(made.f - made.x0)), initial=0.0) > STILL:
-            made = self._follow(middle, at, z, path, lambda point, inputs: model(point, inputs, False))
-        return made
+            return self._follow(middle, at, z, path, model)
+
+        if middle.identified or not middle.derivation.held:
+            return follow("identified" if middle.identified else "step")
+        made = follow("equations")
+        moves = np.max(np.abs(slope_of(made.f - made.x0)), initial=0.0) > STILL
+        return follow("step") if moves else made
 
     def model_equations(self, at: OperatingPoint, way: str | None) -> list[PlantModel]:
         """Return the linear models of the equations of all FMUs, with their slopes."""
         found = model_equations(self.flat, _without_slopes(at), way)
 
-        def model(point: OperatingPoint, z: np.ndarray, place: int) -> PlantModel:
-            return model_equations(self.flat, replace(point, z=z), way)[place]
+        def follow(place: int) -> PlantModel:
+            def model(point: OperatingPoint, z: np.ndarray) -> PlantModel:
+                return model_equations(self.flat, replace(point, z=z), way)[place]
 
-        return [
-            self._follow(middle, at, at.z, middle.path, lambda point, z, i=i: model(point, z, i))
-            for i, middle in enumerate(found)
-        ]
+            return self._follow(found[place], at, at.z, found[place].path, model)
+
+        return [follow(place) for place in range(len(found))]
 
     def _follow(
         self,
@@ -150,22 +152,23 @@ class DerivativesAlong(LocalDerivatives):
 
         pairs = [(shift(s), shift(-s)) for s in (STEP, 2.0 * STEP)]
 
-        def slope(read: Callable[[PlantModel], Any]) -> Any:
-            value = read(middle)
+        def slope(value: Any, ends: Sequence[tuple[Any, Any]]) -> Any:
             if isinstance(value, Mapping):
-                return {key: slope(lambda m, key=key: read(m)[key]) for key in value}
+                return {key: slope(value[key], [(a[key], b[key]) for a, b in ends]) for key in value if key != "t"}
             if isinstance(value, str) or np.asarray(value).dtype.kind not in "fc":
                 return value
             near, far = (
-                (np.asarray(read(a)) - np.asarray(read(b))) * (size / (2.0 * s))
-                for (a, b), s in zip(pairs, (STEP, 2.0 * STEP), strict=True)
+                (np.asarray(a) - np.asarray(b)) * (size / (2.0 * s))
+                for (a, b), s in zip(ends, (STEP, 2.0 * STEP), strict=True)
             )
             self.error = max(self.error, float(np.max(np.abs(near - far), initial=0.0)))
             return join_slope(np.asarray(value), (4.0 * near - far) / 3.0)
 
-        numbers = {name: slope(lambda m, name=name: getattr(m, name)) for name in ("A", "B", "C", "D", "x0", "f")}
-        following = {key: v if key == "t" else slope(lambda m, key=key: m.next[key]) for key, v in middle.next.items()}
-        return replace(middle, **numbers, y_next=slope(lambda m: m.y_next), next=following)
+        made = {
+            name: slope(getattr(middle, name), [(getattr(a, name), getattr(b, name)) for a, b in pairs])
+            for name in ("A", "B", "C", "D", "x0", "f", "y_next", "next")
+        }
+        return replace(middle, **{**made, "next": {**middle.next, **made["next"]}})
 
 
 def _moved(at: OperatingPoint, s: float) -> OperatingPoint:

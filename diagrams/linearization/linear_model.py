@@ -23,13 +23,11 @@ from ..frequency import loop_class
 from ..results import OperatingPoint
 from ..wiring import exact_time
 from .checks import check_loop, check_opening, refuse_transport_delays, replace_stairs
-from .consumers import find_cut_findings, split_consumers
-from .continuous_model import model_continuous
 from .derivatives import LocalDerivatives, find_signal
 from .exchanged import derivations_at, evaluators_at
 from .findings import EntryTaken
-from .flow_model import EQUILIBRIUM
-from .input_ports import name_inputs, split_inputs
+from .flow_model import EQUILIBRIUM, Model, model_continuous
+from .inserted_blocks import find_cut_findings, name_inputs, split_consumers, split_inputs
 from .kinks import find_kinks
 from .loops_over_a_period import (
     advance_point,
@@ -39,7 +37,7 @@ from .loops_over_a_period import (
     ticks_to_renewal,
 )
 from .operating_points import PointLike, check_options, operating_point
-from .over_a_period import Model, model_period, period_of
+from .over_a_period import model_period, period_of
 from .signal_paths import SignalPaths
 
 if TYPE_CHECKING:

@@ -22,7 +22,8 @@ from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
 from .derivatives import LocalDerivatives, Tap
 from .exchanged import evaluators_at
-from .over_a_period import Chain, Model, find_needed, own_states, period_of
+from .flow_model import Model
+from .over_a_period import Chain, find_needed, own_states, period_of
 
 SAME_ROWS = 1e-12
 """Relative difference up to which a wire counts as unchanged from one tick to the next."""

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TypeAlias
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,10 +18,10 @@ from ...blocks.core import Finding, Layout
 from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
-from .coupled_plants import check_coupling
-from .derivatives import SLOPE, LocalDerivatives, Numbers, Tap
+from .checks import check_coupling
+from .derivatives import SLOPE, LocalDerivatives, Numbers
 from .findings import EventWithinPeriod, MemoryActs, UnusualStart
-from .flow_model import EQUILIBRIUM, differentiate_flow
+from .flow_model import EQUILIBRIUM, Four, Model, differentiate_flow
 from .plant_models import (
     PlantModel,
     check_way,
@@ -35,21 +34,6 @@ from .plant_models import (
 
 SAME = 1e-12
 """Largest difference of values that are the same, relative to 1 + their size."""
-Four: TypeAlias = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-
-
-@dataclass
-class Model:
-    """Matrices A, B, C, D of a linear model, with its states and findings; see `Linearization`."""
-
-    matrices: Four
-    dt: float
-    states: list[str]
-    affine: np.ndarray
-    derivations: dict[str, Derivation] = field(default_factory=dict)
-    uncertainty: float = 0.0
-    memory: tuple[str, ...] = ()
-    findings: tuple[Finding, ...] = ()
 
 
 def period_of(flat: FlatDiagram, frozen: frozenset[TickPattern] = NONE) -> int:
@@ -305,23 +289,6 @@ def _are_same(a: np.ndarray, b: np.ndarray) -> bool:
     if np.iscomplexobj(a) or np.iscomplexobj(b):  # values with slopes
         return _are_same(np.real(a), np.real(b)) and _are_same(np.imag(a) / SLOPE, np.imag(b) / SLOPE)
     return bool(np.all(np.abs(a - b) <= SAME * (1.0 + np.abs(a))))
-
-
-# --- signals between ticks --------------------------------------------------------------------------------------------
-
-
-def find_moving(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> tuple[str, ...]:
-    """Return the names of injected signals that change between ticks and that continuous blocks use there."""
-    if not flat.continuous.size:
-        return ()
-    by_d = local.differentiate(NONE, at.t, at.x, at.w)["dx", "d"]
-    injected = zip(local.inputs, local.injected, strict=True)
-    return tuple(signal.name for signal, where in injected if np.any(by_d[:, where]) and is_moving(flat, signal))
-
-
-def is_moving(flat: FlatDiagram, signal: Tap) -> bool:
-    """Whether a signal follows continuous states between two ticks."""
-    return bool(flat.output(signal.port).depends("y", "x")[:, flat.continuous].any())
 
 
 # --- states of the model ---------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,13 +18,13 @@ from ..flat import NONE, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
 from .checks import replace_stairs
-from .continuous_model import model_continuous
 from .derivatives import find_signal
 from .derivatives_along import DerivativesAlong, join_slope, slope_of
 from .exchanged import evaluators_at
+from .flow_model import Four, model_continuous
 from .linear_model import Linearization, linearize
 from .loops_over_a_period import advance_point, find_slower_clocks, model_loop, ticks_to_renewal
-from .over_a_period import Chain, Four, model_period, period_of
+from .over_a_period import Chain, model_period, period_of
 from .plant_models import join_matrices, plant_layout
 from .trim_request import Free, difference, free_parameters, locate, read_value, spread_nodes
 
@@ -48,8 +48,8 @@ class LoopSlope:
         Value of that number.
     matrices, slopes : tuple of ndarray
         A, B, C, D of L, and their derivatives by the number.
-    error : float
-        Largest estimated error of an entry of the slopes; 0 where all are exact.
+    errors : tuple of ndarray
+        Estimated errors of the slopes' entries; zeros where they are exact.
     rest_lost : bool
         Whether the operating point was an equilibrium that no longer is one when the parameter changes: the states are
         held then.
@@ -59,8 +59,13 @@ class LoopSlope:
     value: float
     matrices: Four
     slopes: Four
-    error: float = 0.0
+    errors: Four
     rest_lost: bool = False
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether no difference is part of the slopes."""
+        return not any(np.any(error) for error in self.errors)
 
 
 def differentiate_loop(
@@ -69,7 +74,7 @@ def differentiate_loop(
     parameters: Iterable[str],
     *,
     find: PointFinder | None = None,
-    slow: str = "closed",
+    slow: Literal["closed", "open"] = "closed",
 ) -> list[LoopSlope]:
     """Return the derivatives of a loop's matrices by parameters, one result for each of their numbers.
 
@@ -104,7 +109,7 @@ def differentiate_loop(
 class _Cut:
     """A loop cut at wires, as a function of the diagram and its operating point."""
 
-    def __init__(self, model: Linearization, wires: tuple[str, ...], slow: str):
+    def __init__(self, model: Linearization, wires: tuple[str, ...], slow: Literal["closed", "open"]):
         self.model, self.wires, self.slow = model, wires, slow
         self.flat = model.diagram.flatten_like(model.point)
         self._known: dict[int, tuple[FlatDiagram, OperatingPoint, DerivativesAlong, DerivativesAlong]] = {}
@@ -183,7 +188,13 @@ def _smallest(M: np.ndarray, right: np.ndarray) -> np.ndarray | None:
 
 
 def _with_slopes(
-    flat: FlatDiagram, at: OperatingPoint, x: np.ndarray, w: np.ndarray, of_plants: np.ndarray, z: np.ndarray, chain: Chain
+    flat: FlatDiagram,
+    at: OperatingPoint,
+    x: np.ndarray,
+    w: np.ndarray,
+    of_plants: np.ndarray,
+    z: np.ndarray,
+    chain: Chain,
 ) -> OperatingPoint:
     """Return an operating point with the slopes of its vectors, and of the states and inputs of FMUs."""
     plants, first = dict(at.plants), 0
@@ -222,8 +233,8 @@ class _Changed:
             changed.append(diagram.replace({free.name: free.shape_value(moved)}))
         return cls(h, nodes, changed)
 
-    def slope(self, middle: Any, others: Iterable[Any]) -> tuple[np.ndarray, float]:
-        """Return the slope of a value of the diagram and its error, from its values in the changed diagrams."""
+    def slope(self, middle: Any, others: Iterable[Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the slope of a value of the diagram and its errors, from its values in the changed diagrams."""
         return difference([middle, *others], self.h, self.nodes)
 
 
@@ -240,7 +251,7 @@ def _with_differences(
         if isinstance(here, str) or np.asarray(here).dtype.kind != "f":
             return here
         found, error = changed.slope(here, others)
-        worst = max(worst, error)
+        worst = max(worst, float(np.max(error, initial=0.0)))
         return join_slope(np.asarray(here), found)
 
     parts = {name: slope(getattr(at, name), [getattr(p, name) for p in points]) for name in ("x", "w", "z", "plants")}
@@ -254,7 +265,7 @@ class _StartValues:
         self.cut, self.free, self.find = cut, free, find
 
     def slopes(self) -> list[LoopSlope]:
-        free, cut, model = self.free, self.cut, self.cut.model
+        free, model = self.free, self.cut.model
         found, value = [], free.start
         middle = self._loop(model.diagram, model.point)[0]
         for i, name in enumerate(elements(free.name, free.shape)):
@@ -266,10 +277,9 @@ class _StartValues:
                     "values with diagram.replace(…), one after the other.", block=free.path, port=name,
                 )  # fmt: skip
             both = [changed.slope(M, [four[k] for four, _ in made]) for k, M in enumerate(middle)]
-            A, B, C, D = (slope for slope, _ in both)
+            (A, B, C, D), (eA, eB, eC, eD) = zip(*both, strict=True)
             lost = model.is_equilibrium and not all(rests for _, rests in made)
-            worst = max(error for _, error in both)
-            found.append(LoopSlope(name, float(value[i]), middle, (A, B, C, D), worst, lost))
+            found.append(LoopSlope(name, float(value[i]), middle, (A, B, C, D), (eA, eB, eC, eD), lost))
         return found
 
     def _loop(self, diagram: WiredDiagram, at: OperatingPoint) -> tuple[Four, bool]:
@@ -287,7 +297,9 @@ class _Traced:
         self.cut, self.free, self.find = cut, free, find
         model = cut.model
         _, keys = free.path, free.keys
-        self.value = np.ravel(np.asarray(read_value(model.diagram.structure.blocks[free.path], keys, free.path), dtype=float))
+        self.value = np.ravel(
+            np.asarray(read_value(model.diagram.structure.blocks[free.path], keys, free.path), dtype=float)
+        )
         self.shape = free.shape
         if np.array_equal(self.value, free.start):  # no zero, which a trace takes for structure
             self.diagram, self.flat = model.diagram, cut.flat
@@ -303,7 +315,7 @@ class _Traced:
             model.point.check_fits(self.flat, model.diagram.name)
 
     def slopes(self) -> list[LoopSlope]:
-        free, cut, model = self.free, self.cut, self.cut.model
+        free, cut = self.free, self.cut
         found = []
         packed, error = free.slope_with_error(self.value)
         for i, name in enumerate(elements(free.name, self.shape)):
@@ -320,7 +332,8 @@ class _Traced:
                 )  # fmt: skip
             (A, B, C, D), (dA, dB, dC, dD) = map(np.real, four), map(slope_of, four)
             worst = max(local.error, closed.error, own, float(error[i]))
-            found.append(LoopSlope(name, float(self.value[i]), (A, B, C, D), (dA, dB, dC, dD), worst, lost))
+            eA, eB, eC, eD = (worst * (slope != 0.0) for slope in (dA, dB, dC, dD))
+            found.append(LoopSlope(name, float(self.value[i]), (A, B, C, D), (dA, dB, dC, dD), (eA, eB, eC, eD), lost))
         return found
 
     def _point(self, direction: np.ndarray, i: int) -> tuple[OperatingPoint, float, bool]:

@@ -11,9 +11,9 @@ from ...fmus.running import Derivation, DerivativeMethod
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
+from .checks import find_moving, is_moving
 from .derivatives import LocalDerivatives, Tap, find_signal
 from .exchanged import evaluators_at, linearize_exchanged
-from .over_a_period import find_moving, is_moving
 from .plant_models import linearize_equations
 
 

@@ -19,6 +19,9 @@ from .plant_models import plant_layout
 if TYPE_CHECKING:
     from ...fmus.running import Fmu
 
+WHOLE = 1e-10
+"""Distance from a whole number up to which a slope is one."""
+
 
 @dataclass(eq=False)
 class Target:
@@ -98,7 +101,6 @@ class Free:
             columns.append(np.where(np.isnan(change), 0.0, change))  # NaN stands for no sample time
         return np.array(columns).T
 
-
     def slope_with_error(self, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the derivative of `pack_value` by differences of fourth order, and each column's error.
 
@@ -115,7 +117,7 @@ class Free:
                 found.append(np.nan_to_num(self.pack_value(moved)))  # NaN stands for no sample time
             slope, error = difference(found, h, nodes)
             columns.append(slope)
-            errors.append(error)
+            errors.append(float(np.max(error, initial=0.0)))
         return np.array(columns).T, np.array(errors)
 
 
@@ -131,10 +133,10 @@ def spread_nodes(value: float, h: float, low: float, high: float) -> tuple[float
     return min(h, 0.25 * max(below, above)), (side, 2.0 * side, 4.0 * side)
 
 
-def difference(values: Sequence[Any], h: float, nodes: tuple[float, ...]) -> tuple[np.ndarray, float]:
-    """Return a slope and an estimate of its largest error, from values at 0 and at the nodes, in steps h.
+def difference(values: Sequence[Any], h: float, nodes: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return a slope and an estimate of its errors, from values at 0 and at the nodes, in steps h.
 
-    Slopes that are whole numbers to rounding, as where the values are the argument itself, are exact.
+    Slopes that are whole numbers up to rounding are exact, as where the values are the argument itself.
     """
     f, s = [np.asarray(v, dtype=float) for v in values], nodes[0]
     if len(nodes) == 4:
@@ -142,12 +144,10 @@ def difference(values: Sequence[Any], h: float, nodes: tuple[float, ...]) -> tup
     else:
         near = (4.0 * f[1] - 3.0 * f[0] - f[2]) / (2.0 * s * h)
         far = (4.0 * f[2] - 3.0 * f[0] - f[3]) / (4.0 * s * h)
-    slope = (4.0 * near - far) / 3.0
+    slope, error = (4.0 * near - far) / 3.0, np.abs(near - far)
     whole = np.round(slope)
-    exact = np.abs(slope - whole) <= 1e-10 * (1.0 + np.max(np.abs(f[0]), initial=0.0) / h * 1e-5)
-    exact &= np.abs(near - far) <= 1e-10
-    slope = np.where(exact, whole, slope)
-    return slope, float(np.max(np.where(exact, 0.0, np.abs(near - far)), initial=0.0))
+    exact = (np.abs(slope - whole) <= WHOLE) & (error <= WHOLE)
+    return np.where(exact, whole, slope), np.where(exact, 0.0, error)
 
 
 def index_states(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray]:
