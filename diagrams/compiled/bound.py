@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .loop import _Tick
+from .loop import TickStructure
 
 
 class BoundFunction:
@@ -36,7 +36,7 @@ class BoundFunction:
                 into[i] = address(vector)
         iw, w = np.zeros(function.sz_iw() + 1, dtype=np.int64), np.zeros(function.sz_w() + 1)
         self._kept = given, made, iw, w, arguments, results
-        self.structure = _Tick(at, ctypes.addressof(given), ctypes.addressof(made), address(iw), address(w))
+        self.structure = TickStructure(at, ctypes.addressof(given), ctypes.addressof(made), address(iw), address(w))
 
 
 def address(vector: np.ndarray) -> int | None:

@@ -20,11 +20,45 @@ from ...blocks.core import CompilerError
 from ...fmus.export import SUFFIXES, compile_shared, describe_compiler
 from ...fmus.platform import cache_folder, native_platform
 from ..flat import FlatDiagram, TickPattern
+from .grouping import Tables, make_tables
+from .kernels import write_kernels
 
-LARGEST = 6_000
-"""Operations of a tick up to which it is compiled: the compiler's time grows faster than they do."""
 _MASTER = "loopwright_run"
-_EXPORTING = "#define GCC_HASCLASSVISIBILITY\n"  # so that CasADi's code makes its functions visible
+
+
+@dataclass(frozen=True, eq=False)
+class StraightTick:
+    """A tick as one C function of scalar operations.
+
+    Attributes
+    ----------
+    function : casadi.Function
+        The function that was compiled.
+    address : int
+        Address of the C function.
+    """
+
+    function: Any
+    address: int
+
+
+@dataclass(frozen=True, eq=False)
+class GroupedTick:
+    """A tick as runs of equal blocks.
+
+    Attributes
+    ----------
+    tables : Tables
+        Where the values of each block stand.
+    functions : mapping
+        CasADi functions of the blocks that Python evaluates, by key.
+    address : int
+        Address of the C function that goes over the tables.
+    """
+
+    tables: Tables
+    functions: Mapping[int, Any]
+    address: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +67,8 @@ class TickCode:
 
     Attributes
     ----------
-    functions : mapping
-        CasADi functions that were compiled, by the clocks that act.
-    addresses : mapping
-        Addresses of the C functions, by the clocks that act.
+    ticks : mapping
+        The ticks, by the clocks that act.
     exact : bool
         Whether all of them are operations on scalars, as they are interpreted: then all bits are those of an
         interpreted run. Tables and large matrix products are compiled in another form than they are interpreted in;
@@ -45,8 +77,7 @@ class TickCode:
         The library, which is loaded as long as this lives.
     """
 
-    functions: Mapping[frozenset[TickPattern], Any]
-    addresses: Mapping[frozenset[TickPattern], int]
+    ticks: Mapping[frozenset[TickPattern], StraightTick | GroupedTick]
     exact: bool
     library: ctypes.CDLL
 
@@ -56,51 +87,73 @@ _COMPILED: WeakKeyDictionary[FlatDiagram, TickCode] = WeakKeyDictionary()
 
 def find_obstacle(flat: FlatDiagram) -> str | None:
     """Return why a diagram's ticks can't be compiled; None if they can."""
-    if flat.hybrid:
-        return "it has continuous states, events or transport delays, and a solver goes from tick to tick"
     if flat.loops.slices:
         return "it has an algebraic loop, which is solved by iteration at every tick"
-    opaque = sorted(path for path in flat.checked.traced if flat.table.blocks[path].opaque)
-    if opaque:
-        return f"the block {opaque[0]!r} is evaluated by Python"
     return None
 
 
 def compile_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickCode:
     """Compile the ticks at which these sets of clocks act.
 
+    Small ones are one function of scalar operations, in which the values of one block are used by the next without a
+    memory in between. Large ones, and those with blocks that are no scalar operations, are grouped: one function for
+    each kind of block, called in a loop over all blocks of this kind. Their code knows no numbers and no wiring.
+
     Raises
     ------
     CompilerError
-        If there is no compiler, it fails, or a tick is too large for it.
+        If there is no compiler, or it fails.
     FmuError
         If the cache can't be written.
     """
-    if flat in _COMPILED and tuple(_COMPILED[flat].functions) == tuple(acting):
+    if flat in _COMPILED and tuple(_COMPILED[flat].ticks) == tuple(acting):
         return _COMPILED[flat]
+    straight = None if flat.by_block else _compile_straight(flat, acting)
+    return _COMPILED.setdefault(flat, straight or _compile_grouped(flat, acting))
+
+
+def _compile_straight(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickCode | None:
+    """Return the code of ticks as one function each; None if they are no scalar operations."""
+    found = {clocks: flat.at_tick(clocks).last.fast for clocks in acting}
+    if not all(function.is_a("SXFunction") for function in found.values()):
+        return None
     generator, functions = ca.CodeGenerator("ticks.c"), {}
-    for i, clocks in enumerate(acting):
-        function = functions[clocks] = _named(flat.at_tick(clocks).last.fast, f"tick{i}")
-        count = function.n_instructions()
-        if count > LARGEST:
-            raise CompilerError(
-                f"a tick has {count} operations; at most {LARGEST} are compiled, as a compiler takes seconds for them. "
-                "Leave out compile=True."
-            )
-        generator.add(function)
-    library = load_compiled(_EXPORTING + generator.dump())
-    addresses = {clocks: address_of(library, f"tick{i}") for i, clocks in enumerate(acting)}
-    exact = all(f.is_a("SXFunction") for f in functions.values())
-    return _COMPILED.setdefault(flat, TickCode(functions, addresses, exact, library))
+    for i, (clocks, function) in enumerate(found.items()):
+        functions[clocks] = rename(function, f"tick{i}")
+        generator.add(functions[clocks])
+    library = load_compiled(make_visible(generator.dump()))
+    ticks = {clocks: StraightTick(f, address_of(library, f.name())) for clocks, f in functions.items()}
+    return TickCode(ticks, True, library)
 
 
-def _named(function: Any, name: str) -> Any:
-    """Return a function under another name; of operations on scalars, equal ones are shared."""
+def _compile_grouped(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickCode:
+    programs = {clocks: flat.program_at(clocks) for clocks in acting}
+    functions = {key: f for tick in programs.values() for key, f in tick.program.functions.items()}
+    opaque = {id(flat.blocks.of(path, names)) for path, names in flat.order.steps if flat.table.blocks[path].opaque}
+    kernels = write_kernels({key: f for key, f in functions.items() if key not in opaque})
+    library = load_compiled(kernels.source)
+    address = address_of(library, "grouped")
+    ticks = {
+        clocks: GroupedTick(
+            make_tables(tick, kernels.of), {k: f for k, f in tick.program.functions.items() if k in opaque}, address
+        )
+        for clocks, tick in programs.items()
+    }
+    return TickCode(ticks, kernels.exact, library)
+
+
+def rename(function: Any, name: str) -> Any:
+    """Return a function under another name; of operations on scalars, each is done once."""
     if function.is_a("SXFunction"):
         symbols = function.sx_in()
         return ca.Function(name, symbols, ca.cse(function.call(symbols)))
     symbols = function.mx_in()
     return ca.Function(name, symbols, function.call(symbols))
+
+
+def make_visible(source: str) -> str:
+    """Return C code of CasADi whose functions can be found in a library."""
+    return "#define GCC_HASCLASSVISIBILITY\n" + source
 
 
 def address_of(library: ctypes.CDLL, name: str) -> int:

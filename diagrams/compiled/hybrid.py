@@ -13,7 +13,7 @@ import numpy as np
 from ..flat import NONE, FlatDiagram, TickPattern
 from .bound import BoundFunction, address
 from .hybrid_code import Compiled, HybridCode, hybrid_master
-from .loop import CompiledLoop, _Loop, _Outcome, _Tick
+from .loop import CompiledLoop, LoopStructure, OutcomeStructure, TickStructure
 
 FIXED = ("euler", "heun", "rk4")
 _KINDS = {"euler": 0, "heun": 1, "rk4": 2, "RK23": 3, "RK45": 3, "DOP853": 4, "Radau": 5}
@@ -38,7 +38,7 @@ _INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 class _Problem(ctypes.Structure):
     _fields_ = [
-        *_fields(_INT, "n width"), ("where", _AT), ("flow", _Tick), ("slope", _Tick),
+        *_fields(_INT, "n width"), ("where", _AT), ("flow", TickStructure), ("slope", TickStructure),
         *_fields(_AT, "t x slopes"), *_fields(_REAL, "stop edge left at late"), *_fields(_INT, "rates jacobians"),
     ]  # fmt: skip
 
@@ -61,7 +61,7 @@ class _Method(ctypes.Structure):
 
 class _Watch(ctypes.Structure):
     _fields_ = [
-        ("m", _INT), ("indicators", _Tick), ("jump", _Tick),
+        ("m", _INT), ("indicators", TickStructure), ("jump", TickStructure),
         *_fields(_AT, "z open fired rising falling hysteretic asks hysteresis own own_first"),
         *_fields(_REAL, "spacing finest step"), ("state_size", _INT), ("state", _AT),
         *_fields(_AT, "domain low high slack size rounding largest counts latest fresh recent"), ("fired_times", _INT),
@@ -72,7 +72,7 @@ class _Watch(ctypes.Structure):
 
 class _Hybrid(ctypes.Structure):
     _fields_ = [
-        ("l", _Loop), ("p", _Problem), ("w", _Watch), ("methods", _AT * 2),
+        ("l", LoopStructure), ("p", _Problem), ("w", _Watch), ("methods", _AT * 2),
         *_fields(_INT, "active automatic accepts between budget inside begun stepped"), *_fields(_REAL, "t to"),
         *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
         *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT),
@@ -190,7 +190,7 @@ class CompiledHybrid:
         trial = [np.zeros(1), x.copy(), w, p]
         where = self._own(flat.continuous.astype(np.int64))
         slopes = np.zeros(n * n if "slope" in code.between else 0)
-        self._hybrid = hybrid = _Hybrid(l=loop._loop, automatic=len(methods) > 1, accepts=accepts, budget=_BUDGET)
+        self._hybrid = hybrid = _Hybrid(l=loop.structure, automatic=len(methods) > 1, accepts=accepts, budget=_BUDGET)
         hybrid.between = self.kinds[NONE]
         hybrid.p = _Problem(
             n=n,
@@ -213,7 +213,7 @@ class CompiledHybrid:
         hybrid.taken = self._own(np.concatenate([np.zeros(0), *taken]).astype(np.int64))
         hybrid.taken_first = self._own(np.cumsum([0, *map(len, taken)]).astype(np.int64))
         hybrid.taken_states = self._own(np.zeros(width))
-        self._outcome = _Outcome()
+        self._outcome = OutcomeStructure()
         self._run = hybrid_master()["loopwright_go"]
         self._run.restype = None
 

@@ -14,8 +14,10 @@ import casadi as ca
 
 from ...blocks.core import CompilerError
 from ..flat import NONE, FlatDiagram, TickPattern
-from .code import _EXPORTING, LARGEST, TickCode, _named, address_of, load_compiled
+from .code import StraightTick, TickCode, address_of, load_compiled, make_visible, rename
 
+LARGEST = 6_000
+"""Operations of a function up to which it is compiled: the compiler's time grows faster than they do."""
 _SOURCES = ("master.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
 
 EMBEDDED = ("euler", "heun", "rk4", "RK23", "RK45", "DOP853", "Radau", "auto")
@@ -94,13 +96,13 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
     known = _COMPILED.setdefault(flat, {})
     if (kinds, stiff) in known:
         return known[kinds, stiff]
-    ticks = {clocks: _named(flat.at_tick(clocks).last.fast, f"tick{i}") for i, clocks in enumerate(kinds)}
+    ticks = {clocks: rename(flat.at_tick(clocks).last.fast, f"tick{i}") for i, clocks in enumerate(kinds)}
     others = {"flow": flat.flow.last.fast}
     if stiff:
         others["slope"] = flat.jacobian.fast
     if flat.events:
         others |= {"indicators": flat.indicators.last.fast, "jump": flat.jump.last.fast}
-    others = {name: _named(function, name) for name, function in others.items()}
+    others = {name: rename(function, name) for name, function in others.items()}
     generator = ca.CodeGenerator("hybrid.c")
     for function in (*ticks.values(), *others.values()):
         if (count := function.n_instructions()) > LARGEST:
@@ -109,10 +111,10 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
                 "takes seconds for them. Leave out compile=True."
             )
         generator.add(function)
-    library = load_compiled(_EXPORTING + generator.dump())
-    addresses = {clocks: address_of(library, f"tick{i}") for i, clocks in enumerate(kinds)}
+    library = load_compiled(make_visible(generator.dump()))
+    straight = {c: StraightTick(ticks[c], address_of(library, f"tick{i}")) for i, c in enumerate(kinds)}
     between = {name: Compiled(function, address_of(library, name)) for name, function in others.items()}
-    made = HybridCode(TickCode(ticks, addresses, exact=False, library=library), between)
+    made = HybridCode(TickCode(straight, exact=False, library=library), between)
     return known.setdefault((kinds, stiff), made)
 
 

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from ...fmus.calls import NEAR, NativeStep
-from ..flat import TRUE, TickPattern
-from .code import TickCode, master
+from ..flat import TRUE
+from .code import GroupedTick, StraightTick, TickCode, master
+from .native_tick import at, bind_native
 
 
 class Reason(IntEnum):
@@ -21,11 +22,15 @@ class Reason(IntEnum):
     DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED = range(6)
 
 
-class _Outcome(ctypes.Structure):
+class OutcomeStructure(ctypes.Structure):
+    """Where and why the loop has returned, as C knows it."""
+
     _fields_ = [(name, ctypes.c_int64) for name in ("ticks", "rows", "reason", "plant", "stage", "status")]
 
 
-class _Tick(ctypes.Structure):
+class TickStructure(ctypes.Structure):
+    """A compiled function with its vectors, as C knows it."""
+
     _fields_ = [(name, ctypes.c_void_p) for name in ("evaluate", "arguments", "results", "iw", "w")]
 
 
@@ -50,7 +55,9 @@ class _Plant(ctypes.Structure):
     ]
 
 
-class _Loop(ctypes.Structure):
+class LoopStructure(ctypes.Structure):
+    """The loop over ticks, as C knows it."""
+
     _fields_ = [
         *((name, ctypes.c_int64) for name in ("kinds", "plants", "states", "row", "stops", "every")),
         *((name, ctypes.c_void_p) for name in ("ticks", "fmus", "t", "x", "x_next", "log", "ok", "columns", "stop")),
@@ -123,31 +130,31 @@ class CompiledLoop:
         self._kept: list[Any] = [code, arguments, results, plants, columns]
         t, x, _, _ = arguments
         x_next, _, log, ok = results
-        self.kinds = {clocks: i for i, clocks in enumerate(code.functions)}
-        self._loop = _Loop(
-            kinds=len(code.functions),
+        self.kinds = {clocks: i for i, clocks in enumerate(code.ticks)}
+        self.structure = LoopStructure(
+            kinds=len(code.ticks),
             plants=len(plants),
             states=x.size,
             row=width,
             stops=len(stops),
             every=every,
-            ticks=self._address([self._tick(code, clocks, arguments, results) for clocks in code.functions], _Tick),
+            ticks=self._address([self._tick(tick, arguments, results) for tick in code.ticks.values()], TickStructure),
             fmus=self._address([self._plant(plant) for plant in plants], _Plant),
-            t=_at(t),
-            x=_at(x),
-            x_next=_at(x_next),
-            log=_at(log),
-            ok=_at(ok),
+            t=at(t),
+            x=at(x),
+            x_next=at(x_next),
+            log=at(log),
+            ok=at(ok),
             columns=None if columns is None else self._array(np.ascontiguousarray(columns, dtype=np.int64)),
             stop=self._array(np.array(stops, dtype=np.int64)),
             truth=TRUE,
             near=NEAR,
         )
-        self._outcome, self._run = _Outcome(), master()
+        self._outcome, self._run = OutcomeStructure(), master()
 
     def _array(self, values: np.ndarray) -> int | None:
         self._kept.append(values)
-        return _at(values)
+        return at(values)
 
     def _address(self, structures: Sequence[ctypes.Structure], kind: type[ctypes.Structure]) -> int | None:
         if not structures:
@@ -157,22 +164,11 @@ class CompiledLoop:
         return ctypes.addressof(array)
 
     def _tick(
-        self,
-        code: TickCode,
-        clocks: frozenset[TickPattern],
-        arguments: Sequence[np.ndarray],
-        results: Sequence[np.ndarray],
+        self, tick: StraightTick | GroupedTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
     ) -> ctypes.Structure:
-        function = code.functions[clocks]
-        given, made = (ctypes.c_void_p * function.sz_arg())(), (ctypes.c_void_p * function.sz_res())()
-        for into, vectors in ((given, arguments), (made, results)):
-            for i, vector in enumerate(vectors):
-                into[i] = _at(vector)
-        iw, w = np.zeros(function.sz_iw() + 1, dtype=np.int64), np.zeros(function.sz_w() + 1)
-        self._kept += [given, made]
-        return _Tick(
-            code.addresses[clocks], ctypes.addressof(given), ctypes.addressof(made), self._array(iw), self._array(w)
-        )
+        bound = bind_native(tick, arguments, results)
+        self._kept.append(bound)
+        return TickStructure(bound.address, bound.arguments, bound.results, bound.iw, bound.w)
 
     def _plant(self, step: NativeStep) -> ctypes.Structure:
         inputs, outputs = (
@@ -189,11 +185,11 @@ class CompiledLoop:
     @property
     def skip(self) -> int:
         """Samples to leave out before the next one that is kept."""
-        return int(self._loop.skip)
+        return int(self.structure.skip)
 
     @skip.setter
     def skip(self, count: int) -> None:
-        self._loop.skip = count
+        self.structure.skip = count
 
     def run(self, times: np.ndarray, widths: np.ndarray, kinds: np.ndarray, rows: np.ndarray) -> Outcome:
         """Go through ticks, at most as many as there are rows to be written.
@@ -210,12 +206,10 @@ class CompiledLoop:
             Samples: their time in s, then their values.
         """
         self._run(
-            ctypes.byref(self._loop), ctypes.c_int64(len(widths)), *(ctypes.c_void_p(_at(a)) for a in (times, widths)),
-            ctypes.c_void_p(_at(kinds)), ctypes.c_void_p(_at(rows)), ctypes.byref(self._outcome),
-        )  # fmt: skip
+            ctypes.byref(self.structure),
+            ctypes.c_int64(len(widths)),
+            *(ctypes.c_void_p(at(vector)) for vector in (times, widths, kinds, rows)),
+            ctypes.byref(self._outcome),
+        )
         found = self._outcome
         return Outcome(found.ticks, found.rows, Reason(found.reason), found.plant, found.stage, found.status)
-
-
-def _at(vector: np.ndarray) -> int | None:
-    return vector.ctypes.data if vector.size else None

@@ -9,6 +9,7 @@ from .functions import indicators_of
 from .layout import FlatEvent, StateLayout
 from .logic import TRUE, is_true
 from .plant_ticks import own_step, takes_any_step
+from .program import AND, CHOOSE, COPY, NOT, OR, TRUE_OF, Ids, Operation, Program, TickProgram
 from .stages import Bound, Evaluators, Schedule, bind_function, evaluate_apart
 from .total_derivative import Derivative
 from .trace_stages import trace_schedule
@@ -16,11 +17,17 @@ from .vectors import Vectors, join_columns, loop_mismatch, next_x, plant_inputs,
 from .wired_diagram import WiredDiagram
 
 __all__ = [
+    "AND",
+    "CHOOSE",
+    "COPY",
     "EVERY",
     "INDICATORS",
     "JUMP",
     "NONE",
+    "NOT",
+    "OR",
     "TRUE",
+    "TRUE_OF",
     "Announcer",
     "Apart",
     "Bound",
@@ -28,11 +35,15 @@ __all__ = [
     "Evaluators",
     "FlatDiagram",
     "FlatEvent",
+    "Ids",
     "Instant",
     "Layout",
+    "Operation",
+    "Program",
     "Schedule",
     "StateLayout",
     "TickPattern",
+    "TickProgram",
     "Times",
     "Vectors",
     "WiredDiagram",

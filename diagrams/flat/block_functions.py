@@ -8,6 +8,7 @@ from typing import Any
 import casadi as ca
 
 from ...blocks.tracing import GUARDS, NEXT, Traced, has_large_product
+from .program import Cells
 
 
 class BlockFunctions:
@@ -49,6 +50,8 @@ def call_block(function: Any, arguments: Sequence[Any]) -> list[Any]:
 
     The derivative of a call has a direction for every parameter, thus for every entry of the matrix.
     """
+    if isinstance(arguments[0], Cells):
+        return [*arguments[0].program.call(function, arguments)]
     symbolic = any(isinstance(argument, ca.MX) for argument in arguments)
     made: list[Any] = function.call([*arguments], symbolic and has_large_product(function), False)
     return made

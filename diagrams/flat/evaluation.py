@@ -20,6 +20,7 @@ from .block_functions import BlockFunctions, call_block
 from .clocks import TickPattern
 from .layout import FlatLayout
 from .logic import choose, is_true, logic_and, logic_not, logic_or, to_number
+from .program import Cells
 
 INDICATORS, JUMP = "indicators", "jump"
 """Names of the equations of a block's events, beside its outputs, `NEXT` and `GUARDS`."""
@@ -58,7 +59,7 @@ def evaluate(
     acting : frozenset of TickPattern
         The clocks that tick; without any it is an instant between ticks.
     t, x, w, p : columns
-        CasADi's symbols, or NumPy's numbers.
+        CasADi's symbols, NumPy's numbers, or the `Cells` of a program.
     fired : column, optional
         Which of the diagram's events fire; without it none does.
     opened : bool
@@ -236,7 +237,7 @@ class Instant:
         if path in self.layout.apart:
             return self._call_apart(path, names, state, columns)
         made = call_block(self.functions.of(path, names), [t, state, *columns, p])
-        return [ca.densify(m) for m in made]
+        return [m if isinstance(m, Cells) or m.is_dense() else ca.densify(m) for m in made]
 
     def _arguments(self, path: str, inputs: dict[str, Any]) -> tuple[Any, Any, list[Any], Any]:
         """Return t, x, the inputs and p of a block, as its functions take them.
@@ -368,6 +369,6 @@ def no_evaluator(path: str) -> SimulationError:
 
 def rows(vector: Any, where: slice) -> Any:
     """Return a part of a column; an empty one stays a column, which slicing a single entry would not give."""
-    if isinstance(vector, np.ndarray):
+    if isinstance(vector, np.ndarray | Cells):
         return vector[where]
     return vector[where] if where.stop > where.start else ca.MX(0, 1)

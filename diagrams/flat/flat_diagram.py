@@ -19,8 +19,12 @@ from . import functions
 from .block_functions import BlockFunctions
 from .clocks import TickPattern
 from .layout import FlatLayout, sample_time_of
+from .program import TickProgram
 from .stages import Schedule
 from .total_derivative import Derivative
+
+LARGEST = 2_000
+"""Operations of a tick up to which it is simplified as a whole: a C compiler's time grows faster than they do."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,8 +70,24 @@ class FlatDiagram(FlatLayout):
         all outputs there.
         """
         if acting not in self._ticks:
-            self._ticks[acting] = functions.trace_tick(self, self.blocks, acting)
+            self._ticks[acting] = functions.trace_tick(self, self.blocks, acting, by_block=self.by_block)
         return self._ticks[acting]
+
+    def program_at(self, acting: frozenset[TickPattern]) -> TickProgram:
+        """Return a tick at which the given clocks act as calls of block functions, for grouped code."""
+        return functions.trace_tick_program(self, self.blocks, acting)
+
+    @cached_property
+    def by_block(self) -> bool:
+        """Whether a tick is evaluated block by block: it is large, or has blocks that Python evaluates.
+
+        This holds for interpreted and compiled runs. In another one, operations of several blocks are simplified
+        together.
+        """
+        if any(self.table.blocks[path].opaque for path in self.checked.traced):
+            return True
+        functions = (self.blocks.of(path, names) for path, names in self.order.steps)
+        return sum(int(function.n_instructions()) for function in functions) > LARGEST
 
     @cached_property
     def _ticks(self) -> dict[frozenset[TickPattern], Schedule]:

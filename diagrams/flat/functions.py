@@ -21,10 +21,11 @@ from .clocks import NONE, TickPattern
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, rows
 from .layout import FlatLayout
 from .logic import choose, is_true, logic_and, logic_not
+from .program import Program, TickProgram
 from .stages import Schedule
 from .total_derivative import Derivative
 from .trace_stages import trace_schedule
-from .vectors import join_columns, log, loop_mismatch, next_x, plant_inputs, rates
+from .vectors import join_columns, log, loop_mismatch, next_x, outputs_of, plant_inputs, rates
 
 LARGEST = float(np.finfo(float).max)
 
@@ -35,8 +36,13 @@ def make_symbols(layout: FlatLayout) -> dict[str, Any]:
     return {name: ca.MX.sym(name, size) for name, size in sizes.items()}
 
 
-def trace_tick(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[TickPattern]) -> Schedule:
-    """Return ``(t, x, w, p) -> (x_next, z, log, ok)``: a tick at which the given clocks act."""
+def trace_tick(
+    layout: FlatLayout, functions: BlockFunctions, acting: frozenset[TickPattern], *, by_block: bool = False
+) -> Schedule:
+    """Return ``(t, x, w, p) -> (x_next, z, log, ok)``: a tick at which the given clocks act.
+
+    With ``by_block`` the operations of each block are done as they are, and not simplified with those of others.
+    """
     symbols = make_symbols(layout)
 
     def results(apart: Apart) -> Mapping[str, Any]:
@@ -48,7 +54,22 @@ def trace_tick(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[
             ok = ca.logic_and(ok, ca.mmin(ca.vertcat(*instant.guards) > 0))
         return {**found, "ok": ok}
 
-    return trace_schedule("tick", symbols, results)
+    return trace_schedule("tick", symbols, results, by_block=by_block)
+
+
+def trace_tick_program(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[TickPattern]) -> TickProgram:
+    """Return a tick at which the given clocks act as a program: the calls of block functions that it consists of."""
+    program = Program((layout.width, layout.plant_outputs.total, layout.parameters.total))
+    instant = evaluate(layout, functions, acting, program.t, program.x, program.w, program.p)
+    made, taken = zip(*instant.mismatch, strict=True) if instant.mismatch else ((), ())
+    return TickProgram(
+        program,
+        x_next=program.join([next_x(instant)]).ids,
+        z=plant_inputs(instant).ids,
+        log=program.join([instant.w, *outputs_of(instant), instant.x]).ids,
+        guards=program.join(instant.guards).ids,
+        mismatch=(program.join(made).ids, program.join(taken).ids) if layout.loops.slices else None,
+    )
 
 
 def trace_driven(layout: FlatLayout, functions: BlockFunctions) -> Schedule:

@@ -34,6 +34,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from threading import Lock
 from typing import Any, Protocol
 
 import casadi as ca
@@ -71,6 +72,8 @@ class Evaluator(Protocol):
         ...
 
 
+_EXPANDING = Lock()  # the option of CasADi that says whether to simplify is one for all threads
+
 Evaluators = Mapping[str, Evaluator]
 """Evaluators of the blocks of opaque stages, by path; they belong to one run."""
 
@@ -91,6 +94,8 @@ class TracedStage:
         From the arguments to the results.
     makes : slice
         Which part of c it makes; empty for the last stage.
+    by_block : bool
+        Whether the operations of each block are done as they are.
     """
 
     name: str
@@ -98,11 +103,12 @@ class TracedStage:
     results: tuple[Any, ...]
     function: Any
     makes: slice
+    by_block: bool = False
 
     @cached_property
     def fast(self) -> Any:
         """The function as it is evaluated fastest, with the same results to the last bit; see `speed_up`."""
-        return speed_up(self.function)
+        return speed_up(self.function, simplify=not self.by_block)
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,18 +311,27 @@ def bind_function(function: Any, arguments: Sequence[np.ndarray], results: Seque
     return Bound(call, made, buffer)
 
 
-def speed_up(function: Any) -> Any:
+def speed_up(function: Any, *, simplify: bool = True) -> Any:
     """Return a function in the form that is evaluated fastest: scalar operations.
 
-    Where a block looks up a table, or multiplies a large matrix, it is returned unchanged. The results are the same to
-    the last bit.
+    Where a block looks up a table, or multiplies a large matrix, it is returned unchanged.
+
+    Parameters
+    ----------
+    simplify : bool
+        Simplify the operations of all blocks together, such as a sum with a zero: this may change the sign of a zero,
+        and rounding where a value is added and subtracted again. Else the results are those of the blocks, one by one.
     """
     if has_large_product(function):
         return function
-    try:
-        return function.expand()
-    except RuntimeError:
-        return function
+    with _EXPANDING:
+        ca.GlobalOptions.setSimplificationOnTheFly(simplify)
+        try:
+            return function.expand()
+        except RuntimeError:
+            return function
+        finally:
+            ca.GlobalOptions.setSimplificationOnTheFly(True)
 
 
 def _view(vector: np.ndarray) -> Any:

@@ -13,7 +13,13 @@ from .stages import OpaqueStage, Schedule, TracedStage
 from .vectors import join_columns
 
 
-def trace_schedule(name: str, arguments: Mapping[str, Any], results: Callable[[Apart], Mapping[str, Any]]) -> Schedule:
+def trace_schedule(
+    name: str,
+    arguments: Mapping[str, Any],
+    results: Callable[[Apart], Mapping[str, Any]],
+    *,
+    by_block: bool = False,
+) -> Schedule:
     """Trace a function of the whole diagram.
 
     Parameters
@@ -25,6 +31,8 @@ def trace_schedule(name: str, arguments: Mapping[str, Any], results: Callable[[A
     results : callable
         Evaluates the diagram with these symbols and returns the results by name, as expressions. It is called with
         what `evaluate` takes as ``apart``: this cuts the evaluation at the blocks that are evaluated from outside.
+    by_block : bool
+        Do the operations of each block as they are; else those of all blocks are simplified together.
     """
     cuts = _Cuts()
     made = {n: ca.densify(ca.MX(e)) for n, e in results(cuts).items()}  # a buffer holds every entry, zeros too
@@ -33,7 +41,7 @@ def trace_schedule(name: str, arguments: Mapping[str, Any], results: Callable[[A
     if not any(cut.needed for cut in cuts.made):
         made = _join_again(made, cuts.made)
         function = ca.Function(name, [*symbols], [*made.values()], [*names], [*made])
-        last = TracedStage(name, symbols, tuple(made.values()), function, slice(0, 0))
+        last = TracedStage(name, symbols, tuple(made.values()), function, slice(0, 0), by_block)
         return Schedule(name, names, tuple(made), (last,), 0)
     return _in_stages(name, names, symbols, made, cuts.made)
 

@@ -11,6 +11,7 @@ import numpy as np
 from ...blocks.core import Layout
 from .evaluation import Instant, rows
 from .layout import FlatLayout
+from .program import Cells
 
 
 class Vectors:
@@ -64,15 +65,23 @@ def plant_inputs(instant: Instant) -> Any:
     """Return z: the inputs of what is stepped from outside."""
     layout = instant.layout
     sources = [instant.source(*layout.ports[name]) for name in layout.plant_inputs.slices]
+    if isinstance(instant.t, Cells):
+        return instant.t.program.join(sources)
     return join_columns([ca.MX(ca.densify(ca.DM(s))) if isinstance(s, np.ndarray) else s for s in sources])
 
 
 def log(instant: Instant) -> Any:
     """Return w, all outputs of blocks, x, and, where loops are solved, the residual of the algebraic loops."""
+    return ca.vertcat(
+        instant.w, *outputs_of(instant), instant.x, *([residual(instant)] if instant.layout.loops.slices else [])
+    )
+
+
+def outputs_of(instant: Instant) -> list[Any]:
+    """Return the columns of all outputs of blocks, as the log lays them out."""
     layout = instant.layout
     blocks = [*layout.log.slices][len(layout.plant_outputs.slices) :]
-    outputs = [instant.values[layout.ports[name]] for name in blocks]
-    return ca.vertcat(instant.w, *outputs, instant.x, *([residual(instant)] if layout.loops.slices else []))
+    return [instant.values[layout.ports[name]] for name in blocks]
 
 
 def loop_mismatch(instant: Instant) -> Any:
@@ -90,4 +99,6 @@ def residual(instant: Instant) -> Any:
 
 def join_columns(columns: Sequence[Any]) -> Any:
     """Return columns one below the other; a column without entries where there are none."""
+    if any(isinstance(column, Cells) for column in columns):
+        return next(column.program for column in columns if isinstance(column, Cells)).join(columns)
     return ca.vertcat(*columns) if columns else ca.MX(0, 1)

@@ -15,6 +15,7 @@ from ..compiled import CompiledLoop, Outcome, Reason, compile_ticks, find_obstac
 from ..coupling import Plant
 from ..flat import FlatDiagram, TickPattern
 from ..results import Recorder
+from .diagnosis import forget_trials
 from .workspace import Workspace
 
 FIRST, LARGEST_CHUNK = 1000, 2**20
@@ -57,7 +58,7 @@ class CompiledTicks:
         self._loop: CompiledLoop | None = None
         self._recorder: Recorder | None = None
         self._kind_of = np.full(1 << len(flat.distinct), -1, dtype=np.int32)
-        for kind, clocks in enumerate(self._code.functions):
+        for kind, clocks in enumerate(self._code.ticks):
             self._kind_of[sum(1 << i for i, clock in enumerate(flat.distinct) if clock in clocks)] = kind
         self._chunk = FIRST
 
@@ -154,6 +155,7 @@ class CompiledTicks:
         try:
             if found.reason is Reason.NOT_OK:
                 first = len(self._plants)
+                forget_trials(self._flat)  # an interrupt of a block of Python is raised
             elif found.reason in (Reason.FMU_FAILED, Reason.FMU_FLAGS):
                 status = found.status if found.reason is Reason.FMU_FAILED else 0
                 plant = self._plants[found.plant]

@@ -244,12 +244,6 @@ def test_a_run_without_a_compiler_is_interpreted_and_says_so(monkeypatch, fresh)
     assert_same_bits(one_rate().simulate(1.0, **QUIET), run)
 
 
-def test_large_ticks_are_interpreted_and_say_so(monkeypatch):
-    monkeypatch.setattr(code, "LARGEST", 5)
-    run = one_rate().simulate(1.0, compile=True, **QUIET)
-    assert [m for m in run.messages if "operations" in m]
-
-
 def test_ctrl_c_keeps_what_was_recorded():
     seen = []
 

@@ -1,0 +1,173 @@
+"""A tick as a list of calls: which block function takes which values, and where its results go.
+
+`evaluate` goes over the blocks with `Cells` in place of symbols. Nothing is computed: every call of a block's function,
+and every choice by a gate, is written down as an operation on numbered values. Unlike one CasADi function of the whole
+tick this stays small with many blocks, as equal blocks share a function, and it is where grouped code is made from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+Ids = range | tuple[int, ...]
+
+COPY, TRUE_OF, AND, OR, NOT, CHOOSE = "copy", "is_true", "and", "or", "not", "choose"
+"""Operations on single values, beside the calls of block functions."""
+
+
+class Cells:
+    """A column of numbered values of a program, in place of a column of symbols."""
+
+    __slots__ = ("ids", "program")
+
+    def __init__(self, program: Program, ids: Ids):
+        self.program, self.ids = program, ids
+
+    def __getitem__(self, where: slice | list[int]) -> Cells:
+        return Cells(self.program, self.ids[where] if isinstance(where, slice) else as_ids(self.ids[i] for i in where))
+
+    def numel(self) -> int:
+        """Return the number of entries."""
+        return len(self.ids)
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """A call of a block's function, or an operation on single values.
+
+    Attributes
+    ----------
+    kernel : int or str
+        Key of the function in `Program.functions`, or one of the operations on single values.
+    arguments, results : tuple of range
+        The values that it takes and makes, one range for each column; those of an argument may be empty.
+    """
+
+    kernel: int | str
+    arguments: tuple[range, ...]
+    results: tuple[range, ...]
+
+
+@dataclass(eq=False)
+class Program:
+    """Operations on numbered values: first those of t, x, w and p, then constants and results as they come.
+
+    Attributes
+    ----------
+    t, x, w, p : Cells
+        The arguments.
+    functions : dict
+        CasADi functions of the operations, by key.
+    operations : list of Operation
+        In an order in which they can be done.
+    constants : dict
+        Numbers by the value that holds them.
+    columns : list of range
+        Values that stand one behind the other.
+    """
+
+    widths: tuple[int, int, int]
+    functions: dict[int, Any] = field(default_factory=dict)
+    operations: list[Operation] = field(default_factory=list)
+    constants: dict[int, float] = field(default_factory=dict)
+    columns: list[range] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.count = 0
+        self.t, self.x, self.w, self.p = (Cells(self, self._new(n)) for n in (1, *self.widths))
+        self.given = self.count
+        self._constants: dict[bytes, range] = {}
+        self._sizes: dict[int, list[int]] = {}
+
+    def _new(self, size: int) -> range:
+        self.count += size
+        return range(self.count - size, self.count)
+
+    def _make(self, size: int) -> range:
+        made = self._new(size)
+        if size:
+            self.columns.append(made)
+        return made
+
+    def constant(self, values: Any) -> range:
+        """Return the values that hold some numbers."""
+        numbers = np.ravel(np.asarray(values, dtype=float))
+        key = numbers.tobytes()
+        if key not in self._constants:
+            made = self._constants[key] = self._make(numbers.size)
+            self.constants.update(zip(made, numbers.tolist(), strict=True))
+        return self._constants[key]
+
+    def ids(self, column: Any) -> Ids:
+        """Return the values of a column; numbers become constants."""
+        return column.ids if isinstance(column, Cells) else self.constant(column)
+
+    def call(self, function: Any, arguments: Sequence[Any]) -> list[Cells]:
+        """Write down the call of a block's function."""
+        key = id(function)
+        if key not in self._sizes:
+            self.functions[key] = function
+            self._sizes[key] = [function.numel_out(i) for i in range(function.n_out())]
+        given = tuple(self._together(self.ids(column)) for column in arguments)
+        results = tuple(self._make(size) for size in self._sizes[key])
+        self.operations.append(Operation(key, given, results))
+        return [Cells(self, made) for made in results]
+
+    def apply(self, name: str, *columns: Any) -> Cells:
+        """Write down an operation on single values for each entry of columns; one value may go with all entries."""
+        ids = [self.ids(column) for column in columns]
+        made = self._make(max(map(len, ids)))
+        for i, result in enumerate(made):
+            given = tuple(self._one(part[i if len(part) > 1 else 0]) for part in ids)
+            self.operations.append(Operation(name, given, (self._one(result),)))
+        return Cells(self, made)
+
+    @staticmethod
+    def _one(value: int) -> range:
+        return range(value, value + 1)
+
+    def _together(self, ids: Ids) -> range:
+        """Return values that stand one behind the other: these, or copies of them."""
+        if isinstance(ids, range):
+            return ids
+        copied = self.apply(COPY, Cells(self, ids)).ids
+        assert isinstance(copied, range)
+        return copied
+
+    def join(self, columns: Iterable[Any]) -> Cells:
+        """Return columns one below the other."""
+        return Cells(self, as_ids(value for column in columns for value in self.ids(column)))
+
+
+def as_ids(values: Iterable[int]) -> Ids:
+    """Return values as a range where they stand one behind the other."""
+    found = tuple(values)
+    first = found[0] if found else 0
+    whole = range(first, first + len(found))
+    return whole if found == tuple(whole) else found
+
+
+@dataclass(frozen=True, eq=False)
+class TickProgram:
+    """A tick as a program.
+
+    Attributes
+    ----------
+    program : Program
+        The operations.
+    x_next, z, log, guards : Ids
+        The values that become the results of a tick; ``log`` is without the residual.
+    mismatch : tuple of Ids, or None
+        Of algebraic loops: what came round, and what was taken; None where the log has no residual.
+    """
+
+    program: Program
+    x_next: Ids
+    z: Ids
+    log: Ids
+    guards: Ids
+    mismatch: tuple[Ids, Ids] | None

@@ -1,0 +1,227 @@
+"""Grouped code: one C function for each kind of block, with the bits of the blocks evaluated one by one."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import (
+    PID,
+    Compare,
+    DiscreteIntegrator,
+    Gain,
+    Lookup1D,
+    Product,
+    PulseTrain,
+    PythonFunction,
+    Sine,
+    Sum,
+    TransferFunction,
+    UnitDelay,
+)
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.compiled import code
+from loopwright.diagrams.flat import flat_diagram
+from support.hybrid_blocks import counting
+from support.random_cases import random_cases
+from support.random_linear import BASE, PERIOD, diagram, specs
+
+QUIET = {"progress": False}
+
+
+@pytest.fixture
+def grouped(monkeypatch):
+    """Every diagram is compiled block by block."""
+    monkeypatch.setattr(flat_diagram, "LARGEST", 0)
+
+
+def both(made, duration, **options):
+    interpreted = made.simulate(duration, **QUIET, **options)
+    compiled = made.simulate(duration, compile=True, **QUIET, **options)
+    assert not any(message.startswith("Interpreted") for message in compiled.messages)
+    return interpreted, compiled
+
+
+def assert_same_bits(first, second):
+    assert first.t.tobytes() == second.t.tobytes()
+    assert first.data.tobytes() == second.data.tobytes()
+
+
+def boxed(inside, every=0.01, source=None):
+    return Diagram("d", subsystem(sample_time=every, name="box")(inside)(source or Sine(frequency=3.0, name="source")))
+
+
+def chain(n):
+    """Gains and delays in turn."""
+
+    def inside(signal):
+        for i in range(n):
+            kind = UnitDelay(initial_value=0.0, name=f"b{i}") if i % 2 else Gain(gain=1.0 - 1e-3 * i, name=f"b{i}")
+            signal = kind(signal)
+        return signal
+
+    return boxed(inside)
+
+
+def loops(n):
+    """PID controllers of lags, each driven by the one before."""
+
+    def inside(signal):
+        for i in range(n):
+            lag = TransferFunction(numerator=1.0, denominator=[0.05 + 1e-3 * i, 1.0], name=f"lag{i}")
+            signal = lag(PID(kp=2.0, ki=1.0, kd=0.1, filter_time=0.01, name=f"pid{i}")(signal, lag.y))
+        return signal
+
+    return boxed(inside)
+
+
+def test_a_chain_of_800_blocks_has_the_bits_of_numpy():
+    _, run = both(chain(800), 0.5, record=["source", "box.b1", "box.b40", "box.b399"])
+    u = run["source.y"]
+    for last in (1, 40, 399):
+        expected = u.copy()
+        for i in range(last + 1):
+            expected = np.concatenate([[0.0], expected[:-1]]) if i % 2 else (1.0 - 1e-3 * i) * expected
+        assert np.array_equal(run[f"box.b{last}.y"], expected)
+
+
+@pytest.mark.parametrize("make", [chain, loops])
+def test_large_diagrams_have_the_bits_of_their_interpreted_runs(make):
+    made = make(600)
+    assert made.flattened(None).by_block
+    assert_same_bits(*both(made, 1.0))
+
+
+def test_the_code_knows_neither_the_number_of_blocks_nor_their_parameters(monkeypatch, tmp_path):
+    monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
+    code.load_compiled.cache_clear()
+    loops(100).simulate(0.1, compile=True, **QUIET)
+    built = sorted((tmp_path / "compiled").iterdir())
+    code.load_compiled.cache_clear()
+    loops(150).replace({"box.pid7.kp": 3.5}).simulate(0.1, compile=True, **QUIET)
+    assert sorted((tmp_path / "compiled").iterdir()) == built
+
+
+def test_terms_that_cancel_across_blocks_are_rounded_block_by_block(grouped):
+    """(a − u) + u is not a: both forms say so."""
+
+    def inside(u):
+        left = Sum(signs="+-", name="left")(1e-3, u)
+        return Sum(signs="++", name="back")(left, u)
+
+    interpreted, compiled = both(boxed(inside), 1.0)
+    assert_same_bits(interpreted, compiled)
+    u = compiled["source.y"]
+    assert np.array_equal(compiled["box.back.y"], (1e-3 - u) + u)
+    assert not np.all(compiled["box.back.y"] == 1e-3)
+
+
+@random_cases(2, 30, specs(least=12, continuous=False))
+def test_random_linear_diagrams_have_the_same_bits(spec):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(flat_diagram, "LARGEST", 0)
+        assert_same_bits(*both(diagram(spec.scaled(0.1)), PERIOD * BASE, step=BASE))
+
+
+@pytest.mark.parametrize("mode", ["held", "reset"])
+def test_enabled_boxes_count_while_they_are_enabled(grouped, mode):
+    enable = PulseTrain(period=1.0, duty=0.5)
+    interpreted, compiled = both(Diagram("d", counting(0.1, enabled=mode, start=0.0)(enable=enable).named("n")), 2.0)
+    assert_same_bits(interpreted, compiled)
+    after = {"held": 6, "reset": 1}[mode]
+    assert compiled["n"][[4, 8, 10]].tolist() == [5, 5, after]
+
+
+@pytest.mark.parametrize("edge", ["rising", "falling", "both"])
+def test_triggered_boxes_have_the_same_bits(grouped, edge):
+    @subsystem(sample_time=0.02, name="outer")
+    def outer(u):
+        return counting(name="inner", triggered=edge)(trigger=Compare(">")(u, 0.3))
+
+    assert_same_bits(*both(Diagram("d", outer(Sine(frequency=2.0)).named("n")), 3.0))
+
+
+def test_nested_gates_of_several_rates_with_delays_have_the_same_bits(grouped):
+    @subsystem(sample_time=0.02, enabled="reset", name="outer")
+    def outer(u):
+        slow = subsystem(sample_time=0.06, name="slow")(lambda v: DiscreteIntegrator(name="sum")(v))(u)
+        late = subsystem(sample_time=0.02, delay=2, name="late")(lambda v: Gain(gain=-2.0, name="g")(v))(u)
+        return counting(name="inner", enabled="held", start=2.0)(enable=Compare(">")(u, 0.0)) + slow + late
+
+    made = Diagram("d", outer(Sine(frequency=1.0), enable=PulseTrain(period=0.5, duty=0.6)).named("y"))
+    assert_same_bits(*both(made, 3.0))
+
+
+def test_parts_of_vectors_and_matrices_have_the_same_bits(grouped):
+    def inside(u):
+        both = Gain(gain=[[1.0, 2.0], [3.0, -1.0], [0.5, 0.0]], name="m")
+        back = Gain(gain=[[1.0, 2.0, 0.1], [0.0, 1.0, 3.0]], name="n")
+        drive = Gain(gain=[1.0, -2.0], name="drive")
+        delay = UnitDelay(initial_value=[0.0, 0.0], name="x")
+        y = both(delay.y)
+        delay(0.1 * back(y) + drive(u))
+        return Product(name="p")(y[0], y[2]) + y[1]
+
+    assert_same_bits(*both(boxed(inside), 1.0))
+
+
+def test_tables_beside_other_blocks_have_the_same_values(grouped):
+    def inside(u):
+        table = Lookup1D(breakpoints=[-1.0, 0.0, 0.5, 1.0], values=[2.0, -1.0, 0.25, 3.0], name="table")(u)
+        return Gain(gain=2.0, name="g")(table) + u
+
+    interpreted, compiled = both(boxed(inside), 2.0)
+    assert np.array_equal(interpreted.data, compiled.data)
+    expected = 2.0 * np.interp(compiled["source.y"], [-1.0, 0.0, 0.5, 1.0], [2.0, -1.0, 0.25, 3.0])
+    assert np.max(np.abs(compiled["box.g.y"] - expected)) < 1e-14
+
+
+# --- blocks of Python -------------------------------------------------------------------------------------------------
+
+
+def with_python(function):
+    def inside(u):
+        memory = UnitDelay(initial_value=0.5, name="memory")
+        called = PythonFunction(function, name="python")(memory.y, u)
+        return memory(0.5 * called)
+
+    return boxed(inside)
+
+
+def test_blocks_of_python_are_called_from_c_and_have_the_numbers_of_a_loop_in_python():
+    def step(x, u):
+        return float(np.tanh(x) + u)
+
+    interpreted, compiled = both(with_python(step), 1.0)
+    assert_same_bits(interpreted, compiled)
+    x, expected = 0.5, []
+    for u in compiled["source.y"]:
+        expected.append(x)
+        x = 0.5 * step(x, u)
+    assert compiled["box.memory.y"].tolist() == expected
+
+
+def test_an_exception_in_a_block_of_python_says_the_same_in_both_forms():
+    def fails(x, u):
+        if u < -0.5:
+            raise ValueError("too low")
+        return x + u
+
+    texts = []
+    for form in (False, True):
+        with pytest.raises(Exception, match="too low") as caught:
+            with_python(fails).simulate(1.0, compile=form, **QUIET)
+        texts.append((type(caught.value), str(caught.value), caught.value.run.data.tobytes()))
+    assert texts[0] == texts[1]
+
+
+def test_an_interrupt_in_a_block_of_python_ends_the_run():
+    calls = []
+
+    def interrupted(x, u):
+        calls.append(1)
+        if len(calls) == 60:
+            raise KeyboardInterrupt
+        return x + u
+
+    with with_python(interrupted).simulation(compile=True) as simulation, pytest.raises(KeyboardInterrupt) as caught:
+        simulation.advance(1.0)
+    assert 0.4 < caught.value.run.t[-1] < 0.6
