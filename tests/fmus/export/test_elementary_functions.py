@@ -1,0 +1,218 @@
+"""Elementary functions of exported FMUs, beside mpmath: errors in units in the last place, special values, bits."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import shutil
+import subprocess
+import zipfile
+from importlib import resources
+
+import mpmath
+import numpy as np
+import pytest
+
+import loopwright.fmus.export as export
+from loopwright.fmus.export import compile_shared
+from loopwright.fmus.export.elementary_tables import FUNCTIONS, prepare_functions, restore_functions
+from loopwright.fmus.models import gantry
+
+RUNTIME = resources.files(export) / "runtime" / "elementary.c"
+BOUNDS = {"sin": 0.78, "cos": 0.78, "tanh": 0.58, "exp": 0.52, "expm1": 0.6, "log": 0.52, "pow": 0.54}
+"""Largest errors in ulp that docs/export.md states, for results that are neither tiny nor near overflow."""
+ONE_FUNCTION = """
+#ifdef _WIN32
+__declspec(dllexport)
+#else
+__attribute__((visibility("default")))
+#endif
+void many_{0}(const double *x, const double *z, double *y, long long n) {{
+    (void)z;
+    for (long long i = 0; i < n; i++) y[i] = lw_{0}(x[i]{1});
+}}
+"""
+
+
+def source() -> str:
+    text = prepare_functions(" ".join(f"{name}(x)" for name in FUNCTIONS)) + restore_functions()
+    return text + "".join(ONE_FUNCTION.format(name, ", z[i]" if name == "pow" else "") for name in FUNCTIONS)
+
+
+class Functions:
+    """The functions of a compiled library, for arrays."""
+
+    def __init__(self, path):
+        self._library = ctypes.CDLL(str(path))
+
+    def __call__(self, name, x, z=None):
+        x = np.ascontiguousarray(x, dtype=float)
+        z = x if z is None else np.ascontiguousarray(z, dtype=float)
+        y = np.empty_like(x)
+        pointers = [ctypes.c_void_p(a.ctypes.data) for a in (x, z, y)]
+        getattr(self._library, f"many_{name}")(*pointers, ctypes.c_longlong(x.size))
+        return y
+
+
+@pytest.fixture(scope="module")
+def ours(tmp_path_factory):
+    out = tmp_path_factory.mktemp("elementary") / "functions.so"
+    compile_shared({"all.c": source(), "elementary.c": RUNTIME.read_text("utf-8")}, out, compiled=["all.c"])
+    return Functions(out)
+
+
+def signed(rng, sizes):
+    return sizes * rng.choice([-1.0, 1.0], len(sizes))
+
+
+def arguments(name, n, rng):
+    """Yield arrays of arguments: the whole range, about 0 and 1, and where two of a function's forms meet."""
+    if name in ("sin", "cos"):
+        yield rng.uniform(-7, 7, n)
+        yield signed(rng, 10 ** rng.uniform(-12, 6, n))
+        yield signed(rng, 10 ** rng.uniform(6, 308, n))
+        yield np.arange(1, n) * (math.pi / 2)  # as near to its zeros as doubles come
+        yield signed(rng, rng.uniform(1599, 1601, n))
+        yield signed(rng, 2.0**20 + rng.uniform(-1, 1, n))
+    elif name == "tanh":
+        yield signed(rng, 10 ** rng.uniform(-12, 1.4, n))
+        yield signed(rng, rng.uniform(0.15, 0.25, n))
+        yield rng.uniform(18.5, 19.5, n)
+    elif name == "exp":
+        yield rng.uniform(-690, 690, n)
+        yield signed(rng, 10 ** rng.uniform(-18, 0, n))
+    elif name == "expm1":
+        yield rng.uniform(-45, 690, n)
+        yield signed(rng, 10 ** rng.uniform(-18, 0, n))
+        yield signed(rng, rng.uniform(0.15, 0.4, n))
+    elif name == "log":
+        yield 10 ** rng.uniform(-323, 308, n)
+        yield 1 + signed(rng, 10 ** rng.uniform(-16, -1, n))
+        yield rng.uniform(0.5, 2, n)
+
+
+def powers(n, rng):
+    """Yield pairs whose power is neither tiny nor near overflow."""
+    for low, high in ((-12, -6), (-6, -2), (-2, -0.5)):
+        x = 1 + signed(rng, 10 ** rng.uniform(low, high, n))
+        yield x, rng.uniform(-690, 690, n) / np.log(x)
+    x = 10 ** rng.uniform(-300, 300, n)
+    yield x, rng.uniform(-1, 1, n)
+    yield -np.floor(10 ** rng.uniform(0, 3, n)), np.floor(rng.uniform(-90, 90, n))
+
+
+def ulps(found, exact):
+    nearest = float(exact)
+    return float(abs(mpmath.mpf(found) - exact) / mpmath.mpf(math.ulp(nearest))) if nearest else abs(found) / 5e-324
+
+
+def largest_error(ours, name, n, seed):
+    rng = np.random.default_rng(seed)
+    worst = 0.0
+    if name == "pow":
+        with mpmath.workprec(160):
+            for x, z in powers(n, rng):
+                for a, b, y in zip(x.tolist(), z.tolist(), ours("pow", x, z).tolist(), strict=True):
+                    worst = max(worst, ulps(y, mpmath.power(mpmath.mpf(a), mpmath.mpf(b)).real))
+        return worst
+    for x in arguments(name, n, rng):
+        with mpmath.workprec(1300 if name in ("sin", "cos") and np.abs(x).max() > 1e9 else 200):
+            for a, y in zip(x.tolist(), ours(name, x).tolist(), strict=True):
+                worst = max(worst, ulps(y, getattr(mpmath, name)(mpmath.mpf(a))))
+    return worst
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_errors_stay_below_their_bounds(name, ours):
+    assert largest_error(ours, name, 250, 1) < BOUNDS[name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_errors_of_many_arguments_stay_below_their_bounds(name, ours):
+    assert largest_error(ours, name, 20_000, 2) < BOUNDS[name]
+
+
+def test_tiny_results_and_those_near_overflow_are_within_one_ulp(ours):
+    x = np.concatenate([np.linspace(-745.1, -690, 300), np.linspace(690, 709.78, 300)])
+    with mpmath.workprec(160):
+        worst = max(
+            ulps(y, mpmath.exp(mpmath.mpf(a))) for a, y in zip(x.tolist(), ours("exp", x).tolist(), strict=True)
+        )
+        z = x / math.log(3.7)
+        worst = max(
+            worst,
+            *(
+                ulps(y, mpmath.power(mpmath.mpf(3.7), mpmath.mpf(b)))
+                for b, y in zip(z.tolist(), ours("pow", np.full(len(z), 3.7), z).tolist(), strict=True)
+            ),
+        )
+    assert worst < 1.03
+
+
+def same(found, expected):
+    """Whether two arrays are equal but for one ulp, with signs of zeros, and NaN where the other has it."""
+    with np.errstate(all="ignore"):
+        near = (found == expected) | (np.abs(found - expected) <= 2.3e-16 * np.abs(expected))
+    near |= np.isnan(found) & np.isnan(expected)
+    return near & ((np.signbit(found) == np.signbit(expected)) | np.isnan(expected))
+
+
+SPECIAL = np.array([0.0, 1.0, 2.0, 0.5, 3.0, 2.5, 5e-324, 2e-308, 1e-20, 1e308, math.inf])
+SPECIAL = np.concatenate([SPECIAL, -SPECIAL, [math.nan]])
+
+
+@pytest.mark.parametrize("name", [name for name in FUNCTIONS if name != "pow"])
+def test_special_values_are_those_of_the_c_standard(name, ours):
+    with np.errstate(all="ignore"):
+        expected = getattr(np, name)(SPECIAL)
+    assert same(ours(name, SPECIAL), expected).all()
+
+
+def test_special_powers_are_those_of_the_c_standard(ours):
+    x, z = (a.ravel() for a in np.meshgrid(SPECIAL, SPECIAL))
+    with np.errstate(all="ignore"):
+        expected = np.power(x, z)
+    assert same(ours("pow", x, z), expected).all()
+
+
+def test_odd_and_even_functions_are_so_in_every_bit(ours):
+    x = 10 ** np.random.default_rng(3).uniform(-20, 20, 500)
+    for name in ("sin", "tanh"):
+        assert (ours(name, -x) == -ours(name, x)).all()
+    assert (ours("cos", -x) == ours("cos", x)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="another compiler is compared: needs gcc on the path")
+@pytest.mark.parametrize("level", ["-O0", "-O1", "-O2", "-O3"])
+def test_another_compiler_makes_the_same_bits(level, ours, tmp_path):
+    (tmp_path / "all.c").write_text(source(), encoding="utf-8")
+    (tmp_path / "elementary.c").write_text(RUNTIME.read_text("utf-8"), encoding="utf-8")
+    flags = [level, "-std=c11", "-ffp-contract=off", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
+    subprocess.run(["gcc", *flags, "-o", tmp_path / "f.so", tmp_path / "all.c", "-lm"], check=True, cwd=tmp_path)
+    theirs, rng = Functions(tmp_path / "f.so"), np.random.default_rng(4)
+    for name in FUNCTIONS:
+        pairs = powers(3000, rng) if name == "pow" else ((x, x) for x in arguments(name, 3000, rng))
+        for x, z in pairs:
+            assert ours(name, x, z).tobytes() == theirs(name, x, z).tobytes()
+
+
+def test_the_c_text_holds_only_what_equations_call():
+    assert prepare_functions("a = atan2(x, y) + sqrt(z);") == ""
+    text = prepare_functions("a = tanh(x);")
+    assert "#define tanh lw_tanh" in text
+    assert "lw_exp_table" not in text
+    assert "lw_sin" not in text
+    assert prepare_functions("a = arcsin(x)") == ""
+
+
+def test_an_fmu_asks_the_platform_for_none_of_them():
+    with zipfile.ZipFile(gantry.build()) as archive:
+        (library,) = (
+            n for n in archive.namelist() if n.startswith("binaries/") and n.endswith((".so", ".dll", ".dylib"))
+        )
+        held = archive.read(library)
+        assert "sources/elementary.c" in archive.namelist()
+    assert b"\0tanh\0" not in held
+    assert b"\0sin\0" not in held
