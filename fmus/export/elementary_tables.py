@@ -98,13 +98,13 @@ def _tanh_tables() -> str:
     """Return the series about 0, and for each point i/16 tanh in two parts, -tanh² and the other coefficients."""
     tangents = [Decimal(1)]  # of tanh x = Σ c_k x^(2k+1): its derivative is 1 - tanh², term by term
     for k in range(1, 9):
-        tangents.append(-sum(tangents[i] * tangents[k - 1 - i] for i in range(k)) / (2 * k + 1))
+        tangents.append(-sum((tangents[i] * tangents[k - 1 - i] for i in range(k)), Decimal(0)) / (2 * k + 1))
     rows: list[Decimal] = []
     for i in range(_NODES):
         growth = (Decimal(i) / 8).exp()
         c = [(growth - 1) / (growth + 1)]
         for k in range(10):
-            square = sum(c[j] * c[k - j] for j in range(k + 1))
+            square = sum((c[j] * c[k - j] for j in range(k + 1)), Decimal(0))
             c.append(((1 if k == 0 else 0) - square) / (k + 1))
         nearest = Decimal(float(c[0]))
         rows += [nearest, c[0] - nearest, c[1] - 1, *c[2:]]
