@@ -20,7 +20,6 @@ class Fmi3Calls(FmiCalls):
     """Functions of a library of FMI 3.0."""
 
     prefix = "fmi3"
-    intermediate_status = 0
     """Worst status of inputs that were set within a step."""
     _slopes: tuple[float, Any, Any, list[tuple[float, float]]] | None = None
     types: ClassVar = {
@@ -104,8 +103,6 @@ class Fmi3Calls(FmiCalls):
         self, t: float, references: Sequence[int], inputs: Sequence[float], slopes: Sequence[float]
     ) -> None:
         """Keep the slopes of inputs, which are set when the FMU asks for that within a step (FMI 3.0, 4.2.2)."""
-        if self.intermediate_status > 1:
-            raise RuntimeError(f"fmi3SetFloat64 failed within a step with {self.status_name(self.intermediate_status)}")
         kept, n = (ctypes.c_uint * len(references))(*references), len(inputs)
         self._slopes = t, kept, (ctypes.c_double * n)(), list(zip(inputs, slopes, strict=True))
 

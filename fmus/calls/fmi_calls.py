@@ -16,7 +16,6 @@ from .bound_calls import DISCARD, ERROR, FATAL, PENDING, STATUS, WARNING, BoundC
 
 __all__ = ["DISCARD", "ERROR", "FATAL", "PENDING", "STATUS", "WARNING", "FmiCalls"]
 
-
 MOST_ROUNDS = 100
 """Rounds of an event iteration before an error."""
 Log = Callable[[int, str], None]
@@ -130,6 +129,8 @@ class FmiCalls(ABC):
     """Whether the FMU is told that it may end a step early; set it before `instantiate`."""
     intermediate_inputs: tuple[int, ...] = ()
     """Value references of inputs that are set within a step (FMI 3.0, 4.2.2); set them before `instantiate`."""
+    intermediate_status: int = 0
+    """Worst status of setting them."""
 
     def version(self) -> str:
         """Return the version of FMI that the library states; empty if it states none."""
@@ -354,8 +355,7 @@ class FmiCalls(ABC):
     def exchange_function(self, name: str) -> Callable[..., int]:
         """Return the C function "set_time", which takes the instance and a time, or one of vectors of float64.
 
-        These take the instance, an address and a length: "set_states", "get_states", "derivatives", "indicators",
-        "nominals".
+        These take instance, address and length: "set_states", "get_states", "derivatives", "indicators", "nominals".
         """
         return self._function(f"{self.prefix}{self.exchange_names[name]}")
 

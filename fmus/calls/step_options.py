@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 from fractions import Fraction
 
-from ...blocks.core import FmuError, ParameterError
+from ...blocks.core import ParameterError
 from ..archive import FmuDescription
 from .fmi_calls import FmiCalls
 
@@ -43,7 +43,7 @@ class StepOptions:
     input_derivatives : bool
         Let real inputs go on with their slopes within a step, by the difference from the step before: in FMI 1.0 and
         2.0 where the FMU has ``canInterpolateInputs``; in FMI 3.0 for inputs with ``intermediateUpdate`` where it has
-        ``providesIntermediateUpdate``, in this process alone. This helps where inputs are smooth; where they are held
+        ``providesIntermediateUpdate``. This helps where inputs are smooth; where they are held
         or jump, it overshoots.
     time : StepTime or {"multiplied", "added"}
         Arithmetic by which the FMU is told the time.
@@ -142,21 +142,10 @@ def allows_early_return(about: FmuDescription, options: StepOptions) -> bool:
 
 
 def choose_modes(fmi: FmiCalls, about: FmuDescription, options: StepOptions) -> None:
-    """Tell the calls of co-simulation of FMI 3.0, before `FmiCalls.instantiate`, how the FMU is stepped.
-
-    Raises
-    ------
-    FmuError
-        If inputs are to be set within a step, and the FMU is in another process.
-    """
+    """Tell the calls of co-simulation of FMI 3.0, before `FmiCalls.instantiate`, how the FMU is stepped."""
     fmi.event_mode_used = uses_event_mode(about, options)
     fmi.early_return_allowed = allows_early_return(about, options)
     if options.input_derivatives and about.fmi.startswith("3"):
-        if not fmi.in_process:
-            raise FmuError(
-                "stepping=StepOptions(input_derivatives=True) sets inputs of FMI 3.0 within a step, which works in "
-                "this process alone; it is loaded in one of its own. Give isolate=False, or leave the option out."
-            )
         inputs = about.of("input").values()
         fmi.intermediate_inputs = tuple(
             r for v in inputs if v.intermediate and v.type == "Float64" for r in v.references

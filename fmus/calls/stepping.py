@@ -178,6 +178,9 @@ class CarefulSteps:
             self._tell_slopes(start)
         self._go(start, h)
         instance.set_span(start, h)
+        if (status := self.fmi.intermediate_status) > WARNING:
+            self.fmi.intermediate_status = 0
+            raise instance.report(f"setting its inputs within the step by {h:g} s", status, start)
         self._get(start + h)
 
     def _go(self, t: float, h: float) -> None:

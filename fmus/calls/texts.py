@@ -40,7 +40,12 @@ def list_limits(label: str, about: FmuDescription) -> list[str]:
     found = [f"{label}: no wire carries texts, binaries and clocks: {'; '.join(parts)}"] if parts else []
     still = [v for v in clocks if not about.has_event_mode or v.interval_variability == "triggered"]
     if still:
-        why = "triggered clocks are not driven" if about.has_event_mode else "the FMU has no Event Mode (hasEventMode)"
+        why = (
+            "no wire carries a triggered clock, so what waits for it keeps its start value. Export it with a periodic "
+            "clock, or with a Boolean input in its place"
+            if about.has_event_mode
+            else "the FMU has no Event Mode (hasEventMode)"
+        )
         found.append(f"{label}: the clocks {', '.join(map(str, still))} never tick: {why}")
     if about.complaints:
         more = f", and {len(about.complaints) - 1} more" if len(about.complaints) > 1 else ""

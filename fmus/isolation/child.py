@@ -74,6 +74,8 @@ class Child:
         self.sequences: list[tuple[tuple[Callable[..., int], tuple[Any, ...]], ...]] = []
         self.printf = importlib.import_module(".printf", __package__)
         self.before: list[Any] = []
+        self.line: Any = None
+        """Inputs that go on along lines within a step: start, status, values and slopes, then references, instance."""
         self._logging = threading.Lock()
 
     # ---- requests ----
@@ -237,9 +239,29 @@ class Child:
         self.sequences.append(tuple(bound))
         return len(self.sequences) - 1, []
 
+    def do_follow(
+        self, place: int, references: list[int], n: int, component: int, blobs: list[bytes]
+    ) -> tuple[None, list[bytes]]:
+        """Let inputs follow lines within a step, which the parent writes to the shared memory."""
+        numbers, values = (ctypes.c_double * (2 + 2 * n)).from_buffer(self.memory, place), (ctypes.c_double * n)()
+        self.line = numbers, (ctypes.c_uint * len(references))(*references), ctypes.c_void_p(component), values
+        return None, []
+
+    def _update_inputs(self, environment: Any, t: float, can_set: bool, *others: Any) -> None:
+        """Set the inputs at a time within a step; called by the FMU."""
+        if not can_set or self.line is None:
+            return
+        numbers, references, component, values = self.line
+        n, size = len(values), ctypes.c_size_t
+        for i in range(n):
+            values[i] = numbers[2 + i] + numbers[2 + n + i] * (t - numbers[0])
+        status = self.library["fmi3SetFloat64"](component, references, size(len(references)), values, size(n))
+        numbers[1] = max(numbers[1], status & 0xFFFFFFFF)
+
     def do_unload(self, blobs: list[bytes]) -> tuple[list[str], list[bytes]]:
         """Unload the library, and return traces of the FMU in this process: with any, it is used no more."""
         self.sequences.clear()
+        self.line = None
         handle, self.library = self.library._handle, None
         self.kept.clear()
         if sys.platform == "win32":
@@ -262,7 +284,16 @@ class Child:
                 self.words[MESSAGES] += 1
 
     def _callbacks(self, version: int) -> Any:
-        """Return the callbacks of a version of FMI: the logger alone, and the C library's memory."""
+        """Return the callbacks of a version of FMI: the logger alone, and the C library's memory.
+
+        Number 4 is the callback of FMI 3.0 that sets inputs within a step.
+        """
+        if version == 4:
+            flag, number = ctypes.c_bool, ctypes.c_double
+            update = ctypes.CFUNCTYPE(
+                *(None, ctypes.c_void_p, number, flag, flag, flag, flag), ctypes.POINTER(flag), ctypes.POINTER(number)
+            )
+            return self._keep(update(self._update_inputs))
         if version == 3:
 
             def message3(environment: Any, status: int, category: bytes | None, text: bytes | None) -> None:

@@ -13,6 +13,8 @@ from .process import ChildProcess
 
 _FUNCTION: Any = ctypes._CFuncPtr  # type: ignore[attr-defined]
 _CALLBACKS = {"fmi1CallbackFunctions": 1, "fmi2CallbackFunctions": 2}
+_UPDATE, _UPDATE_ARGUMENTS = 4, 8
+"""Callback of FMI 3.0 that sets inputs within a step, as the child counts them, and its number of arguments."""
 _EARLY = ("nstantiate", "Initialize", "Initialization", "SetupExperiment", "ConfigurationMode")
 
 
@@ -91,7 +93,8 @@ class RemoteFunction:
             elif isinstance(held, ctypes.Structure) and type(held).__name__ in _CALLBACKS:
                 sent.append(("callbacks", _CALLBACKS[type(held).__name__]))
             elif isinstance(held, _FUNCTION):
-                sent.append(("callbacks", 3) if held else ("P", None))
+                kind = _UPDATE if len(held._argtypes_) == _UPDATE_ARGUMENTS else 3  # type: ignore[attr-defined]
+                sent.append(("callbacks", kind) if held else ("P", None))
             elif held is not None and (held is not value or isinstance(held, ctypes.Array | ctypes.Structure)):
                 blobs.append(bytes(held))
                 buffers.append(held)

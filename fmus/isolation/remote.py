@@ -95,7 +95,7 @@ class RemoteCalls(FmiCalls):
 
     def instantiate(self, log: Log) -> None:
         """Make the instance; its messages go to ``log``."""
-        self.process.told, self.process.lose = log, self.lose
+        self.process.told, self.process.lose, self._line = log, self.lose, None
         super().instantiate(log)  # type: ignore[safe-super]
         if self.process.find(self.fmu.component) is not None:  # an address there that is shared memory here
             raise FmuError("its instance has an address that can't be told from shared memory; run it again.")
@@ -142,6 +142,32 @@ class RemoteCalls(FmiCalls):
         if status > WARNING:
             raise FMICallException("fmi3SetBinary", status)
 
+    def set_input_slopes(
+        self, t: float, references: Sequence[int], inputs: Sequence[float], slopes: Sequence[float]
+    ) -> None:
+        """Tell the slopes of inputs; in FMI 3.0 the child sets them when the FMU asks for that within a step."""
+        if self.prefix != "fmi3":
+            super().set_input_slopes(t, references, inputs, slopes)  # type: ignore[safe-super]
+            return
+        if self._line is None:
+            self._line = self.allocate(2 + 2 * len(inputs), ctypes.c_double)
+            place = self.process.find(self._line.ctypes.data)
+            self.process.request(
+                "follow", place, list(references), len(inputs), self.fmu.component, call="fmi3SetFloat64",
+                seconds=self.limits.step_time,
+            )  # fmt: skip
+        self._line[0], self._line[2:] = t, [*inputs, *slopes]
+
+    @property
+    def intermediate_status(self) -> int:
+        """Worst status of setting inputs within a step."""
+        return 0 if self._line is None else int(self._line[1])
+
+    @intermediate_status.setter
+    def intermediate_status(self, value: int) -> None:
+        if self._line is not None:
+            self._line[1] = value
+
     def read_printed(self) -> list[str]:
         """Return the last lines that the FMU has written to its standard output in this process's hold of it."""
         return self.process.read_printed()
@@ -156,6 +182,7 @@ class RemoteCalls(FmiCalls):
 
     def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
         self._path, self._unloaded = library, False
+        self._line: np.ndarray | None = None
         self._freed: deque[Any] = deque()
         super().__init__(name=name, token=token, folder=folder, library=library, model_exchange=model_exchange)  # type: ignore[safe-super]
 

@@ -105,6 +105,14 @@ def _check_chosen(description: FmuDescription, chosen: tuple[str, ...], label: s
         other = description.other.get(name)
         if other is not None and other.is_text and other.causality in ("output", "local", "calculatedParameter"):
             continue
+        if other is not None and other.type_is_clock:
+            raise ParameterError(
+                f"found {name!r}, a {other.interval_variability} {other.causality} clock; expected a number, as no wire "
+                "carries a clock. Leave it out: input clocks tick by themselves, but for triggered ones, in whose place "
+                "the FMU needs a Boolean input.",
+                block=label,
+                port="ports",
+            )
         if other is not None:
             raise ParameterError(
                 f"found {name!r}, a {other.causality} of type {other.type}, which no wire carries; expected a "

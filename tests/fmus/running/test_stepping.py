@@ -8,12 +8,12 @@ import pytest
 from loopwright.blocks import (
     Block,
     Constant,
-    FmuError,
     FmuRuntimeError,
     Gain,
     OptionError,
     Output,
     ParameterError,
+    Ramp,
     Sine,
 )
 from loopwright.diagrams import Diagram
@@ -161,8 +161,12 @@ def test_clocks_that_never_tick_are_told(folder):
     file = small_fmu(folder, "fmi3", EVENTS, MODEL.format(clock=clock, outputs=OUTPUTS, variable="true"), name="still")
     run = simulate(Fmu(file, name="plant"), level=Constant(value=0.0))
     assert run["plant.beats"][-1] == 0.0
-    text = "plant: the clocks beat (triggered Clock) never tick: triggered clocks are not driven"
-    assert text in run.messages
+    text = "plant: the clocks beat (triggered Clock) never tick: no wire carries a triggered clock, so what waits"
+    assert any(message.startswith(text) for message in run.messages)
+    with pytest.raises(
+        ParameterError, match=r"^plant\.ports: found 'beat', a triggered input clock; expected a number"
+    ):
+        Fmu(file, name="plant", ports=["beat"]).inputs
 
 
 def test_a_clock_between_the_steps_of_an_fmu_with_even_steps_is_refused(folder):
@@ -411,10 +415,10 @@ BETWEEN_MODEL = """<CoSimulation modelIdentifier="small" canHandleVariableCommun
 </ModelVariables><ModelStructure><Output valueReference="1"/></ModelStructure>"""
 
 
-@pytest.mark.parametrize(("slopes", "order"), [(False, 1), (True, 2)])
-def test_inputs_are_set_within_a_step_of_fmi_3(folder, slopes, order):
+@pytest.mark.parametrize(("slopes", "order", "isolate"), [(False, 1, False), (True, 2, False), (True, 2, True)])
+def test_inputs_are_set_within_a_step_of_fmi_3(folder, slopes, order, isolate):
     file = small_fmu(folder, "fmi3", BETWEEN, BETWEEN_MODEL, name="between")
-    plant = Fmu(file, name="plant", stepping=StepOptions(input_derivatives=slopes), isolate=False)
+    plant = Fmu(file, name="plant", stepping=StepOptions(input_derivatives=slopes), isolate=isolate)
     errors = []
     for n in (160, 320):
         wave = Gain(gain=np.array([0.25, 0.75]))(Sine(amplitude=1.0, frequency=1.0))
@@ -423,13 +427,16 @@ def test_inputs_are_set_within_a_step_of_fmi_3(folder, slopes, order):
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.25)
 
 
-def test_inputs_within_a_step_need_this_process(folder):
-    file = small_fmu(folder, "fmi3", BETWEEN, BETWEEN_MODEL, name="between")
-    plant = Fmu(file, name="plant", stepping=StepOptions(input_derivatives=True), start={"u": (0.0, 0.0)})
-    with pytest.raises(
-        FmuError, match=r"^plant: stepping=StepOptions\(input_derivatives=True\) sets inputs of FMI 3\.0"
-    ):
-        Diagram("d", plant()).simulate(0.1, step=0.1, progress=False)
+def test_a_fault_within_a_step_is_told_with_its_function(folder):
+    source = BETWEEN.replace("if (n != 1 ||", "if ((v[0] > 0.11 && v[0] < 0.12) || n != 1 ||")
+    file = small_fmu(folder, "fmi3", source, BETWEEN_MODEL, name="between")
+    for isolate in (False, True):
+        plant = Fmu(file, name="plant", stepping=StepOptions(input_derivatives=True), isolate=isolate)
+        wave = Gain(gain=np.array([0.25, 0.75]))(Ramp(slope=1.0))
+        with pytest.raises(
+            FmuRuntimeError, match=r"^plant, t = 0\.4 s: setting its inputs within the step by 0\.1 s .*fmi3Error"
+        ):
+            Diagram("d", plant(u=wave)).simulate(1.0, step=0.1, progress=False)
 
 
 # --- options ------------------------------------------------------------------------------------------------------------
