@@ -93,7 +93,7 @@ class RemoteFunction:
             elif isinstance(held, ctypes.Structure) and type(held).__name__ in _CALLBACKS:
                 sent.append(("callbacks", _CALLBACKS[type(held).__name__]))
             elif isinstance(held, _FUNCTION):
-                kind = _UPDATE if len(held._argtypes_) == _UPDATE_ARGUMENTS else 3  # type: ignore[attr-defined]
+                kind = _UPDATE if len(held._argtypes_) == _UPDATE_ARGUMENTS else 3
                 sent.append(("callbacks", kind) if held else ("P", None))
             elif held is not None and (held is not value or isinstance(held, ctypes.Array | ctypes.Structure)):
                 blobs.append(bytes(held))

@@ -63,6 +63,8 @@ class RemoteCalls(FmiCalls):
     in_process = False
     process: ChildProcess
     limits: Isolation
+    _line: np.ndarray | None = None
+    """Inputs that go on along lines within a step, in the shared memory; see `Child.do_follow`."""
 
     def _open(self, kind: Any, required: tuple[str, ...], **arguments: Any) -> Any:
         """Return an object of FMPy's class whose library is in the child."""
@@ -147,7 +149,7 @@ class RemoteCalls(FmiCalls):
     ) -> None:
         """Tell the slopes of inputs; in FMI 3.0 the child sets them when the FMU asks for that within a step."""
         if self.prefix != "fmi3":
-            super().set_input_slopes(t, references, inputs, slopes)  # type: ignore[safe-super]
+            super().set_input_slopes(t, references, inputs, slopes)
             return
         if self._line is None:
             self._line = self.allocate(2 + 2 * len(inputs), ctypes.c_double)
@@ -182,7 +184,6 @@ class RemoteCalls(FmiCalls):
 
     def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
         self._path, self._unloaded = library, False
-        self._line: np.ndarray | None = None
         self._freed: deque[Any] = deque()
         super().__init__(name=name, token=token, folder=folder, library=library, model_exchange=model_exchange)  # type: ignore[safe-super]
 

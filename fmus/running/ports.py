@@ -107,9 +107,9 @@ def _check_chosen(description: FmuDescription, chosen: tuple[str, ...], label: s
             continue
         if other is not None and other.type_is_clock:
             raise ParameterError(
-                f"found {name!r}, a {other.interval_variability} {other.causality} clock; expected a number, as no wire "
-                "carries a clock. Leave it out: input clocks tick by themselves, but for triggered ones, in whose place "
-                "the FMU needs a Boolean input.",
+                f"found {name!r}, a {other.interval_variability} {other.causality} clock; expected a number, as no "
+                "wire carries a clock. Leave it out: input clocks tick by themselves, but for triggered ones, in whose "
+                "place the FMU needs a Boolean input.",
                 block=label,
                 port="ports",
             )
