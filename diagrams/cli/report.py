@@ -6,13 +6,15 @@ import argparse
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 from ...blocks.core import DefinitionError, FmuError, FmuFileError, LoopwrightError, OptionError, UnknownNameError, near
 from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..paper import EXPERIMENTS, Experiment
-from ..report_writing import Report
+from ..report_writing import Report, symbol
 from ..requirements import Reason, Requirements, Review, Verdict, read_requirements
 from .options import parse_options, share
 from .text import say
@@ -50,6 +52,14 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     report.add_argument(
         "--requirements", metavar="FILE.toml", help="requirements on loops and responses; see docs/reports.md"
     )
+    report.add_argument(
+        "--measured",
+        metavar="WIRE=FILE.csv",
+        action="append",
+        default=[],
+        help="a loop that was measured at a wire: its margins stand beside the model's, requirements hold for them, "
+        "too; repeat it for several",
+    )
     report.add_argument("--check", action="store_true", help="say by the exit status whether they are met")
     for name in ABOUT:
         report.add_argument(f"--{name}", metavar="TEXT", help=f"the {name} in the report's heading")
@@ -77,6 +87,7 @@ def report_command(arguments: argparse.Namespace) -> int:
     if arguments.check and arguments.requirements is None:
         raise OptionError("there is nothing to check. Give the file: --requirements loop.toml.", port="--check")
     asked = None if arguments.requirements is None else read_requirements(arguments.requirements)
+    measured = _read_measured(arguments.measured)
     subject = arguments.diagram or DEFAULT
     with contextlib.ExitStack() as open_file:
         try:
@@ -92,10 +103,10 @@ def report_command(arguments: argparse.Namespace) -> int:
         about = {name: text for name in ABOUT if (text := getattr(arguments, name)) is not None}
         try:
             with _progress(diagram.name) as tell:
-                report = _analyse(diagram, experiment, arguments, asked, about, tell)
+                report = _analyse(diagram, experiment, arguments, asked, about, tell, measured)
         except UnknownNameError as error:
             say(f"loopwright: error: {error}", sys.stderr)
-            return 1 if asked is None else 2
+            return 1 if asked is None and not measured else 2
         except LoopwrightError as error:
             say(f"loopwright: error: {error}", sys.stderr)
             return 1
@@ -117,14 +128,37 @@ def report_command(arguments: argparse.Namespace) -> int:
     return EXIT_STATUS[report.review.verdict] if arguments.check and report.review is not None else 0
 
 
+def _read_measured(given: Sequence[str]) -> dict[str, Any]:
+    """Return the data of measured loops by their wires."""
+    from ..frequency import measured_margins, read_frequency_data
+
+    found: dict[str, Any] = {}
+    for text in given:
+        wire, equals, file = text.partition("=")
+        wire = wire.strip()
+        if not equals or not wire or not file:
+            raise OptionError(f"found {text!r}; expected WIRE=FILE.csv, such as u=u.csv.", port="--measured")
+        if wire in found:
+            raise OptionError(f"the wire {wire!r} is given twice; give it once.", port="--measured")
+        found[wire] = read_frequency_data(Path(file).expanduser())
+        try:
+            measured_margins(found[wire])
+        except OptionError as error:
+            raise OptionError(error.message, block=file, port=error.port) from None
+    return found
+
+
 def _verdict(reviewed: Review) -> str:
     """Return the verdict as lines of text: all requirements that are not met, by the paths of their numbers."""
     lines = [f"Requirements: {reviewed.verdict}."]
     for result in (*reviewed.of(Verdict.FAILED), *reviewed.of(Verdict.UNDECIDED)):
         place = result.path or ".".join(part for part in (result.loop, result.variant, result.quantity) if part)
         found = "" if result.number is None else f" found {result.number},"
-        reason = "" if result.reason is Reason.COMPARED else f" ({result.reason})"
-        lines.append(f"  {result.verdict}: {place}:{found} required {result.limit}{reason}")
+        unit = "" if result.number is None else symbol(result.number.unit)
+        required = f"{result.limit}{'' if unit in ('', '°') else ' '}{unit}"
+        detail = f": {result.detail}" if result.detail else ""
+        reason = "" if result.reason is Reason.COMPARED else f" ({result.reason}{detail})"
+        lines.append(f"  {result.verdict}: {place}:{found} required {required}{reason}")
     return "\n".join(lines)
 
 
@@ -135,6 +169,7 @@ def _analyse(
     asked: Requirements | None,
     about: Mapping[str, str],
     tell: Callable[[str], None],
+    measured: Mapping[str, Any],
 ) -> Report:
     from ..report import analyse, with_drawing
 
@@ -147,6 +182,7 @@ def _analyse(
         decibels=arguments.db,
         hertz=arguments.hz,
         progress=tell,
+        measured=measured,
     )
     return with_drawing(made, diagram)
 

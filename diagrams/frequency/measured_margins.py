@@ -284,21 +284,28 @@ def read_frequency_data(file: str | os.PathLike[str], *, dt: float = 0.0) -> Fre
     Raises
     ------
     OptionError
-        If a column is missing or given twice, or a row has no number there.
+        If the file can't be read, a column is missing or given twice, or a row has no number there.
     """
     import control
 
-    with open(file, encoding="utf-8-sig", newline="") as opened:
-        rows = [row for row in csv.reader(opened) if row and any(cell.strip() for cell in row)]
+    try:
+        with open(file, encoding="utf-8-sig", newline="") as opened:
+            reader = csv.reader(opened)
+            numbered = [(reader.line_num, row) for row in reader if row and any(cell.strip() for cell in row)]
+    except OSError as error:
+        raise OptionError(f"it can't be read: {error.strerror}. Name another file.", block=str(file)) from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise OptionError(f"it is no CSV file in UTF-8: {error}. Save it as one.", block=str(file)) from error
+    rows = [row for _, row in numbered]
     names = [cell.strip().lower() for cell in rows[0]] if rows else []
     columns: dict[str, np.ndarray] = {}
     for k, name in enumerate(names):
         try:
             columns[name] = np.array([float(row[k]) for row in rows[1:]])
         except (ValueError, IndexError):
-            bad = next(i for i, row in enumerate(rows[1:], 2) if len(row) <= k or not _is_number(row[k]))
+            bad = next(line for line, row in numbered[1:] if len(row) <= k or not _is_number(row[k]))
             raise OptionError(
-                f"row {bad} has no number in the column {name!r}; expected one. Mend it, or leave the row out.",
+                f"line {bad} has no number in the column {name!r}; expected one. Mend it, or leave the row out.",
                 block=str(file),
             ) from None
 

@@ -22,7 +22,7 @@ from .review import review
 from .section_injection import injected
 from .section_limits import not_modelled
 from .section_loops import inner
-from .section_measured import measured_loops
+from .section_measured import measured_loops, read_measured
 from .section_poles import closed_loops, memory
 from .section_steps import steps
 from .section_subject import operating_points, remarks, subject, versions
@@ -95,7 +95,8 @@ def analyse(
         Whether magnitudes are drawn in dB, and over a frequency in Hz; without it plain, over rad/s.
     measured : mapping of str to data, optional
         Loops that were measured, by their wires: data as `measured_margins` takes them, or the path of a CSV file (see
-        `read_frequency_data`). Their margins, with intervals, stand beside the model's.
+        `read_frequency_data`). Their margins, with intervals, stand beside the model's, and requirements hold for them
+        as for the model's: passed only if the whole interval is within the limits.
     progress : callable, optional
         Told the key of each section before it is made, and of the injection check each measurement, too.
 
@@ -123,12 +124,13 @@ def analyse(
     tell = progress or (lambda key: None)
     asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(requirements)
     case, sections = kind.sections(
-        diagram, point, experiment, wires, only, tell, stairs, asked, AxisUnits(decibels, hertz)
+        diagram, point, experiment, wires, only, tell, stairs, asked, AxisUnits(decibels, hertz), tuple(measured or ())
     )
-    if measured:
-        sections = (*sections, measured_loops(case, measured))
+    loops_measured = read_measured(case, measured) if measured else ()
+    if loops_measured:
+        sections = (*sections, measured_loops(case, loops_measured))
     made = Report("", sections).numbers()
-    reviewed = None if asked is None else review(case, asked, made)
+    reviewed = None if asked is None else review(case, asked, made, loops_measured)
     if only is None or asked is not None:
         sections = (summary(case, reviewed, made), *sections)
     name = diagram.name if experiment is None else f"Experiment {experiment.letter}: {diagram.name}"

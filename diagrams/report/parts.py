@@ -6,7 +6,7 @@ parts and definitions, which the diagram gives as its ``report_kind``. The parts
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
@@ -70,6 +70,7 @@ class MakesSections(Protocol):
         stairs: str | None = None,
         requirements: Requirements | None = None,
         axes: AxisUnits = RADIANS,
+        measured: Collection[str] = (),
     ) -> tuple[Case, tuple[Section, ...]]:
         """Return the case of a diagram, and its sections."""
 
@@ -132,6 +133,7 @@ class ReportKind(Generic[C]):
         stairs: str | None = None,
         requirements: Requirements | None = None,
         axes: AxisUnits = RADIANS,
+        measured: Collection[str] = (),
     ) -> tuple[Case, tuple[Section, ...]]:
         """Return the case of a diagram, and its sections.
 
@@ -145,6 +147,8 @@ class ReportKind(Generic[C]):
             Requirements on the design, which decide on the variants and steps that are tried.
         axes : AxisUnits
             Units of the axes of frequency responses.
+        measured : collection of str
+            Wires of loops that were measured, on which there may be requirements, too.
         tell : callable
             Told "variants" before the case is made, and the key of each section before it is made; of the injection
             check each measurement, too.
@@ -155,7 +159,7 @@ class ReportKind(Generic[C]):
         case.tell = tell
         if requirements is not None:
             case.requirements = requirements
-            check_names(case, requirements)
+            check_names(case, requirements, measured)
         wanted = set(self.keys if only is None else only)
         case.keys = tuple(key for key in self.keys if key in wanted)
         return case, tuple(self._made(case, tell))

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from ...blocks.core import LoopwrightError, UnknownNameError, near
 from ..frequency import Number
 from ..linearization import find_signal
-from ..requirements import Limit, Reason, RequirementResult, Requirements, Review, StepLimits, Verdict, judge
+from ..requirements import (
+    Limit,
+    Reason,
+    RequirementResult,
+    Requirements,
+    Review,
+    StepLimits,
+    Verdict,
+    judge,
+    judge_interval,
+)
 from .case import Case
 from .points import STEP
 from .section_injection import REFUTED
+from .section_measured import MEASURED, MeasuredLoop
 from .section_steps import key_of_step
 from .stability import Stability
 from .variant import Cut, Variant
@@ -22,7 +33,7 @@ MANY = 10.0
 """Times of its own uncertainty that a measurement has to be off by to refute a linear model."""
 
 
-def check_names(case: Case, asked: Requirements) -> None:
+def check_names(case: Case, asked: Requirements, measured: Collection[str] = ()) -> None:
     """Refuse names in requirements that the diagram does not have.
 
     Raises
@@ -31,15 +42,16 @@ def check_names(case: Case, asked: Requirements) -> None:
         A loop, a variant or a wire that isn't there.
     """
     wires = case.loop_wires()
-    known = {*wires, *wires.values(), *case.extra_loops()}
+    known = {*wires, *wires.values(), *case.extra_loops(), *measured}
     for name in asked.loops:
         if name not in known:
             raise UnknownNameError(f"found requirements on a loop {name!r}; expected a loop of the report. "
                                    f"{near(name, known)}", block=case.diagram.name)  # fmt: skip
+    variants = {**dict.fromkeys(case.variants), **({MEASURED: None} if measured else {})}
     for key in asked.further_variants:
-        if key not in case.variants:
+        if key not in variants:
             raise UnknownNameError(f"found requirements on a variant {key!r}; expected one of the report. "
-                                   f"{near(key, case.variants)}", block=case.diagram.name)  # fmt: skip
+                                   f"{near(key, variants)}", block=case.diagram.name)  # fmt: skip
     flat = case.diagram.flatten(None if case.diagram.has_clock else STEP)
     for limits in asked.steps:
         for wire in (limits.input, limits.output):
@@ -47,7 +59,9 @@ def check_names(case: Case, asked: Requirements) -> None:
                 find_signal(flat, wire)
 
 
-def review(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> Review:
+def review(
+    case: Case, asked: Requirements, numbers: Mapping[str, Number], measured: Sequence[MeasuredLoop] = ()
+) -> Review:
     """Return the verdicts on requirements.
 
     Parameters
@@ -58,8 +72,10 @@ def review(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> Re
         The requirements.
     numbers : mapping of str to Number
         All numbers of the report by their dotted paths.
+    measured : sequence of MeasuredLoop
+        Loops that were measured; limits of their margins hold for the measured ones, too.
     """
-    return Review(tuple(_results(case, asked, numbers)))
+    return Review((*_results(case, asked, numbers), *_measured(case, asked, numbers, measured)))
 
 
 def _results(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> Iterator[RequirementResult]:
@@ -89,6 +105,30 @@ def _results(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> 
             yield from _step(case, v, state, key_of_step(step), step, numbers, loop="")
     for path, limit in asked.numbers.items():
         yield _plain(path, limit, numbers)
+
+
+def _measured(
+    case: Case, asked: Requirements, numbers: Mapping[str, Number], measured: Sequence[MeasuredLoop]
+) -> Iterator[RequirementResult]:
+    """Yield the verdicts on margins of measured loops: the whole interval has to be within the limits."""
+    wires, actual = case.loop_wires(), case.actual
+    dt = actual.model.dt if actual is not None and not actual.problem else 0.0
+    for of in measured:
+        names = tuple(dict.fromkeys((of.key, wires.get(of.key, of.wire), of.wire)))
+        intervals, own = of.intervals(dt), asked.limits_named(names, MEASURED)
+        for name, limit in asked.limits_of(names, MEASURED).items():
+            result = RequirementResult(name, of.key, MEASURED, limit, Verdict.UNDECIDED, Reason.NO_NUMBER)
+            if name not in intervals:
+                if name in own:
+                    yield result
+                continue  # a general limit of the model's numbers
+            at, path = intervals[name], of.path(name)
+            verdict, reason, distance = judge_interval(at.value, at.low, at.high, limit)
+            if verdict is Verdict.PASSED and of.uncertainty is None:
+                verdict, reason = Verdict.UNDECIDED, Reason.NO_UNCERTAINTY
+            said = f"{at.low:.4g} … {at.high:.4g}" if reason is Reason.WITHIN_TOLERANCE else ""
+            result = replace(result, verdict=verdict, reason=reason, distance=distance, detail=said)
+            yield replace(result, path=path, number=numbers[path]) if path in numbers else result
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from ..requirements import Limit, RequirementResult, Review, Verdict
 from .case import Case
 from .review import weakest
 from .section_loops import ROWS
+from .section_measured import MEASURED
 from .section_steps import NAMES
 from .stability import unstable_first
 from .variant import Variant
@@ -83,7 +84,7 @@ def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
         number = result.number
         distance = Number(result.distance, number.unit, number.tolerance, number.confirmed_by, findings=number.findings)
     place = case.loop_wires().get(result.loop, result.loop) or (result.detail if result.quantity[:5] == "step." else "")
-    title = variant.title if variant else "–"
+    title = variant.title if variant else "measured" if result.variant == MEASURED else "–"
     return (
         Judged(said, result.verdict), words_of(result.quantity), place or "whole diagram", title,
         _required(result.limit, unit), result.number if result.number is not None else "–", distance,

@@ -1,6 +1,6 @@
 """Requirements on a design, and the verdicts on its numbers."""
 
-from .limits import Limit, Reason, Verdict, judge
+from .limits import Limit, Reason, Verdict, judge, judge_interval
 from .requirements import LoopLimits, Requirements, StepLimits
 from .results import RequirementResult, Review
 from .toml_file import read_requirements
@@ -15,5 +15,6 @@ __all__ = [
     "StepLimits",
     "Verdict",
     "judge",
+    "judge_interval",
     "read_requirements",
 ]

@@ -36,6 +36,8 @@ class Reason(StrEnum):
     """The report has no such number."""
     NO_VALUE = "no value"
     """The number does not exist (NaN), or its tolerance is not known."""
+    NO_UNCERTAINTY = "no uncertainty"
+    """The number was measured, and the data don't say how well."""
     NOT_CONFIRMED = "not confirmed"
     """No independent computation stands behind the number."""
     FINDINGS = "findings"
@@ -146,6 +148,21 @@ def make_limit(name: str, given: Any, sense: Sense | None, port: str = "") -> Li
             port=where,
         )
     return Limit(low, high)
+
+
+def judge_interval(value: float, low: float, high: float, limit: Limit) -> tuple[Verdict, Reason, float]:
+    """Return the verdict on a number that is known to lie in an interval, its reason, and its value's distance.
+
+    It is passed if the whole interval is within the limits, failed if the whole interval is beyond one of them.
+    """
+    distance = limit.distance(value)
+    if math.isnan(value) or math.isnan(low) or math.isnan(high):
+        return Verdict.UNDECIDED, Reason.NO_VALUE, math.nan
+    if high < limit.low or low > limit.high:
+        return Verdict.FAILED, Reason.COMPARED, distance
+    if limit.low <= low and high <= limit.high:
+        return Verdict.PASSED, Reason.COMPARED, distance
+    return Verdict.UNDECIDED, Reason.WITHIN_TOLERANCE, distance
 
 
 def judge(number: Number, limit: Limit) -> tuple[Verdict, Reason, float]:

@@ -105,8 +105,8 @@ def test_a_file_comes_in(tmp_path, header, columns):
         ("", "columns none; expected one of rad/s"),
         ("omega,gain\n1,2", "expected one of phase_deg, phase_rad"),
         ("omega,hz,real,imag\n1,2,3,4", "expected one of rad/s, omega"),
-        ("omega,real,imag\n1,2,3\n2,x,1", "row 3 has no number in the column 'real'"),
-        ("omega,real,imag\n1,2", "row 2 has no number in the column 'imag'"),
+        ("omega,real,imag\n1,2,3\n2,x,1", "line 3 has no number in the column 'real'"),
+        ("omega,real,imag\n1,2", "line 2 has no number in the column 'imag'"),
     ],
 )
 def test_a_file_that_does_not_fit_is_refused(tmp_path, text, message):
