@@ -3,7 +3,7 @@
 from .code import TickCode, compile_ticks, find_obstacle
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
 from .hybrid_code import compile_hybrid, find_hybrid_obstacle
-from .loop import CompiledLoop, Outcome, Reason
+from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 
 __all__ = [
     "FIXED",
@@ -12,6 +12,7 @@ __all__ = [
     "HybridOutcome",
     "HybridReason",
     "MethodOptions",
+    "NewtonOptions",
     "Outcome",
     "Reason",
     "Span",

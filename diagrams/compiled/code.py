@@ -7,7 +7,7 @@ import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -23,6 +23,8 @@ from ..flat import FlatDiagram, TickPattern
 from .grouping import Tables, make_tables
 from .kernels import write_kernels
 
+LARGEST = 6_000
+"""Operations of a function up to which it is compiled as a whole: the compiler's time grows faster than they do."""
 _MASTER = "loopwright_run"
 
 
@@ -75,11 +77,14 @@ class TickCode:
         there, signs of zeros may differ.
     library : CDLL
         The library, which is loaded as long as this lives.
+    loops : mapping
+        Equations of the algebraic loops, by the clocks that act, where there are some.
     """
 
     ticks: Mapping[frozenset[TickPattern], StraightTick | GroupedTick]
     exact: bool
     library: ctypes.CDLL
+    loops: Mapping[frozenset[TickPattern], StraightTick] = field(default_factory=dict)
 
 
 _COMPILED: WeakKeyDictionary[FlatDiagram, TickCode] = WeakKeyDictionary()
@@ -87,8 +92,8 @@ _COMPILED: WeakKeyDictionary[FlatDiagram, TickCode] = WeakKeyDictionary()
 
 def find_obstacle(flat: FlatDiagram) -> str | None:
     """Return why a diagram's ticks can't be compiled; None if they can."""
-    if flat.loops.slices:
-        return "it has an algebraic loop, which is solved by iteration at every tick"
+    if flat.loops.slices and any(flat.table.blocks[path].opaque for path in flat.checked.traced):
+        return "it has an algebraic loop beside blocks that Python evaluates, and Newton's method runs in C alone"
     return None
 
 
@@ -108,8 +113,44 @@ def compile_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -
     """
     if flat in _COMPILED and tuple(_COMPILED[flat].ticks) == tuple(acting):
         return _COMPILED[flat]
-    straight = None if flat.by_block else _compile_straight(flat, acting)
-    return _COMPILED.setdefault(flat, straight or _compile_grouped(flat, acting))
+    code = None if flat.by_block else _compile_straight(flat, acting)
+    code = code or _compile_grouped(flat, acting)
+    return _COMPILED.setdefault(flat, replace(code, loops=_compile_loops(flat, acting)))
+
+
+def _compile_loops(
+    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]
+) -> dict[frozenset[TickPattern], StraightTick]:
+    """Return the equations of the algebraic loops at ticks: their mismatch, and its derivative."""
+    found = {clocks: flat.loop_equations(clocks) for clocks in acting} if flat.loops.slices else {}
+    functions = {
+        clocks: rename(equations.fast, f"loops{i}")
+        for i, (clocks, equations) in enumerate(found.items())
+        if equations is not None
+    }
+    if not functions:
+        return {}
+    generator = ca.CodeGenerator("loops.c")
+    for function in functions.values():
+        check_size(function)
+        generator.add(function)
+    library = load_compiled(make_visible(generator.dump()))
+    return {clocks: StraightTick(f, address_of(library, f.name())) for clocks, f in functions.items()}
+
+
+def check_size(function: Any) -> None:
+    """Refuse a function that is too large to be compiled as a whole.
+
+    Raises
+    ------
+    CompilerError
+        If it is.
+    """
+    if (count := function.n_instructions()) > LARGEST:
+        raise CompilerError(
+            f"a function of the diagram has {count} operations; at most {LARGEST} are compiled, as a compiler takes "
+            "seconds for them. Leave out compile=True."
+        )
 
 
 def _compile_straight(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickCode | None:
@@ -163,6 +204,11 @@ def address_of(library: ctypes.CDLL, name: str) -> int:
     return address
 
 
+def read_sources(*names: str) -> str:
+    """Return C sources of this package, one behind the other."""
+    return "\n".join(files(__package__).joinpath(name).read_text(encoding="utf-8") for name in names)
+
+
 @lru_cache(maxsize=1)
 def master() -> Any:
     """Return the C function that goes over ticks; it is compiled once on a machine.
@@ -174,7 +220,7 @@ def master() -> Any:
     FmuError
         If the cache can't be written.
     """
-    function = load_compiled(files(__package__).joinpath("master.c").read_text(encoding="utf-8"))[_MASTER]
+    function = load_compiled(read_sources("newton.c", "master.c"))[_MASTER]
     function.restype = None
     return function
 

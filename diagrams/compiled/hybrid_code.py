@@ -6,19 +6,15 @@ import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.resources import files
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import casadi as ca
 
-from ...blocks.core import CompilerError
 from ..flat import NONE, FlatDiagram, TickPattern
-from .code import StraightTick, TickCode, address_of, load_compiled, make_visible, rename
+from .code import StraightTick, TickCode, address_of, check_size, load_compiled, make_visible, read_sources, rename
 
-LARGEST = 6_000
-"""Operations of a function up to which it is compiled: the compiler's time grows faster than they do."""
-_SOURCES = ("master.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
+_SOURCES = ("newton.c", "master.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
 
 EMBEDDED = ("euler", "heun", "rk4", "RK23", "RK45", "DOP853", "Radau", "auto")
 """Solvers that there are in C."""
@@ -105,11 +101,7 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
     others = {name: rename(function, name) for name, function in others.items()}
     generator = ca.CodeGenerator("hybrid.c")
     for function in (*ticks.values(), *others.values()):
-        if (count := function.n_instructions()) > LARGEST:
-            raise CompilerError(
-                f"a function of the diagram has {count} operations; at most {LARGEST} are compiled, as a compiler "
-                "takes seconds for them. Leave out compile=True."
-            )
+        check_size(function)
         generator.add(function)
     library = load_compiled(make_visible(generator.dump()))
     straight = {c: StraightTick(ticks[c], address_of(library, f"tick{i}")) for i, c in enumerate(kinds)}
@@ -129,5 +121,4 @@ def hybrid_master() -> ctypes.CDLL:
     FmuError
         If the cache can't be written.
     """
-    folder = files(__package__)
-    return load_compiled("\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in _SOURCES))
+    return load_compiled(read_sources(*_SOURCES))

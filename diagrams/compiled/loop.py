@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ...fmus.calls import NEAR, NativeStep
-from ..flat import TRUE
+from ..flat import TRUE, TickPattern
 from .code import GroupedTick, StraightTick, TickCode, master
 from .native_tick import at, bind_native
 
@@ -65,7 +65,43 @@ class LoopStructure(ctypes.Structure):
         ("near", ctypes.c_double),
         ("skip", ctypes.c_int64),
         ("halt", ctypes.c_int32),
+        ("loops", ctypes.c_void_p),
     ]
+
+
+class _Newton(ctypes.Structure):
+    _fields_ = [
+        ("n", ctypes.c_int64),
+        ("equations", TickStructure),
+        *((name, ctypes.c_void_p) for name in ("where", "r", "J", "v", "before", "direction", "column", "lu", "rows")),
+        *((name, ctypes.c_double) for name in ("tolerance", "rounding", "singular")),
+        *((name, ctypes.c_int64) for name in ("iterations", "halvings")),
+    ]
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """Newton's method for the algebraic loops of a tick.
+
+    Attributes
+    ----------
+    where : sequence of int
+        Entries of x that hold the values of the loops.
+    tolerance, rounding : float
+        Residuals, relative to 1 + the size of the values: up to the one a loop counts as solved, up to the other it is
+        solved no further.
+    singular : float
+        Least singular value of the derivative that surely determines the values, relative to 1 + the loop's gain.
+    iterations, halvings : int
+        Steps, and halvings of a step, at most.
+    """
+
+    where: Sequence[int]
+    tolerance: float
+    rounding: float
+    singular: float
+    iterations: int
+    halvings: int
 
 
 @dataclass(frozen=True)
@@ -113,6 +149,8 @@ class CompiledLoop:
         One of so many samples is kept.
     stops : sequence of int
         Entries of the log that end the run where they are true.
+    loops : mapping, optional
+        How the algebraic loops of each tick are solved, where there are some.
     """
 
     def __init__(
@@ -126,6 +164,7 @@ class CompiledLoop:
         width: int,
         every: int,
         stops: Sequence[int],
+        loops: Mapping[frozenset[TickPattern], NewtonOptions] | None = None,
     ):
         self._kept: list[Any] = [code, arguments, results, plants, columns]
         t, x, _, _ = arguments
@@ -150,6 +189,9 @@ class CompiledLoop:
             truth=TRUE,
             near=NEAR,
         )
+        if code.loops:
+            solvers = [self._newton(code, clocks, arguments, (loops or {}).get(clocks)) for clocks in code.ticks]
+            self.structure.loops = self._address(solvers, _Newton)
         self._outcome, self._run = OutcomeStructure(), master()
 
     def _array(self, values: np.ndarray) -> int | None:
@@ -169,6 +211,33 @@ class CompiledLoop:
         bound = bind_native(tick, arguments, results)
         self._kept.append(bound)
         return TickStructure(bound.address, bound.arguments, bound.results, bound.iw, bound.w)
+
+    def _newton(
+        self,
+        code: TickCode,
+        clocks: frozenset[TickPattern],
+        arguments: Sequence[np.ndarray],
+        options: NewtonOptions | None,
+    ) -> ctypes.Structure:
+        if clocks not in code.loops or options is None:
+            return _Newton()
+        n = len(options.where)
+        r, J = np.zeros(n), np.zeros(n * n)
+        return _Newton(
+            n=n,
+            equations=self._tick(code.loops[clocks], arguments, [r, J]),
+            where=self._array(np.array(options.where, dtype=np.int64)),
+            r=self._array(r),
+            J=self._array(J),
+            **{name: self._array(np.zeros(n)) for name in ("v", "before", "direction", "column")},
+            lu=self._array(np.zeros(n * n)),
+            rows=self._array(np.zeros(n, dtype=np.int64)),
+            tolerance=options.tolerance,
+            rounding=options.rounding,
+            singular=options.singular,
+            iterations=options.iterations,
+            halvings=options.halvings,
+        )
 
     def _plant(self, step: NativeStep) -> ctypes.Structure:
         inputs, outputs = (

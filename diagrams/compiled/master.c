@@ -1,30 +1,8 @@
 /* The loop over ticks: FMUs step, the diagram's tick is evaluated, its states are taken over, a sample is recorded.
 
    It knows no diagram: a tick is a function pointer with the addresses of its arguments and results. On anything out of
-   the ordinary it returns at that tick; Python, which has the same numbers before it, says what has happened. */
-
-#include <math.h>
-#include <stdbool.h>
-#include <stddef.h>
-#include <stdint.h>
-#include <string.h>
-
-#ifdef _WIN32
-#define VISIBLE __declspec(dllexport)
-#else
-#define VISIBLE __attribute__((visibility("default")))
-#endif
-
-typedef int (*tick_function)(const double **arguments, double **results, long long *iw, double *w, int memory);
-
-/* A tick at which some clocks act. */
-typedef struct {
-    tick_function evaluate;
-    const double **arguments;
-    double **results;
-    long long *iw;
-    double *w;
-} tick;
+   the ordinary it returns at that tick; Python, which has the same numbers before it, says what has happened. It stands
+   behind `newton.c`. */
 
 typedef int (*set_or_get2)(void *instance, const uint32_t *references, size_t count, double *values);
 typedef int (*set_or_get3)(void *instance, const uint32_t *references, size_t count, double *values, size_t size);
@@ -64,6 +42,7 @@ typedef struct {
     double near;            /* distance from the end of a step, in steps, within which a time is that end */
     int64_t skip;           /* samples to leave out before the next one that is kept */
     volatile int32_t halt;  /* not 0: return before the next tick */
+    newton *loops;          /* of each kind of tick; NULL: no algebraic loops */
 } loop;
 
 enum { DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED };
@@ -119,11 +98,13 @@ static int64_t step_plants(const loop *l, double now, double width, outcome *out
     return DONE;
 }
 
-static int call(const tick *f) { return f->evaluate(f->arguments, f->results, f->iw, f->w, 0); }
-
 /* Evaluate a tick at which clocks of some kind act; return DONE, or why its results are not to be taken over. */
 static int64_t evaluate(const loop *l, int64_t kind) {
-    return call(l->ticks + kind) || l->ok[0] == 0.0 ? NOT_OK : DONE;
+    newton *loops = l->loops ? l->loops + kind : NULL;
+    if (!loops || !loops->n) return call(l->ticks + kind) || l->ok[0] == 0.0 ? NOT_OK : DONE;
+    if (solve_loops(loops, l->x) && !call(l->ticks + kind) && l->ok[0] != 0.0) return DONE;
+    undo_loops(loops, l->x); /* Python begins where this has begun */
+    return NOT_OK;
 }
 
 /* Record a sample if it is one that is kept: into the row after the `written` ones; return how many are then. */

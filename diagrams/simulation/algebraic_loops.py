@@ -14,9 +14,14 @@ from ...blocks.core import SimulationError
 
 TOLERANCE = 1e-9
 """Largest residual of an algebraic loop that counts as solved, relative to 1 + the size of its values."""
-_ITERATIONS = 50
-_ROUNDING = 1e-14
-_SINGULAR = 1e-13  # least singular value of J, relative to that of the loop's gain
+ROUNDING = 1e-14
+"""Relative residual up to which it is solved no further."""
+ITERATIONS, HALVINGS = 50, 30
+"""Steps of Newton's method, and halvings of one, at most."""
+EXACT = 4
+"""Values up to which a step is computed here, to the last bit as in C; more are left to LAPACK."""
+SINGULAR = 1e-13
+"""Least singular value of J that determines the values, relative to 1 + the loop's gain."""
 _ASIDE = 1e-3  # step along a direction in which J is zero, relative to 1 + the size of the values
 _APART = 1e-6  # distance of two solutions, relative to 1 + their size
 _STARTS = (0.0, 1.0, -1.0, 10.0, -10.0, 0.1, -0.1, 100.0, -100.0)
@@ -78,21 +83,21 @@ class LoopSolver:
         x, where, call, r = self.x, self.where, self.call, self.r
         call()
         v = x[where]
-        size = float(np.linalg.norm(r))
-        for _ in range(_ITERATIONS):
-            if not self._size(v) > _ROUNDING:
+        size = _length(r)
+        for _ in range(ITERATIONS):
+            if not self._size(v) > ROUNDING:
                 break
             try:
-                direction = np.linalg.solve(self.J, r)
+                direction = _eliminate(self.J, r) if len(r) <= EXACT else np.linalg.solve(self.J, r)
             except np.linalg.LinAlgError:  # the shortest step, to one of many solutions if there are any
                 direction = np.linalg.lstsq(self.J, r)[0] if np.all(np.isfinite(self.J)) else np.array([math.nan])
             if not np.all(np.isfinite(direction)):
                 break
             best, step = 0.0, 1.0  # the mismatch itself must shrink: relative to values that run away, any would
-            for _ in range(30):
+            for _ in range(HALVINGS):
                 x[where] = v - step * direction
                 call()
-                now = float(np.linalg.norm(r))
+                now = _length(r)
                 if now < size:
                     best, size = step, now
                 elif best:
@@ -127,7 +132,7 @@ class LoopSolver:
         else:
             _, sizes, rows = np.linalg.svd(J)
             least, direction = float(sizes[-1]), rows[-1]
-        if least > _SINGULAR * (1.0 + gain):
+        if least > SINGULAR * (1.0 + gain):
             return
         solution = self.x[self.where].copy()
         aside = _ASIDE * (1.0 + np.max(np.abs(solution))) * direction
@@ -135,7 +140,7 @@ class LoopSolver:
         for sign in (1.0, -1.0):  # a multiple root has no neighbours, and is determined
             self.x[self.where] = solution + sign * aside
             self.call()
-            free = free or self._size(solution) <= _ROUNDING * (1.0 + gain)
+            free = free or self._size(solution) <= ROUNDING * (1.0 + gain)
         self.x[self.where] = solution
         self.call()
         if free:
@@ -192,6 +197,37 @@ class LoopSolver:
             f"{_text(self.x[self.where])}, which Newton's method found first; others are {found}. If another one is "
             "meant, solve the equations for the signal by hand, or break the loop with a UnitDelay(initial_value=…)."
         )
+
+
+def _length(r: np.ndarray) -> float:
+    return math.sqrt(sum([v * v for v in r.tolist()]))
+
+
+def _eliminate(J: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """Return J⁻¹ r by Gaussian elimination, operation by operation as `newton.c` does it.
+
+    Raises
+    ------
+    LinAlgError
+        If J is singular.
+    """
+    a, b = J.tolist(), r.tolist()
+    n = len(b)
+    for k in range(n):
+        best = max(range(k, n), key=lambda i: abs(a[i][k]))
+        if a[best][k] == 0:
+            raise np.linalg.LinAlgError
+        a[k], a[best], b[k], b[best] = a[best], a[k], b[best], b[k]
+        for i in range(k + 1, n):
+            factor = a[i][k] / a[k][k]
+            if factor:
+                a[i] = [*a[i][: k + 1], *(v - factor * w for v, w in zip(a[i][k + 1 :], a[k][k + 1 :], strict=True))]
+                b[i] -= factor * b[k]
+    for i in reversed(range(n)):
+        for j in range(i + 1, n):
+            b[i] -= a[i][j] * b[j]
+        b[i] /= a[i][i]
+    return np.array(b)
 
 
 _ADVICE = "Break it with a UnitDelay where a delay is real, or solve the equations for the signal by hand."

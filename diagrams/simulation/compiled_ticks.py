@@ -11,10 +11,11 @@ import numpy as np
 
 from ...blocks.core import CompilerError, SimulationError
 from ...fmus.calls import FmuInstance, NativeStep
-from ..compiled import CompiledLoop, Outcome, Reason, compile_ticks, find_obstacle
+from ..compiled import CompiledLoop, NewtonOptions, Outcome, Reason, compile_ticks, find_obstacle
 from ..coupling import Plant
 from ..flat import FlatDiagram, TickPattern
 from ..results import Recorder
+from .algebraic_loops import EXACT, HALVINGS, ITERATIONS, ROUNDING, SINGULAR, TOLERANCE
 from .diagnosis import forget_trials
 from .workspace import Workspace
 
@@ -28,6 +29,10 @@ CLOCKS = 16
 _SIGNS = (
     "Compiled: it has tables or large matrix products, in which signs of zeros may differ from those of an interpreted "
     "run."
+)
+_LOOPS = (
+    "Compiled: an algebraic loop has {} values. C solves the linear equations of Newton's method with another rounding "
+    "than an interpreted run, so that its values may differ by some 1e-14 times the condition of these equations."
 )
 
 
@@ -63,9 +68,11 @@ class CompiledTicks:
         self._chunk = FIRST
 
     @property
-    def exact(self) -> bool:
-        """Whether every bit is that of an interpreted run."""
-        return self._code.exact
+    def messages(self) -> tuple[str, ...]:
+        """How far results may differ from those of an interpreted run; empty where every bit is the same."""
+        largest = max((len(self._flat.active_loops(clocks)) for clocks in self._code.loops), default=0)
+        loops = () if largest <= EXACT else (_LOOPS.format(largest),)
+        return loops if self._code.exact else (_SIGNS, *loops)
 
     def reaches(self, last: int) -> bool:
         """Whether times up to a tick are quotients of integers that a float64 holds."""
@@ -136,8 +143,13 @@ class CompiledTicks:
                 width=workspace.log.size if entries is None else len(entries),
                 every=recorder.every,
                 stops=self._stops,
+                loops={clocks: self._newton(clocks) for clocks in self._code.loops},
             )
         return self._loop
+
+    def _newton(self, clocks: frozenset[TickPattern]) -> NewtonOptions:
+        where = self._flat.active_loops(clocks)
+        return NewtonOptions(where, TOLERANCE, ROUNDING, SINGULAR, ITERATIONS, HALVINGS)
 
     def _kinds(self, ticks: np.ndarray) -> np.ndarray:
         """Return the clocks that act at ticks, as places among the compiled functions; −1 where none is."""
@@ -213,7 +225,7 @@ def make_compiled(
         except CompilerError as error:
             reason = str(error)
         else:
-            return found, () if found.exact else (_SIGNS,)
+            return found, found.messages
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)
 
 

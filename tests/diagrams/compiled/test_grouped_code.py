@@ -20,6 +20,7 @@ from loopwright.blocks import (
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.compiled import code
 from loopwright.diagrams.flat import flat_diagram
+from support.both_forms import assert_same_bits, both
 from support.hybrid_blocks import counting
 from support.random_cases import random_cases
 from support.random_linear import BASE, PERIOD, diagram, specs
@@ -31,18 +32,6 @@ QUIET = {"progress": False}
 def grouped(monkeypatch):
     """Every diagram is compiled block by block."""
     monkeypatch.setattr(flat_diagram, "LARGEST", 0)
-
-
-def both(made, duration, **options):
-    interpreted = made.simulate(duration, **QUIET, **options)
-    compiled = made.simulate(duration, compile=True, **QUIET, **options)
-    assert not any(message.startswith("Interpreted") for message in compiled.messages)
-    return interpreted, compiled
-
-
-def assert_same_bits(first, second):
-    assert first.t.tobytes() == second.t.tobytes()
-    assert first.data.tobytes() == second.data.tobytes()
 
 
 def boxed(inside, every=0.01, source=None):
