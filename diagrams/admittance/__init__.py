@@ -5,6 +5,7 @@ from .contact import Contact, make_contact
 from .contact_admittance import ContactAdmittance
 from .contact_confirmation import ContactConfirmation, ContactTrial
 from .contact_limits import ContactLimit, ContactMap
+from .contact_trials import TrialMethod
 from .coupled import crossing_frequency, growth_rate, poles
 from .rendered import Passivity, passivity, rendered_admittance, rendered_response, rendered_system, target_admittance
 from .shown_plant import check_plant, is_discrete
@@ -29,6 +30,7 @@ __all__ = [
     "Passivity",
     "StabilityLimit",
     "StabilityMap",
+    "TrialMethod",
     "check_plant",
     "control_rate",
     "crossing_frequency",

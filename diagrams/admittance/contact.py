@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ..linearization import PointLike
     from ..results import OperatingPoint
     from .contact_confirmation import ContactConfirmation
+    from .contact_trials import TrialMethod
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,11 +170,21 @@ class Contact:
         check_properties(environment, vary)
         return find_limit(self.parts, self.direction, vary, environment, low=low, high=high, per_decade=per_decade)
 
-    def confirm(self, limit: ContactLimit, *, push: float = 1e-6) -> ContactConfirmation:
-        """Run the nonlinear diagram at 0.97 and at 1.03 of a limit, with the environment inside the plant.
+    def confirm(
+        self, limit: ContactLimit, *, push: float = 1e-6, method: TrialMethod | str | None = None
+    ) -> ContactConfirmation:
+        """Run the nonlinear diagram at 0.97 and at 1.03 of a limit, with the environment at the plant.
 
-        The environment joins the plant's own equations, in its own FMU or block; the controller is the diagram's. The
-        growth rate of the mode is measured, and compared with the linear loop's.
+        The controller is the diagram's. The growth rate of the mode is measured, and compared with the linear loop's.
+        The result's ``method`` tells where the environment is:
+
+        - "inside": in the equations of a plant of the library, in its own FMU or block.
+        - "solver": beside another plant with equations, or beside an FMU in model exchange. The solver integrates both.
+        - "held": beside an FMU that has co-simulation alone. It gets the force ten times in each tick, and holds it
+          between. That loop has another limit; the runs are beside that one (``tried``), and compared with its own
+          linear model. This confirms the models of plant and controller, and the limit only as far as the two agree.
+
+        Runs begin at the contact's operating point, with all sources held at their values there.
 
         Parameters
         ----------
@@ -181,6 +192,8 @@ class Contact:
             Of `stability_limit`, finite and not 0.
         push : float
             Velocity in m/s with which the contact is set in motion; so small that friction and limits are linear.
+        method : {"inside", "solver", "held"}, optional
+            Place of the environment; the first that is possible without it.
 
         Returns
         -------
@@ -190,13 +203,13 @@ class Contact:
         Raises
         ------
         OptionError
-            If the plant is none of the library, or the contact is not at the diagram's start.
+            If the limit is infinite or 0, or the plant does not allow the method.
         ConfirmationError
             If the runs contradict the limit.
         """
         from .contact_confirmation import confirm_limit
 
-        return confirm_limit(self, limit, push)
+        return confirm_limit(self, limit, push, method)
 
     def stability_map(
         self, x_values: Array, y_values: Array, *, x: str = "stiffness", y: str = "damping", **environment: float

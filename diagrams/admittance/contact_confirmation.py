@@ -1,31 +1,23 @@
 """Confirmation of limits of coupled stability by runs of the nonlinear diagram, with the environment in it.
 
-A run is set in motion by a small push. The growth rate of the mode that the limit is about is measured by its amplitude
-in two windows: the velocity of the contact, demodulated at the mode's predicted frequency.
+`contact_trials` says where the environment is in a run. A run is set in motion by a small push. The growth rate of the
+mode that the limit is about is measured by its amplitude in two windows: that of the contact's velocity, demodulated
+at the mode's predicted frequency.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from ...blocks.core import ConfirmationError, OptionError
-from ..linearization import find_signal
-from .contact_limits import ContactLimit, CoupledLoop, to_rates
-from .contact_parts import ContactParts, Ports
-from .moored_plant import Mooring, hold_sources, library_class, moored_diagram
-
-if TYPE_CHECKING:
-    from ..flat import WiredDiagram
-    from ..results import OperatingPoint
+from .contact_limits import ContactLimit
+from .contact_trials import STEP, TrialMethod, Trials, TriedContact
 
 FACTORS = (0.97, 1.03)
 """Shares of a limit at which the diagram is run."""
-STEP = 1e-3
-"""Sample time in s of the run of a continuous diagram."""
 PUSH = 1e-6
 """Velocity in m/s that the push gives the contact."""
 WITHIN = 0.1
@@ -42,45 +34,6 @@ DECAYED = 9.0
 """Time that other modes have to decay, in their time constants relative to the mode's own."""
 LONGEST = 8.0
 """Longest time in s that is waited for other modes."""
-
-
-class TriedContact(Protocol):
-    """A contact, as its limits are tried."""
-
-    @property
-    def diagram(self) -> WiredDiagram:
-        """Its diagram."""
-
-    @property
-    def plant(self) -> str:
-        """Path of the plant."""
-
-    @property
-    def direction(self) -> np.ndarray:
-        """Unit vector of the environment's direction."""
-
-    @property
-    def point(self) -> OperatingPoint:
-        """Operating point."""
-
-    @property
-    def parts(self) -> ContactParts:
-        """Plant and controller."""
-
-    @property
-    def ports(self) -> Ports:
-        """Ports of the plant."""
-
-    @property
-    def measured(self) -> str | None:
-        """Wire of the measured force."""
-
-    @property
-    def sample_time(self) -> float:
-        """Sample time of the controller in s."""
-
-    def loop(self, vary: str, **environment: float) -> CoupledLoop:
-        """Return the loop with an environment of which one property varies."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +59,7 @@ class ContactTrial:
 
 @dataclass(frozen=True)
 class ContactConfirmation:
-    """Runs below and above a limit, with the environment inside the plant.
+    """Runs below and above a limit, with the environment at the plant.
 
     Attributes
     ----------
@@ -118,6 +71,10 @@ class ContactConfirmation:
         Difference in 1/s of measured and predicted growth rate that was allowed.
     duration : float
         Length of the runs in s.
+    method : TrialMethod
+        Place of the environment in the runs.
+    tried : float
+        Limit that the runs are beside: that of the contact; for a held force, that of the loop with the held force.
     """
 
     limit: ContactLimit
@@ -125,12 +82,17 @@ class ContactConfirmation:
     above: ContactTrial
     within: float
     duration: float
+    method: TrialMethod = TrialMethod.INSIDE
+    tried: float = math.nan
 
     def __str__(self) -> str:
         trials = "; ".join(f"{t.measured:.4g} (predicted {t.predicted:.4g}) at {t.factor:g}" for t in self.trials)
+        of = "of the limit"
+        if self.method is TrialMethod.HELD:
+            of = f"of {self.tried:.6g} {self.limit.unit}, the limit that the held force has itself"
         return (
-            f"growth rates in 1/s of the nonlinear run with the environment inside the plant: {trials} of the limit; "
-            f"speeds up to {max(t.fastest for t in self.trials):.2g} m/s"
+            f"growth rates in 1/s of the nonlinear run with {self.method.value}: {trials} {of}; speeds up to "
+            f"{max(t.fastest for t in self.trials):.2g} m/s"
         )
 
     @property
@@ -139,25 +101,29 @@ class ContactConfirmation:
         return self.below, self.above
 
 
-def confirm_limit(contact: TriedContact, limit: ContactLimit, push: float = PUSH) -> ContactConfirmation:
+def confirm_limit(
+    contact: TriedContact, limit: ContactLimit, push: float = PUSH, method: TrialMethod | str | None = None
+) -> ContactConfirmation:
     """Run a contact's diagram at 0.97 and at 1.03 of a limit; see `Contact.confirm`."""
     _check(contact, limit, push)
-    predicted = [_mode(contact, limit, factor * limit.value) for factor in FACTORS]
+    trials = Trials.of(contact, limit, method)
+    tried = trials.find_own_limit()
+    values = [factor * tried for factor in FACTORS]
+    predicted = [trials.find_mode(value) for value in values]
     within = WITHIN * max(abs(mode.real) for mode in predicted)
     omega = max(abs(mode.imag) for mode in predicted)
     step = contact.sample_time or STEP
     most = GROWN / max(abs(mode.real) for mode in predicted)
     window = min(max(PERIODS * 2 * math.pi / omega if omega else WINDOW, FEWEST * step), WINDOW, 0.35 * most)
-    begin = max(_others_decay(contact, limit, factor * limit.value, window) for factor in FACTORS)
+    begin = max(_others_decay(trials, value, window) for value in values)
     begin = min(begin, max(most - 2 * window, 2 * step))
     duration = begin + 2 * window
     found = []
-    for factor, mode in zip(FACTORS, predicted, strict=True):
-        value = factor * limit.value
-        t, speed, fastest = _run(contact, limit, value, push, duration)
+    for factor, value, mode in zip(FACTORS, values, predicted, strict=True):
+        t, speed, fastest = trials.run(value, push, duration)
         measured = measure_growth(t, speed, abs(mode.imag), begin, window)
         found.append(ContactTrial(factor, value, float(mode.real), measured, fastest))
-    result = ContactConfirmation(limit, found[0], found[1], within, duration)
+    result = ContactConfirmation(limit, found[0], found[1], within, duration, trials.method, tried)
     if any(not abs(t.measured - t.predicted) <= within for t in found) or not found[0].measured < 0 < found[1].measured:
         raise ConfirmationError(
             f"{limit.vary} {limit.value:.6g} {limit.unit} is refuted: {result}; expected differences of at most "
@@ -206,74 +172,12 @@ def _check(contact: TriedContact, limit: ContactLimit, push: float) -> None:
         )
     if not 0.0 < push < math.inf:
         raise OptionError(f"found {push!r}; expected a positive velocity in m/s. Give one.", port="push")
-    if library_class(contact.diagram.blocks[contact.plant]) is None:
-        raise OptionError(
-            "found a plant that is none of the library's; expected one, whose equations the environment can be put "
-            "into. Compare with a run of your own, with the environment as blocks.",
-            block=contact.plant,
-        )
-    if not contact.sample_time and contact.diagram.blocks[contact.plant].stepped:
-        raise OptionError(
-            "found a continuous diagram around an FMU, which exchanges signals with it at the ends of steps alone; "
-            "expected one that can be run as its limit is computed. Confirm a sampled one: diagram.sampled(1e-3).",
-            block=contact.plant,
-        )
-    if contact.point.t > START * float(contact.point.base):
-        raise OptionError(
-            f"found a contact at t = {contact.point.t:g} s; expected one at the start, from which the runs with the "
-            "environment begin. Start the diagram at rest there: diagram.replace({'plant.start.position': …}).",
-            block=contact.plant,
-            port="at",
-            t=contact.point.t,
-        )
 
 
-START = 2.5
-"""Ticks up to which an operating point is the start."""
-
-
-def _mode(contact: TriedContact, limit: ContactLimit, value: float) -> complex:
-    """Return the pole, in 1/s, of the mode that a limit is about."""
-    rates = _rates(contact, limit, value)
-    return complex(rates[int(np.argmin(np.abs(np.abs(rates.imag) - limit.frequency) - 1e-3 * rates.real))])
-
-
-def _rates(contact: TriedContact, limit: ContactLimit, value: float) -> np.ndarray:
-    loop = contact.loop(limit.vary, **limit.environment)
-    return to_rates(contact.parts, np.linalg.eigvals(loop.modes.reduce(loop.close(value).A)))
-
-
-def _others_decay(contact: TriedContact, limit: ContactLimit, value: float, window: float) -> float:
+def _others_decay(trials: Trials, value: float, window: float) -> float:
     """Return the time in s until modes of about the frequency of the limit's have decayed beside it."""
-    mode = _mode(contact, limit, value)
-    rates = _rates(contact, limit, value)
+    mode, rates = trials.find_mode(value), trials.find_rates(value)
     near = np.abs(np.abs(rates.imag) - abs(mode.imag)) < 8 * 2 * math.pi / window
     gaps = mode.real - rates.real[near]
     gaps = gaps[gaps > 1e-6]
     return float(min(LONGEST, max(0.1, DECAYED / float(np.min(gaps)) if len(gaps) else 0.1)))
-
-
-def _run(
-    contact: TriedContact, limit: ContactLimit, value: float, push: float, duration: float
-) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return times, the velocity along the mode's direction, and the largest speed."""
-    environment = {**limit.environment, limit.vary: value}
-    tool = environment.pop("tool_mass", None)
-    mobility = float(contact.direction @ contact.parts.velocity @ contact.parts.force @ contact.direction)
-    step = contact.sample_time or STEP
-    mooring = Mooring(
-        contact.direction, np.asarray(contact.point.values[f"{contact.plant}.{contact.ports.position}"], dtype=float),
-        **{name: float(v) for name, v in environment.items()}, kick=push / (mobility * step), kick_time=step,
-    )  # fmt: skip
-    ports = (contact.ports.force, contact.ports.position, contact.ports.velocity)
-    still = hold_sources(contact.diagram, contact.point.values)
-    source = find_signal(still.flatten_like(contact.point), contact.measured) if contact.measured else None
-    made: Any = moored_diagram(still, contact.plant, ports, source, mooring, tool)
-    options: dict[str, Any] = {} if made.has_clock else {"step": step}
-    name = f"{contact.plant}.{contact.ports.velocity}"
-    run = made.simulate(duration + 4 * step, progress=False, record=[name], states=False, **options)
-    t = np.asarray(run.t)
-    rows = np.unique(np.round(t / step).astype(int), return_index=True)[1]
-    velocity = np.asarray(run[name])[rows]
-    along = np.asarray(limit.direction or contact.direction)
-    return t[rows], velocity @ along, float(np.max(np.linalg.norm(velocity, axis=1)))

@@ -18,7 +18,7 @@ from ...blocks.core import Array, Block, OptionError, Output, Source, parameter
 from ...fmus.export import build
 from ...fmus.models import gantry, gantry_elastic, gantry_stiction, scara
 from ...fmus.running import Fmu
-from ..wiring import Wire
+from ..wiring import Structure, Wire
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -46,8 +46,8 @@ class Mooring:
         Unit vector along which it acts, and the place where its spring is relaxed.
     stiffness, damping, mass : float
         Its properties, N/m, N·s/m and kg.
-    kick, kick_time : float
-        A force in N in its direction in the first seconds, which sets it in motion.
+    kick, kick_time, kick_start : float
+        A force in N in its direction, which sets it in motion, and its end and beginning in s.
     """
 
     direction: np.ndarray
@@ -57,10 +57,11 @@ class Mooring:
     mass: float = 0.0
     kick: float = 0.0
     kick_time: float = 0.0
+    kick_start: float = 0.0
 
     def parameters(self) -> dict[str, Any]:
         """Return the parameters of a moored plant."""
-        names = ("direction", "anchor", "stiffness", "damping", "mass", "kick", "kick_time")
+        names = ("direction", "anchor", "stiffness", "damping", "mass", "kick", "kick_time")  # begun at its start
         return {f"environment_{name}": getattr(self, name) for name in names}
 
 
@@ -196,9 +197,7 @@ def moored_diagram(
             f"found {type(block).__name__}, which is no plant of the library; expected one of {', '.join(LIBRARY)}.",
             block=plant,
         )
-    table = diagram.scheduled.copy()
-    for path, settings in table.subsystems.items():
-        table.subsystems[path] = replace(settings, delay=0)  # the delays have become blocks
+    table = copy_table(diagram)
     if isinstance(block, Fmu):
         names = {new: old for old, new in block.rename.items()}
         force, position, velocity = (names.get(port, port) for port in ports)
@@ -209,10 +208,7 @@ def moored_diagram(
         made: Any = moor(cls, *ports)
         table.blocks[plant] = made(**{k: v for k, v in values.items() if v is not None}, **mooring.parameters(),
                                    name=block.label)  # fmt: skip
-    if tool_mass is not None:
-        for path, sensor in table.blocks.items():
-            if isinstance(sensor, ForceSensor):
-                table.blocks[path] = sensor.replace(tool_mass=tool_mass)
+    set_tool(table, tool_mass)
     if measured is not None:
         source = measured.port
         if source[0] == plant:
@@ -230,6 +226,22 @@ def moored_diagram(
         table.blocks[total], table.subsystem_of[total] = Sum(name=total), ""
         table.wires[total, "u1"], table.wires[total, "u2"] = Wire(*source), Wire(plant, FORCE)
     return diagram.with_structure(table)
+
+
+def copy_table(diagram: WiredDiagram) -> Structure:
+    """Return a copy of a diagram's structure, in which the delays of subsystems have become blocks."""
+    table = diagram.scheduled.copy()
+    for path, settings in table.subsystems.items():
+        table.subsystems[path] = replace(settings, delay=0)
+    return table
+
+
+def set_tool(table: Structure, tool_mass: float | None) -> None:
+    """Give the force sensors another tool; None leaves them their own."""
+    if tool_mass is not None:
+        for path, sensor in table.blocks.items():
+            if isinstance(sensor, ForceSensor):
+                table.blocks[path] = sensor.replace(tool_mass=tool_mass)
 
 
 def _own_start(block: Fmu, cls: type[Block]) -> Mapping[str, Any]:

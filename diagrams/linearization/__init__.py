@@ -1,5 +1,6 @@
 """Linear models, operating points and trim."""
 
+from .copied_point import copy_point
 from .derivatives import Tap, find_signal
 from .findings import (
     BlockFinding,
@@ -40,6 +41,7 @@ __all__ = [
     "ZeroSlope",
     "capture",
     "check_options",
+    "copy_point",
     "differentiate_loop",
     "find_kinks_between",
     "find_signal",

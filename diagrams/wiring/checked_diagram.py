@@ -78,9 +78,9 @@ class CheckedDiagram:
         diagram._set(name, table, loops)
         return diagram
 
-    def with_structure(self, structure: Structure) -> Self:
-        """Return the diagram of another structure, under the same name."""
-        return type(self)._of(self.name, structure, self.loops)
+    def with_structure(self, structure: Structure, loops: str | None = None) -> Self:
+        """Return the diagram of another structure, under the same name, and with other ``loops``, where given."""
+        return type(self)._of(self.name, structure, self.loops if loops is None else loops)
 
     def __reduce__(self) -> tuple[object, ...]:
         return type(self)._of, (self.name, self.structure, self.loops)

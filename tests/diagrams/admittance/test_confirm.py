@@ -76,17 +76,23 @@ def test_what_cannot_be_confirmed_says_why():
         here.confirm(replace(limit, value=np.inf))
     with pytest.raises(OptionError, match="push: found 0"):
         here.confirm(limit, push=0)
-    later = replace(here, point=replace(here.point, t=1.0))
-    with pytest.raises(OptionError, match=r"at t = 1 s; expected one at the start"):
-        later.confirm(limit)
 
 
-def test_a_continuous_diagram_around_an_fmu_is_refused():
-    sampled = contact("gantry", "perp")
-    ideal = sampled.diagram.continuous().contact(direction="perp")
-    limit = replace(sampled.stability_limit("stiffness"), value=1e4)
-    with pytest.raises(OptionError, match=r"a continuous diagram around an FMU.*Confirm a sampled one"):
-        ideal.confirm(limit)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["inside", "held"])
+@pytest.mark.parametrize("side", ["par", "perp"])
+def test_a_limit_under_a_static_force_on_a_curved_path_holds(side, method):
+    made = experiments.compliance().diagram.replace({"free_space.value": (3.0, 1.5)})
+    here = made.contact(direction=side, at=made.operating_point(30.0))  # the steps are over, and the robot rests
+    started = experiments.compliance().diagram.contact(direction=side)
+    moved = here.point.values["plant.position"] - started.point.values["plant.position"]
+    assert np.linalg.norm(moved) > 0.05
+    limit = here.stability_limit(damping=10.0)
+    assert abs(limit.value / started.stability_limit(damping=10.0).value - 1.0) > 0.01
+    found = here.confirm(limit, method=method)
+    for trial in found.trials:
+        assert trial.measured == pytest.approx(trial.predicted, abs=0.01 * abs(trial.predicted) + 1e-3)
+        assert trial.fastest < 1e-5  # it was at rest: the runs begin at the point
 
 
 @pytest.mark.slow

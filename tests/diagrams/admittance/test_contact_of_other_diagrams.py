@@ -9,8 +9,8 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from loopwright.blocks import Block, Constant, ForceSensor, Gain, Input, Output, State, TransferFunction
-from loopwright.diagrams import Diagram, subsystem
-from loopwright.fmus import Fmu, scara
+from loopwright.diagrams import Diagram, TrialMethod, subsystem
+from loopwright.fmus import Fmu, build, scara
 
 # --- another diagram: a cart whose drive lags behind the force that it shows -----------------------------------------
 
@@ -81,6 +81,22 @@ def test_without_damping_a_spring_breaks_the_loop_where_the_admittance_is_no_lon
     s = 1j * w
     Y = (1 + SHARE / (TAU * s + 1)) / (M * s + DRAG / (TAU * s + 1))
     assert here.admittance(w).rendered == pytest.approx(Y, rel=1e-12)
+
+
+@pytest.mark.parametrize("made", ["block", pytest.param("fmu", marks=pytest.mark.slow)])
+def test_a_carts_limit_holds_in_the_run_of_the_solver(made):
+    ports = {"position": "cart.position", "velocity": "cart.velocity", "force": "felt"}
+    here = cart_contact()
+    if made == "fmu":  # its signals are exchanged within the solver's steps, though it has co-simulation, too
+        plant = Fmu(build(Cart(), name="cart"), name="cart")
+        here = cart_diagram(plant).contact("cart.push", direction=[1.0], **ports)
+    found = here.confirm(here.stability_limit())
+    assert found.method is TrialMethod.SOLVER
+    for trial in found.trials:
+        k = trial.value
+        growth = np.roots([M * TAU, M, k * TAU + DRAG, k * (1 + SHARE)]).real.max()
+        assert trial.predicted == pytest.approx(growth, rel=1e-9)
+        assert trial.measured == pytest.approx(growth, rel=0.01)
 
 
 def test_a_force_that_is_not_measured_leaves_the_drag():
