@@ -18,6 +18,8 @@ from .realization import Realization
 
 STEP = 0.01
 LEVEL = 1e-3
+FEW = 6
+"""Values up to which a confirmation names each."""
 
 
 @contextmanager
@@ -81,6 +83,8 @@ def confirm_no_limit(name: str, values: Sequence[float], stable: Callable[[float
             f"found no limit, but {how} say unstable at {bad[0]:.6g}; expected stable. Look at closed_loop_poles.",
             block=name,
         )
+    if len(values) > FEW:
+        return f"{how}: stable at {len(values)} values from {values[0]:.6g} to {values[-1]:.6g}"
     return f"{how}: stable at " + ", ".join(f"{v:.6g}" for v in values)
 
 

@@ -16,7 +16,7 @@ from .findings import (
 )
 from .kinks import find_kinks_between
 from .linear_model import Linearization, linearize, linearize_batch
-from .loops_over_a_period import ticks_to_renewal
+from .loops_over_a_period import ticks_between_renewals, ticks_to_renewal
 from .operating_points import PointLike, capture, check_options, operating_point, run_to
 from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop
 from .plant_equations import PlantEquations, linearize_plant, moves_between_ticks
@@ -52,6 +52,7 @@ __all__ = [
     "operating_point",
     "point_from_states",
     "run_to",
+    "ticks_between_renewals",
     "ticks_to_renewal",
     "trim",
 ]

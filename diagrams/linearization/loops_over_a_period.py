@@ -41,6 +41,12 @@ def ticks_to_renewal(flat: FlatDiagram, ports: Iterable[tuple[str, str]], tick: 
     return 0 if clock is None or clock.acts(tick) else clock.after(tick) - tick
 
 
+def ticks_between_renewals(flat: FlatDiagram, ports: Iterable[tuple[str, str]]) -> int | None:
+    """Return the number of ticks from one renewal of the wires to the next; None if they are not renewed together."""
+    clock = _find_one_clock(flat, list(ports))
+    return None if clock is None else clock.every
+
+
 def find_slower_clocks(flat: FlatDiagram, ports: Iterable[tuple[str, str]], name: str) -> frozenset[TickPattern]:
     """Return the clocks that are slower than the wires: than the fastest clock behind their sources, or their readers.
 

@@ -17,7 +17,15 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError, OptionError, SimulationError
 from ..flat import FlatDiagram, WiredDiagram
-from ..linearization import Linearization, PointLike, find_signal, linearize, operating_point, ticks_to_renewal
+from ..linearization import (
+    Linearization,
+    PointLike,
+    find_signal,
+    linearize,
+    operating_point,
+    ticks_between_renewals,
+    ticks_to_renewal,
+)
 from .injection import InjectionRun, inject_signal
 
 SAMPLES = 1000
@@ -59,7 +67,8 @@ class StepResponse:
     held : bool
         Whether the wire's signal is held between the samples, so that no peak lies between them.
     prediction : (N, 1 + K) ndarray, optional
-        v and the outputs as the linear model predicts them; None where it can't.
+        v and the outputs as the linear model predicts them; None where it can't, as at a wire that is renewed several
+        times in the period of all clocks.
     """
 
     wire: str
@@ -153,6 +162,9 @@ def step_response(
     names = list(outputs)
     taps = [find_signal(flat, name) for name in names]
     every = math.lcm(*(clock.every for clock in flat.distinct)) if sampled and flat.distinct else 1
+    own = ticks_between_renewals(flat, [signal.port]) if sampled and every > 1 else None
+    slow = every // own if own and every % own == 0 else 1  # the wire's renewals in the period of all clocks
+    every //= slow
     period = base * every
     wait = ticks_to_renewal(flat, [signal.port], point.tick) if sampled and every > 1 else 0
     held = (period, ((point.tick + wait) % every) * base) if sampled else None
@@ -198,6 +210,8 @@ def step_response(
     try:
         if wait:
             raise OptionError("the wire is renewed off the period. Measure another one.", port=wire)
+        if slow > 1:
+            raise OptionError("the wire is renewed within the model's period. Measure another one.", port=wire)
         model = linearize(variant, point, inputs=[wire], outputs=[wire, *names], stairs=stairs)
         prediction = predict(model, d, t)
     except LoopwrightError:

@@ -96,7 +96,8 @@ def _results(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> 
                 found = _worst(numbers, f"inner.{key}.{v.key}", name, limit)
                 if found is None and name not in own and _has_channels(numbers, f"inner.{key}"):
                     continue  # a general limit of single loops
-                result = RequirementResult(name, key, v.key, limit, Verdict.UNDECIDED, Reason.NO_NUMBER)
+                reason = Reason.PERIODIC if _is_periodic(numbers, f"inner.{key}.{v.key}") else Reason.NO_NUMBER
+                result = RequirementResult(name, key, v.key, limit, Verdict.UNDECIDED, reason)
                 yield _with(state, result, found, _refuted(numbers, key, v.key))
             step = asked.step_of(names, v.key)
             if step is not None and key in wires:
@@ -219,6 +220,11 @@ def _has_channels(numbers: Mapping[str, Number], start: str) -> bool:
     """Return whether a loop has several channels, of which there is a disk margin alone."""
     mine = [path for path in numbers if path.startswith(f"{start}.")]
     return bool(mine) and not any(path.rpartition(".")[2] == "phase_margin_deg" for path in mine)
+
+
+def _is_periodic(numbers: Mapping[str, Number], start: str) -> bool:
+    """Return whether the margins of a loop are those of a wire that is renewed several times in the period."""
+    return f"{start}.{Cut.PERIODIC}.stable" in numbers
 
 
 def _refuted(numbers: Mapping[str, Number], key: str, variant: str) -> bool:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError
+from ...blocks.core import LoopwrightError, PeriodicLoopError
 from .. import report_figures as figures
 from ..frequency import Number
 from ..linearization import Linearization
@@ -47,6 +47,9 @@ def injected(case: Case) -> Section | None:
                 L = v.loop(wire)  # a wire without a loop at one rate needs no measurement
                 found, model = _measured(case, v, wire)
                 deviation = found.deviation(model, "L")
+            except PeriodicLoopError:
+                text.append(TEXTS.line("periodic", variant=v.title, wire=wire))
+                continue
             except LoopwrightError as error:
                 text.append(TEXTS.line("failed", variant=v.title, wire=wire, message=error.message))
                 continue

@@ -193,8 +193,9 @@ def _periodic_table(wire: str, periodic: Mapping[str, PeriodicMargins]) -> Table
     """Return the margins of a wire with all loops closed, one factor at all its renewals."""
     names = {**ROWS, "disk_frequency": "disk margin at"}
     rows = [(text, *(p.numbers()[name] for p in periodic.values())) for name, text in names.items() if name in PERIODIC]
-    renewals = ("renewals in a period", *(f"{p.renewals} in {p.dt:g} s" for p in periodic.values()))
-    return Table(f"Periodic loop at {wire}, all loops closed", ("", *periodic), (*rows, renewals))
+    renewals = {title: (p.renewals, p.dt) for title, p in periodic.items()}
+    note = TEXTS.line("renewals", renewals=list(dict.fromkeys(renewals.values())))
+    return Table(f"Periodic loop at {wire}, all loops closed", ("", *periodic), tuple(rows), note)
 
 
 def _as_control(r: Realization) -> Any:

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from ...blocks import Saturation
-from ...blocks.core import LoopwrightError
+from ...blocks.core import LoopwrightError, PeriodicLoopError
 from .. import report_figures as figures
 from ..flat import WiredDiagram
 from ..frequency import Number, Realization
+from ..linearization import find_signal
 from ..measure import StepResponse, measure_step, step_response
 from ..report_writing import Plot, Section, Table, Texts
 from ..requirements import StepLimits
@@ -101,6 +102,8 @@ def steps(case: Case) -> Section | None:
                 numbers[f"{where}.{key}"] = Number(change, _unit(v.diagram, name), 1e-9 * change, _how(got))
                 effort.append((_said(test), v.title, name, before, numbers[f"{where}.{key}"]))
             text += [TEXTS.line("saturated", variant=v.title, wire=test.wire, blocks=saturated)] if saturated else []
+            if got.prediction is None:
+                text.append(TEXTS.line("unpredicted", variant=v.title, wire=test.wire))
             if got.moved > 1e-6:
                 text.append(TEXTS.line("moved", variant=v.title, wire=test.wire, moved=got.moved))
             found.setdefault(replace(test, limits=None), {})[v.key] = got
@@ -152,9 +155,12 @@ def _poles(v: Variant, test: StepTest) -> np.ndarray | None:
     """Return the poles that decide how long a response lasts, in 1/s; None at a wire with several entries."""
     if test.output:
         return in_s(v.model.poles, v.model.dt)
-    L = v.loop(test.wire)
-    if L.ninputs > 1:
+    if len(find_signal(v.diagram.flatten_like(v.point), test.wire).entries) > 1:
         return None
+    try:
+        L = v.loop(test.wire)
+    except PeriodicLoopError:
+        return in_s(v.model.poles, v.model.dt)
     r = Realization.of(L)
     poles = np.linalg.eigvals(r.closed_matrix())
     return in_s(1 + poles if r.dt else poles, r.dt)

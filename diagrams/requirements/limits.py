@@ -34,6 +34,8 @@ class Reason(StrEnum):
     """The number's tolerance reaches over the limit."""
     NO_NUMBER = "no number"
     """The report has no such number."""
+    PERIODIC = "periodic"
+    """The loop is renewed several times in the period of all clocks, and has no such number at one rate."""
     NO_VALUE = "no value"
     """The number does not exist (NaN), or its tolerance is not known."""
     NO_UNCERTAINTY = "no uncertainty"

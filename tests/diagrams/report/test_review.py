@@ -386,6 +386,14 @@ def test_margins_with_slow_loops_open_do_not_count_and_those_with_all_loops_clos
     )
 
 
+def test_a_fast_wire_has_no_number_at_one_rate_and_its_verdict_says_so():
+    start = "inner.u.sampled_d0.periodic"
+    changes = {f"{start}.stable": made(1.0), f"{start}.disk_margin": made(1.0)}
+    found = judged_with(Requirements(disk_margin=0.6, bandwidth=1.0), changes, ("disk_margin", "bandwidth"))
+    assert found["disk_margin"].verdict is Verdict.PASSED
+    assert (found["bandwidth"].verdict, found["bandwidth"].reason) == (Verdict.UNDECIDED, Reason.PERIODIC)
+
+
 def test_the_worst_of_several_places_is_judged_and_a_missing_one_decides_nothing():
     start = "inner.u.sampled_d0"
     places = {f"{start}.here.disk_margin": made(1.2), f"{start}.there.disk_margin": made(0.3)}

@@ -1,0 +1,107 @@
+"""Reports of diagrams with several rates: fast wires are judged by periodic margins and by their own steps."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from loopwright.blocks import Constant, Gain, StateSpace
+from loopwright.diagrams import Diagram, Requirements, Verdict, analyse, subsystem
+from loopwright.diagrams.measure import step_response
+from loopwright.diagrams.requirements import Reason
+
+A = np.array([[-250.0, -50.0], [100.0, -0.1]])
+B = np.array([500.0, 0.0])
+FAST, RATIO = 2e-4, 5
+INNER, OUTER = 2.0, 0.4
+
+
+@cache
+def cascade(inner=INNER):
+    """A motor's current loop at 5 kHz in its speed loop at 1 kHz, both by a gain."""
+    motor = StateSpace(A=A, B=B, C=np.eye(2), name="motor")
+
+    @subsystem(sample_time=RATIO * FAST)
+    def speed(w):
+        return Gain(gain=OUTER, name="gain")(Constant(value=0.0, name="r") - w).named("current_wanted")
+
+    @subsystem(sample_time=FAST)
+    def current(i, wanted):
+        return Gain(gain=inner, name="gain")(wanted - i).named("voltage")
+
+    return Diagram("cascade", motor(current(motor.y[0], speed(motor.y[1]))))
+
+
+def by_hand(samples, size, tick=0, inner=INNER):
+    """Return the voltage after a step behind it at a tick, from the motor's exact samples and both gains."""
+    E = expm(np.block([[A, B[:, None]], [np.zeros((1, 3))]]) * FAST)
+    x, wanted, found = np.zeros(2), 0.0, []
+    for k in range(samples):
+        if (tick + k) % RATIO == 0:
+            wanted = -OUTER * x[1]
+        v = inner * (wanted - x[0])
+        found.append(v)
+        x = E[:2, :2] @ x + E[:2, 2] * (v + size)
+    return np.array(found)
+
+
+def test_a_step_at_a_fast_wire_is_sampled_at_each_renewal():
+    got = step_response(cascade(), "voltage", size=0.01, length=0.02, outputs=["current_wanted"])
+    assert got.dt == pytest.approx(FAST, rel=1e-12)
+    begins = int(np.argmax(got.d != 0.0))
+    expected = by_hand(len(got.v) - begins, 0.01, tick=begins + 1)  # the first sample is tick 1
+    np.testing.assert_allclose(got.v[begins:], expected, atol=1e-9 * 0.01)
+    assert got.prediction is None  # the linear model is that over the slow period
+
+
+@pytest.mark.slow
+def test_the_fast_wires_step_is_judged_by_its_peak_between_the_slow_samples():
+    answer = -by_hand(2000, 1.0, tick=2, inner=14.0)
+    final = answer[-1]
+    overshoot = np.max(answer) / final - 1
+    slow = np.max(answer[::RATIO]) / final - 1
+    assert overshoot - slow > 0.01  # what the slow samples don't show
+    limit = (overshoot + slow) / 2
+    asked = Requirements(step={"overshoot": limit}, loops={"current_wanted": {"step": {"overshoot": 5.0}}})
+    report = analyse(cascade(14.0), only=("poles", "inner", "steps"), requirements=asked)
+    found = {(r.loop, r.quantity): r for r in report.review.results}
+    result = found["voltage", "step.overshoot"]
+    assert result.number.value == pytest.approx(overshoot, abs=3 * result.number.tolerance)
+    assert result.verdict is Verdict.FAILED
+
+
+@pytest.mark.slow
+def test_margins_of_a_fast_wire_are_the_periodic_ones_and_others_are_not_decided():
+    asked = Requirements(gain_margin_high=1.1, ms=3.0, bandwidth=10, loops={"voltage": {}})
+    report = analyse(cascade(), only=("poles", "inner"), requirements=asked)
+    found = {(r.loop, r.quantity): r for r in report.review.results}
+    gain = found["voltage", "gain_margin_high"]
+    assert gain.path.endswith(".periodic.gain_margin_high")
+    for factor, stable in ((0.999, True), (1.001, False)):
+        assert is_stable(factor * gain.number.value) is stable
+    for name in ("ms", "bandwidth"):
+        assert (found["voltage", name].verdict, found["voltage", name].reason) == (Verdict.UNDECIDED, Reason.PERIODIC)
+        assert found["current_wanted", name].verdict is not Verdict.UNDECIDED
+    assert report.review.verdict is Verdict.UNDECIDED
+    rows = [row for row in report.sections[0].tables[0].rows if row[0].verdict is Verdict.UNDECIDED]
+    assert all("several times in the period" in row[0] for row in rows)
+
+
+def is_stable(factor):
+    """Return whether the monodromy of the cascade has its eigenvalues in the unit circle, the voltage times a factor."""
+    E = expm(np.block([[A, B[:, None]], [np.zeros((1, 3))]]) * FAST)
+    ends = []
+    for x0 in np.eye(2):
+        x, wanted = x0, -OUTER * x0[1]
+        for _ in range(RATIO):
+            x = E[:2, :2] @ x + E[:2, 2] * factor * INNER * (wanted - x[0])
+        ends.append(x)
+    return bool(np.max(np.abs(np.linalg.eigvals(np.array(ends).T))) < 1)
+
+
+def test_the_injection_check_says_in_words_why_a_fast_wire_is_not_measured():
+    report = analyse(cascade(), loops=["voltage"], only=("injection",))
+    (section,) = (s for s in report.sections if s.key == "injection")
+    assert any("renewed several times in the period of all clocks" in text for text in section.text)
+    assert not any("lifted=True" in text for text in section.text)
