@@ -2,7 +2,8 @@
 
 Everyday diagrams that switch often: a thermostat, a PWM by a comparator, a bouncing ball, a wheel that an anti-lock
 brake holds by a relay; and, if asked for (python benchmarks/events.py antilock), a car that brakes with a fast valve,
-at 13,000 events. Printed are the events of a run, the time for one event to be found in a step (the search), and
+at 13,000 events. With "compiled" behind it (python benchmarks/events.py antilock compiled) they run in C. Printed are
+the events of a run, the time for one event to be found in a step (the search; none in Python for a compiled run), and
 the whole time of the run by its events: the search, the solver, the jump, the record. Times are the processor's, the
 smallest of three runs; nothing else should run beside it.
 """
@@ -114,8 +115,10 @@ def antilock() -> tuple[Diagram, float, float]:
     return Diagram("antilock", car(torque(valve(slip)))), 1.55, 0.01
 
 
-def measure(diagram: Diagram, duration: float, step: float, runs: int = 3) -> tuple[int, float, float]:
-    """Return the events of a run, and the least time in s of its searches and of all of it."""
+def measure(
+    diagram: Diagram, duration: float, step: float, runs: int = 3, *, form: bool = False
+) -> tuple[int, float, float]:
+    """Return the events of a run, and the least time in s of its searches and of all of it; in C, if asked for."""
     spent = [0.0]
     locate = Domains.locate
 
@@ -127,11 +130,11 @@ def measure(diagram: Diagram, duration: float, step: float, runs: int = 3) -> tu
 
     Domains.locate = timed
     try:
-        diagram.simulate(20 * step, step=step, progress=False)
+        diagram.simulate(20 * step, step=step, progress=False, compile=form)
         search = total = np.inf
         for _ in range(runs):
             spent[0], start = 0.0, time.thread_time()
-            run = diagram.simulate(duration, step=step, progress=False)
+            run = diagram.simulate(duration, step=step, progress=False, compile=form)
             total, search = min(total, time.thread_time() - start), min(search, spent[0])
     finally:
         Domains.locate = locate
@@ -142,5 +145,5 @@ if __name__ == "__main__":
     print(f"{'diagram':12s} {'events':>7s} {'search, ms each':>16s} {'all, ms each':>13s}")
     makes = (antilock,) if "antilock" in sys.argv else (thermostat, pwm, ball, brake)
     for make in makes:
-        events, search, total = measure(*make(), runs=1 if make is antilock else 3)
+        events, search, total = measure(*make(), runs=1 if make is antilock else 3, form="compiled" in sys.argv)
         print(f"{make.__name__:12s} {events:7d} {1e3 * search / events:16.3f} {1e3 * total / events:13.3f}")

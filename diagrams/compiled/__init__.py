@@ -4,11 +4,14 @@ from .code import TickCode, compile_ticks, find_obstacle
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
 from .hybrid_code import compile_hybrid, find_hybrid_obstacle
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
+from .watch import RECENT, Fired, Watch
 
 __all__ = [
     "FIXED",
+    "RECENT",
     "CompiledHybrid",
     "CompiledLoop",
+    "Fired",
     "HybridOutcome",
     "HybridReason",
     "MethodOptions",
@@ -17,6 +20,7 @@ __all__ = [
     "Reason",
     "Span",
     "TickCode",
+    "Watch",
     "compile_hybrid",
     "compile_ticks",
     "find_hybrid_obstacle",

@@ -14,13 +14,11 @@ from ..flat import NONE, FlatDiagram, TickPattern
 from .bound import BoundFunction, address
 from .hybrid_code import Compiled, HybridCode, hybrid_master
 from .loop import CompiledLoop, LoopStructure, OutcomeStructure, TickStructure
+from .watch import Fired, Watch, WatchStructure
 
 FIXED = ("euler", "heun", "rk4")
 _KINDS = {"euler": 0, "heun": 1, "rk4": 2, "RK23": 3, "RK45": 3, "DOP853": 4, "Radau": 5}
 _BUDGET = 200_000  # steps of a call, after which Ctrl-C has its turn
-_LOGGED = 2**22  # bytes of events in a call
-_BLOCK = 2100  # instants of a step that are looked at together, and more
-_LATEST, _RECENT = 9, 500
 
 
 class HybridReason(IntEnum):
@@ -59,20 +57,9 @@ class _Method(ctypes.Structure):
     ]
 
 
-class _Watch(ctypes.Structure):
-    _fields_ = [
-        ("m", _INT), ("indicators", TickStructure), ("jump", TickStructure),
-        *_fields(_AT, "z open fired rising falling hysteretic asks hysteresis own own_first"),
-        *_fields(_REAL, "spacing finest step"), ("state_size", _INT), ("state", _AT),
-        *_fields(_AT, "domain low high slack size rounding largest counts latest fresh recent"), ("fired_times", _INT),
-        ("kept", _AT), *_fields(_INT, "kept_times kept_log"), ("log", _AT), *_fields(_INT, "logged capacity"),
-        *_fields(_AT, "times seen gates domains x x_before now strict values motion later fires following"),
-    ]  # fmt: skip
-
-
 class _Hybrid(ctypes.Structure):
     _fields_ = [
-        ("l", LoopStructure), ("p", _Problem), ("w", _Watch), ("methods", _AT * 2),
+        ("l", LoopStructure), ("p", _Problem), ("w", WatchStructure), ("methods", _AT * 2),
         *_fields(_INT, "active automatic accepts between budget inside begun stepped"), *_fields(_REAL, "t to"),
         *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
         *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT),
@@ -168,6 +155,12 @@ class CompiledHybrid:
         Where jumps write the next states.
     methods : sequence of MethodOptions
         The method, and, where it may be changed for one that is made for stiff problems, that one.
+    step : float or None
+        Fixed step of the method in s; None where it chooses its steps.
+    spacing : float
+        Longest time in s between two instants at which indicators of events are evaluated.
+    own : sequence of ndarray
+        For each event: the places of its block's states among the integrated ones.
     accepts : bool
         Whether blocks are to be evaluated after every step: they remember something, have guards, or FMUs read them.
     """
@@ -181,6 +174,9 @@ class CompiledHybrid:
         x_next: np.ndarray,
         methods: Sequence[MethodOptions],
         *,
+        step: float | None,
+        spacing: float,
+        own: Sequence[np.ndarray],
         accepts: bool,
     ):
         self._kept: list[Any] = [code, loop, arguments, x_next]
@@ -209,6 +205,11 @@ class CompiledHybrid:
             hybrid.methods[i] = ctypes.addressof(method)
         hybrid.before = self._own(np.zeros(width))
         hybrid.outputs = flat.log.total
+        self.watch: Watch | None = None
+        """The events; None without any."""
+        if flat.events:
+            self.watch = Watch(flat, code.between, trial, arguments, x_next, spacing=spacing, step=step, own=own)
+            hybrid.w = self.watch.structure
         taken = [flat.taken_at(clocks) for clocks in self.kinds]
         hybrid.taken = self._own(np.concatenate([np.zeros(0), *taken]).astype(np.int64))
         hybrid.taken_first = self._own(np.cumsum([0, *map(len, taken)]).astype(np.int64))
@@ -267,6 +268,16 @@ class CompiledHybrid:
     def begin(self, t: float) -> None:
         """Begin an interval at a tick, or at any instant between two, that the run has reached."""
         self._hybrid.inside, self._hybrid.t = 0, t
+
+    def hand_over_recent(self, times: Sequence[float]) -> None:
+        """Take over the times in s at which events have fired last."""
+        if self.watch is not None:
+            self.watch.set_recent(times)
+            self._hybrid.w.fired_times = len(times)
+
+    def take_fired(self) -> list[Fired]:
+        """Return the events that have fired since the last call."""
+        return [] if self.watch is None else self.watch.take(self._hybrid.w)
 
     def plan(self, steps: Sequence[float | None]) -> None:
         """Let the methods take steps of some lengths in s next; None: they choose their first step."""

@@ -80,7 +80,8 @@ class Domains:
     ):
         n = len(flat.events)
         self.events, self.g, self._open, self._rates = flat.events, g, opened, rates
-        self._spacing = min(float(flat.base), time_scale)
+        self.spacing = min(float(flat.base), time_scale)
+        """Longest time in s between two instants at which indicators are evaluated."""
         self.rising = np.array([e.direction != "falling" for e in flat.events])
         self.falling = np.array([e.direction != "rising" for e in flat.events])
         self._hysteresis = np.array([e.hysteresis for e in flat.events])
@@ -104,9 +105,10 @@ class Domains:
         self._strict: tuple[np.ndarray, np.ndarray] | None = None
         self._set_bounds()
         self.limits = EventLimits(flat.events)
-        self._many, self.search = many, EventSearch(self, many, self._spacing)
-        self._own = [_continuous_states(flat, e) for e in flat.events]
-        self._moves = np.array([where.size > 0 for where in self._own], dtype=bool)
+        self._many, self.search = many, EventSearch(self, many, self.spacing)
+        self.own = [_continuous_states(flat, e) for e in flat.events]
+        """Places of the states of each event's block among the continuous ones."""
+        self._moves = np.array([where.size > 0 for where in self.own], dtype=bool)
 
     # --- the rule ----------------------------------------------------------------------------------------------------
 
@@ -303,7 +305,7 @@ class Domains:
         """Return what `land` compares of the instants before and after a jump; None if no block that jumps moves."""
         if not np.any(fired & self._moves):
             return None
-        h = self._spacing
+        h = self.spacing
         once = x + h * self._rates(t, x)
         twice = once + h * self._rates(t, once)
         z, _ = self._many(np.array([t, t, t]), np.array([x, once, twice]))
@@ -329,7 +331,7 @@ class Domains:
         after = self.motion(t, x, fired)
         assert after is not None
         for i in np.flatnonzero(fired & self._moves).tolist():
-            side, own = self.domain[i], self._own[i]
+            side, own = self.domain[i], self.own[i]
             away = side * after.z[i] < 0.0 or abs(after.z[i]) > abs(before.z[i])
             if away or not side * after.twice[i] > 0.0 or np.array_equal(before.x[own], after.x[own]):
                 continue
@@ -348,7 +350,7 @@ class Domains:
         self.search.fresh = True
 
         def change() -> tuple[float, np.ndarray]:
-            h = self._spacing
+            h = self.spacing
             z, _ = self._many(np.array([t, t]), np.array([x, x + h * self._rates(t, x)]))
             return h, np.abs(z[1] - z[0])
 

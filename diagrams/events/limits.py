@@ -30,27 +30,27 @@ class EventLimits:
         """The side from which each indicator on the border is held: 1, −1; 0 for none."""
         self._stuck = np.zeros(len(events), dtype=int)
         """Events in a row that led back into contact."""
-        self._holds = False
-        """Whether an indicator is held."""
+        self.holds = False
+        """Whether an indicator on the border is held from a side."""
 
     # --- a rest in contact -------------------------------------------------------------------------------------------
 
     def note_contact(self, i: int, side: int) -> None:
         """Note that event ``i``, which has led to that side, has left its indicator in contact."""
-        self._side[i], self._holds = side, True
+        self._side[i], self.holds = side, True
 
     def note(self, now: np.ndarray) -> None:
         """Note the domains: one that is back on the free side has left contact."""
-        if not self._holds:
+        if not self.holds:
             return
         free = now * self._side < 0
         if free.any():
             self._side[free] = self._stuck[free] = 0
-            self._holds = bool(self._side.any())
+            self.holds = bool(self._side.any())
 
     def note_left_border(self, fired: np.ndarray, before: np.ndarray, now: np.ndarray) -> None:
         """Note that events fire: from the border to the side that their jump has held them from, they rest."""
-        if self._holds:
+        if self.holds:
             self._stuck += fired & (before == 0) & (now == self._side)
 
     def rests(self, i: int) -> bool:
@@ -160,6 +160,6 @@ class EventLimits:
         """Go back to what `save` returned."""
         times, largest, recent, side, stuck = saved
         self._largest, self._side, self._stuck = largest.copy(), side.copy(), stuck.copy()
-        self._holds = bool(side.any())
+        self.holds = bool(side.any())
         self._times = [deque(d, maxlen=_ZENO + 1) for d in times]
         self._recent = deque(recent, maxlen=_CHATTER)

@@ -15,22 +15,24 @@ from ...fmus.calls import FmuInstance, NativeStep
 from ..compiled import (
     CompiledHybrid,
     CompiledLoop,
+    Fired,
     HybridOutcome,
     HybridReason,
-    MethodOptions,
     Span,
     compile_hybrid,
     find_hybrid_obstacle,
 )
 from ..coupling import Plant, PlantSteps
 from ..flat import EVERY, FlatDiagram
-from ..results import Recorder
+from ..results import Occurrence, Recorder
+from .compiled_hand_over import hand_over_domains, methods_of, planned_steps, restore_plans, take_back_domains
 from .compiled_ticks import CLOCKS, FIRST, LARGEST_CHUNK, WISHED, acts, is_exact, kinds_of
 from .continuous import Continuous
 from .solver_setup import has_guards, next_instant, remembers
 from .ticks import take_tick
 from .workspace import Workspace
 
+_KEPT = 5000  # events of which the limits may ask
 _MOST_EDGES = 100_000  # discontinuities of sources in a call
 _METHODS = {"euler": "Euler", "heun": "Heun", "rk4": "Runge-Kutta 4", "RK23": "Bogacki-Shampine 3(2)",
             "RK45": "Dormand-Prince 5(4)", "DOP853": "Dormand-Prince 8(5,3)", "Radau": "Radau IIA 5"}  # fmt: skip
@@ -83,6 +85,7 @@ class HybridTicks:
         self._loop: CompiledHybrid | None = None
         self._recorder: Recorder | None = None
         self._chunk = FIRST
+        self._fired: list[Fired] = []
 
     @property
     def solver(self) -> str:
@@ -133,15 +136,27 @@ class HybridTicks:
             rows = recorder.room(t)
             loop.skip = recorder.skip
             started = perf_counter()
+            if self._is_held():
+                following = int(rest[0])
+                asked = HybridOutcome(0, 0, HybridReason.ASK_BETWEEN, 0, 0, 0, t)
+                ended = self._take_interval(loop, k, following, last, asked, recorder)
+                if ended is not None:
+                    return ended
+                k, rest, t = following, rest[1:], self._time_of(following)
+                if arrived(k):
+                    return None
+                continue
             span, lands = self._span(k, rest, last, t)
             found = loop.run(span, rows)
             recorder.took(found.rows, loop.skip)
+            self._tell(loop)
             t = found.t
             done, rest = rest[: found.ticks], rest[found.ticks :]
             if found.ticks:
                 k = int(done[-1])
                 landed = np.flatnonzero(lands[: found.ticks])
-                if landed.size and arrived(int(done[landed[-1]])):
+                over = landed.size and arrived(int(done[landed[-1]]))
+                if over and found.reason is not HybridReason.ENDED:
                     return None
             if found.reason is HybridReason.ENDED:
                 return t
@@ -164,10 +179,8 @@ class HybridTicks:
 
     def _visited(self, k: int, last: int) -> Iterator[int]:
         if self._sampled:
-            return iter(range(k + 1, last + 1))
-        return self._following(k, last)
-
-    def _following(self, k: int, last: int) -> Iterator[int]:
+            yield from range(k + 1, last + 1)
+            return
         while k < last:
             k = min([*(clock.after(k) for clock in self._clocks), last])
             yield k
@@ -252,6 +265,11 @@ class HybridTicks:
         for other in plants[found.plant + 1 :]:
             other.step(now, h)
 
+    def _is_held(self) -> bool:
+        """Whether an indicator is held in contact, or events wait for the end of a fixed step: Python goes on then."""
+        continuous = self._continuous
+        return continuous.sliding.active or (continuous.domains is not None and continuous.domains.limits.holds)
+
     # --- between Python and C ----------------------------------------------------------------------------------------
 
     def _bind(self, recorder: Recorder) -> CompiledHybrid:
@@ -275,9 +293,14 @@ class HybridTicks:
             )
             self._recorder = recorder
             accepts = bool(self._plants) or remembers(self._flat) or has_guards(self._flat)
+            continuous, domains = self._continuous, self._continuous.domains
             self._loop = CompiledHybrid(
-                self._code, self._flat, ticks, arguments, workspace.x_next, self._methods, accepts=accepts
-            )
+                self._code, self._flat, ticks, arguments, workspace.x_next, self._methods,
+                step=float(self._flat.base) if continuous.fixed else None,
+                spacing=math.inf if domains is None else domains.spacing,
+                own=() if domains is None else domains.own,
+                accepts=accepts,
+            )  # fmt: skip
             self._kind_of = np.zeros(1 << len(self._flat.distinct), dtype=np.int32)
             for clocks, kind in self._loop.kinds.items():
                 self._kind_of[sum(1 << i for i, clock in enumerate(self._flat.distinct) if clock in clocks)] = kind
@@ -287,10 +310,27 @@ class HybridTicks:
         """Let C go on from an instant that Python has come to."""
         loop.begin(t)
         loop.plan(planned_steps(self._continuous, self._methods))
+        if loop.watch is not None:
+            assert self._continuous.domains is not None
+            loop.hand_over_recent(hand_over_domains(self._continuous.domains, loop.watch))
 
     def _take_back(self, loop: CompiledHybrid) -> None:
         """Let Python go on from where C has come to."""
         restore_plans(self._continuous, self._methods, loop.planned)
+        if loop.watch is not None:
+            assert self._continuous.domains is not None
+            take_back_domains(self._continuous.domains, loop.watch, self._fired)
+            self._fired = []
+
+    def _tell(self, loop: CompiledHybrid) -> None:
+        """Tell the events that have fired."""
+        fired = loop.take_fired()
+        self._fired = [*self._fired, *fired][-_KEPT:]
+        for one in fired:
+            event = self._flat.events[one.event]
+            of = None if event.subsystem else self._flat.states.of_block[event.path]
+            before, after = ({} if of is None else of.split(x) for x in (one.before, one.after))
+            self._continuous.on_event(Occurrence(one.t, event.path, event.name, before, after))
 
 
 _ASKING = frozenset(
@@ -302,35 +342,6 @@ _ASKING = frozenset(
         HybridReason.NOT_OK,
     }
 )
-
-
-def methods_of(continuous: Continuous) -> list[MethodOptions]:
-    """Return the methods in C that do what a run's solver does."""
-    solver, n = continuous.solver, continuous.where.size
-    if not n:
-        return [MethodOptions("euler", 1.0, np.zeros(0), solver.max_step)]
-    if solver.fixed:
-        return [MethodOptions(solver.name, 1.0, np.zeros(n), solver.max_step)]
-    atol = np.broadcast_to(np.asarray(solver.atol, dtype=float), (n,)).copy()
-    names = [solver.name] if solver.name != "auto" else ["RK45" if solver.rtol >= 1e-8 else "DOP853", "Radau"]
-    return [MethodOptions(name, solver.rtol, atol, solver.max_step) for name in names]
-
-
-def planned_steps(continuous: Continuous, methods: Sequence[MethodOptions]) -> list[float | None]:
-    """Return the steps in s that a run's solver would take next, by its methods."""
-    saved = continuous.solver.save()
-    each = saved.get("methods", {})
-    return [each.get(m.name, saved).get("planned") for m in methods]
-
-
-def restore_plans(continuous: Continuous, methods: Sequence[MethodOptions], steps: Sequence[float | None]) -> None:
-    """Let a run's solver take steps of some lengths in s next."""
-    saved = continuous.solver.save()
-    if "methods" in saved:
-        saved["methods"] = {m.name: {"planned": step} for m, step in zip(methods, steps, strict=True)}
-        continuous.solver.restore(saved)
-    elif "planned" in saved:
-        continuous.solver.restore({"planned": steps[0]})
 
 
 def make_hybrid(
@@ -378,8 +389,6 @@ def _find_obstacle(
 ) -> str | None:
     if (found := find_hybrid_obstacle(flat, continuous.solver.name)) is not None:
         return found
-    if flat.events:
-        return "it has events between ticks"
     if len(flat.distinct) > CLOCKS:
         return f"it has {len(flat.distinct)} different clocks, and at most {CLOCKS} are compiled"
     if not regular:

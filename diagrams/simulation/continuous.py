@@ -15,7 +15,7 @@ from ..flat import Times, announcers
 from ..results import Occurrence
 from ..solvers import AcceptedStep, Problem, make_solver
 from .diagnosis import forget_trials, opaque_failure, state_values
-from .left_of_start import domains_from_left
+from .initialize import domains_from_left
 from .solver_setup import absolute_tolerances, longest_step, next_instant, time_scale_of
 from .transport_delays import delays_of, keep_step
 from .trials import Trials

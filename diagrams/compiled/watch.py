@@ -1,0 +1,189 @@
+"""Events between ticks in C: the domains of their indicators, and what has fired."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..flat import FlatDiagram
+from .bound import BoundFunction, address
+from .hybrid_code import Compiled
+from .loop import TickStructure
+
+_LOGGED = 2**22  # bytes of what has fired in a call
+_INSTANTS = 1100  # of a step that are looked at together, at most
+_LATEST, RECENT = 9, 500
+_INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+
+
+def _fields(kind: Any, names: str) -> list[tuple[str, Any]]:
+    return [(name, kind) for name in names.split()]
+
+
+class WatchStructure(ctypes.Structure):
+    """The events as C knows them."""
+
+    _fields_ = [
+        ("m", _INT), ("indicators", TickStructure), ("jump", TickStructure),
+        *_fields(_AT, "z open fired rising falling hysteretic asks hysteresis own own_first"),
+        *_fields(_REAL, "spacing finest step"), ("state_size", _INT), ("state", _AT),
+        *_fields(_AT, "domain low high slack size rounding largest counts latest fresh recent"), ("fired_times", _INT),
+        ("kept", _AT), *_fields(_INT, "kept_times kept_log"), ("log", _AT), *_fields(_INT, "logged capacity"),
+        *_fields(_AT, "times seen gates domains x x_before now strict values motion later fires following"),
+    ]  # fmt: skip
+
+
+class Fired(NamedTuple):
+    """An event that has fired: its time in s, its place among the events, and the states before and after it."""
+
+    t: float
+    event: int
+    before: np.ndarray
+    after: np.ndarray
+
+
+class Watch:
+    """The events of a run, watched in C.
+
+    Parameters
+    ----------
+    flat : FlatDiagram
+        The diagram.
+    functions : mapping of str to Compiled
+        Its functions ``"indicators"`` and ``"jump"``.
+    trial, here : sequence of ndarray
+        The vectors (t, x, w, p) of a trial, and of the instant that is reached.
+    x_next : ndarray
+        Where jumps write the next states.
+    spacing : float
+        Longest time in s between two instants at which indicators are evaluated.
+    step : float or None
+        Fixed step of the method in s; None where it chooses its steps.
+    own : sequence of ndarray
+        For each event: the places of its block's states among the integrated ones.
+
+    Attributes
+    ----------
+    structure : WatchStructure
+        It as C knows it; valid as long as this lives.
+    domain, low, high, slack, size, rounding, largest : ndarray
+        One entry for each event; see `loopwright.diagrams.events.Domains`.
+    """
+
+    def __init__(
+        self,
+        flat: FlatDiagram,
+        functions: Mapping[str, Compiled],
+        trial: Sequence[np.ndarray],
+        here: Sequence[np.ndarray],
+        x_next: np.ndarray,
+        *,
+        spacing: float,
+        step: float | None,
+        own: Sequence[np.ndarray],
+    ):
+        self._kept: list[Any] = []
+        events, n = flat.events, flat.continuous.size
+        m = self._m = len(events)
+        self._width = flat.width
+        self.structure = WatchStructure(m=m, spacing=spacing, finest=2e-16 * spacing)
+        self.structure.step = np.nan if step is None else step
+        z, opened, fired = np.zeros(m), np.zeros(m), np.zeros(m)
+        for name, vectors in {"z": z, "open": opened, "fired": fired}.items():
+            self._put(name, vectors)
+        self._bind("indicators", functions["indicators"], trial, [z, opened])
+        self._bind("jump", functions["jump"], [*here, fired], [x_next])
+        subsystems = flat.table.subsystems
+        flags = {
+            "rising": [e.direction != "falling" for e in events],
+            "falling": [e.direction != "rising" for e in events],
+            "hysteretic": [e.hysteresis > 0.0 for e in events],
+            "asks": [e.subsystem and subsystems[e.path].when == "reset" for e in events],
+        }
+        for name, values in flags.items():
+            self._put(name, np.array(values, dtype=np.uint8))
+        self._put("hysteresis", np.array([e.hysteresis for e in events]))
+        self._put("own", np.concatenate([np.zeros(0), *own]).astype(np.int64))
+        self._put("own_first", np.cumsum([0, *map(len, own)]).astype(np.int64))
+        self._make_state(m)
+        self._recent = np.zeros(RECENT)
+        self._put("recent", self._recent)
+        row = 2 + 2 * self._width
+        self._log = np.zeros((max(200, _LOGGED // (8 * row)), row))
+        self._put("log", self._log)
+        self.structure.capacity = len(self._log)
+        for name in ("times", "seen", "gates", "domains"):
+            self._put(name, np.zeros(_INSTANTS * (1 if name == "times" else m)))
+        for name in ("x", "x_before"):
+            self._put(name, np.zeros(n))
+        for name in ("now", "strict", "values", "later"):
+            self._put(name, np.zeros(m))
+        self._put("motion", np.zeros(6 * m))
+        for name in ("fires", "following"):
+            self._put(name, np.zeros(m, dtype=np.uint8))
+
+    def _put(self, name: str, vector: np.ndarray) -> None:
+        self._kept.append(vector)
+        setattr(self.structure, name, address(vector))
+
+    def _bind(
+        self, name: str, function: Compiled, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
+    ) -> None:
+        bound = BoundFunction(function.function, function.address, arguments, results)
+        self._kept.append(bound)
+        setattr(self.structure, name, bound.structure)
+
+    def _make_state(self, m: int) -> None:
+        """Lay out what C goes back to where an event is left to Python: one vector, of parts."""
+        sizes = dict.fromkeys(["domain", "low", "high", "slack", "size", "rounding", "largest", "counts"], m)
+        sizes |= {"latest": _LATEST * m, "fresh": 1}
+        state = np.zeros(sum(sizes.values()))
+        self._put("state", state)
+        self._put("kept", state.copy())
+        self.structure.state_size = state.size
+        self._parts: dict[str, np.ndarray] = {}
+        first = 0
+        for name, size in sizes.items():
+            part = self._parts[name] = state[first : first + size]
+            setattr(self.structure, name, address(part))
+            first += size
+        parts = self._parts
+        self.domain, self.low, self.high, self.slack = (parts[name] for name in ("domain", "low", "high", "slack"))
+        self.size, self.rounding, self.largest = (parts[name] for name in ("size", "rounding", "largest"))
+
+    @property
+    def fresh(self) -> bool:
+        """Whether an event has fired since the last step without one."""
+        return bool(self._parts["fresh"][0])
+
+    @fresh.setter
+    def fresh(self, value: bool) -> None:
+        self._parts["fresh"][0] = value
+
+    @property
+    def latest(self) -> list[list[float]]:
+        """Times in s at which each event has fired last."""
+        rows, counts = self._parts["latest"].reshape(self._m, _LATEST), self._parts["counts"]
+        return [row[: int(count)].tolist() for row, count in zip(rows, counts, strict=True)]
+
+    @latest.setter
+    def latest(self, times: Sequence[Sequence[float]]) -> None:
+        rows = self._parts["latest"].reshape(self._m, _LATEST)
+        for i, own in enumerate(times):
+            rows[i, : len(own)] = own
+            self._parts["counts"][i] = len(own)
+
+    def set_recent(self, times: Sequence[float]) -> None:
+        """Take over the times in s at which any event has fired last."""
+        self._recent[: len(times)] = times
+        self.structure.fired_times = len(times)
+
+    def take(self, structure: WatchStructure) -> list[Fired]:
+        """Return what has fired since the last call, from the structure that C has changed."""
+        count, width = structure.logged, self._width
+        rows = self._log[:count].copy()
+        structure.logged = 0
+        return [Fired(float(r[0]), int(r[1]), r[2 : 2 + width], r[2 + width :]) for r in rows]

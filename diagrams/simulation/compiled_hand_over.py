@@ -1,0 +1,60 @@
+"""Between Python and C: plans of the solver, and domains of indicators, are handed over and taken back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+
+import numpy as np
+
+from ..compiled import RECENT, Fired, MethodOptions, Watch
+from ..events import Domains
+from .continuous import Continuous
+
+
+def hand_over_domains(domains: Domains, watch: Watch) -> list[float]:
+    """Let C go on with the domains; return the times in s at which events have fired last."""
+    (domain, _, low, high, slack), (size, rounding), watch.fresh, limits = domains.save()
+    watch.latest, watch.largest[:], recent, _, _ = limits
+    watch.domain[:], watch.low[:], watch.high[:], watch.slack[:] = domain, low, high, slack
+    watch.size[:], watch.rounding[:] = size, rounding
+    return [t for t, _ in recent]
+
+
+def take_back_domains(domains: Domains, watch: Watch, fired: Sequence[Fired]) -> None:
+    """Let Python go on with the domains from C, where some events have fired since they were handed over."""
+    (_, first, *_), _, _, (_, _, recent, side, stuck) = domains.save()
+    groups = groupby(fired, key=lambda one: one.t)
+    recent = [*recent, *((t, tuple(one.event for one in group)) for t, group in groups)][-RECENT:]
+    states = watch.domain.astype(int), first, watch.low, watch.high, watch.slack
+    limits = watch.latest, np.array(watch.largest), recent, side, stuck
+    domains.restore((states, (watch.size, watch.rounding), watch.fresh, limits))
+
+
+def methods_of(continuous: Continuous) -> list[MethodOptions]:
+    """Return the methods in C that do what a run's solver does."""
+    solver, n = continuous.solver, continuous.where.size
+    if not n:
+        return [MethodOptions("euler", 1.0, np.zeros(0), solver.max_step)]
+    if solver.fixed:
+        return [MethodOptions(solver.name, 1.0, np.zeros(n), solver.max_step)]
+    atol = np.broadcast_to(np.asarray(solver.atol, dtype=float), (n,)).copy()
+    names = [solver.name] if solver.name != "auto" else ["RK45" if solver.rtol >= 1e-8 else "DOP853", "Radau"]
+    return [MethodOptions(name, solver.rtol, atol, solver.max_step) for name in names]
+
+
+def planned_steps(continuous: Continuous, methods: Sequence[MethodOptions]) -> list[float | None]:
+    """Return the steps in s that a run's solver would take next, by its methods."""
+    saved = continuous.solver.save()
+    each = saved.get("methods", {})
+    return [each.get(m.name, saved).get("planned") for m in methods]
+
+
+def restore_plans(continuous: Continuous, methods: Sequence[MethodOptions], steps: Sequence[float | None]) -> None:
+    """Let a run's solver take steps of some lengths in s next."""
+    saved = continuous.solver.save()
+    if "methods" in saved:
+        saved["methods"] = {m.name: {"planned": step} for m, step in zip(methods, steps, strict=True)}
+        continuous.solver.restore(saved)
+    elif "planned" in saved:
+        continuous.solver.restore({"planned": steps[0]})
