@@ -82,7 +82,7 @@ class CoupledSteps:
         self.effort = Effort()
         self._refuse(steps)
         self._order = self.links.order(coupling.order)
-        self._takes = self._renewed_inputs()
+        self._takes = self.links.renewed_inputs(self._order)
         self._all_outputs = np.concatenate(
             [np.zeros(0, dtype=int), *(np.arange(s.start, s.stop) for s in self.links.outputs.values())]
         )
@@ -135,16 +135,10 @@ class CoupledSteps:
                     port="coupling",
                 )
 
-    def _renewed_inputs(self) -> dict[str, np.ndarray]:
-        """Return for each plant which of its inputs are renewed before it steps, one plant after the other."""
-        links, before = self.links, np.zeros(len(self._w), dtype=bool)
-        found = {}
-        for path in self._order:
-            mine = links.inputs[path]
-            fresh = links.by_outputs[mine][:, before].any(axis=1) | links.by_states[mine]
-            found[path] = np.arange(mine.start, mine.stop)[fresh & links.smooth_inputs[mine]]
-            before[links.outputs[path]] = True
-        return found
+    @property
+    def order(self) -> tuple[str, ...]:
+        """Order in which the plants step one after the other; empty where they step together."""
+        return self._order if self.coupling.scheme == Scheme.GAUSS_SEIDEL else ()
 
     # --- from tick to tick --------------------------------------------------------------------------------------------
 

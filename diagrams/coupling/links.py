@@ -182,6 +182,20 @@ class Links:
             rest.remove(found[-1])
         return tuple(found)
 
+    def renewed_inputs(self, order: Sequence[str]) -> dict[str, np.ndarray]:
+        """Return for each plant the inputs that are renewed before it steps, where one steps after the other.
+
+        These follow outputs of the plants before it, or states of blocks, which have gone on already.
+        """
+        before = np.zeros(self.flat.plant_outputs.total, dtype=bool)
+        found = {}
+        for path in order:
+            mine = self.inputs[path]
+            fresh = self.by_outputs[mine][:, before].any(axis=1) | self.by_states[mine]
+            found[path] = np.arange(mine.start, mine.stop)[fresh & self.smooth_inputs[mine]]
+            before[self.outputs[path]] = True
+        return found
+
     @cached_property
     def loops(self) -> tuple[tuple[str, ...], ...]:
         """Loops of direct feedthrough across plants: the ports that each goes through, from an output to an input."""

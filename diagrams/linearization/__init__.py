@@ -1,6 +1,5 @@
 """Linear models, operating points and trim."""
 
-from .copied_point import copy_point
 from .derivatives import Tap, find_signal
 from .findings import (
     BlockFinding,
@@ -17,7 +16,7 @@ from .findings import (
 from .kinks import find_kinks_between
 from .linear_model import Linearization, linearize, linearize_batch
 from .loops_over_a_period import ticks_between_renewals, ticks_to_renewal
-from .operating_points import PointLike, capture, check_options, operating_point, run_to
+from .operating_points import PointLike, capture, check_options, copy_point, operating_point, run_to
 from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop
 from .plant_equations import PlantEquations, linearize_plant, moves_between_ticks
 from .trim_search import point_from_states, trim

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ...blocks.core import OptionError, WiringError
-from ..coupling import Links, tells_slopes
+from ..coupling import Links, Scheme, tells_slopes
 from ..flat import NONE, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
+from .coupled_chain import CoupledChain
 from .derivatives import LocalDerivatives, Tap
 from .mean_stairs import NO_STAIRS, Stairs
 
@@ -59,16 +60,15 @@ def check_opening(flat: FlatDiagram, signal: Tap) -> None:
     )
 
 
-def check_coupling(flat: FlatDiagram, at: OperatingPoint) -> None:
-    """Refuse a model over communication steps whose FMUs a run couples in another way than the model.
+def check_coupling(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> CoupledChain | None:
+    """Return the steps of the coupling of the run at a point; None where inputs are held from a step's beginning.
 
-    The model holds the FMUs' inputs from the beginning of a step, as the default coupling does. Where every input
-    comes from sampled subsystems, it is held by every scheme.
+    The default coupling holds them. Where every input comes from sampled subsystems, every scheme does.
 
     Raises
     ------
     OptionError
-        If an input changes within a step, and the coupling is not the default; if the run tells an FMU slopes.
+        If the run takes adaptive communication steps, or tells an FMU slopes.
     """
     for path, inputs in Links(flat).inputs.items():
         if inputs.stop > inputs.start and tells_slopes(flat.table.blocks[path]):
@@ -79,20 +79,21 @@ def check_coupling(flat: FlatDiagram, at: OperatingPoint) -> None:
                 block=path,
                 port="stepping",
             )
-    if not at.coupling:
-        return
     links = Links(flat)
     found = [path for path in links.paths if links.moving[links.inputs[path]].any()]
-    if found:
+    if not at.coupling or not (found or links.felt.any()):
+        return None
+    if at.coupling not in [scheme.value for scheme in Scheme]:
         raise OptionError(
-            f"found an operating point of a run with coupling {at.coupling!r}, in which inputs of {', '.join(found)} "
-            "are not held from the beginning of a communication step; expected coupling 'jacobi', which a linear model "
-            "over communication steps follows. Linearize at a point of a run with that coupling, or, without sampled "
-            "subsystems, in continuous time: linearize(t) without step=, which all couplings approach with shorter "
-            "steps.",
-            block=found[0],
+            f"found an operating point of a run with coupling {at.coupling!r}, in which the length of a communication "
+            "step depends on the motion; expected steps from tick to tick, which a linear model over communication "
+            "steps follows. Linearize at a point of a run without error=, or, without sampled subsystems, in "
+            "continuous time: linearize(t) without step=, which all couplings approach with shorter steps.",
+            block=(found or [*links.paths])[0],
             port="coupling",
         )
+    one_by_one = at.coupling == Scheme.GAUSS_SEIDEL
+    return CoupledChain(flat, local, links, (at.coupling_order or links.order(())) if one_by_one else ())
 
 
 def find_moving(flat: FlatDiagram, local: LocalDerivatives, at: OperatingPoint) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from ...fmus.running import Derivation
 from ..flat import NONE, FlatDiagram, TickPattern
 from ..results import OperatingPoint
 from .checks import check_coupling
+from .coupled_chain import CoupledChain, Step
 from .derivatives import SLOPE, LocalDerivatives, Numbers
 from .findings import EventWithinPeriod, MemoryActs, UnusualStart
 from .flow_model import EQUILIBRIUM, Four, Model, differentiate_flow
@@ -102,7 +103,7 @@ class Chain:
         frozen: frozenset[TickPattern] = NONE,
     ):
         check_way(way)
-        check_coupling(flat, at)
+        self._coupled: CoupledChain | None = check_coupling(flat, local, at)
         self.flat, self.local, self.way, self.frozen = flat, local, way, frozen
         self.first = self.here = at
         self.ticks = list(ticks_of_period(flat, at.tick, count))
@@ -110,6 +111,10 @@ class Chain:
         self.paths = plant_paths(flat)
         self._until = dict.fromkeys(self.paths, at.tick)
         self._holds = any(not self._steps_at(path, k) for path in self.paths for k, _ in self.ticks[1:])
+        self._straight = [] if self._coupled is None else np.flatnonzero(self._coupled.straight).tolist()
+        if self._coupled is not None:
+            self._coupled.check_ticks(self._holds or any(not self._steps_at(path, at.tick) for path in self.paths))
+            self._holds = bool(self._straight)
         self._models: dict[str, PlantModel] = {}
         self.derivations: dict[str, Derivation] = {}
         self.uncertainty, self.n_p = 0.0, 0
@@ -139,16 +144,15 @@ class Chain:
         tick = self.local.differentiate(flat.acting(k) - self.frozen, here.t, here.x, here.w)
         mid_step = [path for path in self.paths if self._until[path] != k]
         held = self._begin_steps(k, tick["z"])
+        kept = [*self._straight, *(i for path in mid_step for i in self._models[path].outputs)]
         models = self.models
         Ap, Bp, Cp, Dp = (join_matrices(flat, models, which) for which in "ABCD")
         nx, nz, n_p, nw = flat.width, flat.plant_inputs.total, len(Ap), flat.plant_outputs.total
         n = nx + n_p + nz + (nw if self._holds else 0)
         W = np.zeros((nw, n), dtype=Cp.dtype)  # the FMUs' outputs before the tick
         W[:, nx : nx + n_p], W[:, nx + n_p : nx + n_p + nz] = Cp, Dp
-        for path in mid_step:
-            mine = self._models[path].outputs
-            W[mine] = 0.0
-            W[mine, [nx + n_p + nz + i for i in mine]] = 1.0
+        W[kept] = 0.0
+        W[kept, [nx + n_p + nz + i for i in kept]] = 1.0
 
         def eliminate_w(quantity: str) -> tuple[np.ndarray, np.ndarray]:
             by_state = tick[quantity, "w"] @ W
@@ -165,17 +169,30 @@ class Chain:
         if flat.continuous.size:
             E, Ew, Ed, x1 = self._differentiate_flow(x1, h)
             x_of, x_by_d = E @ x_of + Ew @ W, E @ x_by_d + Ed
+        else:
+            Ew = np.zeros((nx, nw), dtype=W.dtype)
         P, P_by_d = Bp @ z_of, Bp @ z_by_d
         P[:, nx : nx + n_p] += Ap
-        states = Layout.of({m.path: (len(m.A),) for m in models})
+        W_next, states = W, Layout.of({m.path: (len(m.A),) for m in models})
         for path in self.paths:
             if self._until[path] != following:  # it is on its way
                 rows = states.entries([path])
                 P[rows], P_by_d[rows] = 0.0, 0.0
                 P[rows, [nx + i for i in rows]] = 1.0
+        W_by_d = np.zeros((nw, x_by_d.shape[1]), dtype=W.dtype)
+        if self._coupled is not None:
+            before = np.zeros((n_p, n + x_by_d.shape[1]), dtype=P.dtype)
+            before[:, nx : nx + n_p] = np.eye(n_p)
+            x_all, z_all, w_all = (np.hstack(pair) for pair in ((x_of, x_by_d), (z_of, z_by_d), (W, W_by_d)))
+            end = self._end_time(following)
+            step = Step(x_all, z_all, w_all, before, here.t, end, x1, here.w, tick["z"], dict(states.slices))
+            self._models |= self._coupled.go(step, lambda path, z: self._model_plant(path, z, h), Ew)
+            (x_of, x_by_d), (P, P_by_d), (z_of, z_by_d), (W_next, W_by_d) = (
+                (part[:, :n], part[:, n:]) for part in (step.x, step.p, step.z, step.w)
+            )
         M, N = np.vstack([x_of, P, z_of]), np.vstack([x_by_d, P_by_d, z_by_d])
         if self._holds:
-            M, N = np.vstack([M, W]), np.vstack([N, np.zeros((nw, N.shape[1]))])
+            M, N = np.vstack([M, W_next]), np.vstack([N, W_by_d])
         self.steps.append((M, N, *eliminate_w("y")))
         if not self._begun:
             (self.M, self.N, self.C, self.D), self.n_p = self.steps[0], n_p
@@ -235,6 +252,9 @@ class Chain:
             if a != b and now:
                 self._fired.append(EventWithinPeriod(event.path, event.name, here.t))
 
+    def _end_time(self, k: int) -> float:
+        return self.first.t + float((k - self.first.tick) * self.flat.base)
+
     def _move(self, k: int, h: float, x: np.ndarray, z: np.ndarray) -> None:
         """Move the operating point to tick k."""
         kind = np.result_type(self.here.w, *(m.y_next for m in self.models))
@@ -243,8 +263,7 @@ class Chain:
             if self._until[m.path] == k:
                 w[m.outputs] = m.y_next
                 plants[m.path] = m.next
-        t = self.first.t + float((k - self.first.tick) * self.flat.base)
-        self.here = replace(self.here, t=t, tick=k, x=x, w=w, z=z, plants=plants)
+        self.here = replace(self.here, t=self._end_time(k), tick=k, x=x, w=w, z=z, plants=plants)
 
     @property
     def labels(self) -> list[str]:

@@ -50,6 +50,18 @@ class PlantModel:
     """Operating point of the FMU after the step."""
     identified: bool = False
     """Whether the states are those of an identified model, not the FMU's."""
+    after: tuple[np.ndarray, np.ndarray] | None = None
+    """Derivatives of the outputs after a step by x_p and z before it; None where C and D are those there, too."""
+
+    @property
+    def y_by_states(self) -> np.ndarray:
+        """Derivative of the outputs after a step by x_p before it."""
+        return self.C @ self.A if self.after is None else self.after[0]
+
+    @property
+    def y_by_inputs(self) -> np.ndarray:
+        """Derivative of the outputs after a step by z."""
+        return self.C @ self.B + self.D if self.after is None else self.after[1]
 
 
 def plant_paths(flat: FlatDiagram) -> list[str]:
@@ -227,6 +239,7 @@ def model_step(
         m, derivation = step, step.derivation
         C, D = _outputs_before(flat, at, path, equations, step, z)
     names = _prefix_names(path, m.states)
+    after = (m.C, m.D[:, wired]) if isinstance(m, FmuLinearization) else None
     following = {
         "t": at.plants[path]["t"] + h,
         "state": _states_after(block, at, path, m.f),
@@ -247,6 +260,7 @@ def model_step(
         _largest_error(m),
         m.y0,
         following,
+        after=after,
     )
 
 

@@ -120,6 +120,8 @@ class OperatingPoint:
     """Whether ``base`` was asked for, as a ``step``: FMUs step at every tick then."""
     coupling: str = ""
     """Coupling of the FMUs in the run that has reached it, where it is not the default."""
+    coupling_order: tuple[str, ...] = ()
+    """Paths of the FMUs in the order in which they step there, where one steps after the other."""
     parameters: Mapping[str, Any] = field(default_factory=dict)
     """Parameters that a trim has found with it, by path, as `Diagram.replace` takes them."""
     free: tuple[FreeDirection, ...] = ()

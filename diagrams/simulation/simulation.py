@@ -173,6 +173,11 @@ class Simulation:
         return "" if coupled is None else str(coupled.coupling)
 
     @property
+    def coupling_order(self) -> tuple[str, ...]:
+        """Paths of the FMUs in the order in which they step; empty where they step together."""
+        return () if self._engine.coupled is None else self._engine.coupled.order
+
+    @property
     def stopped(self) -> Stopped | None:
         """The stop condition or FMU that has ended the run."""
         return self._engine.position.stopped
