@@ -61,7 +61,7 @@ static inline double lw_tanh(double x) {
 
 #if LW_NEEDS_EXP || LW_NEEDS_EXPM1 || LW_NEEDS_POW
 /* 2^(k/128) · (1 + tail + r + r²/2 + …) from x + rest; what is beyond the range of exponents goes by two steps. */
-static inline double lw_scale(double hi, double lo, int64_t k) {
+static inline double lw_scale_power(double hi, double lo, int64_t k) {
     int64_t e = k >> 7;
     if (e > -1000 && e < 1000) return hi + lo; /* the exponent is in hi and lo already */
     /* they have 2^0 to 2^(127/128) only */
@@ -76,7 +76,7 @@ static inline double lw_exp_of(double x, double rest) {
     const double *row = lw_exp_table + 2 * (size_t)(n & 127);
     double tail = (row[1] + r) + (r2 * (0.5 + r * (1.0 / 6.0)) + r2 * r2 * (1.0 / 24.0 + r * (1.0 / 120.0)));
     double s = e > -1000 && e < 1000 ? lw_double(lw_bits(row[0]) + ((uint64_t)e << 52)) : row[0];
-    return lw_scale(s, s * tail, n);
+    return lw_scale_power(s, s * tail, n);
 }
 
 static inline double lw_exp(double x) {
