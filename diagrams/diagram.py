@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from .results import OperatingPoint
-from .simulation import SimulatedDiagram
+from .varied_diagram import VariedDiagram
 
 if TYPE_CHECKING:
     from .admittance import Contact
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .report_writing import Report
 
 
-class Diagram(SimulatedDiagram):
+class Diagram(VariedDiagram):
     """A diagram: what its last calls need, found by walking the wires backwards.
 
     Building it checks everything: unwired inputs, double drives, shapes, units, names, algebraic loops.

@@ -38,6 +38,7 @@ from .findings import Finding
 from .frozen import FrozenMapping
 from .instants import FINEST, is_before, left_of, move_earlier, next_edge, period_of, read_time, right_of
 from .layout import Layout, elements, lay_out
+from .one_thread import on_one_thread, one_thread
 from .parameters import ParameterSpec
 from .ports import Event, Input, Output, Port, PortUnit, Shape, State
 from .signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, recorder
@@ -125,6 +126,8 @@ __all__ = [
     "move_earlier",
     "near",
     "next_edge",
+    "on_one_thread",
+    "one_thread",
     "parameter",
     "parse_unit",
     "period_of",

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Array, ConfirmationError, Finding, OptionError, near
-from ..frequency import Number, on_one_thread
+from ...blocks.core import Array, ConfirmationError, Finding, OptionError, near, on_one_thread
+from ..frequency import Number
 from .contact_loop import ClosedLoop, Modes, close_loop, controller_rows, join_environment, split_modes
 from .contact_parts import ContactParts
 from .stability_limits import (

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Array, ConfirmationError, Finding, OptionError, near
-from ..frequency import Number, on_one_thread
+from ...blocks.core import Array, ConfirmationError, Finding, OptionError, near, on_one_thread
+from ..frequency import Number
 from .compliance_loop import AdmittanceLoop
 from .coupled import crossing_frequency, growth_rate, growth_rate_by_control
 

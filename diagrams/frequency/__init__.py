@@ -11,7 +11,6 @@ from .margins_found import GainCrossover, Margins, PhaseCrossover
 from .measured_margins import Interval, MeasuredMargins, measured_margins, read_frequency_data
 from .number import MARK, Number
 from .nyquist import NyquistCount, nyquist_count
-from .one_thread import on_one_thread
 from .periodic_margins import PeriodicMargins, periodic_margins
 from .pole_placement import SampledDesign, place, sampled_gains, sampled_poles
 from .polynomials import relative_difference
@@ -53,7 +52,6 @@ __all__ = [
     "measured_margins",
     "mimo_disk_margin",
     "nyquist_count",
-    "on_one_thread",
     "periodic_margins",
     "place",
     "read_frequency_data",

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, get_type_hints
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError, ParameterError, on_one_thread
 from .carried import carries_findings
 from .confirm import (
     confirm_crossing,
@@ -24,7 +24,6 @@ from .features import split_axis_poles
 from .margins_found import GainCrossover, Margins, PhaseCrossover
 from .number import Number
 from .nyquist import count_encirclements
-from .one_thread import on_one_thread
 from .realization import Realization
 
 if TYPE_CHECKING:

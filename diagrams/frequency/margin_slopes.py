@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ParameterError
+from ...blocks.core import ParameterError, on_one_thread
 from .crossings import Scan
 from .disk import disk_margin, mimo_disk_margin, mu_bound
 from .loop_margins import margins
 from .margins_found import Margins
 from .number import Number
-from .one_thread import on_one_thread
 from .realization import Realization
 from .state_space import read_matrices
 

@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, Finding, ParameterError
+from ...blocks.core import ConfirmationError, Finding, ParameterError, on_one_thread
 from .carried import carries_findings
 from .confirm import confirm_limit, confirm_no_limit, refuse_singular
 from .disk import disk_gains, sensitivity_at
 from .features import SIDES
 from .number import MARK, Number
-from .one_thread import on_one_thread
 from .realization import Realization
 
 if TYPE_CHECKING:

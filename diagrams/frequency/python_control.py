@@ -9,12 +9,11 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, ParameterError
+from ...blocks.core import ConfirmationError, ParameterError, on_one_thread
 from .confirm import confirm_limit, pick_test_values
 from .crossings import Scan
 from .loop_margins import margins
 from .margins_found import Margins
-from .one_thread import on_one_thread
 from .realization import Realization
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path as File
 from types import MappingProxyType
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -35,6 +35,9 @@ from ..simulation import RunKeywords, RunOptions, simulate
 from .fig3_diagram import fig3
 from .options import DEFAULTS, ELLIPSE, merge
 from .wires import IMPEDANCE_PAR, IMPEDANCE_PERP, Channel, Rig, check_plant
+
+if TYPE_CHECKING:
+    from ..sweeps import Sweep
 
 __all__ = [
     "DEFAULTS",
@@ -96,10 +99,31 @@ class Experiment:
         SimulationError
             As in `Diagram.simulate`.
         """
+        self._refuse_own(options)
+        return simulate(self.diagram, self.duration, RunOptions.of(options, block=self.letter), progress=progress)
+
+    def sweep(self, parameters: Mapping[str, Any] | None, **options: Any) -> Sweep:
+        """Run it to its end with many values of parameters; see `Diagram.sweep`.
+
+        Parameters
+        ----------
+        parameters : mapping or None
+            Values or ranges by dotted path; None with a table.
+        **options
+            Options of the sweep, such as ``reduce`` and ``samples``, and of its runs.
+
+        Raises
+        ------
+        OptionError, UnknownNameError
+            As in `Diagram.sweep`; an option of the experiment, which is given to that.
+        """
+        self._refuse_own(options)
+        return self.diagram.sweep(parameters, self.duration, **options)
+
+    def _refuse_own(self, options: Mapping[str, Any]) -> None:
         for name in options:
             if name in DEFAULTS:
                 raise OptionError("it is no option of a run. Give it to the experiment.", block=self.letter, port=name)
-        return simulate(self.diagram, self.duration, RunOptions.of(options, block=self.letter), progress=progress)
 
 
 def _gantry() -> File:

@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
+from ...blocks.core import on_one_thread
 from ...fmus.running import Fmu
 from ..flat import WiredDiagram
-from ..frequency import on_one_thread
 from ..linearization import find_signal
 from ..report_figures import AxisUnits
 from ..report_writing import DEFINITIONS, Report

@@ -1,5 +1,6 @@
 """Results of runs: recording, storage, plots and exports."""
 
+from .memory import memory
 from .operating_point import FreeDirection, OperatingPoint, PointOrigin
 from .plots import (
     BLUE,
@@ -20,7 +21,7 @@ from .recorder import Recorder
 from .recording import Recording
 from .run import Run
 from .saved_state import RunState, check_fits, layout_of, not_open_error
-from .signal_names import index_of, resolve, split_entry
+from .signal_names import entries, index_of, resolve, split_entry
 from .snapshot import Snapshot
 from .stored import Occurrence, Stopped
 from .texts import TextSignal
@@ -46,10 +47,12 @@ __all__ = [
     "Stopped",
     "TextSignal",
     "check_fits",
+    "entries",
     "index_of",
     "layout_of",
     "limit_time",
     "marker_of",
+    "memory",
     "new_figure",
     "not_open_error",
     "resolve",

@@ -174,6 +174,11 @@ class Recorder:
         else:
             self._start()[1].write(event_line(occurrence))
 
+    def begin_anew(self) -> None:
+        """Take the samples of another run into memory, after `finish`."""
+        self._skip, self._tail, self._fired = 0, None, []
+        self.events = self._fired
+
     # --- chunks ------------------------------------------------------------------------------------------------------
 
     def _begin_chunk(self, rows: int) -> None:

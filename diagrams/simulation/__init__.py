@@ -1,7 +1,11 @@
 """The loop over ticks, and between them."""
 
-from .progress import Interrupted
-from .run_options import RunKeywords, RunOptions
+from .duration import default_step, refuse_rest, ticks_in
+from .engine import Engine
+from .initialize import find_initial_state, find_start_values
+from .left_of_start import values_from_left
+from .progress import Interrupted, progress_bar
+from .run_options import KeptKeywords, RunKeywords, RunOptions
 from .simulated_diagram import SimulatedDiagram
 from .simulation import Simulation, simulate
 from .start_at_point import apply_point, copy_states
@@ -9,7 +13,9 @@ from .view import SimulationView
 from .workspace import Workspace
 
 __all__ = [
+    "Engine",
     "Interrupted",
+    "KeptKeywords",
     "RunKeywords",
     "RunOptions",
     "SimulatedDiagram",
@@ -18,5 +24,12 @@ __all__ = [
     "Workspace",
     "apply_point",
     "copy_states",
+    "default_step",
+    "find_initial_state",
+    "find_start_values",
+    "progress_bar",
+    "refuse_rest",
     "simulate",
+    "ticks_in",
+    "values_from_left",
 ]

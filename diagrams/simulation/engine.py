@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core import Block, SimulationError, UnknownNameError, near
+from ...fmus.calls import FmuInstance
 from ..coupling import CoupledSteps, Links, Plant, PlantSteps, load_plants, refuse_exchanged, to_coupling
 from ..exchange import ExchangedBlock, ExchangedBlocks
 from ..flat import FlatDiagram
@@ -134,14 +135,47 @@ class Engine:
     def initialize(self) -> None:
         """Find values of everything at t = 0; the plants are then ready to be stepped."""
         self.steps.bind()
+        self._find_start(None)
+        if self._compile:
+            self._compiled = self._make_compiled()
+
+    def _find_start(self, set_start: Callable[[Workspace], None] | None) -> None:
         delays = None if self.continuous is None else self.continuous.delays
-        initialize(self.workspace, self.plants, delays, self.steps.take_inputs, self.exchanged, self._passes_on)
+        take_inputs = self.steps.take_inputs
+        initialize(self.workspace, self.plants, delays, take_inputs, self.exchanged, self._passes_on, set_start)
         for plant in self.plants.values():
             plant.begin()
         self.exchanged.begin(self.workspace.here.x)
         self.workspace.begun = True
-        if self._compile:
-            self._compiled = self._make_compiled()
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether it goes from tick to tick in C."""
+        return self._compiled is not None
+
+    @property
+    def can_begin_anew(self) -> bool:
+        """Whether `begin_anew` leaves nothing of the run before: without solver, coupling, loops and outside blocks."""
+        plain = self.continuous is None and self.coupled is None and not self.exchanged and not self.workspace.looped
+        return plain and all(isinstance(p, FmuInstance) and p.native is not None for p in self.plants.values())
+
+    def begin_anew(self, flat: FlatDiagram, set_start: Callable[[Workspace], None] | None = None) -> None:
+        """Go back to t = 0 with other numbers; the plants were initialized anew before, and stay bound.
+
+        Parameters
+        ----------
+        flat : FlatDiagram
+            The diagram with its numbers: blocks, parameters and start values. Its functions are those that are bound.
+        set_start : callable, optional
+            Computes start values, as `initialize` takes it.
+        """
+        workspace = self.workspace
+        workspace.begin_anew(flat)
+        self.position.restore(0, None)
+        for plant in self.plants.values():
+            assert isinstance(plant, FmuInstance)
+            plant.read(0.0)
+        self._find_start(set_start)
 
     def _make_compiled(self) -> CompiledTicks | HybridTicks | None:
         """Return the ticks in C; None, with a message, where they can't be had."""

@@ -37,6 +37,7 @@ def initialize(
     take_inputs: Callable[[], None],
     exchanged: ExchangedBlocks,
     passes_on: str = "agree",
+    set_start: Callable[[Workspace], None] | None = None,
 ) -> None:
     """Find values of everything at t = 0.
 
@@ -48,9 +49,10 @@ def initialize(
     value from the left there, so that a derivative sees the jump, as it sees one at any later time.
 
     ``take_inputs`` lets the plants see the inputs z. ``passes_on`` is the exchange of values with them: "agree" until
-    their inputs stay, "once", or "none", where the inputs of FMUs keep their start values.
+    their inputs stay, "once", or "none", where the inputs of FMUs keep their start values. ``set_start`` computes the
+    initial states and first held outputs from the values at hand; `find_start_values` by default.
     """
-    flat = workspace.flat
+    flat, set_start = workspace.flat, set_start or find_start_values
     acting = flat.acting(0)
     workspace.here.t[0] = 0.0
     if delays is not None:
@@ -66,8 +68,7 @@ def initialize(
     search: Search | None = None
     while True:
         assumed = workspace.here.w.copy()
-        _set_initial_states(workspace)
-        _hold_first_outputs(workspace)
+        set_start(workspace)
         workspace.evaluate(acting)
         workspace.check(acting)
         before = workspace.z.copy()
@@ -101,6 +102,12 @@ def initialize(
         last = workspace.here.x.copy()
 
 
+def find_start_values(workspace: Workspace) -> None:
+    """Compute the initial states, first held outputs and controls from the values at hand, block by block."""
+    _set_initial_states(workspace)
+    _hold_first_outputs(workspace)
+
+
 def _set_initial_states(workspace: Workspace) -> None:
     """Compute the initial states of the blocks that ask for their inputs first."""
     flat, x = workspace.flat, workspace.here.x
@@ -109,17 +116,27 @@ def _set_initial_states(workspace: Workspace) -> None:
         ready: set[str] = set()
 
         def before(path: str, inputs: dict[str, Any]) -> None:
-            block, trace = blocks[path], flat.checked.traced[path]
-            if block.starts_from_inputs and path not in ready:
+            if blocks[path].starts_from_inputs and path not in ready:
                 ready.add(path)
-                for port, column in inputs.items():
-                    _check_finite(flat, path, port, column)
-                u = bundle("u", shaped_inputs(trace, inputs))
-                x[flat.states.slices[path]] = _initial(path, block, u, trace.states)
+                x[flat.states.slices[path]] = find_initial_state(flat, path, inputs)
 
         _evaluate(workspace, order=flat.start_order.steps, before=before, taps=values_from_left(workspace))
     for path, where in flat.starts.slices.items():
         x[where] = x[flat.states.slices[path]]
+
+
+def find_initial_state(flat: FlatDiagram, path: str, inputs: dict[str, Any]) -> np.ndarray:
+    """Return the initial state that a block computes from the columns at its inputs, flat.
+
+    Raises
+    ------
+    SimulationError
+        An input that is not finite; a block that fails.
+    """
+    trace = flat.checked.traced[path]
+    for port, column in inputs.items():
+        _check_finite(flat, path, port, column)
+    return _initial(path, flat.table.blocks[path], bundle("u", shaped_inputs(trace, inputs)), trace.states)
 
 
 def _check_finite(flat: FlatDiagram, path: str, port: str, column: Any) -> None:

@@ -11,8 +11,10 @@ from ..results import Run
 
 
 @contextmanager
-def progress_bar(name: str, start: float, end: float, show: bool | None) -> Iterator[Any]:
-    """Yield a function that is told the simulated time, and draws it where that is wanted."""
+def progress_bar(
+    name: str, start: float, end: float, show: bool | None, shown: str = "{task.completed:.2f} / {task.total:g} s"
+) -> Iterator[Any]:
+    """Yield a function that is told the simulated time, or another count, and draws it where that is wanted."""
     if show is None:
         import sys
 
@@ -24,7 +26,7 @@ def progress_bar(name: str, start: float, end: float, show: bool | None) -> Iter
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.2f} / {task.total:g} s"))
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn(shown))
     with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(name, total=end - start)
         yield lambda t: bar.update(task, completed=t - start)

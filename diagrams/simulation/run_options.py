@@ -31,8 +31,8 @@ def check_start_exchange(value: str) -> str:
     return value
 
 
-class RunKeywords(TypedDict, total=False):
-    """The options of a run as keywords, for type checkers; `RunOptions` says what they mean."""
+class KeptKeywords(TypedDict, total=False):
+    """The options of a run that is kept in memory, as keywords, for type checkers; see `RunOptions`."""
 
     step: float | Fraction | None
     solver: str
@@ -42,12 +42,17 @@ class RunKeywords(TypedDict, total=False):
     record: Iterable[str] | None
     every: int
     states: bool
-    to: str | os.PathLike[str] | None
-    overwrite: bool
     start: RunState | OperatingPoint | None
     coupling: str | Coupling
     start_exchange: str
     compile: bool
+
+
+class RunKeywords(KeptKeywords, total=False):
+    """The options of a run as keywords, for type checkers; `RunOptions` says what they mean."""
+
+    to: str | os.PathLike[str] | None
+    overwrite: bool
 
 
 @dataclass(frozen=True, eq=False)

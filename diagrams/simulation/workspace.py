@@ -58,6 +58,13 @@ class Workspace:
         self.messages: tuple[str, ...] = ()
         self._solved: dict[tuple[frozenset[TickPattern], int], LoopSolver] = {}
 
+    def begin_anew(self, flat: FlatDiagram) -> None:
+        """Put all numbers to those with which a run of a diagram begins; its functions are those that are bound."""
+        self.flat, self.begun = flat, False
+        self.p[:], self.here.x[:], self.here.t[0] = flat.p, flat.x0, 0.0
+        for vector in (self.here.w, self.x_next, self.z, self.log, self.ok):
+            vector[:] = 0.0
+
     def _bind(
         self,
         function: Schedule | Derivative,

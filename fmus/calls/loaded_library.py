@@ -194,8 +194,8 @@ class LoadedFmu:
 
     def _find_lost(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Return those of the given parameters and inputs that the FMU has not kept."""
-        about, lost, at = self.description, {}, 0
-        for name in (n for n in given if n in about.texts and is_readable(self.fmi, about.texts[n])):
+        about, lost, at, texts = self.description, {}, 0, self.description.texts
+        for name in (n for n in given if n in texts and is_readable(self.fmi, texts[n])):
             if read_text(self.fmi, about.texts[name]) != given[name]:
                 lost[name] = given[name]
         numbers = {n: v for n in given if n not in about.texts and (v := about.find(n)).causality in _SET}
@@ -203,9 +203,9 @@ class LoadedFmu:
         found = self.read_variables(numbers.values())
         for name, v in numbers.items():
             tolerance = 1e-6 if v.type == "Float32" else 1e-12
-            if not np.allclose(found[at : at + v.size], np.ravel(given[name]).astype(float), rtol=tolerance, atol=0.0):
+            put, at = np.ravel(given[name]).astype(float), at + v.size
+            if not np.all(np.abs(found[at - v.size : at] - put) <= tolerance * np.abs(put)):  # a NaN is lost, too
                 lost[name] = given[name]
-            at += v.size
         return lost
 
     def _initialization_error(self, error: Exception) -> FmuRuntimeError:

@@ -1,0 +1,147 @@
+"""Runs of one diagram with many numbers, bound once: FMUs are reset, states and parameters are set in place."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from time import perf_counter
+from typing import Any
+
+from ...blocks.core import SimulationError
+from ...fmus.calls import FmuInstance
+from ..flat import EVERY, FlatDiagram
+from ..results import Recorder, Recording, Run
+from ..simulation import Engine, RunOptions, SimulatedDiagram, default_step, refuse_rest, ticks_in
+from .start_values import StartValues
+from .variation import Numbers
+
+LOADING = threading.Lock()
+"""Held while FMUs are loaded, reset and initialized: a library may change what the whole process shares."""
+
+Tell = Callable[[float], None]
+
+
+class BoundRun:
+    """Runs of a diagram over one duration, one after the other, each with numbers of its own.
+
+    It is used in a ``with`` statement, which loads the FMUs and frees them.
+
+    Parameters
+    ----------
+    diagram : SimulatedDiagram
+        The diagram.
+    duration : float
+        Simulated time of each run in s.
+    options : RunOptions
+        Options of the runs; they begin at t = 0, and are recorded in memory.
+    """
+
+    def __init__(self, diagram: SimulatedDiagram, duration: float, options: RunOptions):
+        self._name = diagram.name
+        base = default_step(diagram, options.step, duration, options.solver)
+        self.flat: FlatDiagram = diagram.flatten(base) if base is options.step else diagram.flattened(base)
+        self._count, rest = ticks_in(duration, self.flat.base, diagram.name)
+        if rest:
+            refuse_rest(self.flat, self._count, duration, diagram.name)
+        self._end = float(self._count * self.flat.base + rest) if rest else None
+        record, every, states = options.record, options.every, options.states
+        self._recording = Recording(self.flat, diagram.name, record, every, states, None, False)
+        every_tick = base is not None or EVERY in self.flat.visited
+        self._recording.check_memory(self._count, every_tick=every_tick)
+        self._engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=lambda event: None)
+        rows = self._count + 2 if self._engine.every_tick else None
+        self._recorder: Recorder = self._recording.begin(rows)
+        self._start = StartValues(self._engine.workspace)
+        self._stack = ExitStack()
+
+    def __enter__(self) -> BoundRun:
+        with LOADING:
+            try:
+                self._engine.load(self._stack, 0.0)
+                self._engine.initialize()
+            except BaseException:
+                self._stack.close()
+                raise
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        with LOADING:
+            self._stack.close()
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether its runs can follow each other: each leaves nothing behind for the next one."""
+        return self._engine.can_begin_anew and StartValues.fits(self.flat)
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether it goes from tick to tick in C."""
+        return self._engine.is_compiled
+
+    @property
+    def is_broken(self) -> bool:
+        """Whether an FMU of it has failed for good, so that it can't be reset."""
+        return any(isinstance(p, FmuInstance) and p.fatal for p in self._engine.plants.values())
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """Messages about all of its runs."""
+        return self._engine.messages
+
+    def run(self, numbers: Numbers[Any], tell: Tell) -> Run:
+        """Run with the numbers of a sample.
+
+        Parameters
+        ----------
+        numbers : Numbers
+            Numbers of the diagram.
+        tell : callable
+            Told the time in s now and then; what it raises ends the run.
+
+        Raises
+        ------
+        SimulationError
+            As of `Diagram.simulate`; ``error.run`` holds what was recorded until then.
+        """
+        engine, recorder, started = self._engine, self._recorder, perf_counter()
+        recorder.begin_anew()
+        try:
+            with LOADING:
+                for path, plant in engine.plants.items():
+                    assert isinstance(plant, FmuInstance)
+                    plant.reset()
+                    plant.initialize(None, values=numbers.starts.get(path))
+                engine.begin_anew(numbers.flatten(self.flat), self._start.set)
+            engine.take_first_tick(None, recorder.row)
+            if engine.position.stopped is None:
+                if self._count:
+                    engine.go(self._count, recorder, tell)
+                if self._end is not None and engine.position.stopped is None:
+                    engine.end_between_ticks(self._end, recorder.row, tell)
+        except SimulationError as error:
+            culprit = engine.blame(error).at(t=engine.position.t)
+            raise culprit.keep(self._take_record(started)) from culprit.__cause__
+        except BaseException:
+            recorder.finish()
+            raise
+        recorder.last(engine.position.t, engine.workspace.log)
+        return self._take_record(started)
+
+    def _take_record(self, started: float) -> Run:
+        recorder, engine = self._recorder, self._engine
+        t, data = recorder.finish()
+        return Run(
+            t=t,
+            data=data,
+            layout=self.flat.log,
+            wires=self.flat.table.names,
+            units=self._recording.units,
+            diagram=None,
+            elapsed=perf_counter() - started,
+            messages=(*engine.messages, *engine.workspace.messages),
+            stopped=engine.position.stopped,
+            columns=recorder.columns,
+            has_states=self._recording.states,
+            diagram_name=self._name,
+        )

@@ -1,0 +1,70 @@
+"""Worker process of a sweep: it reads a plan and samples from its standard input, and answers with outcomes."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import struct
+import sys
+from typing import Any, BinaryIO
+
+_HEAD = struct.Struct("<Q")
+
+
+def send(file: BinaryIO, message: object) -> None:
+    """Write a message: its length, then its bytes."""
+    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    file.write(_HEAD.pack(len(data)))
+    file.write(data)
+    file.flush()
+
+
+def receive(file: BinaryIO) -> Any:
+    """Read a message.
+
+    Raises
+    ------
+    EOFError
+        If the other side has ended.
+    """
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size:
+        raise EOFError
+    (size,) = _HEAD.unpack(head)
+    data = file.read(size)
+    if len(data) < size:
+        raise EOFError
+    return pickle.loads(data)
+
+
+def main() -> None:
+    """Answer samples until the standard input ends; what anybody prints goes to the standard error."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that has started it tells when it ends
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    orders = sys.stdin.buffer
+    try:
+        sys.path[:] = receive(orders)
+        plan = pickle.loads(receive(orders))
+    except EOFError:
+        return
+    except Exception as error:
+        send(answers, error_text(error))
+        return
+    from ...blocks.core import one_thread
+    from .plan import Worker
+
+    with one_thread(), Worker(plan) as worker:
+        send(answers, "")
+        while True:
+            try:
+                sample = receive(orders)
+            except EOFError:
+                return
+            send(answers, worker.run(sample))
+
+
+def error_text(error: BaseException) -> str:
+    """Return an error with its class."""
+    return f"{type(error).__name__}: {error}"

@@ -1,0 +1,232 @@
+"""Samples of a sweep on a Dask cluster: FMUs travel as bytes, and every worker compiles for itself."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import pickle
+import threading
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ...blocks.core import OptionError, one_thread, replace_file
+from ...fmus import Fmu
+from ...fmus.platform import cache_folder, is_built_here, record_build
+from ..simulation import SimulatedDiagram
+from .outcome import WORKER_ENDED, Failure, Outcome
+from .plan import Plan, Worker
+from .processes import to_bytes
+from .samples import Sample
+
+_CHUNKS = 8
+"""Chunks of samples for each thread of the cluster."""
+_MOST = 64
+"""Most samples of a chunk."""
+
+Made = tuple[Callable[..., SimulatedDiagram], tuple[Any, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class Parcel:
+    """A sweep without the files of its FMUs, as it travels.
+
+    Attributes
+    ----------
+    plan : Plan
+        The sweep; its diagram is made anew where it arrives.
+    made : tuple
+        Function and arguments that make the diagram.
+    files : mapping of str to str
+        SHA-256 digest of each FMU's file, by the block's path.
+    built : frozenset of str
+        Digests of the FMUs that Loopwright has built.
+    """
+
+    plan: Plan
+    made: Made
+    files: Mapping[str, str]
+    built: frozenset[str]
+
+    @classmethod
+    def of(cls, plan: Plan) -> tuple[Parcel, dict[str, bytes]]:
+        """Return a sweep as a parcel, and the contents of its FMUs by digest."""
+        plants = {path: block for path, block in plan.diagram.structure.blocks.items() if isinstance(block, Fmu)}
+        files = {path: plant.description.digest for path, plant in plants.items()}  # the file is what it was
+        contents = {files[path]: Path(plant.file).expanduser().read_bytes() for path, plant in plants.items()}
+        made: Any = plan.diagram.__reduce__()
+        empty: Any = None
+        built = frozenset(digest for digest in contents if is_built_here(digest))
+        return cls(replace(plan, diagram=empty), made, files, built), contents
+
+    def unpack(self, contents: Mapping[str, bytes]) -> Plan:
+        """Return the sweep with its diagram, whose FMUs are files of this machine's cache."""
+        places = {digest: _keep(digest, content, built=digest in self.built) for digest, content in contents.items()}
+        make, (name, structure, *more) = self.made
+        structure = structure.copy()
+        for path, digest in self.files.items():
+            block = copy.copy(structure.blocks[path])
+            object.__setattr__(block, "file", str(places[digest]))
+            structure.blocks[path] = block
+        return replace(self.plan, diagram=make(name, structure, *more))
+
+
+def _keep(digest: str, content: bytes, *, built: bool) -> Path:
+    """Return the file of an FMU in the cache; it is written where it isn't there."""
+    folder = cache_folder() / "travelled"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    path = folder / f"{digest}.fmu"
+    if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+        with replace_file(path) as fresh:
+            fresh.write_bytes(content)
+    if built:
+        record_build(digest)
+    return path
+
+
+# --- on the workers ------------------------------------------------------------------------------------------------
+
+
+class _Bench:
+    """The workers of one sweep in this process: each thread that runs a chunk takes one, and puts it back."""
+
+    def __init__(self, plan: Plan):
+        self.plan, self.idle, self.lock = plan, list[Worker](), threading.Lock()
+        self.alone: Any = threading.Lock() if plan.is_alone else nullcontext()
+
+    @contextmanager
+    def take(self) -> Iterator[Worker]:
+        """Yield a worker that nobody else has."""
+        with self.alone:
+            with self.lock:
+                worker = self.idle.pop() if self.idle else Worker(self.plan)
+            yield worker
+            with self.lock:
+                self.idle.append(worker)
+
+    def close(self) -> None:
+        """Free the FMUs of all workers."""
+        with self.lock:
+            for worker in self.idle:
+                worker.__exit__(None, None, None)
+            self.idle.clear()
+
+
+_benches: dict[str, _Bench] = {}
+_making = threading.Lock()
+
+
+def deliver(content: bytes) -> bytes:
+    """Return a content: a task whose result lies on workers, and is made again where one that had it ends."""
+    return content
+
+
+def run_chunk(key: str, parcel: bytes, digests: Sequence[str], samples: Sequence[Sample], *contents: bytes) -> Any:
+    """Run samples on a worker of a cluster, and return their outcomes."""
+    with _making:
+        if key not in _benches:
+            found: Parcel = pickle.loads(parcel)
+            _benches[key] = _Bench(found.unpack(dict(zip(digests, contents, strict=True))))
+        bench = _benches[key]
+    with one_thread(), bench.take() as worker:
+        return [worker.run(sample) for sample in samples]
+
+
+def release(key: str) -> None:
+    """Free what a sweep holds in this process."""
+    with _making:
+        bench = _benches.pop(key, None)
+    if bench is not None:
+        bench.close()
+
+
+# --- here ------------------------------------------------------------------------------------------------------------
+
+
+def run_on_cluster(plan: Plan, samples: Sequence[Sample], client: Any) -> Generator[Outcome, None, None]:
+    """Yield the outcomes of samples, in the order in which they are ready.
+
+    A worker that ends gives its samples to others. A sample with which workers end again and again is a failure.
+
+    Parameters
+    ----------
+    plan : Plan
+        The sweep.
+    samples : sequence of Sample
+        The samples.
+    client : distributed.Client
+        The cluster.
+
+    Raises
+    ------
+    OptionError
+        If it is no client of a cluster, it has no workers, or they can't run the sweep.
+    """
+    if not all(hasattr(client, name) for name in ("submit", "nthreads", "cancel")):
+        raise OptionError(
+            f"found client={client!r}; expected a distributed.Client, such as Client(n_workers=2).",
+            block=plan.diagram.name,
+            port="client",
+        )
+    import distributed
+
+    library: Any = distributed
+    threads = sum(client.nthreads().values())
+    if not threads:
+        raise OptionError(
+            "the cluster has no worker; expected one at least. Start one: dask worker ADDRESS.",
+            block=plan.diagram.name,
+            port="client",
+        )
+    made, contents = Parcel.of(plan)
+    parcel = to_bytes(made, plan.diagram.name)
+    key = hashlib.sha256(parcel).hexdigest()[:24]
+    packed = client.submit(deliver, parcel, key=f"loopwright-sweep-{key}")
+    files = [client.submit(deliver, data, key=f"loopwright-fmu-{digest}") for digest, data in contents.items()]
+    size = max(1, min(_MOST, len(samples) // (_CHUNKS * threads)))
+
+    def submit(some: Sequence[Sample]) -> Any:
+        return client.submit(run_chunk, key, packed, [*contents], list(some), *files, pure=False)
+
+    chunks = {submit(samples[k : k + size]): samples[k : k + size] for k in range(0, len(samples), size)}
+    waiting = library.as_completed([*chunks])
+    try:
+        for future in waiting:
+            some = chunks.pop(future)
+            error = future.exception() if future.status == "error" else None
+            if future.status == "finished":
+                yield from future.result()
+            elif error is not None and not _has_ended(error):
+                raise OptionError(
+                    f"the cluster's workers can't run the sweep: {type(error).__name__}: {error}. They need Loopwright "
+                    "of this version, and the modules of the diagram's blocks.",
+                    block=plan.diagram.name,
+                    port="client",
+                ) from error
+            elif len(some) > 1:  # which of them was it?
+                for sample in some:
+                    chunks[alone := submit([sample])] = [sample]
+                    waiting.add(alone)
+            else:
+                yield _lost(some[0])
+    finally:
+        client.cancel([*chunks, packed, *files])
+        with suppress(Exception):  # a cluster that is gone has nothing left to free
+            client.run(release, key)
+
+
+def _has_ended(error: BaseException) -> bool:
+    from distributed import KilledWorker
+
+    return isinstance(error, KilledWorker)
+
+
+def _lost(sample: Sample) -> Outcome:
+    values = ", ".join(f"{name!r}: {value!r}" for name, value in sample.parameters.items())
+    text = (
+        "the workers of the cluster that ran this sample ended, several times. Run it alone: "
+        f"diagram.replace({{{values}}}).simulate(…)."
+    )
+    return Outcome(sample.index, failure=Failure(sample.index, WORKER_ENDED, text))

@@ -1,0 +1,214 @@
+"""A sweep as a value that can be sent to workers, and the worker that runs its samples."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import LoopwrightError, SimulationError
+from ...fmus import Fmu
+from ...fmus.isolation import find_limits
+from ...fmus.platform import is_built_here
+from ..results import Run
+from ..simulation import RunOptions, SimulatedDiagram, simulate
+from .bound_run import BoundRun, Tell
+from .outcome import Outcome, describe_failure
+from .reductions import Reduction
+from .samples import Sample, seed_of
+from .variation import Numbers, Variation
+
+_BOUND = 4
+"""Diagrams of different structure that a worker keeps bound at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A sweep without its samples.
+
+    Attributes
+    ----------
+    diagram : SimulatedDiagram
+        The diagram.
+    duration : float
+        Simulated time of each run in s.
+    options : mapping
+        Options of the runs by name.
+    signals : tuple of str
+        Signals whose samples are kept.
+    reductions : mapping of str to callable
+        Functions of a run by name.
+    seeds : tuple of str
+        Full paths of the parameters that take a sample's seed.
+    """
+
+    diagram: SimulatedDiagram
+    duration: float
+    options: Mapping[str, Any]
+    signals: tuple[str, ...] = ()
+    reductions: Mapping[str, Callable[[Run], Any]] = field(default_factory=dict)
+    seeds: tuple[str, ...] = ()
+
+    @property
+    def run_options(self) -> RunOptions:
+        """Options of each run: what is recorded is what is asked for."""
+        record: list[str] | None = [*self.signals]
+        for function in self.reductions.values():
+            if isinstance(function, Reduction):
+                record = None if record is None else [*record, function.signal]
+            else:
+                record = None  # a user's function may ask for any signal
+        given = {"states": False, "record": record, **self.options}
+        return RunOptions.of(given, block=self.diagram.name)
+
+    def parameters_of(self, sample: Sample) -> dict[str, Any]:
+        """Return all parameters of a sample, seeds included."""
+        seeds = {path: seed_of(sample.seed, k) % 2**53 for k, path in enumerate(self.seeds)}
+        return {**sample.parameters, **seeds}
+
+    @property
+    def runs_in_threads(self) -> bool:
+        """Whether its FMUs can run in several threads: all were built by Loopwright on this machine."""
+        return all(find_limits(plant) is None and is_built_here(plant.description.digest) for plant in self._plants)
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether a process can run one sample at a time: an FMU of another tool is loaded in it."""
+        return not all(find_limits(p) is not None or is_built_here(p.description.digest) for p in self._plants)
+
+    @property
+    def _plants(self) -> list[Fmu]:
+        return [block for block in self.diagram.scheduled.blocks.values() if isinstance(block, Fmu)]
+
+
+class Worker:
+    """Runs samples of a sweep, one after the other; used in a ``with`` statement.
+
+    Parameters
+    ----------
+    plan : Plan
+        The sweep.
+    """
+
+    def __init__(self, plan: Plan):
+        self.plan, self._options = plan, plan.run_options
+        self._variation: Variation[Any] = Variation(plan.diagram)
+        self._bound: OrderedDict[Any, BoundRun] = OrderedDict()
+        self._repeats = self._options.start is None and plan.runs_in_threads
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with ExitStack() as stack:
+            for bound in self._bound.values():
+                stack.push(bound.__exit__)
+            self._bound.clear()
+
+    def can_compile(self, sample: Sample) -> bool:
+        """Whether a sample's run goes from tick to tick in C; it is prepared, and not run."""
+        try:
+            bound = self._bind(self._variation.find(self.plan.parameters_of(sample))) if self._repeats else None
+        except LoopwrightError:  # of this sample; its run will tell
+            return False
+        return bound is not None and bound.is_compiled
+
+    def run(self, sample: Sample, tell: Tell = lambda t: None) -> Outcome:
+        """Run a sample; a run that fails is an outcome, too.
+
+        Parameters
+        ----------
+        sample : Sample
+            The sample.
+        tell : callable
+            Told the simulated time in s now and then; what it raises ends the run.
+        """
+        try:
+            return self._outcome(sample, self._simulate(self.plan.parameters_of(sample), tell))
+        except LoopwrightError as error:
+            failure = describe_failure(sample.index, error)
+            run = error.run if isinstance(error, SimulationError) else None
+            if run is None or not len(run.t):
+                return Outcome(sample.index, failure=failure, end=failure.t)
+            t = run.t.copy() if self.plan.signals else None
+            return Outcome(
+                sample.index, {}, t, self._signals(run), failure.t, "", failure, self._units(run), run.messages
+            )
+
+    # --- its runs ----------------------------------------------------------------------------------------------------
+
+    def _simulate(self, parameters: Mapping[str, Any], tell: Tell) -> Run:
+        if self._repeats:
+            numbers = self._variation.find(parameters)
+            bound = self._bind(numbers)
+            if bound is not None:
+                try:
+                    return bound.run(numbers, tell)
+                finally:
+                    if bound.is_broken:
+                        del self._bound[numbers.key]
+                        bound.__exit__(None, None, None)
+        return simulate(self._variation.apply(parameters), self.plan.duration, self._options, progress=False)
+
+    def _bind(self, numbers: Numbers[Any]) -> BoundRun | None:
+        """Return the bound runs of a diagram; None where each run needs a set-up of its own."""
+        if numbers.key not in self._bound:
+            bound = BoundRun(numbers.diagram, self.plan.duration, self._options)
+            try:
+                bound.__enter__()
+            except SimulationError:  # at these numbers; others may do
+                return None
+            if not bound.is_possible:
+                bound.__exit__(None, None, None)
+                self._repeats = self._repeats and numbers.key is not None
+                return None
+            self._bound[numbers.key] = bound
+            if len(self._bound) > _BOUND:
+                self._bound.popitem(last=False)[1].__exit__(None, None, None)
+        self._bound.move_to_end(numbers.key)
+        return self._bound[numbers.key]
+
+    # --- their outcomes ----------------------------------------------------------------------------------------------
+
+    def _outcome(self, sample: Sample, run: Run) -> Outcome:
+        numbers = {name: self._reduce(name, function, run) for name, function in self.plan.reductions.items()}
+        t = run.t.copy() if self.plan.signals else None
+        stopped = "" if run.stopped is None else run.stopped.block
+        return Outcome(
+            sample.index,
+            numbers,
+            t,
+            self._signals(run),
+            float(run.t[-1]),
+            stopped,
+            None,
+            self._units(run),
+            run.messages,
+        )
+
+    def _reduce(self, name: str, function: Callable[[Run], Any], run: Run) -> np.ndarray:
+        try:
+            return np.array(function(run), dtype=float)
+        except LoopwrightError:
+            raise
+        except Exception as error:
+            text = f"the reduction {name!r} failed: {type(error).__name__}: {error}. Try it on a single run."
+            failure = SimulationError(text, block=self.plan.diagram.name, port=name, t=float(run.t[-1]))
+            raise failure.keep(run) from error
+
+    def _signals(self, run: Run) -> dict[str, np.ndarray]:
+        return {name: np.array(run[name]) for name in self.plan.signals}
+
+    def _units(self, run: Run) -> dict[str, str]:
+        found = {name: run.unit(name) for name in self.plan.signals}
+        for name, function in self.plan.reductions.items():
+            if isinstance(function, Reduction):
+                found[name] = run.unit(function.signal) if function.unit is None else function.unit
+        return {name: str(unit) for name, unit in found.items() if unit}

@@ -1,0 +1,186 @@
+"""Samples of a sweep in processes of their own: for runs that Python interprets, and for FMUs of other tools."""
+
+from __future__ import annotations
+
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Generator, Iterable
+from contextlib import suppress
+from queue import SimpleQueue
+from typing import Any, BinaryIO
+
+from ...blocks.core import OptionError
+from .child import receive, send
+from .outcome import WORKER_ENDED, Failure, Outcome
+from .plan import Plan
+from .samples import Sample
+
+_PROGRAM = "from loopwright.diagrams.sweeps.child import main; main()"
+
+
+def run_in_processes(plan: Plan, samples: Iterable[Sample], count: int) -> Generator[Outcome, None, None]:
+    """Yield the outcomes of samples, in the order in which they are ready.
+
+    A process that ends in a run, such as by a crash, makes a failure of that sample alone; another one goes on.
+
+    Parameters
+    ----------
+    plan : Plan
+        The sweep.
+    samples : iterable of Sample
+        The samples.
+    count : int
+        Number of processes.
+
+    Raises
+    ------
+    OptionError
+        If the diagram, or a function of the sweep, can't be sent to a process.
+    """
+    data = to_bytes(plan, plan.diagram.name)
+    waiting, lock, halted = iter(samples), threading.Lock(), threading.Event()
+    ready: SimpleQueue[Outcome | BaseException | None] = SimpleQueue()
+    processes: list[_Process] = [_Process(data) for _ in range(count)]
+
+    def take() -> Sample | None:
+        with lock:
+            return None if halted.is_set() else next(waiting, None)
+
+    def work(process: _Process) -> None:
+        try:
+            while (sample := take()) is not None:
+                ready.put(process.run(sample))
+        except BaseException as error:
+            if not halted.is_set():
+                ready.put(error)
+        finally:
+            ready.put(None)
+
+    threads = [threading.Thread(target=work, args=(process,), daemon=True) for process in processes]
+    for thread in threads:
+        thread.start()
+    left = count
+    try:
+        while left:
+            found = ready.get()
+            if found is None:
+                left -= 1
+            elif isinstance(found, BaseException):
+                raise found
+            else:
+                yield found
+    finally:
+        halted.set()
+        for process in processes:
+            process.end()
+        for thread in threads:
+            thread.join()
+
+
+def to_bytes(plan: object, name: str) -> bytes:
+    """Return a plan as bytes; with cloudpickle, where it is installed, functions and classes of a script travel, too.
+
+    Raises
+    ------
+    OptionError
+        If it can't be turned into bytes.
+    """
+    try:
+        import cloudpickle
+
+        return bytes(cloudpickle.dumps(plan))
+    except ImportError:
+        pass
+    except Exception as error:
+        raise _not_sent(name, error) from error
+    try:
+        data = pickle.dumps(plan, protocol=pickle.HIGHEST_PROTOCOL)
+    except Exception as error:
+        raise _not_sent(name, error) from error
+    if b"__main__" in data:
+        raise _not_sent(name, "it holds classes or functions of the main script")
+    return data
+
+
+def _not_sent(name: str, error: object) -> OptionError:
+    return OptionError(
+        f"the sweep can't be sent to worker processes: {error}. Define classes and functions in a module, or install "
+        "the extra: pip install 'loopwright[sweep]'; workers=1 runs all in this process.",
+        block=name,
+    )
+
+
+class _Process:
+    """A worker process; it is started when it is needed first, and anew after its end."""
+
+    def __init__(self, data: bytes):
+        self._data = data
+        self._process: subprocess.Popen[bytes] | None = None
+        self._lock, self._over = threading.Lock(), False
+
+    def run(self, sample: Sample) -> Outcome:
+        """Return the outcome of a sample; where the process ends, that is its failure."""
+        try:
+            process = self._begin()
+            send(_pipe(process.stdin), sample)
+            found: Outcome = receive(_pipe(process.stdout))
+        except (EOFError, OSError):
+            return Outcome(sample.index, failure=Failure(sample.index, WORKER_ENDED, self._describe_end(sample)))
+        return found
+
+    def _begin(self) -> subprocess.Popen[bytes]:
+        with self._lock:
+            if self._over:
+                raise EOFError
+            if self._process is None:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-c", _PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+                )
+                fresh = True
+            else:
+                fresh = False
+            process = self._process
+        if fresh:
+            send(_pipe(process.stdin), sys.path)
+            send(_pipe(process.stdin), self._data)
+            if text := receive(_pipe(process.stdout)):
+                raise OptionError(
+                    f"the sweep can't be read in a worker process: {text}. Define its classes and functions in a "
+                    "module that can be imported; workers=1 runs all in this process."
+                )
+        return process
+
+    def _describe_end(self, sample: Sample) -> str:
+        process, self._process = self._process, None
+        code: Any = None
+        if process is not None:
+            for pipe in (process.stdin, process.stdout):
+                with suppress(OSError):
+                    _pipe(pipe).close()
+            code = process.wait()
+        end = f"with exit status {code}"
+        if code is not None and code < 0:
+            with suppress(ValueError):
+                end = f"by signal {signal.Signals(-code).name}"
+        values = ", ".join(f"{name!r}: {value!r}" for name, value in sample.parameters.items())
+        return f"the worker process ended {end} in this run. Run it alone: diagram.replace({{{values}}}).simulate(…)."
+
+    def end(self) -> None:
+        """End the process, whatever it does."""
+        with self._lock:
+            self._over = True
+            process = self._process
+        if process is not None:
+            process.kill()
+            process.wait()
+            for pipe in (process.stdin, process.stdout):
+                with suppress(OSError):
+                    _pipe(pipe).close()
+
+
+def _pipe(file: Any) -> BinaryIO:
+    found: BinaryIO = file
+    return found

@@ -1,0 +1,212 @@
+"""The results of a sweep: every run's numbers and samples, as arrays and as one labelled data set."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core import OptionError, UnknownNameError, near
+from .outcome import Failure, Outcome
+from .samples import Samples
+
+if TYPE_CHECKING:
+    from xarray import Dataset
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """The results of a sweep.
+
+    ``sweep["name"]`` is an array with one row for each sample, in their order: a reduction, or the samples of a signal
+    over time. A run that failed has NaN in place of its reductions, and of the samples after its end. ``dataset`` has
+    it all with names, units and parameters.
+
+    Attributes
+    ----------
+    samples : Samples
+        The samples.
+    failures : tuple of Failure
+        Runs that failed, in the order of the samples.
+    elapsed : float
+        Elapsed time in s.
+    reused : int
+        Number of samples that were on disk already.
+    messages : tuple of str
+        Messages of the runs, each once.
+    """
+
+    samples: Samples
+    outcomes: Sequence[Outcome | None] = field(repr=False)
+    diagram_name: str
+    elapsed: float = float("nan")
+    reused: int = 0
+    messages: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        missing = sum(outcome is None for outcome in self.outcomes)
+        failed = len(self.failures)
+        more = (f", {failed} failed" if failed else "") + (f", {missing} not run" if missing else "")
+        return f"<sweep of {self.diagram_name}: {len(self.samples)} samples of {', '.join(self.samples.names)}{more}>"
+
+    @cached_property
+    def failures(self) -> tuple[Failure, ...]:
+        """Runs that failed, in the order of the samples."""
+        return tuple(o.failure for o in self.outcomes if o is not None and o.failure is not None)
+
+    @property
+    def failed(self) -> np.ndarray:
+        """Whether the run of each sample failed, or was not made, (N,) of bool."""
+        return np.array([o is None or o.failure is not None for o in self.outcomes])
+
+    @property
+    def end(self) -> np.ndarray:
+        """Time in s at which the run of each sample ended, (N,); NaN where it did not begin."""
+        return np.array([np.nan if o is None else o.end for o in self.outcomes])
+
+    @cached_property
+    def _reductions(self) -> list[str]:
+        return list(dict.fromkeys(name for o in self.outcomes if o is not None for name in o.numbers))
+
+    @cached_property
+    def _signals(self) -> list[str]:
+        return list(dict.fromkeys(name for o in self.outcomes if o is not None for name in o.signals))
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the reductions and signals that it holds."""
+        return [*self._reductions, *self._signals]
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return a reduction, shape (N, *shape), or the samples of a signal, (N, n, *shape).
+
+        Raises
+        ------
+        UnknownNameError
+            For a name that it doesn't hold.
+        OptionError
+            For numbers whose shape differs from run to run.
+        """
+        if name in self._reductions:
+            return self._stack(name, [None if o is None else o.numbers.get(name) for o in self.outcomes])
+        if name in self._signals:
+            return self._stack_samples(name)
+        raise UnknownNameError(f"the sweep holds no {name!r}. {near(name, self.names)}", block=self.diagram_name)
+
+    def _stack(self, name: str, values: Sequence[np.ndarray | None]) -> np.ndarray:
+        shapes = {value.shape for value in values if value is not None}
+        if len(shapes) > 1:
+            raise OptionError(
+                f"its shape differs from run to run: {', '.join(map(str, sorted(shapes)))}; expected one shape. Let "
+                "the reduction return as many numbers for every run.",
+                block=self.diagram_name,
+                port=name,
+            )
+        (shape,) = shapes or {()}
+        missing = np.full(shape, np.nan)
+        return np.array([missing if value is None else value for value in values])
+
+    def _stack_samples(self, name: str) -> np.ndarray:
+        parts = [None if o is None else o.signals.get(name) for o in self.outcomes]
+        length = max((len(part) for part in parts if part is not None), default=0)
+        shape = next((part.shape[1:] for part in parts if part is not None), ())
+        found = np.full((len(parts), length, *shape), np.nan)
+        for row, part in zip(found, parts, strict=True):
+            if part is not None:
+                row[: len(part)] = part
+        return found
+
+    @cached_property
+    def t(self) -> np.ndarray:
+        """Times of the samples in s: (n,) where all runs share them, else (N, n), NaN after a run's end.
+
+        Raises
+        ------
+        OptionError
+            If no signal was kept.
+        """
+        times = [o.t for o in self.outcomes if o is not None and o.t is not None]
+        if not times:
+            raise OptionError(
+                "no samples were kept in this sweep, so it has no times. Keep signals: signals=['y'].",
+                block=self.diagram_name,
+            )
+        longest = max(times, key=len)
+        if all(np.array_equal(t, longest[: len(t)]) for t in times):
+            return longest
+        found = np.full((len(self.outcomes), len(longest)), np.nan)
+        for row, outcome in zip(found, self.outcomes, strict=True):
+            if outcome is not None and outcome.t is not None:
+                row[: len(outcome.t)] = outcome.t
+        return found
+
+    @cached_property
+    def units(self) -> Mapping[str, str]:
+        """Units of signals and reductions, as far as they are declared."""
+        return {name: unit for o in self.outcomes if o is not None for name, unit in o.units.items()}
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """One xarray data set: the dimensions of a grid are its parameters; else there is one, ``sample``.
+
+        Its variables are the reductions, the signals, over ``t`` (s), the variables ``failed``, ``end_time`` (s) and
+        ``failure``, the message. Entries of vectors count from 1. Where runs have times of their own, samples run over
+        ``step``, and ``t`` is a variable.
+
+        Raises
+        ------
+        OptionError
+            If xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError as error:
+            raise OptionError(
+                "xarray is not installed: pip install 'loopwright[sweep]'. Without it, read arrays: sweep[name]."
+            ) from error
+        samples = self.samples
+        axes: Mapping[str, tuple[Any, ...]] | None = samples.axes
+        dims = ("sample",) if axes is None else tuple(axes)
+        coordinates: dict[str, Any] = {}
+        if axes is None:
+            coordinates["sample"] = ("sample", np.arange(len(samples)))
+            for k, name in enumerate(samples.names):
+                coordinates[name] = ("sample", _labels([row[k] for row in samples.rows]))
+        else:
+            coordinates |= {name: (name, _labels(values)) for name, values in axes.items()}
+        variables: dict[str, Any] = {}
+        text = np.array(
+            ["" if o is None or o.failure is None else str(o.failure.message) for o in self.outcomes], dtype=object
+        )
+        about: list[tuple[str, np.ndarray, dict[str, str]]] = [
+            ("failed", self.failed, {}), ("end_time", self.end, {"units": "s"}), ("failure", text, {}),
+        ]  # fmt: skip
+        for name, values, attributes in about:
+            variables[name] = (dims, values.reshape(samples.shape), attributes)
+        inner: tuple[str, ...] = ()
+        if self._signals:
+            if self.t.ndim == 1:
+                inner, coordinates["t"] = ("t",), ("t", self.t, {"units": "s"})
+            else:
+                inner, variables["t"] = ("step",), ((*dims, "step"), self.t.reshape(*samples.shape, -1), {"units": "s"})
+        for name in self.names:
+            values, own = self[name], inner if name in self._signals else ()
+            extra = values.shape[1 + len(own) :]
+            more = [f"{name}_dim"] if len(extra) == 1 else [f"{name}_dim{i + 1}" for i in range(len(extra))]
+            coordinates |= {dim: (dim, np.arange(1, n + 1)) for dim, n in zip(more, extra, strict=True)}
+            unit = {"units": self.units[name]} if name in self.units else {}
+            variables[name] = ((*dims, *own, *more), values.reshape(*samples.shape, *values.shape[1:]), unit)
+        found: Dataset = xarray.Dataset(
+            variables, coordinates, attrs={"title": self.diagram_name, "seed": samples.seed}
+        )
+        return found
+
+
+def _labels(values: Sequence[Any]) -> np.ndarray:
+    """Return values as a coordinate: numbers where they are numbers, else their texts."""
+    if all(isinstance(value, bool | int | float) for value in values):
+        return np.array(values)
+    return np.array([repr(value.tolist() if isinstance(value, np.ndarray) else value) for value in values])

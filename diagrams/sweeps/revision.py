@@ -1,0 +1,106 @@
+"""Digests: of a sweep without its samples, and of a sample; equal digests, equal outcomes."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import types
+from collections.abc import Mapping
+from fractions import Fraction
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ...blocks.core import Value
+from ..simulation import SimulatedDiagram
+from .plan import Plan
+from .reductions import Reduction
+from .samples import Sample
+
+_OURS = __name__.partition(".")[0]
+_SILENT = ("progress", "compile")
+"""Options of a run that change no result."""
+
+
+def revision_of(plan: Plan) -> str:
+    """Return the digest of a sweep without its samples: the diagram, its equations, duration, options, reductions.
+
+    Equations count by their traces, so that a change in a function that they call is seen; those of blocks that Python
+    evaluates count by their source. FMUs count by their content. A function of the user counts by its own code.
+    """
+    options = {name: value for name, value in plan.options.items() if name not in _SILENT}
+    parts = (
+        _of_diagram(plan.diagram), repr(float(plan.duration)), _text(options), repr(plan.signals),
+        _text(plan.reductions), repr(plan.seeds), ca.CasadiMeta.version(),
+    )  # fmt: skip
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+def key_of(sample: Sample, *, seeded: bool) -> str:
+    """Return the digest of a sample: its parameters, and its seed where the sweep gives it to a block."""
+    text = _text(dict(sample.parameters)) + (repr(sample.seed) if seeded else "")
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _of_diagram(diagram: SimulatedDiagram) -> str:
+    table, checked = diagram.scheduled, diagram.checked
+    parts = [
+        diagram.loops, _text(table.blocks), _text(table.subsystem_of), _text(table.subsystems), _text(table.wires),
+        _text(table.names), _text(table.controls),
+    ]  # fmt: skip
+    seen: dict[int, str] = {}
+    for path, trace in sorted(checked.traced.items()):
+        block = table.blocks[path]
+        if block.opaque:
+            parts.append(_source(type(block)))
+            continue
+        if id(trace) not in seen:
+            functions = (trace.function, trace.indicators, trace.jump, trace.system_matrix)
+            texts = [f.serialize() for f in functions if f is not None]
+            seen[id(trace)] = hashlib.sha256("\0".join(texts).encode()).hexdigest()
+        parts.append(seen[id(trace)])
+        if not type(block).__module__.startswith(_OURS):
+            parts.append(_source(type(block)))  # its start and its instants are no part of the trace
+    return "\0".join(parts)
+
+
+def _source(cls: type) -> str:
+    """Return the source of a class and of those of its bases that are no part of Loopwright."""
+    found = []
+    for each in cls.__mro__:
+        if each.__module__.partition(".")[0] not in (_OURS, "builtins", "abc", "typing"):
+            try:
+                found.append(inspect.getsource(each))
+            except (OSError, TypeError):  # of a class without a file
+                found += [_text(member) for _, member in sorted(vars(each).items()) if inspect.isfunction(member)]
+    return "\0".join(found)
+
+
+def _text(value: Any) -> str:
+    """Return a text of a value that is equal in every process exactly for equal values."""
+    if isinstance(value, Value):
+        kind = type(value)
+        inside = ", ".join(f"{name}={_text(v)}" for name, v in sorted(value.parameters.items()) if name != "file")
+        return f"{kind.__module__}.{kind.__qualname__}({inside}; {value._content})"
+    if isinstance(value, np.ndarray):
+        return f"array({value.dtype.str}, {value.shape}, {np.ascontiguousarray(value).tobytes().hex()})"
+    if isinstance(value, np.generic):
+        return _text(value.item())
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(sorted(f"{_text(k)}: {_text(v)}" for k, v in value.items())) + "}"
+    if isinstance(value, list | tuple):
+        return "(" + ", ".join(map(_text, value)) + ")"
+    if isinstance(value, set | frozenset):
+        return "{" + ", ".join(sorted(map(_text, value))) + "}"
+    if isinstance(value, float):
+        return value.hex()
+    if value is None or isinstance(value, str | bool | int | bytes | Fraction | Reduction):
+        return repr(value)
+    if isinstance(value, types.CodeType):
+        return _text((value.co_name, value.co_code, value.co_names, value.co_consts))
+    if inspect.isfunction(value):
+        closure = [cell.cell_contents for cell in value.__closure__ or ()]
+        return f"function({_text(value.__code__)}, {_text(value.__defaults__)}, {_text(closure)})"
+    fields = dict(getattr(value, "__dict__", {})) or {n: getattr(value, n) for n in getattr(value, "__slots__", ())}
+    return f"{type(value).__module__}.{type(value).__qualname__}({_text(fields)})"

@@ -1,0 +1,149 @@
+"""A sweep on disk: a folder of parts, each of which appears whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+from time import monotonic
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from ...blocks.core import OptionError, replace_file, write_text
+from .outcome import WORKER_ENDED, Failure, Outcome
+
+HEAD = "sweep.json"
+_FORMAT = 1
+_EVERY = 1.0  # s between two parts
+
+
+class Store:
+    """Keeps outcomes in a folder, and finds those that are there.
+
+    Parameters
+    ----------
+    folder : path
+        The folder; it is made where it isn't there.
+    revision : str
+        Digest of all that outcomes depend on besides their samples.
+    about : mapping
+        Facts for people who look into the folder.
+    overwrite : bool
+        Replace a sweep of another revision that stands there.
+
+    Raises
+    ------
+    OptionError
+        If something else stands there.
+    """
+
+    def __init__(self, folder: Path, revision: str, about: dict[str, Any], *, overwrite: bool = False):
+        self.folder = folder
+        self._waiting: list[tuple[str, Outcome]] = []
+        self._last = monotonic()
+        head = folder / HEAD
+        if folder.exists() and not folder.is_dir():
+            raise OptionError(f"found a file at {str(folder)!r}; expected a folder, or nothing. Choose another path.")
+        if head.is_file():
+            try:
+                found = json.loads(head.read_text(encoding="utf-8"))
+                fits = found["format"] == _FORMAT and found["revision"] == revision
+            except (ValueError, KeyError, TypeError):
+                found, fits = {}, False
+            if not fits and not overwrite:
+                raise OptionError(
+                    f"the folder {str(folder)!r} holds a sweep of {found.get('diagram', 'something')!r} that differs "
+                    "from this one in its diagram, duration, options, signals or reductions. Choose another folder, or "
+                    "replace it with overwrite=True."
+                )
+            if not fits:
+                shutil.rmtree(folder)
+        elif folder.exists() and any(folder.iterdir()):
+            raise OptionError(
+                f"the folder {str(folder)!r} holds other files, and no sweep. Choose another one, or an empty one."
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+        if not head.is_file():
+            write_text(head, json.dumps({"format": _FORMAT, "revision": revision, **about}, indent=1) + "\n")
+
+    def read(self) -> dict[str, Outcome]:
+        """Return the outcomes that are there, by the keys of their samples; unfinished parts don't count."""
+        found: dict[str, Outcome] = {}
+        for path in sorted(self.folder.glob("part-*.npz")):
+            found.update(_read_part(path))
+        return found
+
+    def add(self, key: str, outcome: Outcome) -> None:
+        """Keep an outcome; it is on disk within about a second, or after `flush`."""
+        if outcome.failure is None or outcome.failure.kind != WORKER_ENDED:
+            self._waiting.append((key, outcome))
+        if monotonic() - self._last > _EVERY:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what was not written yet."""
+        if self._waiting:
+            try:
+                _write_part(self.folder / f"part-{secrets.token_hex(8)}.npz", self._waiting)
+            except OSError as error:
+                raise OptionError(
+                    f"the sweep can't be written to {str(self.folder)!r}: {error.strerror or error}. What was written "
+                    "before is kept: make room, and call it again."
+                ) from error
+        self._waiting = []
+        self._last = monotonic()
+
+
+def _write_part(path: Path, outcomes: Iterable[tuple[str, Outcome]]) -> None:
+    heads, arrays = [], dict[str, np.ndarray]()
+    for place, (key, outcome) in enumerate(outcomes):
+        failure = None if outcome.failure is None else vars(outcome.failure)
+        heads.append(
+            {
+                "key": key,
+                "numbers": [*outcome.numbers],
+                "signals": [*outcome.signals],
+                "has_t": outcome.t is not None,
+                "end": outcome.end,
+                "stopped": outcome.stopped,
+                "failure": failure,
+                "units": dict(outcome.units),
+                "messages": [*outcome.messages],
+            }
+        )
+        arrays |= {f"{place}.n{k}": value for k, value in enumerate(outcome.numbers.values())}
+        arrays |= {f"{place}.s{k}": value for k, value in enumerate(outcome.signals.values())}
+        if outcome.t is not None:
+            arrays[f"{place}.t"] = outcome.t
+    arrays["heads"] = np.frombuffer(json.dumps(heads).encode(), dtype=np.uint8)
+    save: Any = np.savez
+    with replace_file(path) as fresh:
+        save(fresh, **arrays)
+
+
+def _read_part(path: Path) -> dict[str, Outcome]:
+    found: dict[str, Outcome] = {}
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as part:
+            for place, head in enumerate(json.loads(part["heads"].tobytes())):
+                failure = head["failure"]
+                found[head["key"]] = Outcome(
+                    -1,
+                    {name: part[f"{place}.n{k}"] for k, name in enumerate(head["numbers"])},
+                    part[f"{place}.t"] if head["has_t"] else None,
+                    {name: part[f"{place}.s{k}"] for k, name in enumerate(head["signals"])},
+                    head["end"],
+                    head["stopped"],
+                    None if failure is None else Failure(**failure),
+                    head["units"],
+                    tuple(head["messages"]),
+                )
+    except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+        raise OptionError(
+            f"the file {str(path)!r} of a sweep can't be read: {error}. Remove it; its samples are then run again."
+        ) from error
+    return found

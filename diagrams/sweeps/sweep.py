@@ -1,0 +1,200 @@
+"""A sweep: samples of parameters, run in parallel, kept on disk, and put together in their order."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import OptionError, one_thread
+from ..flat import FlatDiagram
+from ..results import Run, entries, memory, resolve
+from ..simulation import SimulatedDiagram, Simulation, progress_bar
+from .names import find_parameter
+from .outcome import Outcome
+from .plan import Plan, Worker
+from .processes import run_in_processes
+from .reductions import Reduction, check_reductions
+from .result import Sweep
+from .revision import key_of, revision_of
+from .samples import Sample, read_samples
+from .store import Store
+from .threads import run_in_threads
+
+_REFUSED = {
+    "to": "of a sweep, to= is the folder of its results",
+    "overwrite": "of a sweep, overwrite= belongs to its folder",
+}
+
+
+class InterruptedSweep(KeyboardInterrupt):
+    """Ctrl-C in a sweep: a `KeyboardInterrupt` that keeps the results until then.
+
+    Attributes
+    ----------
+    sweep : Sweep
+        The sweep; samples that were not run have NaN.
+    """
+
+    def __init__(self, sweep: Sweep):
+        done = sum(outcome is not None for outcome in sweep.outcomes)
+        super().__init__(f"interrupted after {done} of {len(sweep.samples)} samples")
+        self.sweep = sweep
+
+
+def sweep(
+    diagram: SimulatedDiagram,
+    parameters: Mapping[str, Any] | None,
+    duration: float,
+    *,
+    samples: Any = "grid",
+    count: int | None = None,
+    seed: int = 0,
+    seeds: str | Iterable[str] = (),
+    signals: str | Iterable[str] = (),
+    reduce: Mapping[str, Callable[[Run], Any]] | None = None,
+    to: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    workers: int | None = None,
+    client: Any = None,
+    progress: bool | None = None,
+    options: Mapping[str, Any],
+) -> Sweep:
+    """Run a diagram with many values of its parameters; see `Diagram.sweep`."""
+    started, name = perf_counter(), diagram.name
+    found = read_samples(diagram, parameters, samples, count=count, seed=seed)
+    plan = make_plan(diagram, duration, signals, reduce, seeds, options, count=len(found))
+    count_workers = _check_workers(workers)
+    store, known = None, dict[str, Outcome]()
+    if to is not None:
+        store = Store(Path(to), revision_of(plan), {"diagram": name, "duration": plan.duration}, overwrite=overwrite)
+        known = store.read()
+    keys = [key_of(sample, seeded=bool(plan.seeds)) for sample in found] if store is not None else []
+    outcomes: list[Outcome | None] = [None] * len(found)
+    for place, key in enumerate(keys):
+        if key in known:
+            outcomes[place] = replace(known[key], index=place)
+    reused = sum(outcome is not None for outcome in outcomes)
+    left = [sample for sample in found if outcomes[sample.index] is None]
+    done = reused
+
+    def result() -> Sweep:
+        messages = tuple(dict.fromkeys(m for o in outcomes if o is not None for m in o.messages))
+        return Sweep(found, tuple(outcomes), name, perf_counter() - started, reused, messages)
+
+    try:
+        run = _run(plan, left, count_workers, client)
+        with one_thread(), _bar(name, len(found), progress) as show, closing(run) as stream:
+            show(done)
+            for outcome in stream:
+                outcomes[outcome.index] = outcome
+                if store is not None:
+                    store.add(keys[outcome.index], outcome)
+                done += 1
+                show(done)
+    except KeyboardInterrupt as interrupt:
+        raise InterruptedSweep(result()) from interrupt
+    finally:
+        if store is not None:
+            store.flush()
+    return result()
+
+
+def make_plan(
+    diagram: SimulatedDiagram,
+    duration: float,
+    signals: str | Iterable[str],
+    reduce: Mapping[str, Callable[[Run], Any]] | None,
+    seeds: str | Iterable[str],
+    options: Mapping[str, Any],
+    *,
+    count: int = 1,
+) -> Plan:
+    """Return a sweep as a value, with its names and options checked.
+
+    Raises
+    ------
+    OptionError
+        If nothing is to be kept, for options that are none of a run, or of a single run only.
+    UnknownNameError
+        For a signal or a parameter that isn't there.
+    """
+    name = diagram.name
+    for option, reason in _REFUSED.items():
+        if option in options:
+            raise OptionError(f"found it as an option of a run; {reason}.", block=name, port=option)
+    chosen = (signals,) if isinstance(signals, str) else tuple(signals)
+    reductions = {} if reduce is None else check_reductions(reduce, name)
+    if not chosen and not reductions:
+        raise OptionError(
+            "a sweep keeps what it is asked for, and nothing was asked for. Give signals=['y'], whose samples are "
+            "kept, or reduce={'end': final('y')}, numbers of each run.",
+            block=name,
+        )
+    paths = [find_parameter(diagram, path) for path in ((seeds,) if isinstance(seeds, str) else seeds)]
+    plan = Plan(diagram, duration, {"compile": True, **options}, chosen, reductions, tuple(paths))
+    flat = Simulation(diagram, plan.run_options, duration=duration).flat  # it checks the options
+    for signal in [*chosen, *(f.signal for f in reductions.values() if isinstance(f, Reduction))]:
+        resolve(signal, flat.table.names, flat.log.slices)
+    if clash := sorted(set(chosen) & set(reductions)):
+        raise OptionError(
+            f"found {clash[0]!r} among signals and reductions; give the reduction another name.", block=name
+        )
+    _check_room(plan, flat, count)
+    return plan
+
+
+def _run(plan: Plan, samples: Sequence[Sample], workers: int, client: Any) -> Generator[Outcome, None, None]:
+    """Yield the outcomes of samples where they are run best: here, in threads, in processes or on a cluster."""
+    if not samples:
+        return
+    if client is not None:
+        from .cluster import run_on_cluster
+
+        yield from run_on_cluster(plan, samples, client)
+        return
+    with Worker(plan) as worker:
+        if workers == 1:
+            for sample in samples:
+                yield worker.run(sample)
+            return
+        compiled = worker.can_compile(samples[0])
+    run = run_in_threads if compiled else run_in_processes
+    with closing(run(plan, samples, min(workers, len(samples)))) as stream:
+        yield from stream
+
+
+def _check_workers(workers: int | None) -> int:
+    if workers is None:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if isinstance(workers, bool) or not isinstance(workers, int | np.integer) or workers < 1:
+        raise OptionError(f"found workers={workers!r}; expected a positive integer, or None for every core.")
+    return int(workers)
+
+
+def _check_room(plan: Plan, flat: FlatDiagram, count: int) -> None:
+    """Refuse a sweep whose samples can't fit into memory."""
+    names = flat.table.names
+    width = sum(entries(resolve(name, names, flat.log.slices), flat.log, names).size for name in plan.signals)
+    rows = int(plan.duration / float(flat.base)) // int(plan.run_options.every) + 2
+    needed, there = 2 * 8 * (width + 1) * rows * count, memory()
+    if plan.signals and needed > 0.8 * there:
+        raise OptionError(
+            f"found {count} samples of {rows} instants with {width} numbers each; they need {needed / 2**30:.0f} GiB, "
+            f"and this machine has {there / 2**30:.0f}. Keep reductions, such as reduce={{'end': final('y')}}, fewer "
+            "signals, or one of so many instants: every=10.",
+            block=plan.diagram.name,
+            port="signals",
+        )
+
+
+@contextmanager
+def _bar(name: str, total: int, show: bool | None) -> Iterator[Callable[[int], None]]:
+    with progress_bar(name, 0, total, show, "{task.completed:.0f} of {task.total:.0f} samples") as tell:
+        yield tell

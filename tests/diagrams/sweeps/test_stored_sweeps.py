@@ -1,0 +1,185 @@
+"""Sweeps on disk: a sweep that was cut off goes on, and nothing is run twice."""
+
+import json
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Block, Input, OptionError, Output, Ramp, parameter
+from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.sweeps import InterruptedSweep, final, maximum, store
+from loopwright.diagrams.sweeps.plan import Worker
+
+QUIET = {"progress": False, "workers": 1, "compile": False}
+T = 0.01
+
+
+class Guarded(Block):
+    """Refuses inputs from a limit on."""
+
+    limit: float = parameter(default=0.5)
+    gain: float = parameter(default=2.0)
+    u = Input()
+    y = Output()
+
+    def output(self, t, x, u):
+        return self.gain * u.u
+
+    def guards(self, t, x, u):
+        return {"below the limit": self.limit - u.u}
+
+
+def guarded(slope=1.0):
+    @subsystem(sample_time=T, name="box")
+    def box(u):
+        return Guarded(name="guard")(u)
+
+    return Diagram("guarded", box(Ramp(slope=slope, name="ramp")).named("y"))
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """The samples that were run."""
+    run, found = Worker.run, []
+
+    def counted(self, sample, tell=lambda t: None):
+        found.append(sample.index)
+        return run(self, sample, tell)
+
+    monkeypatch.setattr(Worker, "run", counted)
+    return found
+
+
+GAINS = (1.0, 2.0, 3.0, 4.0)
+KEPT = {"signals": "y", "reduce": {"end": final("y")}}
+
+
+def assert_equal(first, second):
+    assert first.names == second.names
+    for name in first.names:
+        assert first[name].tobytes() == second[name].tobytes()
+    assert first.failures == second.failures
+    assert first.t.tobytes() == second.t.tobytes()
+    assert first.units == second.units
+    assert first.end.tobytes() == second.end.tobytes()
+
+
+def test_what_is_there_is_not_run_again_and_has_the_same_bits(tmp_path, runs):
+    grid = {"guard.gain": GAINS, "guard.limit": (0.05, 1.0)}
+    plain = guarded().sweep(grid, 0.1, **KEPT, **QUIET)
+    first = guarded().sweep(grid, 0.1, **KEPT, to=tmp_path / "s", **QUIET)
+    assert (len(runs), first.reused, len(first.failures)) == (16, 0, 4)
+    again = guarded().sweep(grid, 0.1, **KEPT, to=tmp_path / "s", **QUIET)
+    assert (len(runs), again.reused) == (16, 8)
+    assert_equal(plain, first)
+    assert_equal(plain, again)
+    more = guarded().sweep({**grid, "guard.gain": (0.5, *GAINS)}, 0.1, **KEPT, to=tmp_path / "s", **QUIET)
+    assert (len(runs), more.reused) == (18, 8)
+    assert more["y"][2:].tobytes() == plain["y"].tobytes()
+    np.testing.assert_allclose(more["end"], np.where(np.arange(10) % 2, 0.1, np.nan) * np.repeat((0.5, *GAINS), 2))
+
+
+def test_an_interrupted_sweep_keeps_its_results_and_goes_on(tmp_path, runs, monkeypatch):
+    run = Worker.run
+
+    def interrupt(self, sample, tell=lambda t: None):
+        if sample.index == 2:
+            raise KeyboardInterrupt
+        return run(self, sample, tell)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Worker, "run", interrupt)
+        with pytest.raises(InterruptedSweep, match="interrupted after 2 of 4 samples") as error:
+            guarded().sweep({"guard.gain": GAINS}, 0.1, **KEPT, to=tmp_path / "s", **QUIET)
+    np.testing.assert_allclose(error.value.sweep["end"], [0.1, 0.2, np.nan, np.nan])
+    np.testing.assert_array_equal(error.value.sweep.failed, [False, False, True, True])
+    assert repr(error.value.sweep).endswith("guard.gain, 2 not run>")
+    assert runs == [0, 1]
+    rest = guarded().sweep({"guard.gain": GAINS}, 0.1, **KEPT, to=tmp_path / "s", **QUIET)
+    assert runs == [0, 1, 2, 3]
+    np.testing.assert_allclose(rest["end"], [0.1, 0.2, 0.3, 0.4])
+
+
+def _power(run):
+    return run["y"] @ run["y"]
+
+
+def _other_power(run):
+    return run["y"] @ run["y"] + 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "differs"),
+    [
+        ({}, False),
+        ({"diagram": guarded(slope=2.0)}, True),
+        ({"duration": 0.2}, True),
+        ({"signals": ()}, True),
+        ({"reduce": {"end": maximum("y")}}, True),
+        ({"reduce": {"end": _power}}, True),
+        ({"every": 2}, True),
+        ({"step": 0.005}, True),
+        ({"workers": 2}, False),
+        ({"compile": True}, False),
+    ],
+)
+def test_a_folder_belongs_to_one_diagram_with_one_set_of_options(tmp_path, change, differs):
+    arguments = {"diagram": guarded(), "parameters": {"guard.gain": (1.0,)}, "duration": 0.1, **KEPT, **QUIET}
+
+    def sweep(*, diagram, parameters, duration, **more):
+        return diagram.sweep(parameters, duration, to=tmp_path / "s", **more)
+
+    sweep(**arguments)
+    if not differs:
+        assert sweep(**{**arguments, **change}).reused == 1
+        return
+    with pytest.raises(OptionError, match=r"holds a sweep of 'guarded' that differs .* overwrite=True"):
+        sweep(**{**arguments, **change})
+    assert sweep(**{**arguments, **change}, overwrite=True).reused == 0
+    assert sweep(**{**arguments, **change}).reused == 1
+
+
+def test_a_function_counts_by_its_code(tmp_path):
+    def sweep(function):
+        return guarded().sweep({"guard.gain": (1.0,)}, 0.1, reduce={"n": function}, to=tmp_path / "s", **QUIET)
+
+    sweep(_power)
+    assert sweep(_power).reused == 1
+    with pytest.raises(OptionError, match="differs from this one"):
+        sweep(_other_power)
+
+
+def test_equations_count_by_what_they_do(tmp_path, monkeypatch):
+    sweep = {"parameters": {"guard.gain": (1.0,)}, "duration": 0.1, "to": tmp_path / "s"}
+    guarded().sweep(**sweep, **KEPT, **QUIET)
+    assert guarded().sweep(**sweep, **KEPT, **QUIET).reused == 1
+    monkeypatch.setattr(Guarded, "output", lambda self, t, x, u: self.gain * u.u + 1.0)
+    with pytest.raises(OptionError, match="differs from this one"):
+        guarded().sweep(**sweep, **KEPT, **QUIET)
+
+
+def test_other_files_are_left_alone_and_broken_ones_are_told(tmp_path):
+    def sweep(folder):
+        return guarded().sweep({"guard.gain": (1.0,)}, 0.1, **KEPT, to=folder, **QUIET)
+
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    with pytest.raises(OptionError, match=r"mine' holds other files, and no sweep"):
+        sweep(tmp_path / "mine")
+    with pytest.raises(OptionError, match=r"found a file at .*notes.txt'; expected a folder"):
+        sweep(tmp_path / "mine" / "notes.txt")
+    assert (tmp_path / "mine" / "notes.txt").read_text() == "mine"
+    sweep(tmp_path / "s")
+    (part,) = (tmp_path / "s").glob("part-*.npz")
+    (tmp_path / "s" / ".part-1.abcd.part.npz").write_bytes(b"cut off")  # as a kill in the middle of writing leaves it
+    assert sweep(tmp_path / "s").reused == 1
+    part.write_bytes(part.read_bytes()[:100])
+    with pytest.raises(OptionError, match=r"part-.*can't be read: .* Remove it; its samples are then run again"):
+        sweep(tmp_path / "s")
+    part.unlink()
+    assert sweep(tmp_path / "s").reused == 0
+    head = json.loads((tmp_path / "s" / store.HEAD).read_text())
+    assert head["diagram"] == "guarded"
+    (tmp_path / "s" / store.HEAD).write_text("{")
+    with pytest.raises(OptionError, match="overwrite=True"):
+        sweep(tmp_path / "s")
