@@ -2,8 +2,7 @@
 
 from .duration import default_step, refuse_rest, ticks_in
 from .engine import Engine
-from .initialize import find_initial_state, find_start_values
-from .left_of_start import values_from_left
+from .initialize import find_initial_state, find_start_values, values_from_left
 from .progress import Interrupted, progress_bar
 from .run_options import KeptKeywords, RunKeywords, RunOptions
 from .simulated_diagram import SimulatedDiagram
