@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -25,6 +26,9 @@ from .kernels import write_kernels
 
 LARGEST = 6_000
 """Operations of a function up to which it is compiled as a whole: the compiler's time grows faster than they do."""
+_FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-fno-builtin-pow")
+# Nobody reads errno, so that sine and cosine of one angle are one call; a power of two stays a power in every bit.
+_HELPER = re.compile(r"^casadi_real (casadi_\w+)\(", re.MULTILINE)
 _MASTER = "loopwright_run"
 
 
@@ -193,8 +197,8 @@ def rename(function: Any, name: str) -> Any:
 
 
 def make_visible(source: str) -> str:
-    """Return C code of CasADi whose functions can be found in a library."""
-    return "#define GCC_HASCLASSVISIBILITY\n" + source
+    """Return C code of CasADi whose functions can be found in a library; its small helpers are inlined."""
+    return "#define GCC_HASCLASSVISIBILITY\n" + _HELPER.sub(r"static inline casadi_real \1(", source)
 
 
 def address_of(library: ctypes.CDLL, name: str) -> int:
@@ -240,13 +244,13 @@ def load_compiled(source: str) -> ctypes.CDLL:
         If the cache can't be written.
     """
     platform = native_platform()
-    key = hashlib.sha256("\0".join((platform, *describe_compiler(platform), source)).encode()).hexdigest()
+    key = hashlib.sha256("\0".join((platform, *describe_compiler(platform), *_FLAGS, source)).encode()).hexdigest()
     folder = cache_folder().absolute() / "compiled"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     _check_owner(folder)
     library = folder / f"{key[:40]}{SUFFIXES[platform.rpartition('-')[2]]}"
     if not library.is_file():
-        compile_shared({"code.c": source}, library)
+        compile_shared({"code.c": source}, library, more_flags=_FLAGS)
     return ctypes.CDLL(str(library))
 
 

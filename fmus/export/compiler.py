@@ -137,6 +137,7 @@ def compile_shared(
     compiled: Sequence[str] | None = None,
     include: Sequence[Path] = (),
     compiler: Compiler | None = None,
+    more_flags: Sequence[str] = (),
 ) -> None:
     """Compile C sources into a shared library.
 
@@ -154,6 +155,8 @@ def compile_shared(
         Further folders of headers.
     compiler : Compiler, optional
         The compiler; `find_compiler`'s if not given.
+    more_flags : sequence of str
+        Flags after those of every library.
 
     Raises
     ------
@@ -176,7 +179,8 @@ def compile_shared(
         library = out.name  # a relative name, since some formats contain it
         math = () if platform.endswith("windows") else ("-lm",)
         includes = [f"-I{path}" for path in include]
-        command = [*compiler.command, *flags(compiler, platform), "-I.", *includes, "-o", library, *names, *math]
+        given = [*flags(compiler, platform), *more_flags]
+        command = [*compiler.command, *given, "-I.", *includes, "-o", library, *names, *math]
         _run(command, folder, platform)
         if not (folder / library).is_file():
             raise CompilerError(f"{shlex.join(command)} wrote no library. Check LOOPWRIGHT_CC.")
