@@ -28,7 +28,7 @@ LARGEST = 6_000
 """Operations of a function up to which it is compiled as a whole: the compiler's time grows faster than they do."""
 _FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-fno-builtin-pow")
 # Nobody reads errno, so that sine and cosine of one angle are one call; a power of two stays a power in every bit.
-_HELPER = re.compile(r"^casadi_real (casadi_\w+)\(", re.MULTILINE)
+_HELPER = re.compile(r"^(?=casadi_real\b)", re.MULTILINE)  # a line that defines one
 _MASTER = "loopwright_run"
 
 
@@ -198,7 +198,7 @@ def rename(function: Any, name: str) -> Any:
 
 def make_visible(source: str) -> str:
     """Return C code of CasADi whose functions can be found in a library; its small helpers are inlined."""
-    return "#define GCC_HASCLASSVISIBILITY\n" + _HELPER.sub(r"static inline casadi_real \1(", source)
+    return "#define GCC_HASCLASSVISIBILITY\n" + _HELPER.sub("static inline ", source)
 
 
 def address_of(library: ctypes.CDLL, name: str) -> int:
