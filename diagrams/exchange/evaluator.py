@@ -57,6 +57,23 @@ class ExchangedBlock(Protocol):
         It leaves everything that the block keeps as it is.
         """
 
+    def bound_evaluation(
+        self,
+        ports: Sequence[str],
+        *,
+        rates: bool,
+        indicators: bool,
+        t: np.ndarray,
+        x: np.ndarray,
+        u: np.ndarray,
+        into: np.ndarray,
+        again: bool,
+    ) -> Callable[[], None]:
+        """Return the call that writes an `evaluation` at what stands in t, x and u into another vector.
+
+        With ``again`` another such call always comes right before it, at the same t and x.
+        """
+
     def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
         """Return the derivative of such values by (x, u); None: by differences."""
 
@@ -157,10 +174,40 @@ class ExchangeEvaluator:
     def _bind(self, names: tuple[str, ...]) -> Values:
         if names == (JUMP,):
             return self._jump
+        return self.block.evaluation(self._ports(names), rates=NEXT in names, indicators=INDICATORS in names)
+
+    def _ports(self, names: tuple[str, ...]) -> list[str]:
         ports = [name for name in names if name in self._outputs]
-        known = {*ports, NEXT, GUARDS, INDICATORS}
-        assert known.issuperset(names)
-        return self.block.evaluation(ports, rates=NEXT in names, indicators=INDICATORS in names)
+        assert {*ports, NEXT, GUARDS, INDICATORS}.issuperset(names)
+        return ports
+
+    def bind(
+        self,
+        names: tuple[str, ...],
+        t: np.ndarray,
+        x: np.ndarray,
+        u: np.ndarray,
+        into: np.ndarray,
+        *,
+        again: bool,
+    ) -> Callable[[], None]:
+        """Return `evaluate` bound to vectors; see `loopwright.diagrams.flat.stages.BindingEvaluator`."""
+        if names == (JUMP,):
+
+            def jump() -> None:
+                into[:] = self._jump(float(t[0]), x, u)
+
+            return jump
+        made: Callable[[], None] | None = None
+
+        def call() -> None:  # the block is loaded after the functions are bound
+            nonlocal made
+            if made is None:
+                flags = {"rates": NEXT in names, "indicators": INDICATORS in names, "again": again}
+                made = self.block.bound_evaluation(self._ports(names), **flags, t=t, x=x, u=u, into=into)
+            made()
+
+        return call
 
     def _jump(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Look at an instant that is reached: let events act, or take note of a step that the solver has accepted.

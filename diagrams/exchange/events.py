@@ -49,6 +49,10 @@ class OutsideEvents:
         self._recent = {path: deque[float](maxlen=_MANY) for path in self._evaluators}
         """The last instants at which a block had an event of time or of a step."""
 
+    def next_instant(self, t: float) -> float:
+        """Return the first time event of any block after t, in s; infinite without one."""
+        return min(e.next_instant(t) for e in self._evaluators.values())
+
     def complete_step(self) -> bool:
         """Tell the blocks that the solver has accepted a step; return whether one wants an event, or the end, there."""
         for e in self._evaluators.values():

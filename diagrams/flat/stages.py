@@ -35,7 +35,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -73,6 +73,31 @@ class Evaluator(Protocol):
 
 
 _EXPANDING = Lock()  # the option of CasADi that says whether to simplify is one for all threads
+
+
+@runtime_checkable
+class BindingEvaluator(Protocol):
+    """Evaluator that can be bound to vectors, so that a call costs no copies."""
+
+    def bind(
+        self,
+        names: tuple[str, ...],
+        t: np.ndarray,
+        x: np.ndarray,
+        u: np.ndarray,
+        into: np.ndarray,
+        *,
+        again: bool,
+    ) -> Callable[[], None]:
+        """Return the call that writes `Evaluator.evaluate` at what stands in t, x and u into another vector.
+
+        Parameters
+        ----------
+        again : bool
+            Whether another bound call always comes right before it, at the same t and x.
+        """
+        ...
+
 
 Evaluators = Mapping[str, Evaluator]
 """Evaluators of the blocks of opaque stages, by path; they belong to one run."""
@@ -245,9 +270,12 @@ class Schedule:
         if len(self.stages) == 1:
             return bind_function(self.last.fast, arguments, results)
         c, calls, kept = np.zeros(self.width), list[Callable[[], None]](), list[Bound]()
+        paths = set[str]()
         for stage in self.stages:
             if isinstance(stage, OpaqueStage):
-                calls.append(_call_of(stage, stage.evaluator(evaluators or {}), arguments[0], c))
+                evaluator = stage.evaluator(evaluators or {})
+                calls.append(_call_of(stage, evaluator, arguments[0], c, again=stage.path in paths))
+                paths.add(stage.path)
             else:
                 into = results if stage is self.last else [c[stage.makes]]
                 kept.append(bind_function(stage.fast, [*arguments, c], into))
@@ -352,13 +380,19 @@ def _depends(stage: TracedStage, i: int, k: int, of_c: np.ndarray) -> np.ndarray
     return found if not len(of_c) else found | (pattern(len(stage.arguments) - 1) @ of_c)
 
 
-def _call_of(stage: OpaqueStage, evaluator: Evaluator, t: np.ndarray, c: np.ndarray) -> Callable[[], None]:
+def _call_of(
+    stage: OpaqueStage, evaluator: Evaluator, t: np.ndarray, c: np.ndarray, *, again: bool
+) -> Callable[[], None]:
+    if isinstance(evaluator, BindingEvaluator):
+        return evaluator.bind(stage.names, t, c[stage.states], c[stage.inputs], c[stage.makes], again=again)
     return lambda: stage.run(evaluator, t, c)
 
 
 def _one_after_the_other(calls: Sequence[Callable[[], None]]) -> Callable[[], None]:
+    kept = tuple(calls)
+
     def call() -> None:
-        for each in calls:
+        for each in kept:
             each()
 
     return call

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import casadi as ca
@@ -43,7 +44,8 @@ def trace_schedule(
         function = ca.Function(name, [*symbols], [*made.values()], [*names], [*made])
         last = TracedStage(name, symbols, tuple(made.values()), function, slice(0, 0), by_block)
         return Schedule(name, names, tuple(made), (last,), 0)
-    return _in_stages(name, names, symbols, made, cuts.made)
+    made = _join_again(made, cuts.made)
+    return _in_stages(name, names, symbols, made, [cut for cut in cuts.made if cut.needed])
 
 
 @dataclass
@@ -129,13 +131,10 @@ def _in_stages(
         width += size
         return slice(width - size, width)
 
-    parts: list[tuple[list[Any], slice, OpaqueStage | None]] = []
+    parts: list[tuple[list[Any], slice, OpaqueStage]] = []
     for cut in cuts:
         first = width
         places += [(symbol, place(symbol.numel())) for symbol, _ in cut.carried]
-        if not cut.needed:
-            parts.append(([e for _, e in cut.carried], slice(first, width), None))
-            continue
         states, inputs = place(cut.states.numel()), place(cut.inputs.numel())
         end = width
         places += [(symbol, place(symbol.numel())) for symbol in cut.outputs]
@@ -155,8 +154,7 @@ def _in_stages(
             made = of_c([ca.vertcat(*expressions)])
             function = ca.Function(f"{name}_{i}", [*arguments], [*made], names_in, ["made"])
             stages.append(TracedStage(f"{name}_{i}", arguments, made, function, makes))
-        if outside is not None:
-            stages.append(outside)
+        stages.append(outside)
     made = of_c(results.values())
     function = ca.Function(name, [*arguments], [*made], names_in, [*results])
     stages.append(TracedStage(name, arguments, made, function, slice(0, 0)))
@@ -164,12 +162,22 @@ def _in_stages(
 
 
 def _join_again(results: Mapping[str, Any], cuts: Sequence[_Cut]) -> dict[str, Any]:
-    """Return the results of an evaluation whose cuts nothing needs, as expressions of its arguments."""
+    """Return the results with whatever was carried over cuts that nothing needs; so do later cuts."""
     expressions = [*results.values()]
-    for cut in reversed(cuts):
-        if cut.carried:
-            symbols, carried = zip(*cut.carried, strict=True)
-            expressions = ca.substitute(expressions, [*symbols], [*carried])
+    for i, cut in reversed([*enumerate(cuts)]):
+        if cut.needed or not cut.carried:
+            continue
+        symbols, carried = zip(*cut.carried, strict=True)
+        later = [of for of in cuts[i + 1 :] if of.needed]
+        joined = [
+            *expressions,
+            *chain.from_iterable((of.states, of.inputs, *(e for _, e in of.carried)) for of in later),
+        ]
+        found = iter(ca.substitute(joined, [*symbols], [*carried]))
+        expressions = [next(found) for _ in expressions]
+        for of in later:
+            of.states, of.inputs = next(found), next(found)
+            of.carried = [(symbol, next(found)) for symbol, _ in of.carried]
     return dict(zip(results, expressions, strict=True))
 
 

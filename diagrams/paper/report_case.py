@@ -20,7 +20,7 @@ from ...blocks import (
     Step,
     UnitDelay,
 )
-from ...blocks.core import LoopwrightError
+from ...blocks.core import LoopwrightError, OptionError
 from ...fmus.models import Gantry
 from ...fmus.running import Fmu
 from ..admittance import check_plant, control_rate, is_discrete
@@ -190,9 +190,17 @@ class Fig3Case(Case):
         if where is None or any(f"controller.admittance_{side}" not in self.diagram.blocks for side in SIDES):
             return None
         try:
-            return ReducedLoops.of(self.base, self.smooth, self.plant_model, self.path, where.point)
+            return ReducedLoops.of(self.base, self.smooth, self.plant_model, self.path, self._base_point(where))
         except LoopwrightError as error:
             return error
+
+    def _base_point(self, where: Variant) -> OperatingPoint:
+        """Return the operating point of a variant as one of the base; one without clocks has other states."""
+        try:
+            where.point.check_fits(self.base.flatten_like(where.point), self.base.name)
+        except OptionError:
+            return point_of(self.base, where.point, where.diagram)
+        return where.point
 
     # --- where it is looked at ----------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from ..results import Occurrence
 from ..solvers import AcceptedStep, Problem, make_solver
 from .diagnosis import forget_trials, opaque_failure, state_values
 from .initialize import domains_from_left
-from .solver_setup import absolute_tolerances, longest_step, next_instant, time_scale_of
+from .solver_setup import NextInstants, absolute_tolerances, has_guards, longest_step, remembers, time_scale_of
 from .transport_delays import delays_of, keep_step
 from .trials import Trials
 from .workspace import Workspace
@@ -65,7 +65,7 @@ class Continuous(Trials):
         self.on_event, self.is_stopped = on_event, is_stopped
         self.where = flat.continuous
         self._edge, self._left, self._sources_edge = math.inf, math.inf, math.inf
-        self._beyond = None
+        self._beyond, self._nothing = None, np.zeros(self.where.size)
         self._resolution = rtol, atol
         self._loops = flat.active_loops(NOTHING)
         self._opaque = any(flat.table.blocks[path].opaque for path in flat.checked.traced)
@@ -105,12 +105,18 @@ class Continuous(Trials):
         self.outside: OutsideEvents | None = None
         """Events of blocks that are evaluated from outside; None without such blocks."""
         if exchanged:
-            self._exchanged = exchanged
+            self._exchanged, self._nominals = exchanged, np.zeros(0)
             self.outside = OutsideEvents(exchanged, workspace.here.x, self._jump, self._tell_outside, self._follow)
         if self.delays is not None:
             self._driven = np.zeros(flat.plant_inputs.total)
             self._drive = workspace.plain(flat.driven, [self._driven], workspace.trial)
-        self.sources = [*announcers(flat), *(exchanged.evaluators.items() if exchanged else ())]
+        self.sources = announcers(flat)
+        self._looked = math.nan
+        """Tick at which blocks from outside have been looked at, and before which nothing changes any more."""
+        plain = not (flat.events or self.delays or self._loops or self._opaque or flat.plant_inputs.total)
+        self._accepts = not plain or remembers(flat) or has_guards(flat)
+        """Whether a step that ends at a tick is to be evaluated there, from the left, before the tick itself."""
+        self._announced = NextInstants(self.sources)
         self.late = {t: after for _, one in self.sources if isinstance(one, Times) for t, after in one.late.items()}
         """Instants at which sources are seen at a time just after."""
 
@@ -159,9 +165,10 @@ class Continuous(Trials):
             Whether the instant is a tick, to which events belong that are a few ulps later.
         """
         fired = self._changed(t)
+        known, self._looked = ahead and self._looked == t, math.nan
         if not fired.any():
             ahead = ahead and self._fire_ahead(t)
-            if not self._look_outside(t):
+            if (known and not ahead) or not self._look_outside(t):
                 return ahead
             fired = self._changed(t)
             if not fired.any():
@@ -189,9 +196,10 @@ class Continuous(Trials):
         """Take over what an event of a block from outside may have changed: states, and their nominal values."""
         self._synchronize()
         if self.where.size and not self.fixed:
-            atol = absolute_tolerances(self.flat, self._resolution[1], self._exchanged.nominals())
-            if not np.array_equal(atol, self.solver.atol):
-                self.solver.set_absolute_tolerance(atol)
+            nominals = self._exchanged.nominals()
+            if not np.array_equal(nominals, self._nominals):
+                self._nominals = nominals
+                self.solver.set_absolute_tolerance(absolute_tolerances(self.flat, self._resolution[1], nominals))
 
     def _end_events(self, t: float) -> None:
         if self.delays is not None:
@@ -305,9 +313,12 @@ class Continuous(Trials):
                 self._put(t, step.x if found is None else step.interpolate(t))
                 if found is not None:  # the loops as the indicators saw them, to the last bit
                     workspace.here.x[self._loops] = solved
-                self.accept()
+                if self._accepts or t < end or found is not None:
+                    self.accept()
                 wanted = self.outside is not None and self.outside.complete_step()
             happened = found is not None or wanted
+            if t == end and not (happened or self.delays or self.flat.plant_outputs.total):
+                self._looked = end if is_before(end, self._sources_edge) else math.nan
             if found is None and wanted:
                 self.settle(t)
             if found is not None:
@@ -363,7 +374,8 @@ class Continuous(Trials):
         return self.is_stopped() and (sample(t) or True)
 
     def _next_edge(self, t: float) -> float:
-        self._sources_edge = min((next_instant(path, source, t) for path, source in self.sources), default=math.inf)
+        outside = math.inf if self.outside is None else self.outside.next_instant(t)
+        self._sources_edge = min(self._announced.after(t), outside)
         return min(self._sources_edge, math.inf if self.delays is None else self.delays.next_edge(t))
 
     # --- saved states ------------------------------------------------------------------------------------------------

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import SimulationError
+from ...blocks.core import SimulationError, is_before
 from ..flat import Announcer, FlatDiagram
 
 
@@ -58,6 +59,21 @@ def longest_step(flat: FlatDiagram, max_step: float | None, time_scale: float, s
     if shortest_delay < math.inf:
         longest = min(longest or math.inf, shortest_delay)
     return longest
+
+
+class NextInstants:
+    """The next instant of all sources, which are asked again where it is reached, or where time has gone back."""
+
+    def __init__(self, sources: Sequence[tuple[str, Announcer]]):
+        self._sources = sources
+        self._asked, self._next = math.inf, -math.inf
+
+    def after(self, t: float) -> float:
+        """Return the first instant after t, in s; infinity if there is none."""
+        if not (self._asked <= t and is_before(t, self._next)):
+            self._next = min((next_instant(path, source, t) for path, source in self._sources), default=math.inf)
+            self._asked = t
+        return self._next
 
 
 def next_instant(path: str, block: Announcer, t: float) -> float:

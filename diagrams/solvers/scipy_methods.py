@@ -84,11 +84,12 @@ class SciPySolver(VariableStep):
         self.stuck: tuple[float, np.ndarray] | None = None  # where no step was small enough
         self._retried = 0  # grows if many steps have to be taken again
         self._strange = False  # a rate was not finite since the flag was cleared
+        self._nothing = np.zeros(problem.size)
 
     def rate(self, t: float, x: np.ndarray) -> np.ndarray:
         """Evaluate the rates; see `Solver.rate`."""
         f = super().rate(t, x)
-        if not self._strange and not np.isfinite(f).all():
+        if self._nothing.dot(f) != 0.0:  # one of them is not finite
             self._strange = True
         return f
 

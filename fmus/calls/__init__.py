@@ -1,7 +1,8 @@
 """FMI calls into a library that is loaded in this process."""
 
 from .bound_calls import BoundCalls, Call, exported_name
-from .exchange_instance import ExchangeInstance, is_smooth
+from .evaluated_exchange import is_smooth
+from .exchange_instance import ExchangeInstance
 from .fmi_calls import ERROR, WARNING, FmiCalls, Log
 from .fmu_block import FmuBlock
 from .instance import FmuInstance

@@ -1,4 +1,4 @@
-"""One evaluation of an FMU in model exchange: a fixed sequence of calls on fixed vectors."""
+"""Evaluations of an FMU in model exchange: fixed sequences of calls on fixed vectors."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ import numpy as np
 from .bound_calls import BoundCalls, Call
 from .fmi_calls import WARNING, FmiCalls
 from .transfer import Transfer
+
+_Named = tuple[Callable[..., int], tuple[Any, ...], str]
+"""A function, its arguments, and the name of the call."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +30,7 @@ class Evaluation:
     """Calls that set time, states and inputs, and get outputs, derivatives and indicators; ``then`` follow others.
 
     Each call is bound once, to vectors that stay where they are: a process of its own can make one round trip of it.
+    ``lazy`` says that variables may be computed with the derivatives alone, so that these come first, wanted or not.
 
     Attributes
     ----------
@@ -49,6 +53,7 @@ class Evaluation:
         rates: bool,
         indicators: Vector | None,
         then: Sequence[tuple[Call, str]] = (),
+        lazy: bool = True,
     ):
         self._time, self._inputs, self._index, self._outputs = time, inputs, index, outputs
         self.rates, self.indicators = derivatives if rates else None, indicators
@@ -61,8 +66,10 @@ class Evaluation:
         given = [(group.function, group.arguments, "setting the inputs") for group in inputs.groups]
         got = [(group.function, group.arguments, "reading the outputs") for group in outputs.groups]
         starting = [*given, *got]  # derivatives and indicators can't be computed yet (FMI 2.0, 3.2.3)
-        # Derivatives come before outputs, wanted or not: FMUs of older tools compute their variables with them alone.
-        slopes = _vector_call(fmi, derivatives, "computing the derivatives of its states") if rates or got else []
+        # Derivatives come before outputs: FMUs of older tools compute their variables with them alone.
+        slopes = []
+        if rates or (got and lazy):
+            slopes = _vector_call(fmi, derivatives, "computing the derivatives of its states")
         more = [*given, *slopes, *got, *_vector_call(fmi, indicators, "computing the event indicators")]
         more += [(*call, action) for call, action in then]
         self._running, self._starting = (_bind(fmi, calls) for calls in ([*at, *more], starting))
@@ -98,8 +105,69 @@ class Evaluation:
         return 0, ""
 
 
-_Named = tuple[Callable[..., int], tuple[Any, ...], str]
-"""A function, its arguments, and the name of the call."""
+class DirectEvaluation:
+    """An evaluation in this process on vectors of the caller's: no value is copied.
+
+    Parameters
+    ----------
+    time : c_double
+        The time, as an argument of the calls.
+    t, x, u, into : ndarray
+        Vectors of the time, of the states in the FMU's order, of the inputs that are set, and of the results.
+    again : bool
+        Whether time and states need not be set.
+    """
+
+    def __init__(
+        self,
+        fmi: FmiCalls,
+        *,
+        time: ctypes.c_double,
+        t: np.ndarray,
+        x: np.ndarray,
+        u: np.ndarray,
+        into: np.ndarray,
+        inputs: Sequence[int],
+        outputs: Sequence[int],
+        rates: bool,
+        indicators: int,
+        again: bool,
+    ):
+        n = x.size
+        count = into.size - indicators - (n if rates else 0)
+        slopes, last = into[count : count + n], into[into.size - indicators :]
+        calls: list[_Named] = []
+        if not again:
+            calls = [(fmi.exchange_function("set_time"), (fmi.instance_argument, time), "setting the time")]
+            calls += _vector_call(fmi, Vector("set_states", x), "setting the continuous states")
+        calls += _values_call(fmi, "Set", inputs, u, "setting the inputs")
+        if rates:
+            calls += _vector_call(fmi, Vector("derivatives", slopes), "computing the derivatives of its states")
+        calls += _values_call(fmi, "Get", outputs, into[:count], "reading the outputs")
+        calls += _vector_call(fmi, Vector("indicators", last), "computing the event indicators")
+        self._time, self._t, self._kept = time, t, (x, u, into)
+        self._calls = tuple((function, arguments) for function, arguments, _ in calls)
+        self.actions = [action for _, _, action in calls]
+
+    def run(self) -> tuple[int, int]:
+        """Evaluate it; return the first status that is no success, and the place of that call, or 1 after a warning."""
+        self._time.value = self._t[0]
+        worst = 0
+        for function, arguments in self._calls:
+            if status := function(*arguments):
+                if status > WARNING:
+                    return status, next(i for i, (_, made) in enumerate(self._calls) if made is arguments)
+                worst = status
+        return worst, 0
+
+
+def _values_call(fmi: FmiCalls, verb: str, references: Sequence[int], values: np.ndarray, action: str) -> list[_Named]:
+    """Return the call that sets or gets variables of type Float64."""
+    if not references:
+        return []
+    kept = (ctypes.c_uint * len(references))(*references)
+    arguments = fmi.value_arguments(kept, len(references), values.ctypes.data, values.size)
+    return [(fmi.value_function(verb, "Float64"), arguments, action)]
 
 
 def _vector_call(fmi: FmiCalls, vector: Vector | None, action: str) -> list[_Named]:

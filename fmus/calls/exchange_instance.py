@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...blocks.core import FmuRuntimeError, Layout
-from ..archive import ExchangeInfo, FmuVariable
-from ..platform import is_built_here
-from .bound_calls import DISCARD, ERROR, FATAL, WARNING, BoundCalls, Call
-from .evaluation import Evaluation, Vector
-from .exchange_states import SavedExchange
+from ...blocks.core import FmuRuntimeError
+from .bound_calls import DISCARD, WARNING, BoundCalls, Call
+from .evaluated_exchange import EvaluatedExchange
+from .evaluation import Evaluation
 from .fmi_calls import EventUpdate
 from .fmu_block import FmuBlock, check_next_time
 from .loaded_library import MakeCalls
@@ -23,11 +19,10 @@ from .texts import Text, TextRecord
 from .transfer import Transfer, UnfitError
 
 _ROUNDS = 100  # of an event iteration
-_NOTHING = nullcontext()
 _SAME = 1e-12  # relative change of a continuous input that is no jump
 
 
-class ExchangeInstance(SavedExchange):
+class ExchangeInstance(EvaluatedExchange):
     """Loaded FMU whose continuous states a solver integrates.
 
     After `begin` it is in Continuous-Time Mode. There `evaluation` sets time, states and continuous inputs and gets
@@ -45,24 +40,12 @@ class ExchangeInstance(SavedExchange):
     """
 
     def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
-        super().__init__(block, model_exchange=True, make_calls=make_calls)
-        assert self.description.exchange is not None
-        self.about: ExchangeInfo = self.description.exchange
-        self._ports = dict(block.input_variables)
-        self._places = Layout.of({port: v.shape for port, v in self._ports.items()}).slices
-        self._wired = {port: self._ports[port] for port in wired}
-        self._smooth = {port: v for port, v in self._wired.items() if is_smooth(v)}
+        super().__init__(block, wired, make_calls=make_calls)
         n = self.about.state_count
-        order = self.description.state_order
-        self._order = np.array(order if len(order) == n else range(n), dtype=int)
-        self._time = self.fmi.variable(ctypes.c_double)
-        self._x, self._dx, self._kept = (self._allocate(n) for _ in range(3))
-        self._indicators = self._allocate(len(self.about.indicators))
+        self._kept = self._allocate(n)
         self.next_time, self.nominals, self._has_odd_nominals = math.inf, np.ones(n), False
-        self._evaluations: dict[Any, Evaluation] = {}
         self.ends_run = False
         """Whether the FMU has asked to end the simulation (terminateSimulation)."""
-        self._guarded = self.fmi.in_process and not is_built_here(self.description.digest)
         self._texts = TextRecord(self.fmi, block.text_variables)
         self._events = self.fmi.event_calls()
         self._event: Evaluation | None = None
@@ -70,120 +53,18 @@ class ExchangeInstance(SavedExchange):
         self._bound: dict[tuple[str, int], BoundCalls] = {}
         self._all_inputs: Transfer | None = None
         self._final = True
-        self._discarded = ""
-        self._u = np.zeros(0)
-        """Values of all inputs at the last instant that was reached."""
+        width = sum(v.size for v in self._ports.values())
+        self._least, self._relative = np.full(width, math.inf), np.zeros(width)
+        """Least change of each input that is a jump, by itself and relative to the input; infinite without a wire."""
+        for port, variable in self._wired.items():
+            smooth = _SAME if port in self._smooth else 0.0
+            self._least[self._places[port]] = smooth * variable.nominals.ravel()
+            self._relative[self._places[port]] = smooth
 
     @property
     def t(self) -> float:
         """Time that was set last, in s."""
         return self._time.value if self._running else self._began
-
-    def _allocate(self, n: int) -> np.ndarray:
-        return self.fmi.allocate(n, ctypes.c_double)
-
-    # ---- evaluations ----
-
-    def evaluation(
-        self, ports: Sequence[str], *, rates: bool = False, indicators: bool = False
-    ) -> Callable[[float, np.ndarray, np.ndarray], np.ndarray]:
-        """Return the call ``(t, x, u) -> values`` that gets outputs, then derivatives, then indicators.
-
-        The result is one array, written anew by each call: NaN where the FMU can't compute it there (discard).
-
-        Parameters
-        ----------
-        ports : sequence of str
-            Output ports.
-        rates, indicators : bool
-            Whether the derivatives of the states, and the event indicators, are wanted.
-        """
-        key = (tuple(ports), rates, indicators)
-        if key not in self._evaluations:
-            self._evaluations[key] = self._bind(*key)
-        found = self._evaluations[key]
-
-        def evaluate(t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-            return self._run(found, t, x, u)
-
-        return evaluate
-
-    def _bind(
-        self, ports: tuple[str, ...], rates: bool, indicators: bool, then: tuple[tuple[Call, str], ...] = ()
-    ) -> Evaluation:
-        outputs = {port: self.block.output_variables[port] for port in ports}
-        every = indicators or bool(then)
-        used = {port: v for port, v in self._smooth.items() if every or self._is_used(port, outputs, rates)}
-        index = [np.arange(self._places[p].start, self._places[p].stop) for p in used]
-        inputs = self._allocate(sum(v.size for v in used.values()))
-        got = self._allocate(sum(v.size for v in outputs.values()))
-        return Evaluation(
-            self.fmi,
-            time=self._time,
-            states=Vector("set_states", self._x),
-            inputs=Transfer(self.fmi, "Set", used, inputs),
-            index=np.concatenate([np.zeros(0, dtype=int), *index]),
-            outputs=Transfer(self.fmi, "Get", outputs, got),
-            derivatives=Vector("derivatives", self._dx),
-            rates=rates,
-            indicators=Vector("indicators", self._indicators) if indicators else None,
-            then=then,
-        )
-
-    def _is_used(self, port: str, outputs: dict[str, FmuVariable], rates: bool) -> bool:
-        """Whether an input has to be set: what is wanted may depend on it."""
-        unknown = [*outputs.values()]
-        if rates:
-            unknown += [self.description.find(name) for name in self.description.states.values()]
-            if not self.description.states:
-                return True
-        return any(self.about.pattern(of, self._ports[port]).any() for of in unknown)
-
-    def _run(self, made: Evaluation, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
-        self._x[:] = x[self._order]
-        try:
-            with self.host if self._guarded else _NOTHING:
-                status, action = made.run(t, u, running=self._running)
-        except UnfitError as error:
-            raise self._unfit(error, t) from None
-        if status:
-            if status != DISCARD:
-                raise self._error(action, status, t)
-            self._discarded = f"{action} at t = {t:.9g} s{self._quote_messages().rstrip('.')}"
-            made.result[:] = math.nan
-        elif made.rates is not None:
-            made.result[made.rates_at][self._order] = self._dx
-        return made.result
-
-    @property
-    def discarded(self) -> str:
-        """The last evaluation that the FMU could not compute; empty if there is none."""
-        return self._discarded
-
-    def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
-        """Return the derivative of an `evaluation` by (x, u); None if the FMU computes no directional derivatives."""
-        about = self.description
-        if not self.about.has_derivatives or (self._x.size and not about.states):
-            return None
-        self.evaluation(ports, rates=rates)(t, x, u)
-        outputs = [self.block.output_variables[port] for port in ports]
-        unknown = [*outputs, *(about.find(name) for name in about.states.values() if rates)]
-        smooth = [v for v in unknown if v.type == "Float64"]
-        rows = np.concatenate([np.zeros(0, dtype=bool), *(np.full(v.size, v.type == "Float64") for v in unknown)])
-        J = np.zeros((rows.size, x.size + u.size))
-        column = 0
-        known = [(about.find(name), True) for name in about.states]
-        known += [(v, port in self._smooth and v.type == "Float64") for port, v in self._ports.items()]
-        references = [r for v in smooth for r in v.references]
-        count = sum(v.size for v in smooth)
-        for variable, moves in known:
-            for k in range(variable.size):
-                if moves and count:
-                    refs, seed = seeds(variable, k)
-                    purpose = f"the directional derivative by {variable.name}"
-                    J[rows, column] = self.call(purpose, self.fmi.directional_derivative, references, refs, seed, count)
-                column += 1
-        return J
 
     # ---- the start ----
 
@@ -264,14 +145,8 @@ class ExchangeInstance(SavedExchange):
 
     def has_jumped(self, u: np.ndarray) -> bool:
         """Whether an input has jumped since the last instant that was reached."""
-        for port, variable in self._wired.items():
-            now, before = u[self._places[port]], self._u[self._places[port]]
-            if port not in self._smooth:
-                if not np.array_equal(now, before):
-                    return True
-            elif np.any(np.abs(now - before) > _SAME * np.maximum(np.abs(now), variable.nominals.ravel())):
-                return True
-        return False
+        change = np.abs(u - self._u)
+        return bool((change > np.maximum(self._least, self._relative * np.abs(u))).any())
 
     def handle_event(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Go through Event Mode at an instant, and return the continuous states after it."""
@@ -359,34 +234,5 @@ class ExchangeInstance(SavedExchange):
             self.ends_run = True
             self.add_note(f"it asks to end the simulation at t = {t:.9g} s, {place} (terminateSimulation)")
 
-    # ---- failures ----
-
-    def _error(self, action: str, status: int, t: float) -> FmuRuntimeError:
-        self.failed, self.fatal = status >= ERROR, status >= FATAL
-        u = ", ".join(f"{port} = {self._u[self._places[port]].tolist()}" for port in self._wired)
-        return FmuRuntimeError(
-            f"{action} failed with {self.fmi.status_name(status)} at t = {t:.9g} s{self._quote_messages()} Its states "
-            f"were {self._x.tolist()}, its inputs at the last step {u or 'none'}. Look at the last samples of "
-            "error.run, or check its inputs and start values.",
-            block=self.block.label,
-            t=t,
-        )
-
-    def _unfit(self, error: UnfitError, t: float) -> FmuRuntimeError:
-        advice = "Convert the signal before this input, with Quantizer, say, or leave this output out, by ports=."
-        return FmuRuntimeError(f"{error.reason}. {advice}", block=self.block.label, port=error.port, t=t)
-
 
 _READING = {"get_states": "reading the continuous states", "nominals": "reading the nominal values of the states"}
-
-
-def is_smooth(variable: FmuVariable) -> bool:
-    """Whether an input may be set in Continuous-Time Mode: a real number that is not discrete."""
-    return variable.type in ("Float64", "Float32") and variable.variability == "continuous"
-
-
-def seeds(variable: FmuVariable, k: int) -> tuple[list[int], list[float]]:
-    """Return value references and seeds that move one element of a variable."""
-    if len(variable.references) == variable.size:
-        return [variable.references[k]], [1.0]
-    return list(variable.references), np.eye(variable.size)[k].tolist()

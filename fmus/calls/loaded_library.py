@@ -19,8 +19,7 @@ from .fmi2 import Fmi2Calls
 from .fmi3 import Fmi3Calls
 from .fmi_calls import FATAL, FmiCalls
 from .fmu_block import FmuBlock
-from .message_log import MessageLog, clean_text
-from .process_ends import describe_end
+from .message_log import MessageLog, clean_text, describe_end
 from .shared_steps import SharedReading
 from .step_options import choose_modes
 from .texts import is_readable, list_limits, read_text, write_text

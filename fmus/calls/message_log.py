@@ -1,10 +1,11 @@
-"""Log of an instance: messages of the FMU and notes on it, cleaned and within bounds."""
+"""Log of an instance: messages of the FMU and notes on it, cleaned and within bounds; last words on its end."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
 
+from ...blocks.core import FmuEnd, FmuProcessError
 from .fmi_calls import STATUS
 
 _MOST = 1000
@@ -12,6 +13,18 @@ _MOST = 1000
 _LONGEST = 2000
 """Most characters of a message that are kept."""
 _QUOTED = 5
+
+_RERUN = "Samples until then are in error.run. The FMU can be run again; other FMUs and this process go on."
+_ADVICE = {
+    FmuEnd.CRASH: f"{_RERUN} Report it to its makers.",
+    FmuEnd.EXIT: f"{_RERUN} Report it to its makers: a library must not end its process.",
+    FmuEnd.TIMEOUT: "It may wait for a licence or another program, or hang. Give it more time by "
+    f"isolate=Isolation(step_time=…, start_time=…), or take a smaller step. {_RERUN}",
+    FmuEnd.MEMORY: f"Give it more by isolate=Isolation(memory=…), if it needs that much. {_RERUN}",
+    FmuEnd.OUTPUT: f"Let it log less, or give it more by isolate=Isolation(output=…). {_RERUN}",
+    FmuEnd.LOST: _RERUN,
+}
+"""Next step after the end of an FMU's process."""
 
 
 class MessageLog:
@@ -66,3 +79,8 @@ def clean_text(text: str) -> str:
         return text
     line = " / ".join(part.strip() for part in text.splitlines() if part.strip()).replace("\t", " ")
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)
+
+
+def describe_end(error: FmuProcessError, said: str) -> str:
+    """Return the text that follows the cause: messages of the FMU (``said``), lines that it printed, the next step."""
+    return f"{said.removeprefix('.')}{clean_text(error.printed)} {_ADVICE[error.cause]}"

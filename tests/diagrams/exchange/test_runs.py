@@ -152,3 +152,40 @@ def test_an_evaluation_that_needs_nothing_of_the_fmu_leaves_it_out(files, fmi):
     found = asked(0.5, flat.x0, [], flat.p)[0]
     np.testing.assert_allclose(found, [2.0 * np.sin(np.pi * 0.5)])
     assert [stage.names[0] for stage in flat.jump.opaque][-1] == "jump"
+
+
+def test_a_spring_that_the_position_pulls_on_acts_within_the_step(files, fmi):
+    """The force needs the FMU's output, and the FMU's rates the force: both at every trial of the solver."""
+    m, stiffness = mass_spring_damper.nominal, 30.0
+    plant = Fmu(files[mass_spring_damper, fmi], interface="model_exchange", name="plant")
+    loop = plant(force=Gain(gain=-stiffness, name="spring")(plant.position))
+    run = Diagram("pulled", loop).simulate(2.0, step=0.1, rtol=1e-9, atol=1e-12, progress=False)
+
+    decay = m.damping / (2.0 * m.mass)
+    omega = np.sqrt((m.stiffness + stiffness) / m.mass - decay**2)
+    exact = 0.1 * np.exp(-decay * run.t) * (np.cos(omega * run.t) + decay / omega * np.sin(omega * run.t))
+    np.testing.assert_allclose(run["plant.position"], exact, atol=1e-8)
+
+
+def test_ticks_ask_neither_the_description_nor_the_sources_anew(files, monkeypatch):
+    """Inputs that a sampled subsystem makes jump at every tick: an event each time, and nothing is looked up for it."""
+    from loopwright.diagrams.simulation import continuous, solver_setup
+
+    asked = []
+
+    def count(module, name):
+        plain = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *arguments, **more: asked.append(name) or plain(*arguments, **more))
+
+    count(continuous, "absolute_tolerances")
+    count(solver_setup, "next_instant")
+    plant = Fmu(files[mass_spring_damper, 3], interface="model_exchange", name="plant")
+
+    @subsystem(sample_time=0.01)
+    def controller(y):
+        return Gain(gain=-5.0, name="k")(y)
+
+    loop = plant(force=controller(plant.position) + Sine(frequency=0.5, name="wave"))
+    Diagram("sampled", loop).simulate(1.0, progress=False)
+    assert asked.count("absolute_tolerances") <= 2
+    assert asked.count("next_instant") <= 2

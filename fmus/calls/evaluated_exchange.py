@@ -1,0 +1,274 @@
+"""Instance of an FMU in model exchange that is evaluated at any time, states and inputs."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import FmuRuntimeError, Layout
+from ..archive import ExchangeInfo, FmuVariable
+from ..platform import is_built_here
+from .bound_calls import DISCARD, ERROR, FATAL, Call
+from .evaluation import DirectEvaluation, Evaluation, Vector
+from .exchange_states import SavedExchange
+from .fmi_calls import WARNING
+from .fmu_block import FmuBlock
+from .loaded_library import MakeCalls
+from .transfer import Transfer, UnfitError
+
+_NOTHING = nullcontext()
+
+
+class EvaluatedExchange(SavedExchange):
+    """Instance in model exchange that can be evaluated at any time, states and inputs.
+
+    Attributes
+    ----------
+    about : ExchangeInfo
+        Model exchange as the FMU's description states it.
+    """
+
+    def __init__(self, block: FmuBlock, wired: Sequence[str], *, make_calls: MakeCalls | None = None):
+        super().__init__(block, model_exchange=True, make_calls=make_calls)
+        assert self.description.exchange is not None
+        self.about: ExchangeInfo = self.description.exchange
+        self._ports = dict(block.input_variables)
+        self._places = Layout.of({port: v.shape for port, v in self._ports.items()}).slices
+        self._wired = {port: self._ports[port] for port in wired}
+        self._smooth = {port: v for port, v in self._wired.items() if is_smooth(v)}
+        n = self.about.state_count
+        order = self.description.state_order
+        self._order = np.array(order if len(order) == n else range(n), dtype=int)
+        self._time = self.fmi.variable(ctypes.c_double)
+        self._x, self._dx = (self._allocate(n) for _ in range(2))
+        self._indicators = self._allocate(len(self.about.indicators))
+        self._evaluations: dict[Any, Evaluation] = {}
+        self._is_own = self.fmi.in_process and is_built_here(self.description.digest)
+        self._guarded = self.fmi.in_process and not self._is_own
+        self._is_placed = False
+        """Whether a bound evaluation has just set time and states."""
+        self._discarded = ""
+        self._u = np.zeros(0)
+        """Values of all inputs at the last instant that was reached."""
+
+    def _allocate(self, n: int) -> np.ndarray:
+        return self.fmi.allocate(n, ctypes.c_double)
+
+    def evaluation(
+        self, ports: Sequence[str], *, rates: bool = False, indicators: bool = False
+    ) -> Callable[[float, np.ndarray, np.ndarray], np.ndarray]:
+        """Return the call ``(t, x, u) -> values`` that gets outputs, then derivatives, then indicators.
+
+        The result is one array, written anew by each call: NaN where the FMU can't compute it there (discard).
+
+        Parameters
+        ----------
+        ports : sequence of str
+            Output ports.
+        rates, indicators : bool
+            Whether the derivatives of the states, and the event indicators, are wanted.
+        """
+        key = (tuple(ports), rates, indicators)
+        if key not in self._evaluations:
+            self._evaluations[key] = self._bind(*key)
+        found = self._evaluations[key]
+
+        def evaluate(t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+            return self._run(found, t, x, u)
+
+        return evaluate
+
+    def _bind(
+        self, ports: tuple[str, ...], rates: bool, indicators: bool, then: tuple[tuple[Call, str], ...] = ()
+    ) -> Evaluation:
+        outputs = {port: self.block.output_variables[port] for port in ports}
+        every = indicators or bool(then)
+        used = {port: v for port, v in self._smooth.items() if self._is_needed(port, ports, rates, every)}
+        index = [np.arange(self._places[p].start, self._places[p].stop) for p in used]
+        inputs = self._allocate(sum(v.size for v in used.values()))
+        got = self._allocate(sum(v.size for v in outputs.values()))
+        return Evaluation(
+            self.fmi,
+            time=self._time,
+            states=Vector("set_states", self._x),
+            inputs=Transfer(self.fmi, "Set", used, inputs),
+            index=np.concatenate([np.zeros(0, dtype=int), *index]),
+            outputs=Transfer(self.fmi, "Get", outputs, got),
+            derivatives=Vector("derivatives", self._dx),
+            rates=rates,
+            indicators=Vector("indicators", self._indicators) if indicators else None,
+            then=then,
+            lazy=not self._is_own,
+        )
+
+    def bound_evaluation(
+        self,
+        ports: Sequence[str],
+        *,
+        rates: bool,
+        indicators: bool,
+        t: np.ndarray,
+        x: np.ndarray,
+        u: np.ndarray,
+        into: np.ndarray,
+        again: bool,
+    ) -> Callable[[], None]:
+        """Return the call that writes an `evaluation` at what stands in t, x and u into another vector.
+
+        An FMU that Loopwright has built reads and writes these vectors itself. With ``again`` another such call always
+        comes right before it, at the same t and x, which need not be set anew.
+        """
+        plain = self.evaluation(ports, rates=rates, indicators=indicators)
+
+        def copy() -> None:
+            into[:] = plain(t[0], x, u)
+
+        made = self._bind_direct(tuple(ports), rates, indicators, t, x, u, into, again=False)
+        if made is None:
+            return copy
+        short = self._bind_direct(tuple(ports), rates, indicators, t, x, u, into, again=True) if again else None
+
+        def call() -> None:
+            if not self._running:
+                copy()
+                return
+            direct = made if short is None or not self._is_placed else short
+            status, place = direct.run()
+            self._is_placed = not status
+            if status:
+                self._x[:] = x
+                self._judge(status, direct.actions[place], t[0], into)
+
+        return call
+
+    def _bind_direct(
+        self,
+        ports: tuple[str, ...],
+        rates: bool,
+        indicators: bool,
+        t: np.ndarray,
+        x: np.ndarray,
+        u: np.ndarray,
+        into: np.ndarray,
+        *,
+        again: bool,
+    ) -> DirectEvaluation | None:
+        """Return an evaluation on vectors of the caller's; None where values have to be copied or converted."""
+        outputs = [self.block.output_variables[port] for port in ports]
+        used = [port for port in self._places if port in self._smooth]
+        inputs = [port for port in used if self._is_needed(port, ports, rates, indicators)]
+        variables = [*outputs, *(self._ports[port] for port in inputs)]
+        places = [self._places[port] for port in inputs]
+        adjoining = all(a.stop == b.start for a, b in pairwise(places))
+        sorted_states = np.array_equal(self._order, np.arange(self._order.size))
+        if not (self._is_own and sorted_states and adjoining and all(v.type == "Float64" for v in variables)):
+            return None
+        return DirectEvaluation(
+            self.fmi,
+            time=self._time,
+            t=t,
+            x=x,
+            u=u[places[0].start : places[-1].stop] if places else u[:0],
+            into=into,
+            inputs=[r for port in inputs for r in self._ports[port].references],
+            outputs=[r for v in outputs for r in v.references],
+            rates=rates,
+            indicators=len(self.about.indicators) if indicators else 0,
+            again=again,
+        )
+
+    def _is_needed(self, port: str, ports: Sequence[str], rates: bool, every: bool) -> bool:
+        """Whether an input has to be set: outputs and rates that are wanted may depend on it; or every input has."""
+        if every:
+            return True
+        unknown = [self.block.output_variables[name] for name in ports]
+        if rates:
+            unknown += [self.description.find(name) for name in self.description.states.values()]
+            if not self.description.states:
+                return True
+        return any(self.about.pattern(of, self._ports[port]).any() for of in unknown)
+
+    def _run(self, made: Evaluation, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        self._x[:] = x[self._order]
+        try:
+            with self.host if self._guarded else _NOTHING:
+                status, action = made.run(t, u, running=self._running)
+        except UnfitError as error:
+            raise self._unfit(error, t) from None
+        if status:
+            self._judge(status, action, t, made.result)
+        elif made.rates is not None:
+            made.result[made.rates_at][self._order] = self._dx
+        return made.result
+
+    def _judge(self, status: int, action: str, t: float, into: np.ndarray) -> None:
+        """Write NaN where the FMU can't compute a result (discard), and raise the error of a status that is worse."""
+        if status <= WARNING:
+            return
+        if status != DISCARD:
+            raise self._error(action, status, t)
+        self._discarded = f"{action} at t = {t:.9g} s{self._quote_messages().rstrip('.')}"
+        into[:] = math.nan
+
+    @property
+    def discarded(self) -> str:
+        """The last evaluation that the FMU could not compute; empty if there is none."""
+        return self._discarded
+
+    def slopes(self, ports: Sequence[str], *, rates: bool, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray | None:
+        """Return the derivative of an `evaluation` by (x, u); None if the FMU computes no directional derivatives."""
+        about = self.description
+        if not self.about.has_derivatives or (self._x.size and not about.states):
+            return None
+        self.evaluation(ports, rates=rates)(t, x, u)
+        outputs = [self.block.output_variables[port] for port in ports]
+        unknown = [*outputs, *(about.find(name) for name in about.states.values() if rates)]
+        smooth = [v for v in unknown if v.type == "Float64"]
+        rows = np.concatenate([np.zeros(0, dtype=bool), *(np.full(v.size, v.type == "Float64") for v in unknown)])
+        J = np.zeros((rows.size, x.size + u.size))
+        column = 0
+        known = [(about.find(name), True) for name in about.states]
+        known += [(v, port in self._smooth and v.type == "Float64") for port, v in self._ports.items()]
+        references = [r for v in smooth for r in v.references]
+        count = sum(v.size for v in smooth)
+        for variable, moves in known:
+            for k in range(variable.size):
+                if moves and count:
+                    refs, seed = seeds(variable, k)
+                    purpose = f"the directional derivative by {variable.name}"
+                    J[rows, column] = self.call(purpose, self.fmi.directional_derivative, references, refs, seed, count)
+                column += 1
+        return J
+
+    def _error(self, action: str, status: int, t: float) -> FmuRuntimeError:
+        self.failed, self.fatal = status >= ERROR, status >= FATAL
+        u = ", ".join(f"{port} = {self._u[self._places[port]].tolist()}" for port in self._wired)
+        return FmuRuntimeError(
+            f"{action} failed with {self.fmi.status_name(status)} at t = {t:.9g} s{self._quote_messages()} Its states "
+            f"were {self._x.tolist()}, its inputs at the last step {u or 'none'}. Look at the last samples of "
+            "error.run, or check its inputs and start values.",
+            block=self.block.label,
+            t=t,
+        )
+
+    def _unfit(self, error: UnfitError, t: float) -> FmuRuntimeError:
+        advice = "Convert the signal before this input, with Quantizer, say, or leave this output out, by ports=."
+        return FmuRuntimeError(f"{error.reason}. {advice}", block=self.block.label, port=error.port, t=t)
+
+
+def is_smooth(variable: FmuVariable) -> bool:
+    """Whether an input may be set in Continuous-Time Mode: a real number that is not discrete."""
+    return variable.type in ("Float64", "Float32") and variable.variability == "continuous"
+
+
+def seeds(variable: FmuVariable, k: int) -> tuple[list[int], list[float]]:
+    """Return value references and seeds that move one element of a variable."""
+    if len(variable.references) == variable.size:
+        return [variable.references[k]], [1.0]
+    return list(variable.references), np.eye(variable.size)[k].tolist()
