@@ -23,7 +23,7 @@ import numpy as np
 from ...blocks.core import FmuError, Layout
 from ...fmus.calls import LoadedFmu
 from ...fmus.isolation import open_fmu
-from ...fmus.running import Derivation, DerivativeMethod
+from ...fmus.running import Derivation, DerivativeMethod, RestoredPoint
 
 if TYPE_CHECKING:
     from ...fmus.running import Fmu
@@ -113,7 +113,7 @@ def identify_step(
     error = float(np.max(np.abs(model - G), initial=0.0) + np.max(noise, initial=0.0))
     states, derivation = (
         tuple(f"mode[{i + 1}]" for i in range(len(A))),
-        Derivation(DerivativeMethod.IDENTIFIED, order=len(A)),
+        Derivation(DerivativeMethod.IDENTIFIED, order=len(A), restarted=runner.rest.lied),
     )
     return IdentifiedStep(A, B, C, y0, states, sigma, derivation, error)
 
@@ -154,13 +154,13 @@ class _Runner:
         self.outputs = [v.name for v in block.output_variables.values()]
         self.instance = open_fmu(LoadedFmu, block)
         self._steps, self._fresh = 0, True
-        self._saved: Any = None
+        names = [*dict.fromkeys([*self.inputs, *self.outputs, *self.about.states])]
+        self.rest = RestoredPoint(self.instance, names, self._start_at_rest)
         self._begin()
 
     def close(self) -> None:
         """Free the instance."""
-        if self._saved is not None:
-            self.instance.free_state(self._saved)
+        self.rest.free()
         self.instance.close()
 
     def _begin(self) -> None:
@@ -173,7 +173,7 @@ class _Runner:
 
     def step(self) -> np.ndarray:
         """Step once, and return the outputs."""
-        t, final = self.t0 + self._k * self.h, not self.about.can_save
+        t, final = self.t0 + self._k * self.h, not self.rest.is_restored
         if self.instance.call(f"a step by {self.h:g} s", self.instance.fmi.do_step, t, self.h, final):
             raise FmuError(
                 f"found a step of {self.h:g} s from t = {t:.9g} s that it ends early, or in which it asks to end the "
@@ -198,19 +198,18 @@ class _Runner:
             still = still + 1 if np.all(np.abs(y - last) <= STILL * (1.0 + np.abs(y))) else 0
             last = y
         self._steps = self._k
-        if self.about.can_save:
-            self._saved = self.instance.call("saving its state", self.instance.fmi.save_state)
+        self.rest.save()
         return last
+
+    def _start_at_rest(self) -> None:
+        self._begin()
+        while self._k < self._steps:
+            self.step()
 
     def return_to_rest(self) -> None:
         """Go back to the rest that `settle` has found."""
-        if self._saved is not None:
-            self.instance.call("restoring its state", self.instance.fmi.set_state, self._saved)
-            self._k = self._steps
-        else:
-            self._begin()
-            while self._k < self._steps:
-                self.step()
+        self.rest.go_back()
+        self._k = self._steps
 
     def measure_response(self, name: str, change: np.ndarray, samples: int) -> np.ndarray:
         """Return the outputs after each step, with one input changed during the first step."""

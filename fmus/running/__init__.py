@@ -4,11 +4,13 @@ from .derivation import Derivation, DerivativeMethod
 from .exchange import find_exchange_slopes
 from .fmu import Fmu
 from .linearization import FmuLinearization
+from .restored_point import RestoredPoint
 
 __all__ = [
     "Derivation",
     "DerivativeMethod",
     "Fmu",
     "FmuLinearization",
+    "RestoredPoint",
     "find_exchange_slopes",
 ]

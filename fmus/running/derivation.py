@@ -37,6 +37,8 @@ class Derivation:
         Whether a step was computed from the equations, by a matrix exponential with held inputs.
     order : int, optional
         Number of states of an identified model.
+    restarted : bool
+        Whether the FMU was started anew for each difference, as it does not restore the states that it saves.
 
     Examples
     --------
@@ -48,6 +50,7 @@ class Derivation:
     interface: str = ""
     held: bool = False
     order: int | None = None
+    restarted: bool = False
 
     @property
     def is_exact(self) -> bool:
@@ -62,4 +65,6 @@ class Derivation:
             text += f", order {self.order}"
         if self.held:
             text += ", held over a step by a matrix exponential"
+        if self.restarted:
+            text += ", each from a new start, as the FMU does not restore its state though it says so"
         return text

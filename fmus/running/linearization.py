@@ -15,6 +15,7 @@ from ..calls import FmuBlock, LoadedFmu
 from ..isolation import open_fmu
 from .derivation import Derivation, DerivativeMethod
 from .differences import Column, differentiate
+from .restored_point import RestoredPoint
 
 EQUATIONS, STEP = 1e-5, 1e-4
 """Relative distances of differences: of equations, and of steps, which an adaptive solver makes less smooth."""
@@ -341,20 +342,26 @@ def _linearize_step(point: _OperatingPoint, instance: LoadedFmu, h: float, relat
     x, u = instance.values(point.states), instance.values(point.inputs)
     point.check(x)
     at = about.layout(known).split(np.concatenate([x, u]))
-    saved = instance.call("saving its state", instance.fmi.save_state) if about.can_save else None
+
+    def start_anew(set_before: Mapping[str, Any]) -> None:
+        instance.reset()
+        instance.initialize(None, start_time=point.t, values={**point.given, **at, **set_before})
+        instance.begin()
+
+    back = RestoredPoint(instance, [*known, *point.outputs], lambda: start_anew({}))
+    back.save()
 
     def step_from_point(
         set_before: Mapping[str, Any], set_after: Mapping[str, Any], *, first: bool = False
     ) -> np.ndarray:
         """Take a step from the operating point; states are set by the initialization, inputs in Step Mode."""
-        if not first and saved is not None and not set_before:
-            instance.call("restoring its state", instance.fmi.set_state, saved)
+        if set_before:
+            back.free()
+            start_anew(set_before)
         elif not first:
-            instance.reset()
-            instance.initialize(None, start_time=point.t, values={**point.given, **at, **set_before})
-            instance.begin()
+            back.go_back()
         instance.set_values(set_after)
-        if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, saved is None):
+        if instance.call(f"a step by {h:g} s", instance.fmi.do_step, point.t, h, not back.is_restored):
             raise FmuError(
                 f"it ends its step from t = {point.t:.9g} s by {h:g} s early, or asks to end the simulation in it "
                 "(terminateSimulation), so the step has no derivative. Take a smaller h, or another operating point.",
@@ -374,7 +381,6 @@ def _linearize_step(point: _OperatingPoint, instance: LoadedFmu, h: float, relat
 
         J, uncertainty = map(point.widen, differentiate(column, values, evaluate))
     finally:
-        if saved is not None:
-            instance.free_state(saved)
-    derivation = Derivation(DerivativeMethod.STEP_DIFFERENCES)
+        back.free()
+    derivation = Derivation(DerivativeMethod.STEP_DIFFERENCES, restarted=back.lied)
     return point.model(J, x, u, values, h=h, derivation=derivation, uncertainty=uncertainty)

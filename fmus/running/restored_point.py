@@ -1,0 +1,83 @@
+"""A point of an instance to which differences go back again and again, checked to be reached."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..calls import LoadedFmu
+
+_ROUNDING = 1e-12
+"""Largest difference of a value that was restored, relative to its size: far below the distances of differences."""
+
+
+class RestoredPoint:
+    """A state that is saved and restored, as long as that has the values of the point again.
+
+    Values are compared until each has moved and come back once. They are read after a restore at the point itself,
+    too, so that an FMU which computes outputs anew then is compared with itself.
+
+    Parameters
+    ----------
+    instance : LoadedFmu
+        The instance.
+    names : sequence of str
+        Variables to compare, by the FMU's names.
+    start : callable
+        Brings a fresh instance to the point, where a state can't be restored, or the FMU does not restore it.
+
+    Attributes
+    ----------
+    is_restored : bool
+        Whether states are restored; else every return begins anew.
+    lied : bool
+        Whether the FMU has said that it restored a state, and had not.
+    """
+
+    def __init__(self, instance: LoadedFmu, names: Sequence[str], start: Callable[[], None]):
+        self._instance, self._names, self._start = instance, [*names], start
+        self.is_restored, self.lied = instance.description.can_save, False
+        self._handle: Any = None
+        about = [instance.description.find(name) for name in names]
+        self._nominals = np.concatenate([np.zeros(0), *(np.abs(np.ravel(v.nominals)) for v in about)])
+        self._open = np.ones(self._nominals.size, dtype=bool)
+        self._begun = np.zeros(0)
+
+    def save(self) -> None:
+        """Take the instance's present state as the point."""
+        instance = self._instance
+        self.free()
+        if self.is_restored:
+            self._handle = instance.call("saving its state", instance.fmi.save_state)
+            instance.call("restoring its state", instance.fmi.set_state, self._handle)
+            self._begun = instance.values(self._names)
+
+    def go_back(self) -> None:
+        """Bring the instance to the point."""
+        if self._handle is not None and self._restore():
+            return
+        self.free()
+        self._start()
+        self.save()
+
+    def free(self) -> None:
+        """Free the saved state; do so before the instance is made anew, to which it does not belong."""
+        if self._handle is not None:
+            self._instance.free_state(self._handle)
+            self._handle = None
+
+    def _restore(self) -> bool:
+        """Restore the state; return whether the values are those of the point."""
+        instance, compares = self._instance, bool(self._open.any())
+        moved = instance.values(self._names) if compares else self._begun
+        instance.call("restoring its state", instance.fmi.set_state, self._handle)
+        if not compares:
+            return True
+        allowed, found = _ROUNDING * (self._nominals + np.abs(self._begun)), instance.values(self._names)
+        if np.any(self._open & np.isfinite(self._begun) & ~(np.abs(found - self._begun) <= allowed)):
+            self.is_restored, self.lied = False, True
+            return False
+        self._open &= ~(np.abs(moved - self._begun) > allowed)
+        return True
