@@ -87,6 +87,7 @@ static int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
             if (evaluate(&h->l, h->between) != DONE) return ask(h, ASK_BETWEEN);
         }
         if (t == edge || h->found) h->begun = 0;
+        if (!h->begun && (happened || t < end)) m->has_slope = 0;
         if (g->i < s->count && !s->lands[g->i] && s->times[g->i + 1] == t && t < end) {
             g->out->rows = record(&h->l, t, g->rows, g->out->rows);
             g->i++;

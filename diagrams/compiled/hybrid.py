@@ -14,6 +14,7 @@ from ..flat import NONE, FlatDiagram, TickPattern
 from .bound import BoundFunction, address
 from .hybrid_code import Compiled, HybridCode, hybrid_master
 from .loop import CompiledLoop, LoopStructure, OutcomeStructure, TickStructure
+from .radau import radau_numbers
 from .watch import Fired, Watch, WatchStructure
 
 FIXED = ("euler", "heun", "rk4")
@@ -62,7 +63,7 @@ class _Hybrid(ctypes.Structure):
         ("l", LoopStructure), ("p", _Problem), ("w", WatchStructure), ("methods", _AT * 2),
         *_fields(_INT, "active automatic accepts between budget inside begun stepped"), *_fields(_REAL, "t to"),
         *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
-        *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT),
+        *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT), ("looked_at", _REAL),
     ]  # fmt: skip
 
 
@@ -253,6 +254,7 @@ class CompiledHybrid:
                 made.E, made.P = (self._own(np.array(a, dtype=float)) for a in (of_scipy.E, of_scipy.P))
         elif name == "Radau":
             made.order, made.exponent = 3, 3
+            made.A = self._own(radau_numbers())
             made.tolerance = max(10 * np.finfo(float).eps / options.rtol, min(0.03, options.rtol**0.5))
             made.J, made.lu, made.lu_complex = (self._own(np.zeros(k * n * n)) for k in (1, 1, 2))
             made.Z, made.W, made.F = (self._own(np.zeros(3 * n)) for _ in range(3))
@@ -283,6 +285,21 @@ class CompiledHybrid:
         """Let the methods take steps of some lengths in s next; None: they choose their first step."""
         for method, step in zip(self.methods, steps, strict=True):
             method.planned = np.nan if step is None else step
+
+    @property
+    def active(self) -> int:
+        """Place of the method that goes on."""
+        return int(self._hybrid.active)
+
+    @active.setter
+    def active(self, place: int) -> None:
+        if place != self._hybrid.active:
+            self._hybrid.active, self._hybrid.hits, self._hybrid.misses, self._hybrid.easy = place, 0, 0, 0
+
+    def looked_at(self) -> float:
+        """Return the step in s at which the problem has seemed stiff, or no longer; going on is possible then."""
+        self._hybrid.switched = 0
+        return float(self._hybrid.looked_at)
 
     @property
     def planned(self) -> list[float | None]:

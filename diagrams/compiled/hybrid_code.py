@@ -104,6 +104,7 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
         check_size(function)
         generator.add(function)
     library = load_compiled(make_visible(generator.dump()))
+    hybrid_master()  # if it can't be compiled, the run is interpreted
     straight = {c: StraightTick(ticks[c], address_of(library, f"tick{i}")) for i, c in enumerate(kinds)}
     between = {name: Compiled(function, address_of(library, name)) for name, function in others.items()}
     made = HybridCode(TickCode(straight, exact=False, library=library), between)

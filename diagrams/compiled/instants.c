@@ -32,6 +32,7 @@ typedef struct hybrid {
     const int64_t *taken, *taken_first; /* states that a tick of each kind renews */
     double *taken_states;
     int64_t switched;   /* 1: stiff, it seems; 2: no longer */
+    double looked_at;   /* step in s at which it seemed so */
 } hybrid;
 
 typedef struct {
@@ -75,9 +76,44 @@ static int64_t accept(hybrid *h) {
 static bool has_room(const hybrid *h, const progress *g) { return h->l.skip || g->out->rows < g->s->room; }
 
 
+/* Look for signs that stability bounds an explicit method's steps, or that it would no longer; see AutoSolver. */
 static void look_for_stiffness(hybrid *h, const method *m) {
-    (void)h;
-    (void)m;
+    const int64_t n = m->n, last = m->stages - 1;
+    const double width = m->t - m->t_old;
+    if (m->sliver) return;
+    if (m->kind == RADAU) {
+        double norm = 0.0;
+        for (int64_t i = 0; i < n; i++) {
+            double sum = 0.0;
+            for (int64_t j = 0; j < n; j++)
+                sum += fabs(m->J[i * n + j]) * (m->atol[j] + m->rtol * fabs(m->x[j]));
+            norm = fmax(norm, sum / (m->atol[i] + m->rtol * fabs(m->x[i])));
+        }
+        h->easy = width * norm < 1.0 ? h->easy + 1 : 0;
+        if (h->easy >= 20) h->easy = 0, h->switched = 2, h->looked_at = width;
+        return;
+    }
+    if (!h->hits && m->steps % 10) return;
+    double change = 0.0, apart = 0.0;
+    for (int64_t i = 0; i < n; i++) {
+        double argument = 0.0;
+        for (int64_t j = 0; j < last; j++) argument += m->A[last * m->stages + j] * m->K[j * n + i];
+        const double weight = 1.0 / (m->atol[i] + m->rtol * fabs(m->x[i]));
+        const double a = (m->x[i] - (m->x_old[i] + width * argument)) * weight;
+        const double c = (m->K[(last + 1) * n + i] - m->K[last * n + i]) * weight;
+        apart += a * a;
+        change += c * c;
+    }
+    const double product = apart > 0.0 ? width * sqrt(change / apart) : 0.0;
+    if (!(product > (m->kind == EIGHT ? 6.1 : 3.25))) {
+        if (++h->misses >= 6) h->hits = h->misses = 0;
+        return;
+    }
+    h->misses = 0;
+    if (++h->hits < 15) return;
+    h->hits = 0;
+    h->switched = 1;
+    h->looked_at = width;
 }
 
 /* --- events that fire ---------------------------------------------------------------------------------------------- */

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from itertools import groupby
 
@@ -10,6 +11,9 @@ import numpy as np
 from ..compiled import RECENT, Fired, MethodOptions, Watch
 from ..events import Domains
 from .continuous import Continuous
+from .solver_setup import next_instant
+
+_MOST_EDGES = 100_000  # discontinuities of sources in a call
 
 
 def hand_over_domains(domains: Domains, watch: Watch) -> list[float]:
@@ -41,6 +45,35 @@ def methods_of(continuous: Continuous) -> list[MethodOptions]:
     atol = np.broadcast_to(np.asarray(solver.atol, dtype=float), (n,)).copy()
     names = [solver.name] if solver.name != "auto" else ["RK45" if solver.rtol >= 1e-8 else "DOP853", "Radau"]
     return [MethodOptions(name, solver.rtol, atol, solver.max_step) for name in names]
+
+
+def find_edges(
+    continuous: Continuous, t: float, end: float, *, limited: bool = True
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the discontinuities of sources from t on, up to the first one of each after the end; see `Span`.
+
+    Parameters
+    ----------
+    limited : bool
+        Return None if there are more than fit into a call.
+    """
+    found = set[float]()
+    for path, source in continuous.sources:
+        edge = t
+        while edge <= end and (edge := next_instant(path, source, edge)) < math.inf:
+            found.add(edge)
+            if limited and len(found) > _MOST_EDGES:
+                return None
+    if t in continuous.late:
+        found.add(t)
+    edges = np.array(sorted(found))
+    return edges, np.array([continuous.late.get(float(edge), float(edge)) for edge in edges])
+
+
+def active_method(continuous: Continuous, methods: Sequence[MethodOptions]) -> int:
+    """Return the place of the method that a run's solver goes on with."""
+    active = continuous.solver.save().get("active")
+    return next((i for i, m in enumerate(methods) if m.name == active), 0)
 
 
 def planned_steps(continuous: Continuous, methods: Sequence[MethodOptions]) -> list[float | None]:

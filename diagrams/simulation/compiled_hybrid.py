@@ -23,17 +23,25 @@ from ..compiled import (
     find_hybrid_obstacle,
 )
 from ..coupling import Plant, PlantSteps
-from ..flat import EVERY, FlatDiagram
+from ..flat import EVERY
 from ..results import Occurrence, Recorder
-from .compiled_hand_over import hand_over_domains, methods_of, planned_steps, restore_plans, take_back_domains
-from .compiled_ticks import CLOCKS, FIRST, LARGEST_CHUNK, WISHED, acts, is_exact, kinds_of
+from ..solvers import AutoSolver
+from .compiled_hand_over import (
+    active_method,
+    find_edges,
+    hand_over_domains,
+    methods_of,
+    planned_steps,
+    restore_plans,
+    take_back_domains,
+)
+from .compiled_ticks import FIRST, LARGEST_CHUNK, WISHED, acts, find_obstacle_at_ticks, is_exact, kinds_of
 from .continuous import Continuous
-from .solver_setup import has_guards, next_instant, remembers
+from .solver_setup import has_guards, remembers
 from .ticks import take_tick
 from .workspace import Workspace
 
 _KEPT = 5000  # events of which the limits may ask
-_MOST_EDGES = 100_000  # discontinuities of sources in a call
 _METHODS = {"euler": "Euler", "heun": "Heun", "rk4": "Runge-Kutta 4", "RK23": "Bogacki-Shampine 3(2)",
             "RK45": "Dormand-Prince 5(4)", "DOP853": "Dormand-Prince 8(5,3)", "Radau": "Radau IIA 5"}  # fmt: skip
 
@@ -160,6 +168,8 @@ class HybridTicks:
                     return None
             if found.reason is HybridReason.ENDED:
                 return t
+            if found.reason is HybridReason.LOOK:
+                self._decide(loop, t)
             if found.reason in _ASKING:
                 following = int(rest[0])
                 ended = self._take_interval(loop, k, following, last, found, recorder)
@@ -188,10 +198,10 @@ class HybridTicks:
     def _span(self, k: int, ticks: np.ndarray, last: int, t: float) -> tuple[Span, np.ndarray]:
         """Return the ticks of a call, from tick ``k`` on, where the states have come to t; and which are landed on."""
         base = self._flat.base
-        edges = self._edges(t, self._time_of(int(ticks[-1])))
+        edges = find_edges(self._continuous, t, self._time_of(int(ticks[-1])))
         while edges is None:
             ticks = ticks[: max(1, len(ticks) // 2)]
-            edges = self._edges(t, self._time_of(int(ticks[-1])), limited=len(ticks) > 1)
+            edges = find_edges(self._continuous, t, self._time_of(int(ticks[-1])), limited=len(ticks) > 1)
         kinds = self._kinds(ticks)
         lands = np.ones(len(ticks), dtype=np.uint8)
         if not self._lands:
@@ -203,21 +213,6 @@ class HybridTicks:
         ends = np.concatenate([[k], ticks])
         n, d = base.numerator, base.denominator
         return Span(ends * n / d, np.diff(ends) * n / d, kinds, lands, self._time_of(beyond), *edges), lands
-
-    def _edges(self, t: float, end: float, *, limited: bool = True) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the discontinuities of sources from t on, up to the first one of each after the end."""
-        continuous, found = self._continuous, set[float]()
-        late = continuous.late
-        for path, source in continuous.sources:
-            edge = t
-            while edge <= end and (edge := next_instant(path, source, edge)) < math.inf:
-                found.add(edge)
-                if limited and len(found) > _MOST_EDGES:
-                    return None
-        if t in late:
-            found.add(t)
-        edges = np.array(sorted(found))
-        return edges, np.array([late.get(float(edge), float(edge)) for edge in edges])
 
     def _kinds(self, ticks: np.ndarray) -> np.ndarray:
         """Return the clocks that act at ticks, as places among the compiled functions."""
@@ -255,6 +250,16 @@ class HybridTicks:
             recorder.row(end, workspace.log)
         self._hand_over(loop, end if ended is None else ended)
         return ended
+
+    def _decide(self, loop: CompiledHybrid, t: float) -> None:
+        """Decide, after signs of stiffness or of none, which method goes on from t."""
+        solver, h = self._continuous.solver, loop.looked_at()
+        assert isinstance(solver, AutoSolver)
+        self._take_back(loop)
+        self._continuous.enter(t)
+        if solver.decide(t, self._workspace.here.x[self._continuous.where], h):
+            self._workspace.messages += (solver.statistics.messages[-1],)
+            self._hand_over(loop, t)
 
     def _judge(self, found: HybridOutcome, now: float, h: float) -> None:
         """Go on from the call of an FMU that the loop could not go beyond."""
@@ -310,6 +315,7 @@ class HybridTicks:
         """Let C go on from an instant that Python has come to."""
         loop.begin(t)
         loop.plan(planned_steps(self._continuous, self._methods))
+        loop.active = active_method(self._continuous, self._methods)
         if loop.watch is not None:
             assert self._continuous.domains is not None
             loop.hand_over_recent(hand_over_domains(self._continuous.domains, loop.watch))
@@ -364,7 +370,8 @@ def make_hybrid(
     native = {
         path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance) and plant.native is not None
     }
-    reason = _find_obstacle(workspace.flat, continuous, plants, native, regular=regular)
+    reason = find_hybrid_obstacle(workspace.flat, continuous.solver.name)
+    reason = reason or find_obstacle_at_ticks(workspace.flat, plants, native, regular=regular)
     if reason is None:
         try:
             found = HybridTicks(workspace, continuous, native, steps, stops, every=every)
@@ -377,23 +384,3 @@ def make_hybrid(
             )
             return found, (told,) if continuous.where.size else ()
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)
-
-
-def _find_obstacle(
-    flat: FlatDiagram,
-    continuous: Continuous,
-    plants: Mapping[str, Plant],
-    native: Mapping[str, FmuInstance],
-    *,
-    regular: bool,
-) -> str | None:
-    if (found := find_hybrid_obstacle(flat, continuous.solver.name)) is not None:
-        return found
-    if len(flat.distinct) > CLOCKS:
-        return f"it has {len(flat.distinct)} different clocks, and at most {CLOCKS} are compiled"
-    if not regular:
-        return "an FMU takes longer steps than from one tick to the next, or a coupling is asked for that iterates"
-    for path in plants:
-        if path not in native:
-            return f"the FMU {path!r} runs in a process of its own, or has ports that are no Float64, or options"
-    return None

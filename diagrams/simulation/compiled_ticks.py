@@ -218,7 +218,7 @@ def make_compiled(
     native = {
         path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance) and plant.native is not None
     }
-    reason = _find_run_obstacle(workspace.flat, plants, native, regular=regular)
+    reason = find_obstacle(workspace.flat) or find_obstacle_at_ticks(workspace.flat, plants, native, regular=regular)
     if reason is None:
         try:
             found = CompiledTicks(workspace, native, stops, every=every)
@@ -229,11 +229,10 @@ def make_compiled(
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)
 
 
-def _find_run_obstacle(
+def find_obstacle_at_ticks(
     flat: FlatDiagram, plants: Mapping[str, Plant], native: Mapping[str, FmuInstance], *, regular: bool
 ) -> str | None:
-    if (found := find_obstacle(flat)) is not None:
-        return found
+    """Return why the clocks and the plants of a run can't be gone over in C; None if they can."""
     if len(flat.distinct) > CLOCKS:
         return f"it has {len(flat.distinct)} different clocks, and at most {CLOCKS} are compiled"
     if not regular:

@@ -2,9 +2,11 @@
 
 from .base import AcceptedStep, Polynomial, Problem, solver_name
 from .choose import make_solver
+from .scipy_methods import AutoSolver
 
 __all__ = [
     "AcceptedStep",
+    "AutoSolver",
     "Polynomial",
     "Problem",
     "make_solver",

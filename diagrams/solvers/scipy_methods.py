@@ -265,6 +265,23 @@ class AutoSolver(VariableStep):
             self._switch(self._explicit, step.t, step.x, h, why="no longer stiff")
         return step
 
+    def decide(self, t: float, x: np.ndarray, h: float) -> bool:
+        """Decide at (t, x), after signs of stiffness or of none at steps of h in s, which method goes on.
+
+        Returns
+        -------
+        bool
+            Whether it is another one; it starts at the next `restart`.
+        """
+        self.stop = t
+        if self._active is self._implicit:
+            self._switch(self._explicit, t, x, h, why="no longer stiff")
+            return True
+        stiff = -h * self._leftmost_eigenvalue(t, x) > 0.5 * _STABLE[self._explicit.name]
+        if stiff:
+            self._switch(self._implicit, t, x, h, why=f"stiff at steps of {h:.2g} s")
+        return stiff
+
     def _switch(self, to: SciPySolver, t: float, x: np.ndarray, h: float | None, *, why: str) -> None:
         self._hits = self._misses = self._easy = 0
         self._switches += 1
