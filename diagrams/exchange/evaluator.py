@@ -51,6 +51,9 @@ class ExchangedBlock(Protocol):
     def nominals(self) -> np.ndarray:
         """Nominal values of its states."""
 
+    def add_note(self, text: str) -> None:
+        """Add a message of the run on this block."""
+
     def evaluation(self, ports: Sequence[str], *, rates: bool = False, indicators: bool = False) -> Values:
         """Return the call ``(t, x, u) -> values`` of outputs, rates of the states and indicators, one after the other.
 

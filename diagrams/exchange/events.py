@@ -14,7 +14,8 @@ from .exchanged_blocks import ExchangedBlocks
 
 _ROUNDS = 100  # of events at one instant
 _MANY, _SPAN = 500, 1e-8  # so many instants within so many seconds (relative to 1 + |t|), as for those of indicators
-_PART = 1e-3  # and within so much of the time between two ticks: a run in picoseconds goes on
+_PART = 1e-2  # and within so much of the time between two ticks: a run in picoseconds goes on
+_SLOW = 0.5  # part of the time between two ticks within which so many instants make a run slow
 
 
 class OutsideEvents:
@@ -48,6 +49,7 @@ class OutsideEvents:
         self._nothing = np.zeros(len(self.flat.events))
         self._recent = {path: deque[float](maxlen=_MANY) for path in self._evaluators}
         """The last instants at which a block had an event of time or of a step."""
+        self._told = set[str]()
 
     def next_instant(self, t: float) -> float:
         """Return the first time event of any block after t, in s; infinite without one."""
@@ -91,14 +93,24 @@ class OutsideEvents:
                 return
             recent.clear()  # the run has gone back to a saved state
         recent.append(t)
-        if len(recent) < _MANY or t - recent[0] >= min(_SPAN * (1.0 + abs(t)), _PART * float(self.flat.base)):
+        span, base = t - recent[0], float(self.flat.base)
+        if len(recent) < _MANY or span >= min(_SPAN * (1.0 + abs(t)), _SLOW * base):
+            return
+        if span >= _PART * base:
+            if path not in self._told:
+                self._told.add(path)
+                self._evaluators[path].block.add_note(
+                    f"t = {t:.9g} s: its events ({name}) come every {span / (_MANY - 1):.2g} s, about "
+                    f"{base / span * (_MANY - 1):.2g} times between two ticks of {base:g} s, so the run goes on "
+                    "slowly. Look up in its documentation which input or parameter sets the time between its events"
+                )
             return
         time = self._evaluators[path].block.next_time
         told = f"the next time event is at t + {time - t:.2g} s" if np.isfinite(time) else "it has no time event ahead"
         raise SimulationError(
-            f"its events pile up ({name}): they came at {_MANY} instants within {t - recent[0]:.2g} s, so the run "
-            f"would not go on; {told}. Look up in its documentation which input or parameter sets the time between "
-            "its events, or report it to its makers.",
+            f"its events pile up ({name}): they came at {_MANY} instants within {span:.2g} s, while two ticks are "
+            f"{base:g} s apart, so the run would not go on; {told}. Look up in its documentation which "
+            "input or parameter sets the time between its events, or report it to its makers.",
             block=path,
             t=t,
         )

@@ -33,6 +33,9 @@ class SteppedInstance(Protocol):
     def call(self, purpose: str, function: Callable[..., R], *arguments: Any) -> R:
         """Call a method of ``fmi``; an error begins with the purpose."""
 
+    def add_note(self, text: str) -> None:
+        """Add a message of the run."""
+
     def set_span(self, t: float, h: float) -> None:
         """Set start and length of the next step in s."""
 

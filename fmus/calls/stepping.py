@@ -7,7 +7,8 @@ options need that.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -25,6 +26,10 @@ from .transfer import Transfer, UnfitError
 _ROUNDED = 1e-9
 """Part of a step within which two times are one."""
 R = TypeVar("R")
+_MANY, _SPAN = 500, 1e-8
+"""So many parts of a step within so many seconds (relative to 1 + |t|) are events that pile up."""
+_MOST, _SLOW = 50_000, 1000
+"""Parts of a step, at the rate of the last ones, that are an error, and those that are told."""
 _CHANGED = 2
 """Qualifier of an interval that the FMU has set anew (fmi3IntervalChanged)."""
 
@@ -118,6 +123,7 @@ class CarefulSteps:
         self.next_event = math.inf
         self._last: tuple[float, np.ndarray] | None = None  # time and values of the inputs of the step before
         self._added: float | None = None
+        self._has_told = False
         self._fresh = True  # discrete inputs have not been set since the start
 
     # ---- the start ----
@@ -185,7 +191,7 @@ class CarefulSteps:
 
     def _go(self, t: float, h: float) -> None:
         """Step from t by h, in parts where events lie between or the FMU ends a step early."""
-        end, now, still = t + h, t, 0
+        end, now, still, instants = t + h, t, 0, deque[float](maxlen=_MANY)
         while end - now > _ROUNDED * h:
             target = min([end, self.next_event, *(c.next for c in self.clocks)])
             if not self.about.variable_step:
@@ -194,6 +200,9 @@ class CarefulSteps:
             reached, event = self._take(now, (end if target == end else target) - now)
             still = still + 1 if reached - now <= _ROUNDED * h else 0
             if still > MOST_ROUNDS:
+                latest = [*instants][-MOST_ROUNDS:]
+                if latest[-1] > latest[0]:
+                    self._look_for_pile(latest, h, ends=True)
                 raise FmuRuntimeError(
                     f"its steps returned early at {reached:.9g} s {still} times in a row; expected that it goes on. "
                     "Report it to its makers, or leave early_return out of stepping=.",
@@ -203,11 +212,36 @@ class CarefulSteps:
             now = end if end - reached <= _ROUNDED * h else reached
             if self._check_end(t, h, now):
                 return
+            instants.append(now)
+            if len(instants) == _MANY:
+                self._look_for_pile(instants, h)
             due = [c for c in self.clocks if c.next <= now + _ROUNDED * h and now < end]
             if self.has_events and (event or due or self.next_event <= now + _ROUNDED * h):
                 self._handle_events(now, due, set_inputs=False)
                 if self._check_end(t, h, now):
                     return
+
+    def _look_for_pile(self, instants: Sequence[float], h: float, *, ends: bool = False) -> None:
+        """Tell of events that come so often that a step of h takes long; refuse those with which it would not end."""
+        now, each = instants[-1], (instants[-1] - instants[0]) / (len(instants) - 1)
+        refused = ends or (h > _MOST * each and instants[-1] - instants[0] < _SPAN * (1.0 + abs(now)))
+        if not refused and (h < _SLOW * each or self._has_told):
+            return
+        clocks = [f"its clock {c.variable.name}" for c in self.clocks if c.next <= now + 2.0 * each]
+        own = "a time event" if self.next_event <= now + 2.0 * each else "an event within a step"
+        found = (
+            f"found events ({clocks[0] if clocks else own}) every {each:.2g} s, about {h / each:.2g} times in a step"
+        )
+        advice = "Look up in its documentation which input or parameter sets the time between its events"
+        if refused:
+            raise FmuRuntimeError(
+                f"{found} of {h:g} s, so the run would not go on; expected events that leave it its way. {advice}, or "
+                "report it to its makers.",
+                block=self.instance.block.label,
+                t=now,
+            )
+        self._has_told = True
+        self.instance.add_note(f"t = {now:.9g} s: {found} of {h:g} s; the run goes on slowly. {advice}")
 
     def _check_end(self, t: float, h: float, now: float) -> bool:
         """Return whether the FMU asks to end the simulation now; raise its error before the end of the step."""

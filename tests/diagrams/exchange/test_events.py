@@ -163,6 +163,24 @@ def test_time_events_that_pile_up_are_an_error(cache, tmp_path, fmi):
     assert error.value.run.t[-1] == 0.2
 
 
+@pytest.mark.parametrize(
+    ("tick", "refused"), [(1e-7, True), pytest.param(1.2e-9, False, marks=pytest.mark.slow), (1e-10, False)]
+)
+def test_time_events_in_picoseconds_are_told_where_ticks_are_short(cache, tmp_path, tick, refused):
+    """Events 1e-12 s apart: 1e5, 1200 and 100 between two ticks."""
+    file = eventful_fmu(tmp_path, 3, following="c->t + 1e-12")
+    diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    with diagram.simulation(step=Fraction(tick).limit_denominator(10**12), solver="euler") as simulation:
+        if refused:
+            with pytest.raises(SimulationError, match=r"pile up \(time_event\): .*ticks are 1e-07 s apart"):
+                simulation.advance(tick)
+            return
+        simulation.advance(tick)
+        told = [m for m in simulation.run().messages if "so the run goes on slowly" in m]
+    assert len(told) == (tick == 1.2e-9)
+    assert all("its events (time_event) come every 1e-12 s, about 1.2e+03 times between two ticks" in m for m in told)
+
+
 def test_many_time_events_that_leave_the_run_its_way_are_none(cache, tmp_path):
     file = eventful_fmu(tmp_path, 3, following="c->t + 1e-5")
     diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))

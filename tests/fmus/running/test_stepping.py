@@ -129,6 +129,24 @@ def test_periodic_clocks_tick_at_their_times_whatever_the_step(clocked):
         assert run["plant.beats"].tolist() == [1.0, *[np.floor((t - 1e-9) / 0.15) + 1.0 for t in run.t[1:]]]
 
 
+@pytest.mark.parametrize(("step", "every"), [(0.1, 1e-12), (1e-7, 1e-12), (0.1, 2e-5), (1e-3, 1e-5)])
+def test_a_clock_that_ticks_very_often_is_told_with_its_rate(folder, step, every):
+    clock = CLOCK.replace("0.15", f"{every:g}")
+    file = small_fmu(
+        folder, "fmi3", EVENTS, MODEL.format(clock=clock, outputs=OUTPUTS, variable="true"), name=f"often{every:g}"
+    )
+    diagram = Diagram("d", Fmu(file, name="plant", isolate=False)(u=Constant(value=0.0), level=Constant(value=0.0)))
+    if every == 1e-12:
+        with pytest.raises(FmuRuntimeError, match=r"^plant, t = .*events \(its clock beat\) every 1e-12 s, about 1e\+"):
+            diagram.simulate(step, step=step, progress=False)
+        return
+    run = diagram.simulate(step, step=step, progress=False)
+    assert run["plant.beats"][-1] == pytest.approx(step / every, abs=1)
+    told = [m for m in run.messages if "goes on slowly" in m]
+    assert len(told) == (step == 0.1)
+    assert all("its clock beat) every 2e-05 s, about 5e+03 times in a step of 0.1 s" in m for m in told)
+
+
 def test_a_countdown_clock_ticks_when_the_fmu_says(folder):
     """From the time event at 0.25 s on, the FMU counts down 0.18 s, once."""
     clock = CLOCK.replace('"constant" intervalDecimal="0.15"', '"countdown"')
