@@ -115,6 +115,7 @@ def compile_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -
     FmuError
         If the cache can't be written.
     """
+    flat = flat.origin  # other numbers change no code
     if flat in _COMPILED and tuple(_COMPILED[flat].ticks) == tuple(acting):
         return _COMPILED[flat]
     code = None if flat.by_block else _compile_straight(flat, acting)

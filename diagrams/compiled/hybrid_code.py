@@ -89,7 +89,7 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
         If the cache can't be written.
     """
     kinds = (NONE, *(clocks for clocks in acting if clocks))
-    known = _COMPILED.setdefault(flat, {})
+    known = _COMPILED.setdefault(flat.origin, {})
     if (kinds, stiff) in known:
         return known[kinds, stiff]
     ticks = {clocks: rename(flat.at_tick(clocks).last.fast, f"tick{i}") for i, clocks in enumerate(kinds)}

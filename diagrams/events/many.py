@@ -63,7 +63,7 @@ class ManyInstants:
     def __init__(self, flat: FlatDiagram, at: Instant, time_at: Callable[[float], float]):
         self._function, self._x, self._w, self._p = flat.indicators.last.fast, at.x, at.w, at.p
         self._time_at, where = time_at, flat.continuous
-        self._made = _MADE.setdefault(flat, {})
+        self._made = _MADE.setdefault(flat.origin, {})
         together = where.size > 0 and where[-1] - where[0] == where.size - 1
         self._where: slice | np.ndarray = slice(int(where[0]), int(where[-1]) + 1) if together else where
         self._states, self._events = where.size, self._function.numel_out(0)

@@ -5,6 +5,7 @@ from .announced import Announcer, Times, announcers
 from .clocks import EVERY, NONE, TickPattern
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator
 from .flat_diagram import FlatDiagram
+from .flatten import renumber
 from .functions import indicators_of
 from .layout import FlatEvent, StateLayout
 from .logic import TRUE, is_true
@@ -60,6 +61,7 @@ __all__ = [
     "own_step",
     "plant_inputs",
     "rates",
+    "renumber",
     "takes_any_step",
     "trace_schedule",
 ]

@@ -7,24 +7,38 @@ Nothing in it changes but these caches: a run has its own vectors, of parameters
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self, TypeVar, overload
 
 import numpy as np
 
 from ...blocks.core import Block
-from ..wiring import Checked
+from ..wiring import Checked, Structure
 from . import functions
 from .block_functions import BlockFunctions
 from .clocks import TickPattern
-from .layout import FlatLayout, sample_time_of
+from .layout import FlatEvent, FlatLayout, sample_time_of
 from .program import TickProgram
 from .stages import Schedule
 from .total_derivative import Derivative
 
+T = TypeVar("T")
+
 LARGEST = 2_000
 """Operations of a tick up to which it is simplified as a whole: a C compiler's time grows faster than they do."""
+
+
+class _shared(cached_property[T]):  # noqa: N801 (a decorator)
+    """A property that is computed once for a diagram and for all that have other numbers alone."""
+
+    @overload
+    def __get__(self, instance: None, owner: type[Any] | None = None) -> Self: ...
+    @overload
+    def __get__(self, instance: object, owner: type[Any] | None = None) -> T: ...
+    def __get__(self, instance: object, owner: type[Any] | None = None) -> Self | T:
+        return super().__get__(instance.origin if isinstance(instance, FlatDiagram) else instance, owner)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,11 +65,27 @@ class FlatDiagram(FlatLayout):
         """Return the same diagram with some blocks evaluated from outside, in stages of their own."""
         return replace(self, apart=frozenset(paths) | frozenset(self.outside))
 
+    def with_numbers(
+        self, table: Structure, p: np.ndarray, x0: np.ndarray, events: tuple[FlatEvent, ...]
+    ) -> FlatDiagram:
+        """Return a diagram with other blocks, parameters and start values, which shares the functions of this one."""
+        found = copy.copy(self)
+        for values in (p, x0):
+            values.setflags(write=False)
+        found.__dict__.update(table=table, p=p, x0=x0, events=events, _origin=self.origin)
+        return found
+
+    @property
+    def origin(self) -> FlatDiagram:
+        """The diagram whose functions these are: it itself, or the one from which it has other numbers alone."""
+        found: FlatDiagram = self.__dict__.get("_origin", self)
+        return found
+
     # --- functions ---------------------------------------------------------------------------------------------------
 
-    @cached_property
+    @_shared
     def blocks(self) -> BlockFunctions:
-        """The functions of the blocks."""
+        """Return the functions of the blocks."""
         return BlockFunctions(self.checked.traced)
 
     @property
@@ -77,7 +107,7 @@ class FlatDiagram(FlatLayout):
         """Return a tick at which the given clocks act as calls of block functions, for grouped code."""
         return functions.trace_tick_program(self, self.blocks, acting)
 
-    @cached_property
+    @_shared
     def by_block(self) -> bool:
         """Whether a tick is evaluated block by block: it is large, or has blocks that Python evaluates.
 
@@ -89,41 +119,41 @@ class FlatDiagram(FlatLayout):
         functions = (self.blocks.of(path, names) for path, names in self.order.steps)
         return sum(int(function.n_instructions()) for function in functions) > LARGEST
 
-    @cached_property
+    @_shared
     def _ticks(self) -> dict[frozenset[TickPattern], Schedule]:
         return {}
 
-    @cached_property
+    @_shared
     def flow(self) -> Schedule:
-        """The rates of the continuous states between ticks, ``(t, x, w, p) -> dx``."""
+        """Return the rates of the continuous states between ticks, ``(t, x, w, p) -> dx``."""
         return functions.trace_flow(self, self.blocks)
 
-    @cached_property
+    @_shared
     def jacobian(self) -> Derivative:
-        """The derivative of `flow` by the continuous states, ``(t, x, w, p) -> (n, n)``."""
+        """Return the derivative of `flow` by the continuous states, ``(t, x, w, p) -> (n, n)``."""
         return functions.differentiate_flow(self, self.flow)
 
-    @cached_property
+    @_shared
     def jacobian_with_loops(self) -> Derivative:
-        """The derivatives of `flow` and of the mismatch of algebraic loops, by the continuous states and the loops."""
+        """Return the derivatives of `flow` and of algebraic loops' mismatch, by continuous states and loops."""
         return functions.differentiate_flow_with_loops(self, self.blocks)
 
-    @cached_property
+    @_shared
     def indicators(self) -> Schedule:
         """``(t, x, w, p) -> (g, open)``: indicators of `events`, and whether the subsystems around them are enabled."""
         return functions.trace_indicators(self, self.blocks)
 
-    @cached_property
+    @_shared
     def jump(self) -> Schedule:
         """``(t, x, w, p, fired) -> x_next``: x after events."""
         return functions.trace_jump(self, self.blocks)
 
-    @cached_property
+    @_shared
     def driven(self) -> Schedule:
         """``(t, x, w, p) -> z`` between ticks: the inputs of transport delays, and of FMUs."""
         return functions.trace_driven(self, self.blocks)
 
-    @cached_property
+    @_shared
     def exchange(self) -> Schedule:
         """``(t, x, w, p, log) -> z`` between ticks: the inputs of plants, with outputs of sampled blocks from log."""
         return functions.trace_exchange(self, self.blocks)
@@ -141,7 +171,7 @@ class FlatDiagram(FlatLayout):
             self._loops[acting] = functions.trace_loops(self, self.blocks, acting)
         return self._loops[acting]
 
-    @cached_property
+    @_shared
     def _loops(self) -> dict[frozenset[TickPattern], Derivative | None]:
         return {}
 

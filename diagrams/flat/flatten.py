@@ -8,7 +8,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from ...blocks.core import Layout, SampleTimeError, Shape
+from ...blocks.core import Block, Layout, SampleTimeError, Shape
 from ..wiring import Checked, Structure, evaluation_order, join, stepped_blocks
 from .clocks import TickPattern
 from .flat_diagram import FlatDiagram
@@ -117,6 +117,29 @@ def flatten(
         asked=step is not None if asked is None else asked,
         apart=frozenset(path for path in paths if blocks[path].evaluated_outside),
     )
+
+
+def renumber(flat: FlatDiagram, blocks: Mapping[str, Block]) -> FlatDiagram:
+    """Return a flattened diagram with other numbers; it shares the functions of ``flat``.
+
+    Parameters
+    ----------
+    flat : FlatDiagram
+        The flattened diagram.
+    blocks : mapping of str to Block
+        Blocks by path that differ from those of ``flat`` in numbers alone: their traces are the same ones.
+    """
+    table = flat.table.copy()
+    table.blocks.update(blocks)
+    p, x0 = flat.p.copy(), flat.x0.copy()
+    for path, block in blocks.items():
+        if path not in flat.checked.traced:
+            continue
+        p[flat.parameters.slices[path]] = flat.pack(path, block)
+        inputs = flat.checked.traced[path].inputs
+        if values := [np.ravel(port.start_value(block, inputs)) for port in block.states.values()]:
+            x0[flat.states.slices[path]] = np.concatenate(values)
+    return flat.with_numbers(table, p, x0, tuple(_events(table, flat.checked)) if flat.events else ())
 
 
 def _input_shape(table: Structure, checked: Checked, path: str, port: str) -> Shape:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from fractions import Fraction
-from typing import Protocol
+from typing import Protocol, Self
 
+from ...blocks.core import Block
 from ..wiring import CheckedDiagram, Structure, exact_time, stepped_blocks
 from .flat_diagram import FlatDiagram
-from .flatten import flatten
+from .flatten import flatten, renumber
 from .plant_ticks import own_step
 
 
@@ -27,10 +29,27 @@ class WiredDiagram(CheckedDiagram):
     """A wired diagram with its functions, each made once: the diagram that runs, and that linear models are made of."""
 
     _flat: dict[tuple[Fraction | None, bool], FlatDiagram]
+    _origin: tuple[WiredDiagram, dict[str, Block]] | None
 
     def _set(self, name: str, table: Structure, loops: str) -> None:
         super()._set(name, table, loops)
-        self.__dict__["_flat"] = {}
+        self.__dict__.update(_flat={}, _origin=None)
+
+    def renumbered(self, blocks: Mapping[str, Block]) -> Self:
+        """Return a variant with other numbers, which shares the functions of this diagram; nothing is checked again.
+
+        Parameters
+        ----------
+        blocks : mapping of str to Block
+            Blocks by path that differ from those of this diagram in numbers alone: their traces are the same ones.
+        """
+        found = type(self).__new__(type(self))
+        found.__dict__.update(self.__dict__)
+        structure, scheduled = self.structure.copy(), self.scheduled.copy()
+        structure.blocks.update(blocks)
+        scheduled.blocks.update(blocks)
+        found.__dict__.update(structure=structure, scheduled=scheduled, _flat={}, _origin=(self, dict(blocks)))
+        return found
 
     def flatten(self, step: float | Fraction | None = None) -> FlatDiagram:
         """Return the diagram as one CasADi function of a tick.
@@ -63,6 +82,9 @@ class WiredDiagram(CheckedDiagram):
         """
         asked = step is not None if asked is None else asked
         key = (step, asked)
+        if key not in self._flat and self._origin is not None:
+            origin, blocks = self._origin
+            self._flat[key] = renumber(origin.flattened(step, asked=asked), blocks)
         if key not in self._flat:
             solve = self.loops == "solve"
             self._flat[key] = flatten(self.scheduled, self.checked, step, asked=asked, name=self.name, solve=solve)

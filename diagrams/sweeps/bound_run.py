@@ -10,7 +10,7 @@ from typing import Any
 
 from ...blocks.core import SimulationError
 from ...fmus.calls import FmuInstance
-from ..flat import EVERY, FlatDiagram
+from ..flat import EVERY, FlatDiagram, renumber
 from ..results import Recorder, Recording, Run
 from ..simulation import Engine, RunOptions, SimulatedDiagram, default_step, refuse_rest, ticks_in
 from .start_values import StartValues
@@ -112,7 +112,7 @@ class BoundRun:
                     assert isinstance(plant, FmuInstance)
                     plant.reset()
                     plant.initialize(None, values=numbers.starts.get(path))
-                engine.begin_anew(numbers.flatten(self.flat), self._start.set)
+                engine.begin_anew(renumber(self.flat, numbers.blocks), self._start.set)
             engine.take_first_tick(None, recorder.row)
             if engine.position.stopped is None:
                 if self._count:

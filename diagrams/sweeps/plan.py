@@ -145,17 +145,16 @@ class Worker:
     # --- its runs ----------------------------------------------------------------------------------------------------
 
     def _simulate(self, parameters: Mapping[str, Any], tell: Tell) -> Run:
-        if self._repeats:
-            numbers = self._variation.find(parameters)
-            bound = self._bind(numbers)
-            if bound is not None:
-                try:
-                    return bound.run(numbers, tell)
-                finally:
-                    if bound.is_broken:
-                        del self._bound[numbers.key]
-                        bound.__exit__(None, None, None)
-        return simulate(self._variation.apply(parameters), self.plan.duration, self._options, progress=False)
+        numbers = self._variation.find(parameters)
+        bound = self._bind(numbers) if self._repeats else None
+        if bound is None:
+            return simulate(numbers.make_diagram(), self.plan.duration, self._options, progress=False)
+        try:
+            return bound.run(numbers, tell)
+        finally:
+            if bound.is_broken:
+                del self._bound[numbers.key]
+                bound.__exit__(None, None, None)
 
     def _bind(self, numbers: Numbers[Any]) -> BoundRun | None:
         """Return the bound runs of a diagram; None where each run needs a set-up of its own."""

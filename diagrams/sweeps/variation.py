@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import copy
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-
 from ...blocks.core import Block, LoopwrightError, identity
 from ...blocks.tracing import structure
 from ...fmus import Fmu
 from ...fmus.archive import FmuDescription
-from ..flat import FlatDiagram
 from ..simulation import SimulatedDiagram
 from ..wiring import change_parameter, split_path
 
@@ -44,22 +40,15 @@ class Numbers(Generic[D]):
     blocks: Mapping[str, Block] = field(default_factory=dict)
     starts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
-    def flatten(self, flat: FlatDiagram) -> FlatDiagram:
-        """Return the flattened diagram with these numbers; it shares the functions of ``flat``, that of `diagram`."""
-        if not self.blocks:
-            return flat
-        found, table = copy.copy(flat), flat.table.copy()
-        table.blocks.update(self.blocks)
-        p, x0 = flat.p.copy(), flat.x0.copy()
-        for path, block in self.blocks.items():
-            p[flat.parameters.slices[path]] = flat.pack(path, block)
-            inputs = flat.checked.traced[path].inputs
-            values = [np.ravel(port.start_value(block, inputs)) for port in block.states.values()]
-            if values:
-                x0[flat.states.slices[path]] = np.concatenate(values)
-        for name, value in (("table", table), ("p", p), ("x0", x0)):
-            object.__setattr__(found, name, value)
-        return found
+    def make_diagram(self) -> D:
+        """Return the diagram with these numbers; it shares the functions of `diagram`."""
+        plants = {path: self._start_with(path, values) for path, values in self.starts.items()}
+        return self.diagram.renumbered({**self.blocks, **plants}) if self.blocks or plants else self.diagram
+
+    def _start_with(self, path: str, values: Mapping[str, Any]) -> Fmu:
+        block = self.diagram.scheduled.blocks[path]
+        assert isinstance(block, Fmu)
+        return block.replace(start={**block.start, **values})
 
 
 class Variation(Generic[D]):
@@ -75,11 +64,8 @@ class Variation(Generic[D]):
         self._diagram = diagram
         self._others: OrderedDict[Any, D] = OrderedDict()
         self._places: dict[str, tuple[str, list[str]] | None] = {}
+        self._structures: dict[str, Any] = {}
         self._descriptions: dict[str, FmuDescription] = {}
-
-    def apply(self, parameters: Mapping[str, Any]) -> D:
-        """Return the diagram with the parameters of a sample."""
-        return self._diagram.replace(parameters) if parameters else self._diagram
 
     def find(self, parameters: Mapping[str, Any]) -> Numbers[D]:
         """Return the numbers of a sample.
@@ -89,15 +75,15 @@ class Variation(Generic[D]):
         LoopwrightError
             A value that a parameter does not take.
         """
-        other: dict[str, Any] = {}
+        other: set[str] = set()
         blocks: dict[str, Block] = {}
-        names: dict[str, list[str]] = {}
         starts: dict[str, dict[str, Any]] = {}
+        names: dict[str, list[str]] = {}
         scheduled = self._diagram.scheduled.blocks
         for name, value in parameters.items():
             place = self._place(name)
             if place is None or isinstance(value, Block):
-                other[name] = value
+                other.add(name)
                 continue
             path, keys = place
             block = scheduled[path]
@@ -105,15 +91,18 @@ class Variation(Generic[D]):
                 starts.setdefault(path, {})[keys[1]] = block.start_value(self._about(path, block), keys[1], value)
             else:
                 blocks[path] = change_parameter(blocks.get(path, block), keys, value)
-                names.setdefault(path, []).append(name)
-        for path in [path for path, block in blocks.items() if not self._is_numbers(path, block)]:
-            other |= {name: parameters[name] for name in names[path]}
-            del blocks[path]
+            names.setdefault(path, []).append(name)
+        changed = {path for path, block in blocks.items() if not self._is_numbers(path, block)}
+        for path in changed | ({self._owner(name) for name in other} & names.keys() if other else set()):
+            other.update(names[path])
+            blocks.pop(path, None)
+            starts.pop(path, None)
         if not other:
             return Numbers(self._diagram, None, blocks, starts)
-        key = frozenset((name, identity(value)) for name, value in other.items())
+        structural = {name: value for name, value in parameters.items() if name in other}  # in their order
+        key = tuple((name, identity(value)) for name, value in structural.items())
         if key not in self._others:
-            self._others[key] = self._diagram.replace(other)
+            self._others[key] = self._diagram.replace(structural)
             while len(self._others) > _KEPT:
                 self._others.popitem(last=False)
         self._others.move_to_end(key)
@@ -131,6 +120,15 @@ class Variation(Generic[D]):
             self._places[name] = self._find_place(name)
         return self._places[name]
 
+    def _owner(self, name: str) -> str:
+        """Return the path of the block that a name belongs to, or is; empty for a subsystem's setting."""
+        if name in self._diagram.structure.blocks:
+            return name
+        try:
+            return split_path(self._diagram.structure, name, self._diagram.name)[0]
+        except LoopwrightError:
+            return ""
+
     def _find_place(self, name: str) -> tuple[str, list[str]] | None:
         diagram = self._diagram
         try:
@@ -141,16 +139,23 @@ class Variation(Generic[D]):
         if diagram.scheduled.blocks.get(path) is not block:
             return None
         if isinstance(block, Fmu):
+            if not block.stepped:
+                return None
             about = block.description
             name = ".".join(keys[1:])
             plain = keys[0] == "start" and name in about.variables and not about.structural
             return (path, ["start", name]) if plain and not _has_elements(block, name) else None
         return (path, keys) if path in diagram.checked.traced and keys[0] in type(block).parameter_specs else None
 
+    def _structure(self, path: str, block: Block) -> Any:
+        if path not in self._structures:
+            self._structures[path] = structure(block)
+        return self._structures[path]
+
     def _is_numbers(self, path: str, block: Block) -> bool:
         """Whether a block differs from that of the diagram in numbers alone: its functions are those of that."""
         old, wires = self._diagram.scheduled.blocks[path], self._diagram.scheduled.wires
-        if structure(block) != structure(old):
+        if block.opaque or structure(block) != self._structure(path, old) or [*block.events] != [*old.events]:
             return False
         free = [port for port in old.inputs if (path, port) not in wires]
         return all(identity(block.inputs[q].default) == identity(old.inputs[q].default) for q in free)

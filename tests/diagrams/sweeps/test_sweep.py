@@ -194,6 +194,18 @@ def test_zeros_blocks_sample_times_and_fixed_values_may_be_swept_too():
     assert len({found["h"][i].tobytes() for i in range(8)}) == 8
 
 
+def test_a_block_that_is_replaced_and_its_parameters_go_together():
+    diagram = many_rates()
+    table = [
+        {"start": Start(factor=5.0), "start.factor": 2.0, "inner.factor": 1.0},
+        {"start": Start(factor=5.0), "start.factor": 0.0, "inner.factor": 2.0},
+    ]
+    found = diagram.sweep(None, 0.3, samples=table, signals=["g", "start.y"], **INTERPRETED)
+    assert not found.failures
+    assert_equals_single_runs(diagram, found, 0.3, ["g", "start.y"])
+    assert found["start.y"][0, 0] == 2.0 * 0.25  # the step has its value from the left at the start
+
+
 class Guarded(Block):
     """Refuses inputs from a limit on."""
 

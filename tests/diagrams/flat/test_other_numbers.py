@@ -1,0 +1,98 @@
+"""Diagrams with other numbers share the functions of their origin, and run as diagrams that were made anew."""
+
+import pytest
+
+from loopwright.blocks import Gain, Integrator, Pulse, Relay, Sine, Step, TransferFunction
+from loopwright.diagrams import Diagram, experiments, subsystem
+from loopwright.diagrams.flat import functions
+
+QUIET = {"progress": False}
+
+
+def thermostat():
+    """A relay with hysteresis around a lag, a pulse that it lands on, and a sampled filter behind."""
+
+    @subsystem(sample_time=0.05, name="filter")
+    def filtered(u):
+        return TransferFunction(numerator=(1.0,), denominator=(0.2, 1.0), name="smooth")(u)
+
+    room = Integrator(name="room", initial_value=1.0)
+    relay = Relay(on_point=0.1, off_point=-0.1, name="relay")
+    heat = relay(0.5 - Gain(gain=1.0, name="sensor")(room.y))
+    door = Pulse(start_time=0.6, end_time=0.9, rise_time=0.02, amplitude=-1.5, name="door")
+    wind = Sine(frequency=3.0, amplitude=0.2, name="wind")
+    closed = room(2.0 * heat - room.y + door + wind)
+    return Diagram(
+        "thermostat", closed, filtered(room.y).named("y"), Step(times=0.31, values=1.0, name="step").y.named("s")
+    )
+
+
+CHANGES = {
+    "relay.on_point": 0.05,
+    "relay.off_point": -0.15,
+    "room.initial_value": 0.4,
+    "door.start_time": 0.71,
+    "wind.frequency": 4.0,
+    "filter.smooth.denominator": (0.3, 1.0),
+    "step.times": 0.555,
+}
+
+
+def renumbered(diagram, changes):
+    blocks = {}
+    other = diagram.replace(changes)
+    for path, block in diagram.scheduled.blocks.items():
+        if other.scheduled.blocks[path] != block:
+            blocks[path] = other.scheduled.blocks[path]
+    return diagram.renumbered(blocks), other
+
+
+def assert_equal_runs(first, second):
+    assert first.t.tobytes() == second.t.tobytes()
+    assert first.data.tobytes() == second.data.tobytes()
+    assert list(first.events) == list(second.events)
+
+
+@pytest.mark.parametrize("options", [{}, {"solver": "rk4", "step": 0.01}, {"compile": True}], ids=str)
+def test_runs_with_events_and_jumps_are_those_of_a_diagram_that_was_made_anew(options):
+    diagram = thermostat()
+    before = diagram.simulate(2.0, **QUIET, **options)
+    variant, other = renumbered(diagram, CHANGES)
+    run = variant.simulate(2.0, **QUIET, **options)
+    assert_equal_runs(run, other.simulate(2.0, **QUIET, **options))
+    assert run.data.tobytes() != before.data.tobytes()
+    assert len(run.events) > 4
+    assert_equal_runs(before, diagram.simulate(2.0, **QUIET, **options))  # the origin stays as it was
+
+
+def test_functions_are_traced_once(monkeypatch):
+    diagram = thermostat()
+    diagram.simulate(0.2, **QUIET)
+    for name in ("trace_tick", "trace_flow", "trace_indicators", "trace_jump"):
+        monkeypatch.setattr(functions, name, lambda *_, **__: pytest.fail("traced again"))
+    variant, _ = renumbered(diagram, CHANGES)
+    variant.simulate(0.2, **QUIET)
+    again = variant.renumbered({"room": variant["room"].replace(initial_value=0.9)})
+    assert again.simulate(0.2, **QUIET)["room.y"][0] == 0.9
+    assert again.flatten().origin is diagram.flatten()
+    assert again["relay"].on_point == 0.05
+
+
+def test_functions_that_a_variant_asks_for_first_belong_to_all(monkeypatch):
+    diagram = thermostat()
+    variant, _ = renumbered(diagram, CHANGES)
+    variant.simulate(0.2, **QUIET)
+    for name in ("trace_tick", "trace_flow", "trace_indicators", "trace_jump"):
+        monkeypatch.setattr(functions, name, lambda *_, **__: pytest.fail("traced again"))
+    diagram.simulate(0.2, **QUIET)
+
+
+def test_a_variant_of_an_fmu_runs_is_linearized_and_replaced_as_any_diagram():
+    diagram = experiments.path_following().diagram
+    variant, other = renumbered(diagram, {"plant.start.coulomb_scale": 2.0, "controller.pid_par.a0": 7000.0})
+    assert_equal_runs(variant.simulate(0.1, **QUIET), other.simulate(0.1, **QUIET))
+    assert variant.structure == other.structure
+    assert (
+        variant.replace({"controller.pid_par.a0": 8000.0}).structure
+        == other.replace({"controller.pid_par.a0": 8000.0}).structure
+    )
