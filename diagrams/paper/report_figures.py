@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..report import look_of
+from ..report_figures import set_powers
 from ..report_writing import Plot, Texts
 from ..results import DARK, VERMILION, new_figure, style
 
@@ -56,6 +57,8 @@ def draw_admittances(
         top.set_ylabel("|Y| [m/(N s)]")
         bottom.set_ylabel("phase of Y [°]")
         bottom.set_xlabel("ω [rad/s]")
+        set_powers(bottom.xaxis, bottom.get_xlim(), 9)
+        set_powers(top.yaxis, top.get_ylim(), 6)
         top.legend(loc="best")
     return Plot(key, TEXTS.line("rendered", along=along), figure)
 
@@ -109,8 +112,10 @@ def draw_stability(
         ax.set_yscale("log")
         ax.set_xlim(k[0], k[-1])
         ax.set_ylim(b[0], b[-1])
-        ax.set_xlabel("stiffness k$_e$ of the environment [N/m]")
-        ax.set_ylabel("damping b$_e$ [N s/m]")
+        set_powers(ax.xaxis, ax.get_xlim(), 9)
+        set_powers(ax.yaxis, ax.get_ylim(), 6)
+        ax.set_xlabel("stiffness kₑ of the environment [N/m]")
+        ax.set_ylabel("damping bₑ [N s/m]")
         figure.colorbar(filled, ax=ax, label="growth rate σ [1/s]", ticks=levels, format="%g")
         ax.legend(loc="upper left")
     return Plot(key, TEXTS.line("map", along=along), figure)

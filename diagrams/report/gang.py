@@ -35,8 +35,9 @@ def gang_of_four(case: Case, key: str, wire: str) -> tuple[Plot, ...]:
                     found = _responses(v, wire, other)
                 except LoopwrightError:
                     continue
-                if found is not None:
-                    curves[v.key] = (v.title, *found)
+                if found is None:
+                    break  # the wires are those of all variants
+                curves[v.key] = (v.title, *found)
         if curves:
             return (figures.gang(f"inner_{key}_gang", curves, wire, other, case.axes, case.looks),)
     return ()

@@ -1,6 +1,6 @@
 """Figures of a design report, drawn without pyplot."""
 
-from .axes import AxisUnits
+from .axes import AxisUnits, set_powers
 from .drawings import with_drawing
 from .loop_figures import bode, gang, nyquist, response, sensitivities
 from .measured_figures import Measured, injected, measured
@@ -16,6 +16,7 @@ __all__ = [
     "nyquist",
     "response",
     "sensitivities",
+    "set_powers",
     "step_responses",
     "with_drawing",
 ]

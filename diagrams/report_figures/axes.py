@@ -15,6 +15,9 @@ DECADES = 2.0
 """Decades from which on the ticks of a logarithmic axis are powers of ten."""
 
 
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
 class AxisUnits(NamedTuple):
     """Units of the axes of frequency responses: plain or in dB, over rad/s or Hz."""
 
@@ -59,13 +62,28 @@ def set_powers(axis: Axis, ends: tuple[float, float], most: int) -> None:
     axis.set_minor_formatter(NullFormatter())
     decades = abs(math.log10(ends[1] / ends[0])) if min(ends) > 0 else DECADES
     if decades >= DECADES:
+        axis.set_major_formatter(FuncFormatter(_power))
         axis.set_major_locator(LogLocator(numticks=most))
         return
+    axis.set_major_formatter(FuncFormatter(_label))
     subs = (1.0, 2.0, 5.0) if decades > 0.5 else (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
     axis.set_major_locator(LogLocator(subs=subs, numticks=10 * most))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-def set_frequencies(ax: Axes) -> None:
-    """Set few ticks on the frequency axis of a narrow figure, so that none overlap."""
-    set_powers(ax.xaxis, ax.get_xlim(), 5)
+def _power(value: float, position: int | None = None) -> str:
+    """Return a power of ten in plain characters: parsing mathematics takes more time than drawing all else."""
+    return "10" + str(round(math.log10(value))).translate(_RAISED) if value > 0 else ""
+
+
+def _label(value: float, position: int | None = None) -> str:
+    """Return a number in plain characters, a large or a small one by its power of ten."""
+    if not value > 0 or 1e-3 < value < 1e4:
+        return f"{value:.6g}".replace("-", "−")
+    power = math.floor(math.log10(value) + 1e-9)
+    factor = value / 10.0**power
+    return ("" if abs(factor - 1) < 1e-6 else f"{factor:.6g}·") + "10" + str(power).translate(_RAISED)
+
+
+def set_frequencies(ax: Axes, most: int = 5) -> None:
+    """Set so many ticks at most on the frequency axis, so that none overlap: few on that of a narrow figure."""
+    set_powers(ax.xaxis, ax.get_xlim(), most)

@@ -85,6 +85,7 @@ def bode(
         top.axhline(axes.magnitude(1.0), color=DARK, linewidth=0.6)
         bottom.axhline(-180, color=DARK, linewidth=0.6)
         _degrees(bottom)
+        set_frequencies(bottom, 9)
         top.set_ylabel(axes.magnitude_label("|L|"))
         bottom.set_ylabel("phase of L [°]")
         bottom.set_xlabel(axes.frequency_label)

@@ -74,6 +74,15 @@ def _drawn(figure: Any) -> str:
     from matplotlib import rc_context
 
     buffer = io.StringIO()
-    with rc_context({"svg.fonttype": "path", "svg.hashsalt": "loopwright"}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None}, bbox_inches="tight", pad_inches=0.03)
+    engine = figure.get_layout_engine()
+    options: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.03} if engine is None else {}
+    own: dict[Any, Any] = {"svg.fonttype": "path", "svg.hashsalt": "loopwright"}
+    with rc_context({**own, "figure.autolayout": False, "figure.constrained_layout.use": False}):
+        if engine is not None:  # with an engine, or a tight box, saving would go over the whole figure twice
+            engine.execute(figure)
+            figure.set_layout_engine(None)
+        try:
+            figure.savefig(buffer, format="svg", metadata={"Date": None}, **options)
+        finally:
+            figure.set_layout_engine(engine)
     return buffer.getvalue()

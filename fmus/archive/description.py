@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -198,19 +199,22 @@ def read_description(
         for this platform; if its archive is unsafe, damaged or beyond the limits. Its ``fault`` is an `FmuFault`.
     """
     path = Path(file).expanduser()
-    if not path.is_file():
+    try:
+        status = os.stat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        status = None
+    if status is None or not stat.S_ISREG(status.st_mode):
         found = f"{str(path)!r} is a folder" if path.is_dir() else f"there is no file {str(path)!r}"
         raise FmuFileError(f"{found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
-    stat = path.stat()
-    return _read(
-        path.resolve(), stat.st_mtime_ns, stat.st_size, limits or ArchiveLimits(), tuple(sorted((sizes or {}).items()))
-    )
+    identity = (status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size)
+    return _read(os.path.abspath(path), identity, limits or ArchiveLimits(), tuple(sorted((sizes or {}).items())))
 
 
 @lru_cache(maxsize=256)
 def _read(
-    path: Path, mtime: int, length: int, limits: ArchiveLimits, sizes: tuple[tuple[str, int], ...]
+    place: str, identity: tuple[int, ...], limits: ArchiveLimits, sizes: tuple[tuple[str, int], ...]
 ) -> FmuDescription:
+    path = Path(place).resolve()
     archive = FmuArchive.open(path, limits)
     entries, text = set(archive.files), archive.description()
     root = parse_xml(path, DESCRIPTION, text)

@@ -12,6 +12,7 @@ from loopwright.diagrams.report.gang import gang_of_four
 from loopwright.diagrams.report_figures import AxisUnits, Measured, measured
 from loopwright.diagrams.report_figures.loop_figures import bode, nyquist
 from loopwright.diagrams.report_writing import Judged
+from loopwright.diagrams.report_writing.figures import embedded
 from loopwright.diagrams.report_writing.html import to_html
 from loopwright.diagrams.results import BLUE
 from tests.support import reviewed
@@ -139,3 +140,15 @@ def test_a_block_that_is_defined_at_samples_has_no_continuous_variant_and_the_re
     case = Case(reviewed.crane())
     assert case.variants["continuous"].problem.startswith("controller.observer is defined at samples only")
     assert "sample_time=" not in case.variants["continuous"].problem
+
+
+def test_a_figure_is_laid_out_once_and_drawn_once(monkeypatch):
+    w = np.geomspace(1.0, 100.0, 9)
+    figure = measured("m", "u", Measured("model", w, 1 / (1j * w), w, 1 / (1j * w)), AxisUnits()).figure
+    engine, draws, layouts = figure.get_layout_engine(), [], []
+    whole, execute = type(figure).draw, type(engine).execute
+    monkeypatch.setattr(type(figure), "draw", lambda self, renderer: draws.append(1) or whole(self, renderer))
+    monkeypatch.setattr(type(engine), "execute", lambda self, fig: layouts.append(1) or execute(self, fig))
+    assert "<svg" in embedded(figure, "k").screen
+    assert (len(draws), len(layouts)) == (1, 1)
+    assert figure.get_layout_engine() is engine
