@@ -14,7 +14,7 @@ from ...blocks.core import Array, Finding, OptionError, UnknownNameError
 from ...fmus.running import Derivation
 from ..linearization import check_options, operating_point
 from .compliance_loop import SIDES
-from .contact_admittance import ContactAdmittance, compute_admittance
+from .contact_admittance import ContactAdmittance, compute_admittance, look_again
 from .contact_limits import ContactLimit, ContactMap, CoupledLoop, check_properties, find_limit, map_growth
 from .contact_loop import close_loop, join_environment
 from .contact_parts import ContactParts, Ports, take_apart
@@ -168,7 +168,11 @@ class Contact:
             If python-control's interconnection of the same parts disagrees.
         """
         check_properties(environment, vary)
-        return find_limit(self.parts, self.direction, vary, environment, low=low, high=high, per_decade=per_decade)
+        found = find_limit(self.parts, self.direction, vary, environment, low=low, high=high, per_decade=per_decade)
+        alone = not any(environment.values()) and "tool_mass" not in environment
+        if vary == "stiffness" and alone and 0.0 < found.value < math.inf:
+            found = replace(found, second_look=look_again(self.parts, self.direction, found.frequency))
+        return found
 
     def confirm(
         self, limit: ContactLimit, *, push: float = 1e-6, method: TrialMethod | str | None = None

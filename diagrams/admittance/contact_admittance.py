@@ -40,6 +40,27 @@ class ContactAdmittance:
     findings: tuple[Finding, ...] = ()
 
 
+BESIDE = 0.05
+"""Part of a frequency within which the admittance's real part changes its sign beside a limit."""
+
+
+def look_again(parts: ContactParts, direction: np.ndarray, omega: float) -> float:
+    """Return the stiffness ω/|Y| at which Re Y(jω) = 0 beside a frequency in rad/s; NaN without one."""
+    from scipy.optimize import brentq
+
+    low, high = (1.0 - BESIDE) * omega, (1.0 + BESIDE) * omega
+    if not 0.0 < low < high < (math.pi / parts.sample_time if parts.sample_time else math.inf):
+        return math.nan
+
+    def real(w: float) -> float:
+        return float(compute_admittance(parts, direction, np.array([w]))[0].real)
+
+    if not real(low) * real(high) < 0.0:
+        return math.nan
+    w = float(brentq(real, low, high, rtol=1e-12))
+    return w / float(np.abs(compute_admittance(parts, direction, np.array([w]))[0]))
+
+
 def compute_admittance(parts: ContactParts, direction: np.ndarray, omega: Array) -> np.ndarray:
     """Return the admittance along a direction, m/(N s).
 

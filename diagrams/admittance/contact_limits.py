@@ -69,6 +69,10 @@ class ContactLimit:
         Properties that were held.
     findings : tuple of Finding
         Kinks and stairs of the diagram that the linear model leaves out.
+    second_look : float
+        Stiffness in N/m of a spring alone, from the admittance: ω/|Y| where Re Y(jω) = 0, beside the limit's frequency.
+        It is the limit in continuous time, and within about 1e-3 of it in a sampled loop, where Y is the fundamental.
+        NaN for other environments, and without such a frequency.
     """
 
     vary: str
@@ -84,6 +88,7 @@ class ContactLimit:
     confirmed_by: str
     environment: dict[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
+    second_look: float = math.nan
 
     @property
     def number(self) -> Number:

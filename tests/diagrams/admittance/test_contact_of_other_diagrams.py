@@ -78,6 +78,8 @@ def test_without_damping_a_spring_breaks_the_loop_where_the_admittance_is_no_lon
     limit, w = here.stability_limit(), here.passivity().frequency
     assert limit.frequency == pytest.approx(w, rel=1e-9)
     assert limit.value == pytest.approx(w / abs(here.admittance(w).rendered), rel=1e-8)
+    assert limit.second_look == pytest.approx(DRAG / (TAU * SHARE), rel=1e-8)
+    assert math.isnan(here.stability_limit(damping=1.0).second_look)
     s = 1j * w
     Y = (1 + SHARE / (TAU * s + 1)) / (M * s + DRAG / (TAU * s + 1))
     assert here.admittance(w).rendered == pytest.approx(Y, rel=1e-12)
