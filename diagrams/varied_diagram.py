@@ -1,4 +1,4 @@
-"""A diagram whose parameters are varied: sweeps of runs.
+"""A diagram whose parameters are varied: sweeps of runs, sensitivities and worst cases.
 
 Each method imports what it needs when it is called, so that a run does not pay for it.
 """
@@ -6,13 +6,15 @@ Each method imports what it needs when it is called, so that a run does not pay 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Unpack
 
 from .results import Run
 from .simulation import KeptKeywords, SimulatedDiagram
 
 if TYPE_CHECKING:
+    from .requirements import Requirements
+    from .studies import Sensitivities, WorstCase
     from .sweeps import Sweep
 
 
@@ -93,4 +95,111 @@ class VariedDiagram(SimulatedDiagram):
             self, parameters, duration, samples=samples, count=count, seed=seed, seeds=seeds, signals=signals,
             reduce=reduce, to=to, overwrite=overwrite, workers=workers, client=client, progress=progress,
             options=options,
+        )  # fmt: skip
+
+    def sensitivity(
+        self,
+        loop: str | Iterable[str],
+        parameters: str | Iterable[str] | None = None,
+        *,
+        at: Any = None,
+        delay: int = 0,
+        skew: float = 0.0,
+        **options: Any,
+    ) -> Sensitivities:
+        """Return the derivatives of a loop's margins by parameters of the diagram; see docs/worst_case.md.
+
+        They are exact derivatives of the linear model, hold and delay included: of its matrices by CasADi, of the
+        margins by implicit differentiation at their crossings and peaks. By an FMU's parameter they are differences,
+        with their error.
+
+        Parameters
+        ----------
+        loop : str or list of str
+            Wire that the loop is cut at, as of `Linearization.loop`. Of several wires, or one with several entries,
+            there is the disk margin alone.
+        parameters : list of str, optional
+            Paths, ``"controller.pid.kp"`` or ``"plant.mass"`` of an FMU. Without it, all numbers in the traced
+            equations that are not 0, and the parameters that the blocks of FMUs set.
+        at : OperatingPoint, Snapshot, float or callable, optional
+            Point, as in `linearize`. An equilibrium follows the parameter; a point that is not at rest keeps its
+            states. A function from a diagram to a point, ``lambda d: d.trim(…)``, is asked anew for changed parameters.
+        delay, skew
+            As of `margins`. ``options`` are those of `linearize`.
+
+        Returns
+        -------
+        Sensitivities
+            ``found["pid.kp", "phase_margin_deg"].per_percent``; ``found.of("ms")``; ``print``; ``found.plot("ms")``.
+
+        Raises
+        ------
+        UnknownNameError, ParameterError
+            A wire or parameter that isn't there; a parameter that is structure of the equations.
+        """
+        from .studies import find_sensitivities
+
+        return find_sensitivities(self, loop, parameters, at=at, delay=delay, skew=skew, **options)
+
+    def worst_case(
+        self,
+        parameters: Mapping[str, Any] | None,
+        loop: str | Iterable[str] | None = None,
+        *,
+        quantity: str | None = None,
+        requirements: Requirements | None = None,
+        samples: Any = "latin",
+        count: int | None = None,
+        seed: int = 0,
+        starts: int = 3,
+        steps: int = 15,
+        at: Any = None,
+        points: Sequence[Any] | None = None,
+        delay: int = 0,
+        progress: Callable[[str], None] | None = None,
+        **options: Any,
+    ) -> WorstCase:
+        """Find the worst case of a loop's margin, or of requirements, over ranges of parameters.
+
+        Samples of the ranges come first, then all corners (of up to 5 numbers), then searches downhill from the worst
+        of them, along the exact derivatives of the margins. A case that can't be analysed counts as the worst and
+        tells its reason; then come unstable loops, by their growth.
+
+        Parameters
+        ----------
+        parameters : mapping of str to (low, high) or Box
+            Ranges by path; values of each for a grid; None where ``samples`` is a table.
+        loop : str or list of str
+            Wire that the loop is cut at; with requirements several wires, each a loop of its own.
+        quantity : str, optional
+            The number, ``"disk_margin"`` without it: one of those that `Requirements` can limit.
+        requirements : Requirements, optional
+            In place of a number: the smallest distance to a limit, relative to the limit, is made worst.
+        samples, count, seed
+            As of `sweep`: ``count`` samples of a Latin hypercube (100), ``"grid"``, or a table.
+        starts, steps : int
+            Number of searches, 0 for none, and the most steps of each.
+        at : OperatingPoint, Snapshot, float or callable, optional
+            Point of each case, as of `sensitivity`; ``points`` is a list of them, each of which every case is tried at.
+        delay : int
+            Whole samples of delay in series with sampled loops.
+        progress : callable, optional
+            Told a line for every case. ``options`` are those of `linearize`.
+
+        Returns
+        -------
+        WorstCase
+            ``found.diagram.simulate(…)`` runs the worst case, ``found.confirm()`` measures it; ``found.parameters``,
+            ``found.table()``, ``found.plot()``.
+
+        Raises
+        ------
+        OptionError, UnknownNameError
+            Ranges, numbers or loops that aren't there; a diagram that can't be analysed as it is.
+        """
+        from .studies import find_worst_case
+
+        return find_worst_case(
+            self, parameters, loop, quantity=quantity, requirements=requirements, samples=samples, count=count,
+            seed=seed, starts=starts, steps=steps, at=at, points=points, delay=delay, progress=progress, **options,
         )  # fmt: skip

@@ -3,7 +3,8 @@
 from typing import TYPE_CHECKING
 
 from .carried import with_findings
-from .disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin
+from .disk import DiskMargin, disk_margin, loop_at, mimo_disk_margin, mu_bound
+from .features import find_hidden_unstable
 from .loop_class import loop_class
 from .loop_margins import margins
 from .margin_slopes import MarginSlope, margin_slopes
@@ -44,6 +45,7 @@ __all__ = [
     "delayed_hold",
     "delayed_hold_margin",
     "disk_margin",
+    "find_hidden_unstable",
     "gang_of_four",
     "loop_at",
     "loop_class",
@@ -51,6 +53,7 @@ __all__ = [
     "margins",
     "measured_margins",
     "mimo_disk_margin",
+    "mu_bound",
     "nyquist_count",
     "periodic_margins",
     "place",

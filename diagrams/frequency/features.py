@@ -173,3 +173,15 @@ def _refine(r: Realization, omega: np.ndarray, delay: float) -> np.ndarray:
             break
         omega = np.sort(np.concatenate([omega, np.sqrt(omega[1:] * omega[:-1])[coarse]]))
     return omega
+
+
+def find_hidden_unstable(r: Realization) -> tuple[complex, ...]:
+    """Return the hidden poles beyond the limit, in the planes of s or z.
+
+    Coinciding poles on the limit scatter to both sides and are left out.
+    """
+    if not len(r.hidden):
+        return ()
+    _, rest = split_axis_poles(r, r.hidden, max(r.scale, float(np.abs(r.hidden).max())))
+    beyond = rest[rest.real > 0]
+    return tuple(complex(p) for p in (np.exp(beyond * r.dt) if r.dt else beyond))

@@ -20,7 +20,7 @@ from .confirm import (
     refuse_singular,
 )
 from .crossings import Crossing, Peak, Scan
-from .features import split_axis_poles
+from .features import find_hidden_unstable
 from .margins_found import GainCrossover, Margins, PhaseCrossover
 from .number import Number
 from .nyquist import count_encirclements
@@ -119,21 +119,12 @@ class _MarginFinder:
             phase_crossovers=tuple(self._make_phase_crossover(c) for c in self.phase),
             closed_loop_poles=tuple(complex(p) for p in np.sort_complex(poles + 1 if r.dt else poles)),
             hidden_poles=tuple(complex(p) for p in (r.hidden + 1 if r.dt else r.hidden)),
-            hidden_unstable=self._find_hidden_unstable(),
+            hidden_unstable=find_hidden_unstable(r),
             encirclements=encirclements,
             dt=r.dt,
             findings=(),
             **found,
         )
-
-    def _find_hidden_unstable(self) -> tuple[complex, ...]:
-        """Return the hidden poles beyond the limit; coinciding ones on it scatter to both sides and are left out."""
-        r = self.r
-        if not len(r.hidden):
-            return ()
-        _, rest = split_axis_poles(r, r.hidden, max(r.scale, float(np.abs(r.hidden).max())))
-        beyond = rest[rest.real > 0]
-        return tuple(complex(p) for p in (np.exp(beyond * r.dt) if r.dt else beyond))
 
     def _frequency(self, c: Crossing, how: str) -> Number:
         ends = c.omega in (0.0, np.inf) or c.omega == self.r.nyquist

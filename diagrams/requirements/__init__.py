@@ -1,17 +1,19 @@
 """Requirements on a design, and the verdicts on its numbers."""
 
-from .limits import Limit, Reason, Verdict, judge, judge_interval
+from .limits import SENSES, Limit, Reason, Sense, Verdict, judge, judge_interval
 from .requirements import LoopLimits, Requirements, StepLimits
 from .results import RequirementResult, Review
 from .toml_file import read_requirements
 
 __all__ = [
+    "SENSES",
     "Limit",
     "LoopLimits",
     "Reason",
     "RequirementResult",
     "Requirements",
     "Review",
+    "Sense",
     "StepLimits",
     "Verdict",
     "judge",

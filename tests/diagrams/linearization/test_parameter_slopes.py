@@ -3,28 +3,12 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import PID, Block, Constant, Gain, Input, Integrator, Output, ParameterError, State, parameter
+from loopwright.blocks import PID, Constant, Gain, Integrator, ParameterError
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.linearization import differentiate_loop
+from support.tuned_loops import Tank
 
 T = 0.05
-
-
-class Tank(Block):
-    """A tank whose outflow goes with the root of its level."""
-
-    inflow = Input()
-    level = Output()
-    h = State(start="start")
-    area: float = parameter(default=1.0)
-    outlet: float = parameter(default=1.0)
-    start: float = parameter(default=1.0)
-
-    def output(self, t, x, u):
-        return x.h
-
-    def derivative(self, t, x, u):
-        return (u.inflow - self.outlet * np.sqrt(x.h)) / self.area
 
 
 def make_lag(rate=3.0, kp=2.0, ki=1.5, sample_time=T, method=None):

@@ -1,0 +1,22 @@
+"""Studies of a design's margins over its parameters: sensitivities, worst cases."""
+
+from .cases import Case, CaseOrigin, CaseState, Goal
+from .confirmation import ConfirmationKind, RunConfirmation, confirm_sensitivity
+from .sensitivity import Sensitivities, Sensitivity, find_sensitivities, sensitivities_of
+from .worst_case import WorstCase, find_worst_case
+
+__all__ = [
+    "Case",
+    "CaseOrigin",
+    "CaseState",
+    "ConfirmationKind",
+    "Goal",
+    "RunConfirmation",
+    "Sensitivities",
+    "Sensitivity",
+    "WorstCase",
+    "confirm_sensitivity",
+    "find_sensitivities",
+    "find_worst_case",
+    "sensitivities_of",
+]

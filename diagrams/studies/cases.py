@@ -1,0 +1,172 @@
+"""Cases of a study: parameters, an operating point, and what came of them; and the numbers that a study looks at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+from ...blocks.core import OptionError, near
+from ..frequency import Number
+from ..requirements import SENSES, Limit, Requirements, Sense
+
+
+class CaseState(StrEnum):
+    """Outcome of one case."""
+
+    STABLE = "stable"
+    """All loops are stable; their numbers are there."""
+    UNSTABLE = "unstable"
+    """A closed loop is unstable."""
+    MOVING = "moving"
+    """The operating point is not at rest with these parameters: the numbers belong to a point that passes."""
+    FAILED = "failed"
+    """It could not be analysed: the parameters are refused, no operating point is found, or no linear model."""
+
+
+class CaseOrigin(StrEnum):
+    """Where a case comes from."""
+
+    NOMINAL = "nominal"
+    """The diagram as it is."""
+    SAMPLE = "sample"
+    """A sample of the ranges."""
+    CORNER = "corner"
+    """A corner of the ranges."""
+    SEARCH = "search"
+    """A step of the local search."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One choice of parameters at one operating point, with its numbers.
+
+    Attributes
+    ----------
+    index : int
+        Place among all cases.
+    origin : CaseOrigin
+        Sample, corner or search.
+    parameters : mapping
+        Values by path, as `Diagram.replace` takes them; empty of the diagram as it is.
+    point : int
+        Place of the operating point among those asked for.
+    state : CaseState
+        Outcome.
+    goodness : float
+        Distance to the limit, or the number by its sense: the smaller, the worse.
+    loop, quantity : tuple of str, str
+        The loop and the number that the goodness belongs to.
+    numbers : mapping
+        Numbers of the loops, by wires and name.
+    growth : float
+        Growth of the fastest unstable pole in 1/s; NaN of a stable case.
+    reason : str
+        Why it failed.
+    """
+
+    index: int
+    origin: CaseOrigin
+    parameters: Mapping[str, Any]
+    point: int
+    state: CaseState
+    goodness: float
+    loop: tuple[str, ...] = ()
+    quantity: str = ""
+    numbers: Mapping[tuple[str, ...], Mapping[str, Number]] = field(default_factory=dict, repr=False)
+    growth: float = math.nan
+    reason: str = ""
+
+    @property
+    def value(self) -> float:
+        """The number that the goodness belongs to; NaN where there is none."""
+        number = self.numbers.get(self.loop, {}).get(self.quantity)
+        return math.nan if number is None else number.value
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the facts by name, the parameters by their paths."""
+        facts: dict[str, Any] = {
+            "case": self.index,
+            "origin": self.origin.value,
+            "point": self.point,
+            "state": self.state.value,
+        }
+        facts |= {"value": self.value, "quantity": self.quantity, "loop": ", ".join(self.loop)}
+        return facts | {"growth": self.growth, "reason": self.reason, **self.parameters}
+
+
+@dataclass(frozen=True)
+class Goal:
+    """The numbers whose worst case is looked for: by loop, each with its limit, or one number without a limit."""
+
+    loops: Mapping[tuple[str, ...], Mapping[str, Limit | None]]
+
+    def goodness(self, loop: tuple[str, ...], quantity: str, value: float) -> float:
+        """Return the distance of a number to its limit over the limit's size; without a limit the number by its sense.
+
+        Infinite numbers are as good as can be.
+        """
+        limit = self.loops[loop][quantity]
+        if limit is None:
+            return value if SENSES[quantity] is Sense.LEAST else -value
+        ends = [abs(end) for end in limit if math.isfinite(end)]
+        return limit.distance(value) / (max(ends) or 1.0)
+
+    def slope(self, loop: tuple[str, ...], quantity: str, value: float) -> float:
+        """Return the derivative of the goodness by the number."""
+        limit = self.loops[loop][quantity]
+        if limit is None:
+            return 1.0 if SENSES[quantity] is Sense.LEAST else -1.0
+        ends = [abs(end) for end in limit if math.isfinite(end)]
+        return (1.0 if value - limit.low < limit.high - value else -1.0) / (max(ends) or 1.0)
+
+
+def describe(case: Case) -> str:
+    """Return one line about a case."""
+    if case.state is CaseState.FAILED:
+        return f"failed: {case.reason}"
+    if case.state is CaseState.UNSTABLE:
+        return f"unstable at {', '.join(case.loop)}, growth {case.growth:.4g} 1/s"
+    moving = " (the point is not at rest)" if case.state is CaseState.MOVING else ""
+    number = case.numbers[case.loop][case.quantity]
+    return f"{case.quantity} = {number} at {', '.join(case.loop)}{moving}"
+
+
+def make_goal(
+    loops: str | Iterable[str] | None, quantity: str | None, requirements: Requirements | None, diagram: str
+) -> Goal:
+    """Return the numbers to be looked at.
+
+    Raises
+    ------
+    OptionError
+        If neither a number nor requirements are given, or both; no loop; requirements that limit no loop's number.
+    """
+    if (quantity is None) == (requirements is None):
+        raise OptionError(
+            f"found quantity={quantity!r} and requirements={requirements!r}; expected one of them. Give a number, such "
+            "as quantity='disk_margin', or Requirements(phase_margin_deg=45).",
+            block=diagram,
+        )
+    if quantity is not None and quantity not in SENSES:
+        raise OptionError(f"a loop has no number {quantity!r}. {near(quantity, SENSES)}", block=diagram)
+    wires = [loops] if isinstance(loops, str) else list(loops or ())
+    if requirements is None:
+        if not wires:
+            raise OptionError("found no loop; expected the name of a wire. Give loop='u'.", block=diagram)
+        assert quantity is not None
+        return Goal({tuple(wires): {quantity: None}})
+    found: dict[tuple[str, ...], Mapping[str, Limit | None]] = {}
+    for wire in dict.fromkeys([*wires, *requirements.loops]):
+        limits = requirements.limits_of([wire], "")
+        if limits:
+            found[wire,] = dict(limits)
+    if not found:
+        raise OptionError(
+            "found requirements that limit no number of a loop; expected some, such as phase_margin_deg=45, and "
+            "loop='u'. Limits of step responses and of the report's numbers belong to report().",
+            block=diagram,
+        )
+    return Goal(found)

@@ -1,0 +1,273 @@
+"""Second computations of what a study has found: differences of margins, and runs of the worst case."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core import ConfirmationError, LoopwrightError, OptionError, SimulationError
+from ..flat import WiredDiagram
+from ..frequency import Margins, Realization, disk_margin, margins, mimo_disk_margin, mu_bound
+from ..linearization import Linearization, find_signal, linearize, trim
+from ..measure import frequency_response, step_response
+from ..results import OperatingPoint
+from .numbers import numbers_of
+from .parameters import changed_entry
+
+if TYPE_CHECKING:
+    from .cases import Case
+    from .sensitivity import Sensitivities, Sensitivity
+
+AGREEMENT = 1e-3
+"""Relative difference up to which a difference of margins confirms a slope."""
+STEP = 1e-3
+"""Change of a parameter for a confirmation, relative to its size."""
+AMPLITUDE = 1e-6
+"""Size of a test signal, relative to 1 + that of the wire's signal."""
+GROWTHS = 8.0
+"""Time constants of an unstable pole over which its growth is measured."""
+MANY = 20000
+"""Most samples of that."""
+GROWTH_AGREEMENT = 0.1
+"""Relative difference of a growth that confirms an instability."""
+MARGIN_AGREEMENT = 1e-2
+"""Relative difference of a measured number that confirms a margin."""
+
+MOST_UNCERTAIN = 1e-2
+"""Relative uncertainty of a measurement above which it confirms nothing."""
+
+
+class ConfirmationKind(StrEnum):
+    """Way in which a run confirms a worst case."""
+
+    INJECTION = "injection"
+    """A sine is added to the wire of the running diagram, at the frequency that decides the margin."""
+    GROWTH = "growth"
+    """A small step is added to the wire, and the signal grows as the unstable pole says."""
+
+
+@dataclass(frozen=True)
+class RunConfirmation:
+    """Confirmation of a worst case by a run of the diagram.
+
+    Attributes
+    ----------
+    kind : ConfirmationKind
+        Injection, or growth.
+    wire : str
+        Wire at which the test signal was added.
+    omega : float
+        Frequency of the sine in rad/s; NaN of a growth.
+    predicted, measured : float
+        The margin, or the growth in 1/s, which the linear model's response shows in the same time. A response that
+        leaves all bounds has an infinite growth.
+    agrees : bool
+        Whether they agree: a margin to 1 % and ten times the measurement's own uncertainty, a growth to 10 %.
+    uncertainty : float
+        Relative uncertainty of the measurement's loop L; NaN of a growth.
+    """
+
+    kind: ConfirmationKind
+    wire: str
+    omega: float
+    predicted: float
+    measured: float
+    agrees: bool
+    uncertainty: float = math.nan
+
+    def __str__(self) -> str:
+        verdict = "confirmed" if self.agrees else "NOT confirmed"
+        at = "" if math.isnan(self.omega) else f" at {self.omega:.6g} rad/s"
+        return (
+            f"{verdict} by {self.kind.value} at {self.wire!r}{at}: predicted {self.predicted:.6g}, measured "
+            f"{self.measured:.6g}"
+        )
+
+
+def confirm_case(diagram: WiredDiagram, case: Case, at: Any, amplitude: float | None, delay: int) -> RunConfirmation:
+    """Return the confirmation of a case by a run of the diagram with its parameters.
+
+    Raises
+    ------
+    OptionError
+        If the case could not be analysed, its loop has several wires, or the number can't be measured at one frequency.
+    """
+    if not case.loop or delay:
+        raise OptionError(
+            "found a case without a loop that a run has, as it failed, or has a delay in series; expected one with "
+            "delay=0 that was analysed. Look at its reason.", block=diagram.name,
+        )  # fmt: skip
+    if len(case.loop) > 1 and case.quantity:
+        raise OptionError(
+            f"found a loop cut at {len(case.loop)} wires at once; expected one wire, at which a run can be tested. "
+            "Simulate found.diagram.", block=diagram.name,
+        )  # fmt: skip
+    point = at(diagram) if callable(at) else at
+    model = linearize(diagram, point)
+    if case.quantity:
+        size = amplitude if amplitude is not None else _size_at(model, case.loop[0])
+        return _measure_margin(diagram, model, case, size)
+    return _measure_growth(diagram, model, case, amplitude)
+
+
+def _size_at(model: Linearization, wire: str) -> float:
+    source = model.diagram.names.get(wire.partition("[")[0])
+    path = wire if source is None else f"{source.block}.{source.port}"
+    return AMPLITUDE * (1.0 + float(np.max(np.abs(model.point.values.get(path, 0.0)), initial=0.0)))
+
+
+def _measure_margin(diagram: WiredDiagram, model: Linearization, case: Case, amplitude: float) -> RunConfirmation:
+    """Measure L at the frequency that decides a margin, and read the margin from it."""
+    L, wire = model.loop(*case.loop), case.loop[0]
+    omega = _deciding_frequency(L, case.quantity, case.value, diagram.name)
+    response = frequency_response(diagram, wire, [omega], amplitude=amplitude, at=model.point)
+    measured = np.asarray(response.L.frdata)[:, :, 0]
+    here = float(response.omega[0])
+    predicted = np.asarray(L(np.exp(1j * here * L.dt) if L.dt else 1j * here)).reshape(measured.shape)
+    value, expected = (_read_margin(M, case.quantity, here) for M in (measured, predicted))
+    off = float(response.uncertainty[0])
+    room = (MARGIN_AGREEMENT + 10.0 * off) * max(abs(expected), abs(case.value))
+    near = math.isfinite(value) and abs(value - expected) <= room and abs(expected - case.value) <= 5.0 * room
+    agrees = near and off < MOST_UNCERTAIN
+    return RunConfirmation(ConfirmationKind.INJECTION, wire, here, case.value, value, agrees, off)
+
+
+def _deciding_frequency(L: Any, quantity: str, value: float, name: str) -> float:
+    """Return the frequency in rad/s at which a margin is decided."""
+    if quantity == "disk_margin":
+        made = (disk_margin if L.ninputs == 1 else mimo_disk_margin)(L)
+        return _inside(made.frequency.value, L, name)
+    found: Margins = margins(L)
+    if quantity in ("ms", "modulus_margin"):
+        return _inside(found.ms_frequency.value, L, name)
+    if quantity == "mt":
+        return _inside(found.mt_frequency.value, L, name)
+    if quantity == "bandwidth":
+        return _inside(found.bandwidth.value, L, name)
+    if quantity in ("gain_margin_low", "gain_margin_high"):
+        near = [c.frequency.value for c in found.phase_crossovers if c.gain_margin.value == value]
+    elif quantity == "phase_margin_deg":
+        near = [c.frequency.value for c in found.gain_crossovers if abs(c.phase_margin_deg.value) == value]
+    else:
+        lag = found.delay_margin_s.value
+        near = [
+            c.frequency.value
+            for c in found.gain_crossovers
+            if abs(np.radians(c.phase_margin_deg.value) % (2 * np.pi) / c.frequency.value - lag) <= 1e-9 * lag
+        ]
+    return _inside(near[0] if near else math.nan, L, name)
+
+
+def _inside(omega: float, L: Any, name: str) -> float:
+    """Return a frequency at which a sine can be injected."""
+    top = 0.9 * np.pi / L.dt if L.dt else math.inf
+    if not 0 < omega < math.inf:
+        raise OptionError(
+            f"found a margin that is decided at {omega} rad/s; expected a frequency at which a sine can be added. Take "
+            "another number, such as quantity='disk_margin'.", block=name,
+        )  # fmt: skip
+    return min(omega, top)
+
+
+def _read_margin(L: np.ndarray, quantity: str, omega: float) -> float:
+    """Return a margin from L at the frequency that decides it."""
+    S = np.linalg.inv(np.eye(len(L)) + L)
+    one = complex(L[0, 0])
+    if quantity == "disk_margin":
+        return 1 / mu_bound(S - 0.5 * np.eye(len(L)))
+    lag = float(np.angle(-one) % (2 * np.pi))
+    values = {
+        "ms": abs(S[0, 0]),
+        "modulus_margin": 1 / abs(S[0, 0]),
+        "mt": abs(1 - S[0, 0]),
+        "phase_margin_deg": abs(float(np.degrees(np.angle(-one)))),
+        "delay_margin_s": lag / omega,
+    }
+    if quantity in ("gain_margin_low", "gain_margin_high"):
+        return float(-1 / one.real)
+    return float(values.get(quantity, math.nan))
+
+
+def _find_unstable_wire(model: Linearization, wires: tuple[str, ...]) -> str:
+    """Return an entry of a wire whose own loop has the unstable poles: those of another loop are hidden in a loop."""
+    flat = model.diagram.flatten_like(model.point)
+    for name in (*wires, *model.diagram.names):
+        for label in find_signal(flat, name).labels:
+            try:
+                r = Realization.of(model.loop(label))
+            except LoopwrightError:
+                continue
+            if r.order and not r.is_stable():
+                return label
+    return find_signal(flat, wires[0]).labels[0]
+
+
+def _measure_growth(
+    diagram: WiredDiagram, model: Linearization, case: Case, amplitude: float | None
+) -> RunConfirmation:
+    """Add a small step to the wire, and measure how the signal grows over time constants of the unstable pole."""
+    wire, dt = _find_unstable_wire(model, case.loop), model.dt
+    size = _size_at(model, wire) if amplitude is None else amplitude
+    length = GROWTHS / max(case.growth, 1e-12)
+    if dt:
+        length = min(max(length, 40 * dt), MANY * dt)
+    try:
+        found = step_response(diagram, wire, size=size, length=length, at=model.point)
+    except SimulationError:
+        return RunConfirmation(ConfirmationKind.GROWTH, wire, math.nan, case.growth, math.inf, agrees=True)
+    measured = _read_growth(found.v, found.t)
+    expected = case.growth if found.prediction is None else _read_growth(found.prediction[:, 0], found.t)
+    agrees = 0.0 < measured < math.inf and abs(measured - expected) <= GROWTH_AGREEMENT * abs(expected)
+    return RunConfirmation(ConfirmationKind.GROWTH, wire, math.nan, expected, measured, agrees)
+
+
+def _read_growth(v: np.ndarray, t: np.ndarray) -> float:
+    """Return the growth in 1/s of a signal from the second to the last quarter of its time."""
+    half = len(v) // 2
+    first, last = (float(np.max(np.abs(v[k + half // 2 : k + half]), initial=0.0)) for k in (0, len(v) - half))
+    return float(math.log(last / first) / (t[len(v) - half] - t[0])) if first > 0 and last > 0 else -math.inf
+
+
+def confirm_sensitivity(found: Sensitivities, row: Sensitivity, *, delay: int = 0, skew: float = 0.0) -> Sensitivity:
+    """Return a sensitivity that a second computation has confirmed: differences of the margin itself.
+
+    The diagram is changed by ±0.1 % of the parameter, linearized at the point as anew, and its margin is computed.
+
+    Raises
+    ------
+    ConfirmationError
+        If the two disagree.
+    """
+    model = found.model
+    if model is None or not math.isfinite(row.slope.value):
+        return row
+    h = STEP * (abs(row.value) or 1.0)
+
+    def number(change: float) -> float:
+        diagram = model.diagram.replace(changed_entry(model.diagram, row.parameter, row.value + change))
+        made = linearize(diagram, model.point, plants=model.plants, stairs=model.stairs, step=model.step)
+        if model.is_equilibrium and not made.is_equilibrium and not row.rest_lost:
+            made = linearize(diagram, _trim(diagram, model.point), plants=model.plants, stairs=model.stairs)
+        return numbers_of(made.loop(*found.wires), delay, skew)[row.quantity].value
+
+    a, b, c, d = (number(s * h) for s in (1.0, -1.0, 2.0, -2.0))
+    other = (8.0 * (a - b) - (c - d)) / (12.0 * h)
+    error = abs((a - b) / (2 * h) - (c - d) / (4 * h)) + 10 * row.number.tolerance / h
+    off = abs(other - row.slope.value)
+    if not off <= max(AGREEMENT * abs(row.slope.value), error, row.slope.tolerance):
+        raise ConfirmationError(
+            f"found {row.slope.value:.9g} as the derivative of {row.quantity} by {row.parameter}, but differences of "
+            f"the margin give {other:.9g}; expected the same to {AGREEMENT:g}. Look at the crossings near it: the "
+            "margin may have a kink there.",
+            block=model.diagram.name,
+        )
+    how = f"{row.slope.confirmed_by}; differences of the margin of the changed diagram give {other:.6g}"
+    return replace(row, slope=replace(row.slope, confirmed_by=how))
+
+
+def _trim(diagram: WiredDiagram, at: OperatingPoint) -> OperatingPoint:
+    return trim(diagram, None, None, rates=None, fixed=(), at=at, tolerance=1e-9)

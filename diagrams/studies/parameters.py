@@ -1,0 +1,103 @@
+"""Parameters of a study: those that a loop can be differentiated by, their values and units."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import Block, OptionError, Value
+from ...blocks.tracing import traced_parameters
+from ..flat import WiredDiagram
+from ..wiring import split_path
+
+
+def list_parameters(diagram: WiredDiagram) -> tuple[list[str], dict[str, str]]:
+    """Return the paths of all parameters that a loop can be differentiated by, and those left out with the reason.
+
+    They are the numbers in traced equations that are not 0, and the parameters that an FMU's block sets.
+    """
+    found, left_out = [], dict[str, str]()
+    for path, block in sorted(diagram.blocks.items()):
+        if block.stepped:
+            about: Any = block
+            for name in getattr(block, "start", {}):
+                variable = about.description.variables.get(name)
+                if variable is not None and variable.causality == "parameter" and _is_number(block, name):
+                    found.append(f"{path}.start.{name}")
+            continue
+        if block.opaque or block.evaluated_outside:
+            left_out[path] = "its equations are evaluated from outside; name its parameters to difference them"
+            continue
+        for name, value in traced_parameters(block):
+            if not _holds_numbers(value):
+                continue
+            if not np.all(value):
+                left_out[f"{path}.{name}"] = "it is 0, and so structure of the traced equations; name it to include it"
+            else:
+                found.append(f"{path}.{name}")
+    return found, left_out
+
+
+def _is_number(block: Any, name: str) -> bool:
+    value = np.asarray(block.start[name])
+    return value.dtype.kind == "f" and bool(value.size)
+
+
+def _holds_numbers(value: Any) -> bool:
+    return isinstance(value, float | np.ndarray) and np.asarray(value).dtype.kind == "f" and np.size(value) > 0
+
+
+def unit_of(diagram: WiredDiagram, parameter: str) -> str:
+    """Return the declared unit of a parameter; "" where there is none."""
+    path, keys = split_path(diagram.structure, parameter.partition("[")[0], diagram.name)
+    block: Block = diagram.structure.blocks[path]
+    if block.stepped and keys[0] == "start":
+        about: Any = block
+        variable = about.description.variables.get(".".join(keys[1:]))
+        return str(getattr(variable, "unit", None) or "")
+    owner: Any = block
+    for key in keys[:-1]:
+        owner = owner.__dict__[key]
+        if not isinstance(owner, Value):
+            return ""
+    spec = type(owner).parameter_specs.get(keys[-1])
+    return "" if spec is None or spec.unit is None else spec.unit
+
+
+def changed_entry(diagram: WiredDiagram, parameter: str, value: float) -> dict[str, Any]:
+    """Return the change for `Diagram.replace` that sets a parameter, or one entry of an array: ``"pid.poles[2]"``.
+
+    Raises
+    ------
+    OptionError
+        If an entry is meant that the parameter does not have.
+    """
+    name, bracket, entry = parameter.partition("[")
+    if not bracket:
+        return {name: value}
+    whole = np.array(read_parameter(diagram, name), dtype=float)
+    try:
+        place = tuple(int(i) - 1 for i in entry.rstrip("]").split(","))
+        if min(place) < 0 or len(place) != whole.ndim:
+            raise IndexError
+        whole[place] = value
+    except (ValueError, IndexError):
+        raise OptionError(
+            f"found {parameter!r}; expected an entry of an array of shape {whole.shape}, counted from 1, such as "
+            f"'{name}[1]'.", block=diagram.name,
+        ) from None  # fmt: skip
+    return {name: whole}
+
+
+def read_parameter(diagram: WiredDiagram, name: str) -> Any:
+    """Return the value of a parameter, or of an FMU's start value, by its full path."""
+    path, keys = split_path(diagram.structure, name, diagram.name)
+    owner: Any = diagram.structure.blocks[path]
+    if owner.stepped and keys[0] == "start":
+        key = ".".join(keys[1:])
+        known = owner.start.get(key)
+        return owner.description.variables[key].start if known is None else known
+    for key in keys:
+        owner = owner.__dict__[key] if isinstance(owner, Value) else owner[key]
+    return owner

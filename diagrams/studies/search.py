@@ -1,0 +1,264 @@
+"""The search of a worst case: cases computed one after the other, corners of the ranges, and the way downhill."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core import LoopwrightError, OptionError
+from ..flat import WiredDiagram
+from ..frequency import Number, Realization, find_hidden_unstable, margin_slopes
+from ..linearization import Linearization, differentiate_loop, linearize
+from ..sweeps import Box
+from .cases import Case, CaseOrigin, CaseState, Goal, describe
+from .numbers import numbers_of
+
+if TYPE_CHECKING:
+    from ..linearization import LoopSlope
+
+MOST_CORNERS = 5
+"""Number of parameters up to which all corners of the ranges are tried."""
+UNSTABLE = -1e6
+"""Goodness of a loop on the limit of stability; below it, less its growth, that of an unstable one."""
+FAILED = -1e9
+"""Goodness of a case that can't be analysed."""
+PATTERN = (0.1, 0.03, 0.01, 0.003)
+"""Steps along single parameters that end a search, in shares of the ranges."""
+DIFFERENCE = 1e-4
+"""Step of a difference by a parameter without an exact derivative, in shares of its range."""
+
+
+class Study:
+    """Cases of a diagram, computed one after the other and kept."""
+
+    def __init__(
+        self,
+        diagram: WiredDiagram,
+        goal: Goal,
+        boxes: Mapping[str, Box],
+        points: tuple[Any, ...],
+        delay: int,
+        options: Mapping[str, Any],
+        tell: Callable[[str], None],
+    ):
+        self.diagram, self.goal, self.boxes, self.points = diagram, goal, boxes, points
+        self.delay, self.options, self.tell = delay, options, tell
+        self.cases: list[Case] = []
+        self.names = [(name, i) for name, box in boxes.items() for i in range(box.size)]
+        self.smooth = {name for name in boxes if not _is_start_value(diagram, name)}
+        self._models: dict[int, Linearization] = {}
+
+    # --- cases --------------------------------------------------------------------------------------------------------
+
+    def run(self, parameters: Mapping[str, Any], origin: CaseOrigin) -> list[Case]:
+        """Return the cases of some parameters at all points."""
+        made = []
+        for place in range(len(self.points)):
+            case = self._analyse(parameters, place, origin)
+            made.append(case)
+            self.cases.append(case)
+        worst = min(made, key=lambda case: case.goodness)
+        self.tell(f"{origin.value} {len(self.cases)}: {describe(worst)}")
+        return made
+
+    def _analyse(self, parameters: Mapping[str, Any], place: int, origin: CaseOrigin) -> Case:
+        start = Case(len(self.cases), origin, dict(parameters), place, CaseState.FAILED, FAILED)
+        try:
+            diagram = self.diagram.replace(parameters) if parameters else self.diagram
+            point = self.points[place]
+            asked = point(diagram) if callable(point) else point
+            model = linearize(diagram, asked, **self.options)
+            case = self._judge(start, model)
+        except LoopwrightError as error:
+            return replace(start, reason=str(error))
+        self._models[case.index] = model
+        return case
+
+    def _judge(self, case: Case, model: Linearization) -> Case:
+        """Return a case with its numbers and its goodness."""
+        numbers: dict[tuple[str, ...], dict[str, Number]] = {}
+        worst: tuple[float, tuple[str, ...], str] = (math.inf, (), "")
+        unstable: tuple[str, ...] = ()
+        growth = -math.inf
+        for wires in self.goal.loops:
+            L = model.loop(*wires)
+            r = Realization.of(L, delay=self.delay)
+            own = r.logarithm(r.eigenvalues()) if r.order and not r.is_stable() else np.zeros(0)
+            hidden = np.array(find_hidden_unstable(r))  # poles of other loops, which this one does not move
+            beyond = [*own.real, *(np.log(np.abs(hidden)) / r.dt if r.dt else hidden.real)]
+            if beyond:
+                if max(beyond) > growth:
+                    growth, unstable = float(max(beyond)), wires
+                continue
+            found = numbers[wires] = numbers_of(L, self.delay)
+            for quantity in self.goal.loops[wires]:
+                if quantity not in found or math.isnan(found[quantity].value):
+                    continue
+                goodness = self.goal.goodness(wires, quantity, found[quantity].value)
+                if goodness < worst[0]:
+                    worst = (goodness, wires, quantity)
+        if unstable:
+            return replace(
+                case, state=CaseState.UNSTABLE, goodness=UNSTABLE - max(growth, 0.0), loop=unstable, growth=growth,
+                numbers=numbers,
+            )  # fmt: skip
+        if not worst[1]:
+            return replace(case, reason="none of its loops has any of the numbers that are asked for")
+        rests = model.is_equilibrium or not self._starts_at_rest(case.point)
+        state = CaseState.STABLE if rests else CaseState.MOVING
+        return replace(case, state=state, goodness=worst[0], loop=worst[1], quantity=worst[2], numbers=numbers)
+
+    def _starts_at_rest(self, place: int) -> bool:
+        """Whether the diagram as it is rests at a point."""
+        model = self._models.get(place)
+        return model is not None and model.is_equilibrium
+
+    # --- ranges -------------------------------------------------------------------------------------------------------
+
+    def parameters_at(self, fractions: np.ndarray) -> dict[str, Any]:
+        """Return the parameters at a point of the ranges, each fraction between 0 and 1."""
+        found, first = {}, 0
+        for name, box in self.boxes.items():
+            part = np.clip(fractions[first : first + box.size], 0.0, 1.0)
+            found[name] = box.at(part if np.ndim(box.low) else float(part[0]))
+            first += box.size
+        return found
+
+    def fractions_of(self, parameters: Mapping[str, Any]) -> np.ndarray:
+        """Return the point of the ranges at which parameters stand."""
+        parts = []
+        for name, box in self.boxes.items():
+            low, high, value = (np.ravel(np.asarray(v, dtype=float)) for v in (box.low, box.high, parameters[name]))
+            if box.scale == "log":
+                low, high, value = np.log(low), np.log(high), np.log(value)
+            width = np.where(high > low, high - low, 1.0)
+            parts.append(np.clip((value - low) / width, 0.0, 1.0))
+        return np.concatenate(parts)
+
+    def _widths(self, parameters: Mapping[str, Any]) -> np.ndarray:
+        """Return the derivative of each parameter's numbers by its fraction."""
+        parts = []
+        for name, box in self.boxes.items():
+            low, high, value = (np.ravel(np.asarray(v, dtype=float)) for v in (box.low, box.high, parameters[name]))
+            parts.append(value * np.log(high / low) if box.scale == "log" else high - low)
+        return np.concatenate(parts)
+
+    # --- search -------------------------------------------------------------------------------------------------------
+
+    def try_corners(self) -> None:
+        """Run the corners of the ranges: all of a few parameters."""
+        n = len(self.names)
+        if n <= MOST_CORNERS:
+            for corner in itertools.product((0.0, 1.0), repeat=n):
+                self.run(self.parameters_at(np.array(corner)), CaseOrigin.CORNER)
+
+    def search(self, starts: int, steps: int) -> None:
+        """Go downhill from the worst cases that could be analysed; an unstable one is bad enough."""
+        ranked = sorted((c for c in self.cases if c.parameters and c.quantity), key=lambda c: (c.goodness, c.index))
+        begun: list[np.ndarray] = []
+        for case in ranked:
+            if len(begun) == starts or self._is_lost():
+                break
+            fractions = self.fractions_of(case.parameters)
+            if any(np.max(np.abs(fractions - other)) < 0.05 for other in begun):
+                continue
+            begun.append(fractions)
+            self._descend(fractions, steps)
+        if not self._is_lost():
+            self._polish()
+
+    def _is_lost(self) -> bool:
+        return any(case.state is CaseState.UNSTABLE for case in self.cases)
+
+    def _descend(self, fractions: np.ndarray, steps: int) -> None:
+        """Go downhill along the gradient, within the ranges, and try the corner that it points to."""
+        from scipy.optimize import minimize
+
+        ends = list[np.ndarray]()
+
+        def evaluate(x: np.ndarray) -> tuple[float, np.ndarray]:
+            case = min(self.run(self.parameters_at(x), CaseOrigin.SEARCH), key=lambda c: c.goodness)
+            if case.state in (CaseState.UNSTABLE, CaseState.FAILED):
+                raise _LostError
+            gradient = self.gradient(case, x)
+            ends.append(gradient)
+            return case.goodness, gradient
+
+        try:
+            minimize(
+                evaluate, fractions, jac=True, method="L-BFGS-B", bounds=[(0.0, 1.0)] * fractions.size,
+                options={"maxiter": steps, "maxfun": 2 * steps},
+            )  # fmt: skip
+        except _LostError:
+            return
+        if ends and len(self.names) > MOST_CORNERS:
+            corner = np.where(ends[-1] > 0.0, 0.0, 1.0)
+            self.run(self.parameters_at(np.where(ends[-1] == 0.0, fractions, corner)), CaseOrigin.CORNER)
+
+    def gradient(self, case: Case, fractions: np.ndarray) -> np.ndarray:
+        """Return the derivative of a case's goodness by the fractions, exact where the parameters are traced."""
+        model, found = self._models[case.index], np.zeros(fractions.size)
+        L = model.loop(*case.loop)
+        slopes: list[LoopSlope | None] = []
+        point = self.points[case.point]
+        find = point if callable(point) else None
+        for name in self.boxes:
+            try:
+                if name not in self.smooth:
+                    raise OptionError("no traced parameter")
+                slopes += differentiate_loop(model, case.loop, [name], find=find)
+            except LoopwrightError:
+                slopes += [None] * self.boxes[name].size
+        known = [s for s in slopes if s is not None]
+        made = margin_slopes(L, [s.slopes for s in known], delay=self.delay)[case.quantity].slopes
+        exact = iter(made)
+        by_number = self.goal.slope(case.loop, case.quantity, case.value)
+        widths = self._widths(case.parameters)
+        for i, slope in enumerate(slopes):
+            value = math.nan if slope is None else next(exact)
+            if math.isfinite(value):
+                found[i] = by_number * value * widths[i]
+            else:
+                found[i] = self._difference(case, fractions, i)
+        return found
+
+    def _difference(self, case: Case, fractions: np.ndarray, i: int) -> float:
+        side = -1.0 if fractions[i] > 0.5 else 1.0
+        moved = fractions.copy()
+        moved[i] += side * DIFFERENCE
+        other = min(self.run(self.parameters_at(moved), CaseOrigin.SEARCH), key=lambda c: c.goodness)
+        change = (other.goodness - case.goodness) / (side * DIFFERENCE)
+        return change if abs(change) < abs(UNSTABLE) else 0.0
+
+    def _polish(self) -> None:
+        """Step along single parameters from the worst case on: a kink in the margin stops a gradient, but not these."""
+        known = [c for c in self.cases if c.parameters and c.quantity]
+        if not known:
+            return
+        best = min(known, key=lambda c: (c.goodness, c.index))
+        for step in PATTERN:
+            better = True
+            while better and not self._is_lost():
+                better, middle = False, self.fractions_of(best.parameters)
+                for i, side in itertools.product(range(middle.size), (1.0, -1.0)):
+                    moved = middle.copy()
+                    moved[i] = np.clip(moved[i] + side * step, 0.0, 1.0)
+                    if moved[i] == middle[i]:
+                        continue
+                    case = min(self.run(self.parameters_at(moved), CaseOrigin.SEARCH), key=lambda c: c.goodness)
+                    if case.goodness < best.goodness - 1e-9 * (1.0 + abs(best.goodness)):
+                        best, better = case, True
+                        break
+
+
+class _LostError(Exception):
+    """The search has come to a case that is unstable or can't be analysed."""
+
+
+def _is_start_value(diagram: WiredDiagram, name: str) -> bool:
+    return any(name.startswith(f"{path}.start.") for path, block in diagram.blocks.items() if block.stepped)

@@ -1,0 +1,299 @@
+"""Sensitivity of a loop's margins to the parameters of its diagram."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...blocks.core import LoopwrightError, UnknownNameError, near
+from ..flat import WiredDiagram
+from ..frequency import MarginSlope, Number, margin_slopes
+from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize
+from ..results import OperatingPoint
+from ..sweeps import find_parameter
+from .parameters import list_parameters, unit_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ROUNDING = 1e-9
+"""Relative error of a slope by rounding alone."""
+PEAK_ERROR = 1e-6
+"""Relative error of the slope of a disk margin of several channels, whose frequency is searched for."""
+EXACT = "exact derivative of the linear model"
+ESTIMATED = "differences of linear models with changed start values"
+Four = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """The derivative of one number of a loop by one number of a parameter.
+
+    Attributes
+    ----------
+    parameter, value, unit : str, float, str
+        Path of the parameter, with the entry of an array, its value, and its unit ("" where none is declared).
+    quantity : str
+        Name of the loop's number, such as ``"phase_margin_deg"``.
+    number : Number
+        The loop's number.
+    slope : Number
+        Its derivative by the parameter, in the number's unit over the parameter's.
+    kink : bool
+        Whether another crossing has nearly the same margin: beyond it the slope is another one.
+    rest_lost : bool
+        Whether the operating point does not stay at rest when the parameter changes; the states are held then.
+    """
+
+    parameter: str
+    value: float
+    unit: str
+    quantity: str
+    number: Number
+    slope: Number
+    kink: bool = False
+    rest_lost: bool = False
+
+    @property
+    def per_percent(self) -> Number:
+        """Change of the number when the parameter grows by 1 %, in the number's unit, to first order."""
+        s, share = self.slope, abs(self.value) / 100.0
+        return replace(s, value=s.value * share, tolerance=s.tolerance * share, unit=self.number.unit)
+
+    @property
+    def relative(self) -> float:
+        """Relative change of the number over the relative change of the parameter; NaN where one of them is 0."""
+        size = self.number.value
+        return self.slope.value * self.value / size if size and math.isfinite(size) else math.nan
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether no difference is part of the slope."""
+        return self.slope.confirmed_by != ESTIMATED
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the facts by name."""
+        return {
+            "parameter": self.parameter,
+            "value": self.value,
+            "unit": self.unit,
+            "quantity": self.quantity,
+            "number": self.number.value,
+            "slope": self.slope.value,
+            "tolerance": self.slope.tolerance,
+            "per_percent": self.per_percent.value,
+            "relative": self.relative,
+            "kink": self.kink,
+            "rest_lost": self.rest_lost,
+        }
+
+
+@dataclass(frozen=True)
+class Sensitivities(Sequence[Sensitivity]):
+    """Sensitivities of a loop's numbers to parameters, in the order of the parameters.
+
+    ``found["pid.kp", "phase_margin_deg"]`` is one of them, ``found.of("ms")`` those of one number, the largest first.
+
+    Attributes
+    ----------
+    wires : tuple of str
+        Wires that the loop is cut at.
+    rows : tuple of Sensitivity
+        All of them.
+    stable : bool
+        Whether the closed loop is stable. The numbers and slopes of an unstable one are NaN.
+    without_effect : tuple of str
+        Parameters that change nothing in the loop.
+    left_out : mapping
+        Parameters that have no derivative here, with the reason.
+    model : Linearization
+        The linear model.
+    """
+
+    wires: tuple[str, ...]
+    rows: tuple[Sensitivity, ...]
+    stable: bool
+    without_effect: tuple[str, ...] = ()
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    model: Linearization | None = field(default=None, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Sensitivity]:
+        return iter(self.rows)
+
+    def __getitem__(self, key: Any) -> Any:
+        if isinstance(key, int | slice):
+            return self.rows[key]
+        if not (isinstance(key, tuple) and len(key) == 2):
+            raise UnknownNameError(
+                f"found {key!r}; expected a parameter and a number, such as found['pid.kp', 'phase_margin_deg']."
+            )
+        name, quantity = key
+        names = tuple(dict.fromkeys(row.parameter for row in self.rows))
+        full = [n for n in names if n == name or n.endswith(f".{name}")]
+        if len(full) != 1:
+            raise UnknownNameError(f"found no sensitivity to {name!r}. {near(str(name), names)}")
+        for row in self.rows:
+            if (row.parameter, row.quantity) == (full[0], quantity):
+                return row
+        raise UnknownNameError(f"the loop has no {quantity!r}. {near(str(quantity), self.quantities)}")
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """Names of the loop's numbers."""
+        return tuple(dict.fromkeys(row.quantity for row in self.rows))
+
+    def of(self, quantity: str, count: int | None = None) -> list[Sensitivity]:
+        """Return the sensitivities of one number, the largest change per 1 % first.
+
+        Raises
+        ------
+        UnknownNameError
+            If the loop has no such number.
+        """
+        if self.rows and quantity not in self.quantities:
+            raise UnknownNameError(f"the loop has no {quantity!r}. {near(str(quantity), self.quantities)}")
+        mine = [row for row in self.rows if row.quantity == quantity and math.isfinite(row.slope.value)]
+        return sorted(mine, key=lambda row: (-abs(row.per_percent.value), row.parameter))[:count]
+
+    def table(self) -> list[dict[str, Any]]:
+        """Return all rows as mappings; ``pandas.DataFrame(found.table())`` shows them."""
+        return [row.as_dict() for row in self.rows]
+
+    def __str__(self) -> str:
+        lines = [f"loop at {', '.join(self.wires)}: change per 1 % of each parameter (derivative)"]
+        if not self.stable:
+            lines.append("the closed loop is unstable: it has no margins")
+        for quantity in self.quantities:
+            mine = self.of(quantity)
+            if mine:
+                lines.append(f"{quantity} = {mine[0].number}")
+            for row in mine:
+                marks = "".join((" (kink)" if row.kink else "", " (states held)" if row.rest_lost else ""))
+                lines.append(
+                    f"  {row.parameter:44s} {row.per_percent.value:+12.4g}   ({row.slope.value:+.6g} ± "
+                    f"{row.slope.tolerance:.1g}, at {row.value:g} {row.unit}){marks}"
+                )
+        if self.without_effect:
+            lines.append(f"without effect: {', '.join(self.without_effect)}")
+        lines += [f"left out: {name}: {reason}" for name, reason in self.left_out.items()]
+        return "\n".join(lines)
+
+    def plot(self, quantity: str = "disk_margin", count: int = 8) -> Figure:
+        """Return a bar for each of the largest changes per 1 % of a parameter."""
+        from matplotlib.figure import Figure
+
+        mine = self.of(quantity, count)[::-1]
+        figure = Figure(figsize=(6.4, 0.9 + 0.32 * max(len(mine), 1)), layout="constrained")
+        axes = figure.add_subplot()
+        values = [row.per_percent.value for row in mine]
+        axes.barh([row.parameter for row in mine], values, color=["C0" if v >= 0 else "C3" for v in values])
+        axes.axvline(0.0, color="0.3", linewidth=0.8)
+        unit = "" if not mine or mine[0].number.unit == "1" else f" in {mine[0].number.unit}"
+        axes.set_xlabel(f"change of {quantity}{unit} per 1 % of the parameter")
+        axes.grid(axis="x", alpha=0.3)
+        return figure
+
+
+def find_sensitivities(
+    diagram: WiredDiagram,
+    loop: str | Iterable[str],
+    parameters: str | Iterable[str] | None = None,
+    *,
+    at: Any = None,
+    delay: int = 0,
+    skew: float = 0.0,
+    plants: str | None = None,
+    stairs: str | None = None,
+    **options: Any,
+) -> Sensitivities:
+    """Return the derivatives of a loop's margins by parameters; see `Diagram.sensitivity`."""
+    wires = (loop,) if isinstance(loop, str) else tuple(loop)
+    find: PointFinder | None = at if callable(at) and not isinstance(at, OperatingPoint) else None
+    point = find(diagram) if find is not None else at
+    model = linearize(diagram, point, plants=plants, stairs=stairs, **options)
+    return sensitivities_of(model, wires, parameters, find=find, delay=delay, skew=skew)
+
+
+def sensitivities_of(
+    model: Linearization,
+    wires: tuple[str, ...],
+    parameters: str | Iterable[str] | None = None,
+    *,
+    find: PointFinder | None = None,
+    delay: int = 0,
+    skew: float = 0.0,
+) -> Sensitivities:
+    """Return the derivatives of the margins of a linear model's loop by parameters of its diagram."""
+    diagram = model.diagram
+    left_out: dict[str, str] = {}
+    if parameters is None:
+        names, left_out = list_parameters(diagram)
+    else:
+        given = [parameters] if isinstance(parameters, str) else list(parameters)
+        names = list(dict.fromkeys(find_parameter(diagram, name) for name in given))
+    L = model.loop(*wires)
+    slopes: list[LoopSlope] = []
+    for name in names:
+        try:
+            slopes += differentiate_loop(model, wires, [name], find=find)
+        except LoopwrightError as error:
+            if parameters is not None:
+                raise
+            left_out[name] = error.message
+    acting = [one for one in slopes if any(np.any(M) for M in one.slopes)]
+    found = margin_slopes(L, [one.slopes for one in acting], delay=delay, skew=skew)
+    bounds = _bound_errors(L, acting, found, delay, skew)
+    rows = []
+    for i, one in enumerate(acting):
+        unit = unit_of(diagram, one.parameter)
+        for quantity, slope in found.items():
+            value = slope.slopes[i]
+            rounding = PEAK_ERROR if len(wires) > 1 or L.ninputs > 1 else ROUNDING
+            tolerance = rounding * abs(value) + bounds[quantity][i]
+            how = EXACT if one.is_exact else ESTIMATED
+            over = _over(slope.number.unit, unit)
+            number = Number(value, over, tolerance, how, findings=slope.number.findings)
+            rows.append(
+                Sensitivity(one.parameter, one.value, unit, quantity, slope.number, number, slope.kink, one.rest_lost)
+            )
+    without = tuple(one.parameter for one in slopes if one not in acting)
+    stable = not any(math.isnan(f.number.value) for name, f in found.items() if name in ("ms", "disk_margin"))
+    return Sensitivities(wires, tuple(rows), stable, without, left_out, model)
+
+
+def _over(unit: str, below: str) -> str:
+    if not below or below == "1":
+        return unit
+    return f"{unit}/({below})" if any(c in below for c in "/*·") else f"{unit}/{below}"
+
+
+def _bound_errors(
+    L: Any, slopes: Sequence[LoopSlope], found: Mapping[str, MarginSlope], delay: int, skew: float
+) -> dict[str, np.ndarray]:
+    """Return bounds of the slopes' errors that come of errors of the matrices' entries, by the numbers' names."""
+    bounds = {name: np.zeros(len(slopes)) for name in found}
+    rough = [i for i, one in enumerate(slopes) if not one.is_exact]
+    if not rough:
+        return bounds
+    shapes = [M.shape for M in (L.A, L.B, L.C, L.D)]
+    places = [(k, place) for k, shape in enumerate(shapes) for place in np.ndindex(*shape)]
+    needed = [(k, p) for k, p in places if any(slopes[i].errors[k][p] for i in rough)]
+    units = []
+    for k, place in needed:
+        four = [np.zeros(shape) for shape in shapes]
+        four[k][place] = 1.0
+        units.append((four[0], four[1], four[2], four[3]))
+    by_entry = margin_slopes(L, units, delay=delay, skew=skew)
+    for name, one in by_entry.items():
+        gradient = np.nan_to_num(np.abs(one.slopes))
+        for i in rough:
+            errors = np.array([slopes[i].errors[k][place] for k, place in needed])
+            bounds[name][i] = float(gradient @ errors)
+    return bounds

@@ -1,0 +1,201 @@
+"""Worst cases: the smallest margins of a loop over ranges of parameters, found by samples and a local search.
+
+The worst samples are where searches begin. A search goes downhill along the exact derivatives of the margins, within
+the ranges (L-BFGS-B); where a margin changes from one crossing to another its slope jumps, so that steps along single
+parameters follow. Corners of the ranges are tried, too. Whatever can't be analysed is data: it counts as the worst.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from ...blocks.core import OptionError
+from ..flat import WiredDiagram
+from ..requirements import Requirements
+from ..sweeps import Box, Samples, read_samples
+from .cases import Case, CaseOrigin, CaseState, Goal, describe, make_goal
+from .confirmation import RunConfirmation, confirm_case
+from .search import Study
+from .worst_case_plot import plot_cases
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class WorstCase:
+    """Worst case of a loop's numbers over ranges of parameters.
+
+    ``diagram.simulate(…)`` of ``found.diagram`` runs it; ``found.parameters`` are its parameters for `replace`.
+
+    Attributes
+    ----------
+    worst : Case
+        The worst of all cases.
+    nominal : tuple of Case
+        The diagram as it is, at each operating point.
+    cases : tuple of Case
+        All cases in the order in which they were computed.
+    boxes : mapping of str to Box
+        The ranges; empty where the samples were a table.
+    goal : Goal
+        The numbers and their limits.
+    base : Diagram
+        The diagram as it is.
+    points : tuple
+        The operating points as they were asked for.
+    """
+
+    worst: Case
+    nominal: tuple[Case, ...]
+    cases: tuple[Case, ...] = field(repr=False)
+    boxes: Mapping[str, Box] = field(repr=False)
+    goal: Goal = field(repr=False)
+    base: WiredDiagram = field(repr=False)
+    points: tuple[Any, ...] = field(repr=False)
+    options: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """Parameters of the worst case, as `Diagram.replace` takes them."""
+        return self.worst.parameters
+
+    @property
+    def diagram(self) -> Any:
+        """The diagram with the parameters of the worst case, ready to be simulated."""
+        return self.base.replace(self.worst.parameters) if self.worst.parameters else self.base
+
+    @property
+    def unstable(self) -> tuple[Case, ...]:
+        """The cases with an unstable loop."""
+        return tuple(case for case in self.cases if case.state is CaseState.UNSTABLE)
+
+    @property
+    def failures(self) -> tuple[Case, ...]:
+        """The cases that could not be analysed; each tells its reason."""
+        return tuple(case for case in self.cases if case.state is CaseState.FAILED)
+
+    @property
+    def worst_analysed(self) -> Case:
+        """The worst of the cases that could be analysed."""
+        return min((c for c in self.cases if c.state is not CaseState.FAILED), key=lambda c: (c.goodness, c.index))
+
+    @property
+    def worst_sample(self) -> Case:
+        """The worst of the samples, from which the search went on."""
+        mine = [case for case in self.cases if case.origin is CaseOrigin.SAMPLE]
+        return min(mine, key=lambda case: case.goodness)
+
+    def table(self) -> list[dict[str, Any]]:
+        """Return all cases as mappings, the worst first; ``pandas.DataFrame(found.table())`` shows them."""
+        return [case.as_dict() for case in sorted(self.cases, key=lambda case: (case.goodness, case.index))]
+
+    def confirm(self, amplitude: float | None = None) -> RunConfirmation:
+        """Confirm the worst case by a run of the diagram with its parameters.
+
+        The margin of a stable one is measured with a sine at the frequency that decides it; the signal of an unstable
+        one has to grow as its pole says.
+
+        Parameters
+        ----------
+        amplitude : float, optional
+            Size of the test signal in the wire's unit; 1e-6 of 1 + the wire's size without it.
+
+        Raises
+        ------
+        OptionError
+            If the worst case failed, or has a number or a loop that one sine can't measure.
+        """
+        if self.worst.state is CaseState.FAILED:
+            raise OptionError(
+                f"found a worst case that failed: {self.worst.reason} Expected one that was analysed: look at "
+                "worst_analysed.", block=self.base.name,
+            )  # fmt: skip
+        return confirm_case(self.diagram, self.worst, self.points[self.worst.point], amplitude, self.options["delay"])
+
+    def __str__(self) -> str:
+        w, n = self.worst, min(self.nominal, key=lambda case: case.goodness)
+        counts = {state: sum(case.state is state for case in self.cases) for state in CaseState}
+        told = ", ".join(f"{count} {state.value}" for state, count in counts.items() if count)
+        lines = [f"worst of {len(self.cases)} cases ({told}), found by {w.origin.value}:"]
+        lines.append(f"  {describe(w)}; as it is: {describe(n)}")
+        lines += [f"  {name} = {_short(value)}" for name, value in w.parameters.items()]
+        if w.point or len(self.points) > 1:
+            lines.append(f"  at operating point {w.point} of {len(self.points)}")
+        if counts[CaseState.FAILED]:
+            lines.append(f"  {counts[CaseState.FAILED]} cases failed, the first: {self.failures[0].reason}")
+        return "\n".join(lines)
+
+    def plot(self, parameters: Sequence[str] | None = None) -> Figure:
+        """Return a scatter of the number over each parameter: samples, search, the worst case and the limit.
+
+        Raises
+        ------
+        OptionError
+            If there is no such parameter, or none with one entry.
+        """
+        return plot_cases(self, parameters)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def find_worst_case(
+    diagram: WiredDiagram,
+    parameters: Mapping[str, Any] | None,
+    loop: str | Iterable[str] | None = None,
+    *,
+    quantity: str | None = None,
+    requirements: Requirements | None = None,
+    samples: Any = "latin",
+    count: int | None = None,
+    seed: int = 0,
+    starts: int = 3,
+    steps: int = 15,
+    at: Any = None,
+    points: Sequence[Any] | None = None,
+    delay: int = 0,
+    progress: Callable[[str], None] | None = None,
+    **options: Any,
+) -> WorstCase:
+    """Return the worst case of a loop's numbers over ranges of parameters; see `Diagram.worst_case`."""
+    if quantity is None and requirements is None:
+        quantity = "disk_margin"
+    if points is not None and at is not None:
+        raise OptionError("found at and points; expected one of them. Give points=[…] alone.", block=diagram.name)
+    goal = make_goal(loop, quantity, requirements, diagram.name)
+    if samples == "latin" and count is None:
+        count = 100
+    drawn = read_samples(diagram, parameters, samples, count=count, seed=seed)
+    boxes = _read_boxes(diagram, parameters, drawn)
+    places = tuple(points) if points is not None else (at,)
+    study = Study(diagram, goal, boxes, places, delay, options, progress or (lambda text: None))
+    nominal = study.run({}, CaseOrigin.NOMINAL)
+    if all(case.state is CaseState.FAILED for case in nominal):
+        raise OptionError(
+            f"the diagram as it is can't be analysed: {nominal[0].reason} Mend that first.", block=diagram.name
+        )
+    for sample in drawn:
+        study.run(sample.parameters, CaseOrigin.SAMPLE)
+    if boxes and starts > 0:
+        study.try_corners()
+        study.search(starts, steps)
+    cases = tuple(study.cases)
+    worst = min(cases, key=lambda case: (case.goodness, case.index))
+    return WorstCase(worst, tuple(nominal), cases, boxes, goal, diagram, places, {**options, "delay": delay})
+
+
+def _read_boxes(diagram: WiredDiagram, parameters: Mapping[str, Any] | None, drawn: Samples) -> dict[str, Box]:
+    """Return the ranges of a search: those of a Latin hypercube, or from the least to the largest value of a grid."""
+    if drawn.boxes:
+        return dict(drawn.boxes)
+    if drawn.axes is None:
+        return {}
+    return {
+        name: Box(min(values), max(values))
+        for name, values in drawn.axes.items()
+        if all(isinstance(v, float | int) and not isinstance(v, bool) for v in values)
+    }

@@ -1,0 +1,78 @@
+"""Scatter of the cases of a worst-case study."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...blocks.core import OptionError, near
+from .cases import CaseOrigin, CaseState
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from .worst_case import WorstCase
+
+
+def plot_cases(found: WorstCase, parameters: Sequence[str] | None = None) -> Figure:
+    """Return a scatter of the number over each parameter; see `WorstCase.plot`."""
+    from matplotlib.figure import Figure
+
+    every = [name for name, value in found.worst.parameters.items() if isinstance(value, float | int)]
+    names = every if parameters is None else list(parameters)
+    for name in names:
+        if name not in every:
+            raise OptionError(f"found no parameter {name!r} with one number in the study. {near(name, every)}")
+    if not names:
+        raise OptionError("found no parameter with one number; expected one to draw over. Look at table().")
+    loop, quantity = _drawn(found)
+    figure = Figure(figsize=(3.4 * min(len(names), 3), 3.2 * math.ceil(len(names) / 3)), layout="constrained")
+    grid = figure.subplots(math.ceil(len(names) / 3), min(len(names), 3), squeeze=False)
+    looks = {
+        CaseOrigin.SAMPLE: ("C0", 12, "samples"),
+        CaseOrigin.CORNER: ("C4", 18, "corners"),
+        CaseOrigin.SEARCH: ("C1", 8, "search"),
+    }
+    for place, axes in enumerate(grid.flat):
+        if place >= len(names):
+            axes.set_visible(False)
+            continue
+        name = names[place]
+        for origin, (color, size, label) in looks.items():
+            mine = [c for c in found.cases if c.origin is origin and c.state in (CaseState.STABLE, CaseState.MOVING)]
+            mine = [c for c in mine if loop in c.numbers and math.isfinite(c.numbers[loop][quantity].value)]
+            if mine:
+                y = [c.numbers[loop][quantity].value for c in mine]
+                axes.scatter([c.parameters[name] for c in mine], y, s=size, color=color, label=label, alpha=0.8)
+        bad = [c for c in found.cases if c.parameters and c.state in (CaseState.UNSTABLE, CaseState.FAILED)]
+        low = axes.get_ylim()[0] if axes.collections else 0.0
+        if bad:
+            x = [c.parameters[name] for c in bad]
+            axes.scatter(x, np.full(len(bad), low), marker="x", color="C3", s=20, label="unstable or failed")
+        worst = found.worst
+        y_worst = worst.numbers[loop][quantity].value if loop in worst.numbers else low
+        axes.scatter([worst.parameters[name]], [y_worst], marker="*", s=130, color="C3", label="worst", zorder=3)
+        limit = found.goal.loops[loop][quantity]
+        for end in () if limit is None else limit:
+            if math.isfinite(end):
+                axes.axhline(end, color="0.3", linestyle="--", linewidth=0.9)
+        if name in found.boxes and found.boxes[name].scale == "log":
+            axes.set_xscale("log")
+        axes.set_xlabel(name if len(name) < 34 else f"…{name[-32:]}")
+        axes.grid(alpha=0.3)
+        if place % 3 == 0:
+            unit = next((c.numbers[loop][quantity].unit for c in found.cases if loop in c.numbers), "1")
+            axes.set_ylabel(quantity if unit == "1" else f"{quantity} ({unit})")
+    figure.axes[0].legend(fontsize="small")
+    return figure
+
+
+def _drawn(found: WorstCase) -> tuple[tuple[str, ...], str]:
+    """Return the loop and the number that are drawn: those of the worst case, or else the first."""
+    if found.worst.quantity:
+        return found.worst.loop, found.worst.quantity
+    loop = next(iter(found.goal.loops))
+    return loop, next(iter(found.goal.loops[loop]))

@@ -1,0 +1,84 @@
+"""Sensitivities of margins to parameters of a diagram."""
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import UnknownNameError
+from loopwright.diagrams import experiments
+from loopwright.diagrams.studies import confirm_sensitivity
+from support.tuned_loops import make_pi_loop, pi_phase_margin
+
+NAMES = ["p.gain", "ki.gain", "rate.gain"]
+
+
+def test_phase_margins_have_the_slopes_of_their_closed_form():
+    values = np.array([1.0, 0.5, 2.0])
+    found = make_pi_loop(*values).sensitivity("u", NAMES)
+    h = 1e-3
+    for i, name in enumerate(NAMES):
+        moves = [values + s * h * np.eye(3)[i] for s in (1.0, -1.0, 2.0, -2.0)]
+        a, b, c, d = (pi_phase_margin(*move) for move in moves)
+        row = found[name, "phase_margin_deg"]
+        slope = (8 * (a - b) - (c - d)) / (12 * h)
+        assert row.slope.value == pytest.approx(slope, rel=1e-8)
+        assert row.is_exact
+        assert row.per_percent.value == pytest.approx(slope * values[i] / 100, rel=1e-8)
+        assert row.relative == pytest.approx(slope * values[i] / pi_phase_margin(*values), rel=1e-8)
+    largest = found.of("phase_margin_deg", 1)[0]
+    assert largest.parameter == max(NAMES, key=lambda name: abs(found[name, "phase_margin_deg"].per_percent.value))
+
+
+def test_without_names_all_numbers_are_taken_and_zeros_are_told():
+    found = make_pi_loop().sensitivity("u")
+    assert {row.parameter for row in found} == set(NAMES)
+    assert "r.value" in found.left_out
+    assert "phase_margin_deg" in str(found)
+    assert len(found.table()) == len(found)
+    assert [t.get_text() for t in found.plot("ms").axes[0].get_yticklabels()]
+
+
+def test_parameters_that_change_nothing_are_named():
+    found = make_pi_loop().replace({"r.value": 1.0}).sensitivity("u", ["r.value", "p.gain"])
+    assert found.without_effect == ("r.value",)
+    assert {row.parameter for row in found} == {"p.gain"}
+
+
+def test_a_slope_is_confirmed_by_differences_of_the_margin():
+    found = make_pi_loop().sensitivity("u", "p.gain")
+    row = confirm_sensitivity(found, found["p.gain", "ms"])
+    assert "differences of the margin" in row.slope.confirmed_by
+
+
+def test_an_unstable_loop_has_no_sensitivities():
+    found = make_pi_loop(kp=-2.0).sensitivity("u", "p.gain")
+    assert not found.stable
+    assert np.isnan(found["p.gain", "phase_margin_deg"].slope.value)
+    assert found.of("phase_margin_deg") == []
+    assert "unstable" in str(found)
+
+
+def test_names_that_are_not_there_are_told_with_near_ones():
+    diagram = make_pi_loop()
+    with pytest.raises(UnknownNameError, match="Did you mean 'gain'"):
+        diagram.sensitivity("u", "p.gian")
+    found = diagram.sensitivity("u", "p.gain")
+    with pytest.raises(UnknownNameError, match="phase_margin_deg"):
+        found["p.gain", "phase_margin"]
+    with pytest.raises(UnknownNameError, match="ms"):
+        found.of("mss")
+
+
+@pytest.mark.slow
+def test_the_weakest_margin_of_fig3_leans_on_the_friction_that_is_compensated():
+    """α at the motor forces, by an FMU's start value (differences) and by the model's (exact); each confirmed."""
+    found = experiments.compliance().diagram.sensitivity(
+        "motor_force", ["plant.coulomb_scale", "feedback_linearization.model.coulomb_scale", "pid_par.a2"]
+    )
+    for row in found:
+        assert row.quantity == "disk_margin"
+        assert row.number.value == pytest.approx(0.317, abs=1e-3)
+        confirmed = confirm_sensitivity(found, row)
+        assert confirmed.slope.tolerance < 1e-4 * abs(row.slope.value)
+    assert found["plant.start.coulomb_scale", "disk_margin"].slope.value > 0.5
+    assert found["model.coulomb_scale", "disk_margin"].slope.value < -1.0
+    assert not found["plant.start.coulomb_scale", "disk_margin"].is_exact

@@ -1,0 +1,141 @@
+"""Worst cases of margins and requirements over ranges of parameters."""
+
+import math
+
+import numpy as np
+import pytest
+
+from loopwright.blocks import Constant, Gain, OptionError, UnknownNameError
+from loopwright.diagrams import Diagram
+from loopwright.diagrams.requirements import Requirements
+from loopwright.diagrams.studies import CaseOrigin, CaseState, ConfirmationKind
+from loopwright.diagrams.sweeps import Box
+from support.tuned_loops import Tank, make_pi_loop, pi_phase_margin
+
+RANGES = {"p.gain": (0.5, 2.0), "ki.gain": (0.2, 4.0), "rate.gain": (1.0, 3.0)}
+
+
+def draw(count, seed=5):
+    rng = np.random.default_rng(seed)
+    return [tuple(rng.uniform(low, high) for low, high in RANGES.values()) for _ in range(count)]
+
+
+@pytest.mark.slow
+def test_the_worst_phase_margin_of_a_pi_loop_is_no_better_than_of_1000_random_points():
+    """The closed form gives the random points' margins."""
+    found = make_pi_loop().worst_case(RANGES, "u", quantity="phase_margin_deg", count=20, seed=1)
+    random = min(pi_phase_margin(*values) for values in draw(1000))
+    assert found.worst.value <= random
+    values = [found.parameters[name] for name in RANGES]
+    assert found.worst.value == pytest.approx(pi_phase_margin(*values), rel=1e-9)
+    confirmed = found.confirm()
+    assert confirmed.agrees
+    assert confirmed.kind is ConfirmationKind.INJECTION
+
+
+def test_a_search_goes_down_to_the_worst_corner():
+    found = make_pi_loop().worst_case(
+        {"p.gain": (0.5, 2.0)}, "u", quantity="phase_margin_deg", count=2, seed=1, starts=1, steps=4
+    )
+    assert found.worst.value == pytest.approx(pi_phase_margin(0.5, 0.5, 2.0), rel=1e-9)
+    assert found.parameters == {"p.gain": 0.5}
+    assert found.worst.goodness <= found.worst_sample.goodness
+    assert found.diagram.blocks["p"].gain == 0.5
+    assert {row["origin"] for row in found.table()} >= {"nominal", "sample", "corner"}
+    assert len(found.plot().axes) == 1
+    assert "found by corner" in str(found)
+
+
+def test_the_gradient_of_the_search_is_that_of_the_margin():
+    from loopwright.diagrams.studies.cases import make_goal
+    from loopwright.diagrams.studies.search import Study
+
+    diagram = make_pi_loop()
+    boxes = {"p.gain": Box(0.5, 2.0), "ki.gain": Box(0.2, 4.0, "log")}
+    goal = make_goal("u", "phase_margin_deg", None, "pi")
+    study = Study(diagram, goal, boxes, (None,), 0, {}, lambda text: None)
+    at = np.array([0.4, 0.6])
+    case = study.run(study.parameters_at(at), CaseOrigin.SEARCH)[0]
+    found = study.gradient(case, at)
+
+    def margin(x):
+        values = study.parameters_at(x)
+        return pi_phase_margin(values["p.gain"], values["ki.gain"], 2.0)
+
+    h = 1e-4
+    for i, direction in enumerate(np.eye(2)):
+        assert found[i] == pytest.approx((margin(at + h * direction) - margin(at - h * direction)) / (2 * h), rel=1e-6)
+
+
+def test_requirements_are_compared_by_their_distance():
+    asked = Requirements(phase_margin_deg=60, ms=1.3)
+    found = make_pi_loop().worst_case({"p.gain": [0.5, 1.0, 2.0]}, "u", requirements=asked, samples="grid", starts=0)
+    by_hand = {kp: pi_phase_margin(kp, 0.5, 2.0) / 60 - 1 for kp in (0.5, 1.0, 2.0)}
+    for case in found.cases:
+        if case.parameters and case.quantity == "phase_margin_deg":
+            assert case.goodness == pytest.approx(by_hand[case.parameters["p.gain"]], rel=1e-9)
+    assert found.worst.goodness == min(case.goodness for case in found.cases)
+
+
+def test_an_unstable_case_is_the_worst_and_a_run_grows():
+    found = make_pi_loop().worst_case({"p.gain": (-2.0, 2.0)}, "u", count=4, seed=0)
+    assert found.worst.state is CaseState.UNSTABLE
+    assert found.parameters["p.gain"] == -2.0
+    roots = np.roots([1.0, 2.0 + 2.0 * -2.0, 2.0 * 0.5])
+    assert found.worst.growth == pytest.approx(roots.real.max(), rel=1e-9)
+    assert all(case.growth <= found.worst.growth for case in found.unstable)
+    confirmed = found.confirm()
+    assert confirmed.kind is ConfirmationKind.GROWTH
+    assert confirmed.agrees, confirmed
+
+
+def make_tank():
+    tank = Tank(outlet=0.7, area=2.0, start=1.44, name="tank")
+    inflow = Constant(value=0.7 * math.sqrt(1.44), name="inflow")
+    u = Gain(gain=2.0, name="k")(1.44 - tank.level).named("u")
+    return Diagram("tank", tank(inflow=inflow + u))
+
+
+def test_a_case_that_cannot_be_analysed_counts_as_the_worst_and_tells_why():
+    found = make_tank().worst_case(
+        None, "u", quantity="bandwidth", samples=[{"tank.start": 1.44}, {"tank.start": -1.0}], starts=0
+    )
+    assert found.worst.state is CaseState.FAILED
+    assert found.parameters == {"tank.start": -1.0}
+    assert "tank" in found.worst.reason
+    assert found.worst_analysed.state is not CaseState.FAILED
+    assert "1 cases failed" in str(found) or "failed" in str(found)
+    with pytest.raises(OptionError, match="failed"):
+        found.confirm()
+
+
+def test_a_point_that_no_longer_rests_says_so():
+    found = make_tank().worst_case(None, "u", quantity="bandwidth", samples=[{"tank.outlet": 1.4}], starts=0)
+    assert [case.state for case in found.cases] == [CaseState.STABLE, CaseState.MOVING]
+    trimmed = make_tank().worst_case(
+        None, "u", quantity="bandwidth", samples=[{"tank.outlet": 1.4}], starts=0, at=lambda d: d.trim()
+    )
+    assert [case.state for case in trimmed.cases] == [CaseState.STABLE, CaseState.STABLE]
+
+
+def test_several_operating_points_are_tried():
+    found = make_tank().worst_case(
+        {"k.gain": (1.0, 2.0)}, "u", quantity="bandwidth", count=2, starts=0,
+        points=[lambda d: d.trim(), lambda d: d.replace({"inflow.value": 2.0}).trim()],
+    )  # fmt: skip
+    assert {case.point for case in found.cases} == {0, 1}
+    assert len(found.nominal) == 2
+
+
+def test_wrong_questions_are_refused():
+    diagram = make_pi_loop()
+    with pytest.raises(UnknownNameError):
+        diagram.worst_case({"p.gian": (0.5, 2.0)}, "u", count=2)
+    with pytest.raises(OptionError, match="expected one of them"):
+        diagram.worst_case({"p.gain": (0.5, 2.0)}, "u", quantity="ms", requirements=Requirements(ms=2))
+    with pytest.raises(OptionError, match="ms"):
+        diagram.worst_case({"p.gain": (0.5, 2.0)}, "u", quantity="mss")
+    with pytest.raises(OptionError, match="no loop"):
+        diagram.worst_case({"p.gain": (0.5, 2.0)}, quantity="ms")
+    with pytest.raises(OptionError, match="limit no number"):
+        diagram.worst_case({"p.gain": (0.5, 2.0)}, "u", requirements=Requirements(step={"overshoot": 0.1}))
