@@ -66,6 +66,7 @@ from .report_writing import Plot, Report, Section, Table
 from .requirements import Requirements, Review, Verdict
 from .results import Occurrence, OperatingPoint, Run, RunState, Snapshot, Stopped, TextSignal
 from .simulation import Interrupted, RunOptions, Simulation, SimulationView
+from .studies import RunConfirmation, Sensitivities, Sensitivity, WorstCase, confirm_sensitivity
 from .sweeps import (
     Box,
     Failure,
@@ -127,12 +128,15 @@ __all__ = [
     "Review",
     "Rig",
     "Run",
+    "RunConfirmation",
     "RunOptions",
     "RunState",
     "Sample",
     "SampledDesign",
     "Samples",
     "Section",
+    "Sensitivities",
+    "Sensitivity",
     "Simulation",
     "SimulationView",
     "Snapshot",
@@ -149,11 +153,13 @@ __all__ = [
     "TrialMethod",
     "Verdict",
     "Wire",
+    "WorstCase",
     "ZeroSlope",
     "analyse",
     "check_block",
     "compare_with_control",
     "complementary",
+    "confirm_sensitivity",
     "crossing_frequency",
     "delayed_hold",
     "delayed_hold_margin",

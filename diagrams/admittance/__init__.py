@@ -7,6 +7,7 @@ from .contact_confirmation import ContactConfirmation, ContactTrial
 from .contact_limits import ContactLimit, ContactMap
 from .contact_trials import TrialMethod
 from .coupled import crossing_frequency, growth_rate, poles
+from .moored_plant import hold_sources
 from .rendered import Passivity, passivity, rendered_admittance, rendered_response, rendered_system, target_admittance
 from .shown_plant import check_plant, is_discrete
 from .stability_limits import (
@@ -35,6 +36,7 @@ __all__ = [
     "control_rate",
     "crossing_frequency",
     "growth_rate",
+    "hold_sources",
     "is_discrete",
     "make_contact",
     "passivity",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core import ConfirmationError, LoopwrightError, OptionError, SimulationError
+from ..admittance import hold_sources
 from ..flat import WiredDiagram
 from ..frequency import Margins, Realization, disk_margin, margins, mimo_disk_margin, mu_bound
 from ..linearization import Linearization, find_signal, linearize, trim
@@ -108,6 +109,9 @@ def confirm_case(diagram: WiredDiagram, case: Case, at: Any, amplitude: float | 
         )  # fmt: skip
     point = at(diagram) if callable(at) else at
     model = linearize(diagram, point)
+    still = hold_sources(diagram, model.point.values)  # references that move would move the point
+    if still is not diagram:
+        diagram, model = still, linearize(still, model.point)
     if case.quantity:
         size = amplitude if amplitude is not None else _size_at(model, case.loop[0])
         return _measure_margin(diagram, model, case, size)

@@ -24,8 +24,8 @@ ROUNDING = 1e-9
 """Relative error of a slope by rounding alone."""
 PEAK_ERROR = 1e-6
 """Relative error of the slope of a disk margin of several channels, whose frequency is searched for."""
-EXACT = "exact derivative of the linear model"
-ESTIMATED = "differences of linear models with changed start values"
+BY_DERIVATIVE = "exact derivative of the linear model"
+BY_DIFFERENCES = "differences of linear models with changed start values"
 Four = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -43,6 +43,8 @@ class Sensitivity:
         The loop's number.
     slope : Number
         Its derivative by the parameter, in the number's unit over the parameter's.
+    is_exact : bool
+        Whether no difference is part of the slope.
     kink : bool
         Whether another crossing has nearly the same margin: beyond it the slope is another one.
     rest_lost : bool
@@ -55,6 +57,7 @@ class Sensitivity:
     quantity: str
     number: Number
     slope: Number
+    is_exact: bool = True
     kink: bool = False
     rest_lost: bool = False
 
@@ -69,11 +72,6 @@ class Sensitivity:
         """Relative change of the number over the relative change of the parameter; NaN where one of them is 0."""
         size = self.number.value
         return self.slope.value * self.value / size if size and math.isfinite(size) else math.nan
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether no difference is part of the slope."""
-        return self.slope.confirmed_by != ESTIMATED
 
     def as_dict(self) -> dict[str, Any]:
         """Return the facts by name."""
@@ -257,12 +255,11 @@ def sensitivities_of(
             value = slope.slopes[i]
             rounding = PEAK_ERROR if len(wires) > 1 or L.ninputs > 1 else ROUNDING
             tolerance = rounding * abs(value) + bounds[quantity][i]
-            how = EXACT if one.is_exact else ESTIMATED
+            how = BY_DERIVATIVE if one.is_exact else BY_DIFFERENCES
             over = _over(slope.number.unit, unit)
             number = Number(value, over, tolerance, how, findings=slope.number.findings)
-            rows.append(
-                Sensitivity(one.parameter, one.value, unit, quantity, slope.number, number, slope.kink, one.rest_lost)
-            )
+            made = Sensitivity(one.parameter, one.value, unit, quantity, slope.number, number)
+            rows.append(replace(made, is_exact=one.is_exact, kink=slope.kink, rest_lost=one.rest_lost))
     without = tuple(one.parameter for one in slopes if one not in acting)
     stable = not any(math.isnan(f.number.value) for name, f in found.items() if name in ("ms", "disk_margin"))
     return Sensitivities(wires, tuple(rows), stable, without, left_out, model)

@@ -136,7 +136,7 @@ class WorstCase:
         OptionError
             If there is no such parameter, or none with one entry.
         """
-        return plot_cases(self, parameters)
+        return plot_cases(self.cases, self.worst, self.goal, self.boxes, parameters)
 
 
 def _short(value: Any) -> str:

@@ -3,32 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...blocks.core import OptionError, near
-from .cases import CaseOrigin, CaseState
+from ..sweeps import Box
+from .cases import Case, CaseOrigin, CaseState, Goal
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from .worst_case import WorstCase
 
-
-def plot_cases(found: WorstCase, parameters: Sequence[str] | None = None) -> Figure:
+def plot_cases(
+    cases: Sequence[Case], worst: Case, goal: Goal, boxes: Mapping[str, Box], parameters: Sequence[str] | None = None
+) -> Figure:
     """Return a scatter of the number over each parameter; see `WorstCase.plot`."""
     from matplotlib.figure import Figure
 
-    every = [name for name, value in found.worst.parameters.items() if isinstance(value, float | int)]
+    every = [name for name, value in worst.parameters.items() if isinstance(value, float | int)]
     names = every if parameters is None else list(parameters)
     for name in names:
         if name not in every:
             raise OptionError(f"found no parameter {name!r} with one number in the study. {near(name, every)}")
     if not names:
         raise OptionError("found no parameter with one number; expected one to draw over. Look at table().")
-    loop, quantity = _drawn(found)
+    loop, quantity = _drawn(worst, goal)
     figure = Figure(figsize=(3.4 * min(len(names), 3), 3.2 * math.ceil(len(names) / 3)), layout="constrained")
     grid = figure.subplots(math.ceil(len(names) / 3), min(len(names), 3), squeeze=False)
     looks = {
@@ -42,37 +43,36 @@ def plot_cases(found: WorstCase, parameters: Sequence[str] | None = None) -> Fig
             continue
         name = names[place]
         for origin, (color, size, label) in looks.items():
-            mine = [c for c in found.cases if c.origin is origin and c.state in (CaseState.STABLE, CaseState.MOVING)]
+            mine = [c for c in cases if c.origin is origin and c.state in (CaseState.STABLE, CaseState.MOVING)]
             mine = [c for c in mine if loop in c.numbers and math.isfinite(c.numbers[loop][quantity].value)]
             if mine:
                 y = [c.numbers[loop][quantity].value for c in mine]
                 axes.scatter([c.parameters[name] for c in mine], y, s=size, color=color, label=label, alpha=0.8)
-        bad = [c for c in found.cases if c.parameters and c.state in (CaseState.UNSTABLE, CaseState.FAILED)]
+        bad = [c for c in cases if c.parameters and c.state in (CaseState.UNSTABLE, CaseState.FAILED)]
         low = axes.get_ylim()[0] if axes.collections else 0.0
         if bad:
             x = [c.parameters[name] for c in bad]
             axes.scatter(x, np.full(len(bad), low), marker="x", color="C3", s=20, label="unstable or failed")
-        worst = found.worst
         y_worst = worst.numbers[loop][quantity].value if loop in worst.numbers else low
         axes.scatter([worst.parameters[name]], [y_worst], marker="*", s=130, color="C3", label="worst", zorder=3)
-        limit = found.goal.loops[loop][quantity]
+        limit = goal.loops[loop][quantity]
         for end in () if limit is None else limit:
             if math.isfinite(end):
                 axes.axhline(end, color="0.3", linestyle="--", linewidth=0.9)
-        if name in found.boxes and found.boxes[name].scale == "log":
+        if name in boxes and boxes[name].scale == "log":
             axes.set_xscale("log")
         axes.set_xlabel(name if len(name) < 34 else f"…{name[-32:]}")
         axes.grid(alpha=0.3)
         if place % 3 == 0:
-            unit = next((c.numbers[loop][quantity].unit for c in found.cases if loop in c.numbers), "1")
+            unit = next((c.numbers[loop][quantity].unit for c in cases if loop in c.numbers), "1")
             axes.set_ylabel(quantity if unit == "1" else f"{quantity} ({unit})")
     figure.axes[0].legend(fontsize="small")
     return figure
 
 
-def _drawn(found: WorstCase) -> tuple[tuple[str, ...], str]:
+def _drawn(worst: Case, goal: Goal) -> tuple[tuple[str, ...], str]:
     """Return the loop and the number that are drawn: those of the worst case, or else the first."""
-    if found.worst.quantity:
-        return found.worst.loop, found.worst.quantity
-    loop = next(iter(found.goal.loops))
-    return loop, next(iter(found.goal.loops[loop]))
+    if worst.quantity:
+        return worst.loop, worst.quantity
+    loop = next(iter(goal.loops))
+    return loop, next(iter(goal.loops[loop]))
