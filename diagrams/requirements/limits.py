@@ -135,9 +135,10 @@ def make_limit(name: str, given: Any, sense: Sense | None, port: str = "") -> Li
     where = port or name
     expected = "two numbers, low and high" if sense is None else f"a number ({sense}), or two: low and high"
     ends = given if isinstance(given, tuple | list) else (given,)
+    step = f"Give {name} = [low, high]{'' if sense is None else ', or one number'}."
     good = all(isinstance(end, int | float) and not isinstance(end, bool) and not math.isnan(end) for end in ends)
-    if not good or len(ends) not in ((2,) if sense is None else (1, 2)):
-        raise OptionError(f"found {given!r}; expected {expected}. Give {name} = (low, high).", port=where)
+    if not good or len(ends) != (2 if sense is None or ends is given else 1):
+        raise OptionError(f"found {given!r}; expected {expected}. {step}", port=where)
     if len(ends) == 1:
         end = float(ends[0])
         if math.isinf(end):
@@ -146,7 +147,7 @@ def make_limit(name: str, given: Any, sense: Sense | None, port: str = "") -> Li
     low, high = map(float, ends)
     if not low <= high or (low == -math.inf and high == math.inf) or low == math.inf or high == -math.inf:
         raise OptionError(
-            f"found {given!r}; expected a range with low ≤ high, and one of them finite. Give {name} = (low, high).",
+            f"found {given!r}; expected a range with low ≤ high, and one of them finite. {step}",
             port=where,
         )
     return Limit(low, high)

@@ -58,7 +58,7 @@ class StepLimits:
         for name in limits:
             if name not in STEP_SENSES:
                 hint = near(name, [*STEP_SENSES, *PLACES])
-                raise OptionError(f"a step response has no {name!r}. {hint}", port="step")
+                raise OptionError(f"a step response has no {name!r}. {hint}", port=f"step.{name}")
         self.input, self.output = input, output
         self.size = None if size is None else float(size)
         self.length = None if length is None else float(length)
@@ -170,20 +170,29 @@ class Requirements(LoopLimits):
             raise OptionError("found two without an input; expected one. Name the wires of the others.", port="step")
         super().__init__(step=own[0] if own else None, variants=variants, **limits)
         if not isinstance(stable, bool):
-            raise OptionError(f"found {stable!r}; expected True or False.", port="stable")
+            raise OptionError(f"found {stable!r}; expected true or false. Give one of them.", port="stable")
         self.stable = stable
         self.steps: tuple[StepLimits, ...] = tuple(one for one in steps if one.input)
         if loops is not None and not isinstance(loops, Mapping):
             raise OptionError(
-                f"found {loops!r}; expected limits by loop, such as {{'u': {{'ms': 1.6}}}}.", port="loops"
+                f"found {loops!r}; expected limits by loop. Write [loops.u], and ms = 1.6 "
+                "below it; in Python loops={'u': {'ms': 1.6}}.",
+                port="loops",
             )
         self.loops: Mapping[str, LoopLimits] = MappingProxyType(
             {str(wire): _loop_limits(given, f"loops.{wire}") for wire, given in (loops or {}).items()}
         )
         if numbers is not None and not isinstance(numbers, Mapping):
-            raise OptionError(f"found {numbers!r}; expected ranges by dotted path.", port="numbers")
+            raise OptionError(
+                f"found {numbers!r}; expected ranges by dotted path. Write [numbers], and "
+                "'poles.sampled_d0.slowest' = [-100, -2] below it; in Python numbers={…: (-100, -2)}.",
+                port="numbers",
+            )
         self.numbers: Mapping[str, Limit] = MappingProxyType(
-            {str(path): make_limit(str(path), given, None) for path, given in (numbers or {}).items()}
+            {
+                str(path): make_limit(repr(str(path)), given, None, f"numbers.{path}")
+                for path, given in (numbers or {}).items()
+            }
         )
 
     @staticmethod
@@ -242,15 +251,23 @@ def _variants(given: Any) -> dict[str, LoopLimits]:
     if isinstance(given, Mapping):
         return {str(key): _loop_limits(limits, f"variants.{key}") for key, limits in given.items()}
     if isinstance(given, Iterable):
-        return {str(key): LoopLimits() for key in given}
-    raise OptionError(f"found {given!r}; expected keys of variants, such as ['sampled_d1'].", port="variants")
+        keys = list(given)
+        if all(isinstance(key, str) for key in keys):
+            return {key: LoopLimits() for key in keys}
+    raise OptionError(
+        f"found {given!r}; expected keys of variants. Give a list of them, such as ['sampled_d1'].", port="variants"
+    )
 
 
 def _loop_limits(given: Any, port: str) -> LoopLimits:
     if type(given) is LoopLimits:
         return given
     if not isinstance(given, Mapping):
-        raise OptionError(f"found {given!r}; expected limits by name, such as {{'ms': 1.6}}.", port=port)
+        raise OptionError(
+            f"found {given!r}; expected limits by name. Write [{port}], and ms = 1.6 below it; in Python "
+            "{'ms': 1.6}.",
+            port=port,
+        )
     try:
         return LoopLimits(**{str(name): limit for name, limit in given.items()})
     except OptionError as error:

@@ -127,7 +127,7 @@ def test_the_step_of_a_loop_replaces_the_general_one_and_steps_between_wires_sta
         ({"loops": {"u": 3}}, "loops.u: found 3; expected limits by name"),
         ({"loops": {"u": {"mss": 3}}}, "loops.u.mss: there is no requirement 'mss'. Did you mean 'ms'"),
         ({"numbers": {"poles.sampled_d0.slowest": -1.0}}, "found -1.0; expected two numbers, low and high"),
-        ({"stable": 1}, "stable: found 1; expected True or False"),
+        ({"stable": 1}, "stable: found 1; expected true or false"),
     ],
 )  # fmt: skip
 def test_wrong_requirements_are_refused_with_the_next_step(wrong, said):
@@ -175,7 +175,7 @@ def test_a_toml_file_says_the_same_as_code(tmp_path):
         ("ms = ", "is not TOML"),
         ("", "requires nothing"),
         ("variants = ['sampled_d1']", "requires nothing"),
-        ("mss = 1.6", "limits.toml.mss: there is no requirement 'mss'. Did you mean 'ms'"),
+        ("mss = 1.6", "limits.toml, line 1: mss: there is no requirement 'mss'. Did you mean 'ms'"),
     ],
 )
 def test_a_file_that_requires_nothing_or_something_unknown_is_refused(tmp_path, text, said):
@@ -220,3 +220,44 @@ def test_step_limits_come_from_a_mapping_or_are_taken_as_they_are():
     assert StepLimits.of(limits) is limits
     with pytest.raises(OptionError, match="expected a mapping"):
         StepLimits.of(0.3)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "ms = 1.6\nphase_margin = 45",
+            r"limits.toml, line 2: phase_margin: there is no .* Did you mean 'phase_margin_deg'",
+        ),
+        (
+            "# limits\n\nms = '1.6'",
+            r"line 3: ms: found '1.6'; expected a number \(at most\).* Give ms = \[low, high\], or one",
+        ),
+        (
+            "ms = 1.6\n[step]\nsize = 1\novershot = 0.1",
+            r"line 4: step.overshot: a step response has no 'overshot'. Did you",
+        ),
+        (
+            "[loops.u]\nms = 1.6\n[loops.'c.v']\nMs = 1",
+            r"line 4: loops.c.v.Ms: there is no requirement 'Ms'. Did you mean 'ms'",
+        ),
+        ("[loop.u]\nms = 1", r"line 1: loop: there is no requirement 'loop'. Did you mean 'loops'"),
+        ("loops.u = 3", r"line 1: loops.u: found 3; expected limits by name. Write \[loops.u\]"),
+        (
+            "[numbers]\n'a.b' = 3",
+            r"line 2: numbers.a.b: found 3; expected two numbers, low and high. Give 'a.b' = \[low, high\]",
+        ),
+        ("variants = [1]", r"line 1: variants: found \[1\]; expected keys of variants. Give a list of them"),
+        ("bandwidth = [50]", r"line 1: bandwidth: found \[50\]; expected a number"),
+        (
+            "[variants.sampled_d1]\nms = [2, 1]",
+            r"line 2: variants.sampled_d1.ms: found \[2, 1\]; expected a range with low",
+        ),
+        ("loops = {u = {ms = 'x'}}", r"line 1: loops.u.ms: found 'x'"),
+    ],
+)
+def test_an_error_in_the_file_names_line_and_key(tmp_path, text, said):
+    file = tmp_path / "limits.toml"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(OptionError, match=said):
+        read_requirements(file)
