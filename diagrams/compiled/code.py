@@ -154,7 +154,8 @@ def check_size(function: Any) -> None:
     if (count := function.n_instructions()) > LARGEST:
         raise CompilerError(
             f"a function of the diagram has {count} operations; at most {LARGEST} are compiled, as a compiler takes "
-            "seconds for them. Leave out compile=True."
+            "seconds for them. Leave out compile=True, or, if it is the derivative of the rates, take a solver without "
+            "one: solver='RK45'."
         )
 
 

@@ -14,7 +14,7 @@ static double begin_stretch(hybrid *h, progress *g, double end) {
     while (e < s->edges && !is_before(h->t, s->edge[e])) e++;
     const double edge = e < s->edges && is_before(s->edge[e], end) ? s->edge[e] : end;
     p->edge = p->stop = edge;
-    p->left = fmax(h->t, left_of(edge));
+    p->left = larger(h->t, left_of(edge));
     for (int64_t i = 0; i < p->n; i++) m->x[i] = h->l.x[p->where[i]];
     restart(m, h->t);
     h->begun = 1;

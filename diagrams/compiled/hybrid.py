@@ -19,7 +19,7 @@ from .watch import Fired, Watch, WatchStructure
 
 FIXED = ("euler", "heun", "rk4")
 _KINDS = {"euler": 0, "heun": 1, "rk4": 2, "RK23": 3, "RK45": 3, "DOP853": 4, "Radau": 5}
-_BUDGET = 200_000  # steps of a call, after which Ctrl-C has its turn
+_SECONDS = 0.05  # of a call, about, after which Ctrl-C has its turn
 
 
 class HybridReason(IntEnum):
@@ -187,7 +187,8 @@ class CompiledHybrid:
         trial = [np.zeros(1), x.copy(), w, p]
         where = self._own(flat.continuous.astype(np.int64))
         slopes = np.zeros(n * n if "slope" in code.between else 0)
-        self._hybrid = hybrid = _Hybrid(l=loop.structure, automatic=len(methods) > 1, accepts=accepts, budget=_BUDGET)
+        self._hybrid = hybrid = _Hybrid(l=loop.structure, automatic=len(methods) > 1, accepts=accepts)
+        hybrid.budget = _budget(code.between["flow"].function, methods, n)
         hybrid.between = self.kinds[NONE]
         hybrid.p = _Problem(
             n=n,
@@ -347,3 +348,9 @@ class CompiledHybrid:
         return HybridOutcome(
             found.ticks, found.rows, HybridReason(found.reason), found.plant, found.stage, found.status, self._hybrid.t
         )
+
+
+def _budget(flow: Any, methods: Sequence[MethodOptions], n: int) -> int:
+    """Return the steps of a call: an operation takes about 1 ns, and so does one of the factors of a Jacobian."""
+    step = 100 + 15 * flow.n_instructions() + (4 * n**3 if any(m.name == "Radau" for m in methods) else 0)
+    return max(10, int(_SECONDS * 1e9 / step))

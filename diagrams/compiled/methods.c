@@ -36,7 +36,19 @@ typedef struct {
 
 static const double TOLERANCE = 4.0 * 2.220446049250313e-16; /* of a time; see blocks/core/instants.py */
 
-static inline double ulp(double t) { return nextafter(fabs(t), INFINITY) - fabs(t); }
+/* The distance to the next number further from zero, the larger and the smaller one of two: without libm's calls. */
+static inline double ulp(double t) {
+    const double size = fabs(t);
+    uint64_t bits;
+    double next;
+    memcpy(&bits, &size, sizeof bits);
+    bits++;
+    memcpy(&next, &bits, sizeof next);
+    return next - size;
+}
+
+static inline double larger(double a, double b) { return a > b ? a : b; }
+static inline double smaller(double a, double b) { return a < b ? a : b; }
 static inline double left_of(double t) { return t - 4.0 * TOLERANCE * fabs(t); }
 static inline bool is_before(double a, double b) { return b < INFINITY ? a < b - 2.0 * TOLERANCE * fabs(b) : a < b; }
 
@@ -67,7 +79,7 @@ static double norm_of(const double *e, const double *scale, int64_t n) {
 }
 
 /* Write where a method of fixed step comes to from (t, x) with the rates f, at the time `to`. */
-static void apply(method *m, double t, const double *x, const double *f, double to, double *out) {
+static inline void apply(method *m, double t, const double *x, const double *f, double to, double *out) {
     problem *p = m->of;
     const int64_t n = m->n;
     const double h = to - t;
@@ -103,10 +115,10 @@ static double first_step(method *m, double order) {
     for (int64_t i = 0; i < n; i++) y[i] = m->x[i] + h0 * m->f[i];
     rate(p, m->t + h0, y, f);
     for (int64_t i = 0; i < n; i++) f[i] -= m->f[i];
-    const double d2 = norm_of(f, scale, n) / h0, larger = d1 > d2 ? d1 : d2;
-    const double h1 = d1 <= 1e-15 && d2 <= 1e-15 ? fmax(1e-6, h0 * 1e-3) : pow(0.01 / larger, 1.0 / (order + 1.0));
+    const double d2 = norm_of(f, scale, n) / h0, most = larger(d1, d2);
+    const double h1 = d1 <= 1e-15 && d2 <= 1e-15 ? fmax(1e-6, h0 * 1e-3) : pow(0.01 / most, 1.0 / (order + 1.0));
     const double h = fmin(fmin(100.0 * h0, h1), fmin(length, m->longest));
-    return isfinite(h) && isfinite(larger) ? h : 1e-6 * length;
+    return isfinite(h) && isfinite(most) ? h : 1e-6 * length;
 }
 
 /* Start at (t, m->x), up to p->stop. */
@@ -121,16 +133,16 @@ static void restart(method *m, double t) {
         if (m->count < 1) m->count = 1;
         return;
     }
-    m->sliver = p->stop - t <= 100 * ulp(fmax(fabs(t), fabs(p->stop)));
+    m->sliver = p->stop - t <= 100 * ulp(larger(fabs(t), fabs(p->stop)));
     rate(p, t, m->x, m->f);
     if (m->sliver) return;
     if (isnan(m->planned))
         m->h = first_step(m, m->exponent);
     else
-        m->h = fmin(m->planned, p->stop - t);
+        m->h = smaller(m->planned, p->stop - t);
 }
 
-static int step_fixed(method *m) {
+static inline int step_fixed(method *m) {
     problem *p = m->of;
     const int64_t n = m->n;
     m->done++;
@@ -165,11 +177,11 @@ static inline void stage(method *m, const double *a, int64_t s, double h, const 
 }
 
 /* Return the norm of the error of a step to m->g; the scale is that of both ends. */
-static double error_of(const method *m, double h) {
+static inline double error_of(const method *m, double h) {
     const int64_t n = m->n, rows = m->stages + 1;
     double sum = 0.0, sum3 = 0.0;
     for (int64_t i = 0; i < n; i++) {
-        const double scale = m->atol[i] + fmax(fabs(m->x[i]), fabs(m->g[i])) * m->rtol;
+        const double scale = m->atol[i] + larger(fabs(m->x[i]), fabs(m->g[i])) * m->rtol;
         double e = 0.0, e3 = 0.0;
         for (int64_t j = 0; j < rows; j++) e += m->K[j * n + i] * m->E[j];
         if (m->kind == EIGHT)
@@ -183,10 +195,10 @@ static double error_of(const method *m, double h) {
     return sum == 0.0 && sum3 == 0.0 ? 0.0 : fabs(h) * sum / sqrt((sum + 0.01 * sum3) * (double)n);
 }
 
-static int step_explicit(method *m) {
+static inline int step_explicit(method *m) {
     problem *p = m->of;
     const int64_t n = m->n, last = m->stages;
-    const double least = 10.0 * (nextafter(m->t, INFINITY) - m->t), before = m->h;
+    const double least = 10.0 * ulp(m->t), before = m->h;
     double h = m->h > m->longest ? m->longest : m->h < least ? least : m->h, factor, to;
     bool again = false;
     memcpy(m->K, m->f, n * sizeof(double));
@@ -204,8 +216,8 @@ static int step_explicit(method *m) {
         const double error = error_of(m, h);
         if (error < 1.0) {
             if (all_finite(m->g, n) && all_finite(m->K + last * n, n)) {
-                factor = error == 0.0 ? 10.0 : fmin(10.0, 0.9 * pow(error, -1.0 / (m->exponent + 1.0)));
-                if (again) factor = fmin(1.0, factor);
+                factor = error == 0.0 ? 10.0 : smaller(10.0, 0.9 * pow(error, -1.0 / (m->exponent + 1.0)));
+                if (again) factor = smaller(1.0, factor);
                 break;
             }
             h *= 0.25;
@@ -224,7 +236,7 @@ static int step_explicit(method *m) {
     m->t_old = m->t;
     m->t = to;
     m->h = h * factor;
-    m->planned = to == p->stop ? fmax(before, m->h) : m->h; /* a step that was cut says little about the next */
+    m->planned = to == p->stop ? larger(before, m->h) : m->h; /* a step that was cut says little about the next */
     return PASSED;
 }
 

@@ -184,7 +184,7 @@ static double predict_factor(double h, double h_before, double error, double err
 
 /* Return the norm of the error at m->g, of which m->error is solved for. */
 static double weigh_error(method *m) {
-    for (int64_t i = 0; i < m->n; i++) m->scale[i] = m->atol[i] + fmax(fabs(m->x[i]), fabs(m->g[i])) * m->rtol;
+    for (int64_t i = 0; i < m->n; i++) m->scale[i] = m->atol[i] + larger(fabs(m->x[i]), fabs(m->g[i])) * m->rtol;
     return norm_of(m->error, m->scale, m->n);
 }
 
@@ -192,7 +192,7 @@ static int step_radau(method *m) {
     problem *p = m->of;
     const radau *r = (const radau *)m->A;
     const int64_t n = m->n;
-    const double least = 10.0 * (nextafter(m->t, INFINITY) - m->t), before = m->h;
+    const double least = 10.0 * ulp(m->t), before = m->h;
     double h = m->h, h_before = m->predicts ? m->h_before : NAN, error_before = m->predicts ? m->error_before : NAN;
     double to, error, safety, speed = NAN, factor;
     int iterations = 0;

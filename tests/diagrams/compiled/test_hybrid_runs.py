@@ -7,16 +7,23 @@ from scipy.linalg import expm
 from loopwright.blocks import (
     Clock,
     Compare,
+    Constant,
+    FmuRuntimeError,
+    Function,
     Gain,
+    GuardError,
     Integrator,
     PulseTrain,
+    Requirement,
+    SimulationError,
     Sine,
     StopCondition,
     TransferFunction,
     UnitDelay,
 )
-from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams import Diagram, Interrupted, Run, subsystem
 from loopwright.fmus import Fmu, dc_motor
+from support.zoo import zoo_fmu
 
 QUIET = {"progress": False}
 T = 1e-3
@@ -168,8 +175,6 @@ def test_a_solver_that_is_not_in_c_is_interpreted_and_says_so(solver):
 
 
 def test_growth_beyond_all_bounds_says_the_same_and_keeps_the_same():
-    from loopwright.blocks import Function, SimulationError
-
     x = Integrator(name="x", initial_value=1.0)
     made = Diagram("d", x(Function(lambda x: x**2, name="square")(x.y)))
     runs = []
@@ -185,3 +190,70 @@ def test_growth_beyond_all_bounds_says_the_same_and_keeps_the_same():
 def test_a_clock_is_integrated():
     run = compiled(Diagram("d", Integrator(name="x")(Clock())), 2.0, solver="DOP853")
     assert np.max(np.abs(run["x.y"] - 0.5 * run.t**2)) < 1e-12
+
+
+def failing(error, made, duration, **options):
+    """Return the errors of an interpreted and of a compiled run."""
+    caught = []
+    for form in (False, True):
+        with pytest.raises(error) as one:
+            made.simulate(duration, compile=form, **QUIET, **options)
+        caught.append(one.value)
+    assert caught[0].block == caught[1].block
+    assert caught[1].t == pytest.approx(caught[0].t, rel=1e-6)
+    assert np.max(np.abs(caught[0].run.data - caught[1].run.data)) < 1e-9
+    assert caught[0].run.t.tobytes() == caught[1].run.t.tobytes()
+    return caught
+
+
+def test_a_guard_that_fails_between_ticks_says_the_same_and_keeps_the_same():
+    x = Integrator(name="x", initial_value=1.0)
+    ramp = Integrator(name="ramp")(x(0.0 * Clock()))
+    made = Diagram("d", Requirement(requirement="below 0.5533", name="limit")(Compare("<")(ramp, 0.5533)))
+    first, second = failing(GuardError, made, 1.0, step=0.01)
+    assert str(first).partition("t =")[0] == str(second).partition("t =")[0]
+    assert second.t == pytest.approx(0.5533, abs=1e-6)
+
+
+def test_a_root_that_leaves_its_domain_says_the_same_and_keeps_the_same():
+    x = Integrator(name="x", initial_value=1.0)
+    made = Diagram("d", x(Function(lambda x: -1.0 - np.sqrt(x), name="root")(x.y)))
+    first, second = failing(SimulationError, made, 2.0, step=0.01)
+    assert second.block == first.block == "root"
+
+
+@pytest.mark.parametrize("fault", ["step discard 0.05", "set error 0.05", "get error 0.05"])
+def test_an_fmu_that_fails_beside_continuous_states_says_the_same_and_keeps_the_same(fault, tmp_path):
+    plant = Fmu(zoo_fmu(tmp_path, 3, fault), isolate=False, name="plant")
+    made = Diagram("d", plant(u=Integrator(name="x")(Constant(value=1.0))))
+    first, second = failing(FmuRuntimeError, made, 1.0, step=0.01)
+    assert str(first) == str(second)
+
+
+def test_ctrl_c_keeps_what_was_recorded():
+    def interrupt(t):
+        if t > 5.0:
+            raise KeyboardInterrupt
+
+    with oscillator().simulation(step=0.001, compile=True) as simulation, pytest.raises(Interrupted) as caught:
+        simulation.advance(1e6, progress=interrupt)
+    run = caught.value.run
+    assert 5.0 < run.t[-1] < 1e5
+    assert np.max(np.abs(run["x.y"] - np.cos(5.0 * run.t))) < 1e-4 * run.t[-1]
+
+
+def test_a_run_to_disk_is_the_same(tmp_path):
+    whole = compiled(loop_with_lags(), 2.0, every=3)
+    compiled(loop_with_lags(), 2.0, every=3, to=tmp_path / "run")
+    assert np.array_equal(Run.open(tmp_path / "run").data, whole.data)
+
+
+def test_a_run_without_a_compiler_is_interpreted_and_says_so(monkeypatch):
+    from loopwright.diagrams.compiled import code, hybrid_code
+
+    monkeypatch.setenv("LOOPWRIGHT_CC", "no-such-compiler")
+    code.load_compiled.cache_clear()
+    hybrid_code.hybrid_master.cache_clear()
+    run = oscillator(omega=3.0).simulate(1.0, compile=True, **QUIET)
+    assert [m for m in run.messages if "no-such-compiler" in m]
+    assert np.max(np.abs(run["x.y"] - np.cos(3.0 * run.t))) < 1e-4
