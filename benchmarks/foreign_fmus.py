@@ -1,8 +1,9 @@
-"""FMUs of other tools, run by Loopwright and by FMPy: python benchmarks/foreign_fmus.py FOLDER --table table.md.
+"""FMUs of other tools, run by Loopwright and by FMPy: python benchmarks/foreign_fmus.py FOLDER --page PAGE.md.
 
 FOLDER has one folder for each source of FMUs; without one, two FMUs of the library stand in. Each run has a process of
 its own, an empty working folder and a time limit. Both importers take the FMU's default stop time and step, at most
-`STEPS` steps, and its start values; inputs without one are 0. The table has one row for each FMU and interface.
+`STEPS` steps, and its start values; inputs without one are 0. ``--table`` has a row for each FMU and interface that
+differ. ``--page`` writes counts, and the differences by their reasons (`REASONS`), between two marks of a page.
 
 An FMU is a program: run those of strangers without a network, `unshare -rn python benchmarks/foreign_fmus.py …`.
 """
@@ -32,6 +33,42 @@ from loopwright.fmus import dc_motor
 STEPS = 200
 CLOSE = 1e-9
 """Difference of two runs, relative to the signal's size, up to which they agree."""
+MARKS = "<!-- written by benchmarks/foreign_fmus.py -->", "<!-- up to here -->"
+REASONS = (
+    ("hybrid-cosim|singlewatertank-20sim|watertankcontroller-c", "",
+     "the library is not named for the model identifier; it is the only one in its folder"),
+    ("rollback-", "",
+     ("it wants its state of before restored before a shorter step; Loopwright goes on from its "
+     "`lastSuccessfulTime`")),
+    ("uart", "",
+     "the library lacks `fmi2DeSerializeFMUstate`, which no run calls"),
+    ("FMI4j.*BouncingBall", "",
+     ("a variable is parameter and constant at once: a rule broken, and no reason not to run; `run.messages` "
+     "tells it")),
+    ("altairengineering", "CoSimulation",
+     "it wants Event Mode, which Loopwright uses where an FMU has clocks"),
+    ("FMPy/.*(Controller|Drivetrain)", "ModelExchange",
+     "nominal values of 0; 1 stands in for them, and `run.messages` tells it"),
+    ("Reference-FMUs.*Roberts", "ModelExchange",
+     "stiff: Loopwright changes to an implicit method of its own accord"),
+    ("MassSpringDamper1|[Tt]hreetank|[Tt]hreewatertank", "CoSimulation",
+     ("the FMU compares sums of rounded times, and takes an internal step more or less in some steps, at other "
+     "places for each importer")),
+    ("PumpAndValve", "",
+     "its output `CPUtime` is the time that it took"),
+    ("Linear|JModelica", "",
+     ("shared libraries are missing (`liblapack.so.3`, `libgfortran.so.3` or `.so.4`); the error and "
+     "`loopwright doctor` name them")),
+    ("fmi3functiontest", "",
+     "FMI 3.0-beta.3"),
+    ("PyFMI.*bouncingBall", "ModelExchange",
+     "FMI 1.0 is taken for co-simulation only"),
+    ("ModelicaGym_CartPole", "",
+     "it crashes in its instantiation: it requires a licence"),
+    ("fuelrail|OSOM|Roberts", "CoSimulation",
+     "slow"),
+)  # fmt: skip
+"""Reasons of differences: a pattern for source and file, an interface or none, and the reason as it was found."""
 INTERFACES = {"CoSimulation": "co_simulation", "ModelExchange": "model_exchange"}
 
 
@@ -242,6 +279,51 @@ def as_table(rows: list[dict[str, object]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def as_page(rows: list[dict[str, object]]) -> str:
+    """Return the text of the page: counts in words, those of each source, and the differences by their reasons."""
+    from importlib.metadata import version
+
+    ran = [sum(row[importer] == "runs" for row in rows) for importer in ("ours", "fmpy")]
+    both = [row for row in rows if row["gap"] is not None]
+    text = (
+        f"Of {len(rows)} runs of {len({row['path'] for row in rows})} FMUs from {len({row['source'] for row in rows})} "
+        f"sources, Loopwright completed {ran[0]}, and FMPy {version('fmpy')} {ran[1]}. In {sum(map(agrees, both))} of "
+        f"the {len(both)} that both completed, they agree."
+    )
+    counts = as_table(rows).split("\n\n")[0]
+    lines = ["| runs that differ, or fail | here | in FMPy | reason |", "|---|---|---|---|"]
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for row in rows:
+        if row["ours"] == row["fmpy"] == "runs" and agrees(row):
+            continue
+        kind = {"CoSimulation": "co-simulation", "ModelExchange": "model exchange"}[str(row["interface"])]
+        name = f"{Path(str(row['file'])).stem} ({str(row['source']).split('/')[-1]}, FMI {row['fmi']} {kind})"
+        groups.setdefault((explain(row), outline(str(row["ours"])), outline(str(row["fmpy"]))), []).append(name)
+    for (reason, ours, fmpy_says), names in sorted(groups.items()):
+        kept = ", ".join(f"{name} {n} times" if n > 1 else name for name, n in Counter(names).items())
+        lines.append(f"| {kept} | {ours} | {fmpy_says} | {reason} |")
+    return "\n\n".join([text, counts, "\n".join(lines)])
+
+
+def explain(row: dict[str, object]) -> str:
+    """Return the reason of a difference, as far as it is known."""
+    for pattern, interface, reason in REASONS:
+        if re.search(pattern, f"{row['source']}/{row['file']}") and interface in ("", row["interface"]):
+            return reason
+    return "not known"
+
+
+def outline(outcome: str) -> str:
+    """Return the kind of an outcome: "runs", the end of the time, or the name of an error."""
+    return outcome if outcome.startswith(("runs", "no end", "process")) else f"`{outcome.split(':')[0]}`"
+
+
+def write_page(page: Path, rows: list[dict[str, object]]) -> None:
+    """Write the text between the marks of a page."""
+    before, rest = page.read_text().split(MARKS[0])
+    page.write_text(f"{before}{MARKS[0]}\n\n{as_page(rows)}\n\n{MARKS[1]}{rest.split(MARKS[1])[1]}")
+
+
 def agrees(row: dict[str, object]) -> bool:
     """Whether both runs are one, to rounding in co-simulation and to ten times the tolerance in model exchange."""
     return row["gap"] is not None and float(row["gap"]) <= (CLOSE if row["interface"] == "CoSimulation" else 1e-6)
@@ -257,7 +339,11 @@ def short_name(tool: str) -> str:
     """Return a tool's name without its version."""
     words = dict.fromkeys(re.split(r"[ /,:(]+", tool))
     skipped = {"version", "-", "compiler", "requires", "development", "inline"}
-    kept = [word for word in words if word[-1:].isalpha() and word.lower() not in skipped and word[1:2] != "."]
+    kept = [
+        word
+        for word in words
+        if word[-1:].isalpha() and word.lower() not in skipped and not re.match(r"\d\.|\d{4}", word)
+    ]
     return " ".join(kept[:2]) or "not stated"
 
 
@@ -269,12 +355,18 @@ def main() -> None:
     parser.add_argument("--only", default="", help="part of the path of the FMUs to run")
     parser.add_argument("--table", type=Path, help="file of the table, in Markdown")
     parser.add_argument("--json", type=Path, help="file of all results")
+    parser.add_argument("--page", type=Path, help="page to write counts and differences into, between its marks")
+    parser.add_argument(
+        "--results", type=Path, help="take the results of an earlier run from its --json, and run nothing"
+    )
     parser.add_argument("--one", nargs=4, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.one:
         return one(*given.one)
     os.nice(10)
-    rows = []
+    rows = json.loads(given.results.read_text()) if given.results else []
+    if given.results:
+        given.folder = Path(os.devnull)
     if given.folder is None:
         given.folder = Path(tempfile.mkdtemp(prefix="loopwright-"))
         atexit.register(shutil.rmtree, given.folder, ignore_errors=True)
@@ -291,6 +383,8 @@ def main() -> None:
             given.json.write_text(json.dumps(rows, indent=1))
         if given.table:
             given.table.write_text(as_table(rows))
+    if given.page:
+        write_page(given.page, rows)
     counts = Counter((row["interface"], row["ours"] == "runs", row["fmpy"] == "runs") for row in rows)
     for (interface, ours, fmpy_runs), n in sorted(counts.items(), key=str):
         print(

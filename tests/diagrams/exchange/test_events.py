@@ -151,6 +151,18 @@ def test_a_failure_names_fmu_call_and_time_and_keeps_the_samples(cache, tmp_path
     assert error.value.run.t[-1] >= 0.2
 
 
+@pytest.mark.drawn(3)
+@pytest.mark.parametrize("solver", ["RK45", "Radau", "BDF", "CVODE_Adams", "rk4", "euler"])
+@pytest.mark.parametrize("duration", [0.7, 0.72])
+def test_no_solver_evaluates_beyond_the_end_of_the_run(cache, tmp_path, solver, duration):
+    """The FMU fails fatally there, as one with a table that ends; the run's end may lie between two ticks."""
+    file = eventful_fmu(tmp_path, 3, fault=f"if (c->t > {duration} * (1.0 + 1e-15)) return 4;")
+    diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=0.0, name="n")))
+    run = diagram.simulate(duration, step=0.1, solver=solver, progress=False)
+    assert run.t[-1] == duration
+    np.testing.assert_allclose(run["plant.x"], exact(run.t, 0.5), atol=1e-12)
+
+
 @pytest.mark.parametrize("fmi", [2, 3])
 def test_time_events_that_pile_up_are_an_error(cache, tmp_path, fmi):
     file = eventful_fmu(tmp_path, fmi, following="c->t < 0.25 ? 0.25 : c->t + 1e-12")

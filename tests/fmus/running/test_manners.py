@@ -101,3 +101,13 @@ def test_no_step_passes_a_stop_time_that_was_told(file, duration):
     """The FMU fails fatally where a step ends a rounding error beyond the end that it was told."""
     run = Diagram("d", Fmu(file, name="plant")()).simulate(duration, step=0.1, progress=False)
     assert run.t[-1] == pytest.approx(duration)
+
+
+@pytest.mark.parametrize(
+    "experiment", ['stopTime="NaN"', 'stopTime="INF"', 'startTime="5" stopTime="1"', 'stepSize="0"', 'stepSize="soon"']
+)
+def test_an_impossible_default_experiment_does_not_change_a_run(tmp_path, experiment):
+    model = MODEL.replace("<ModelVariables>", f"<DefaultExperiment {experiment}/><ModelVariables>", 1)
+    plant = Fmu(small_fmu(tmp_path, "fmi2", CHANGES, model), name="plant", isolate=False)
+    run = Diagram("d", plant()).simulate(0.3, step=0.1, progress=False)
+    assert run["plant.time"] == pytest.approx([0.0, 0.1, 0.2, 0.3], abs=1e-15)
