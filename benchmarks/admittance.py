@@ -37,9 +37,7 @@ def contacts() -> Iterator[tuple[str, str, int, Contact]]:
 def print_table(found: list[tuple[str, str, int, Contact]]) -> dict[tuple[str, str, int, float], float]:
     """Print limits with the growth rates of their runs; return the limits that the runs have confirmed."""
     confirmed = {}
-    print(
-        "| robot | direction | delay | environment | largest | at rad/s | growth at 0.97, 1.03, run (model) | m/s |"
-    )
+    print("| robot | direction | delay | environment | largest | at rad/s | growth at 0.97, 1.03, run (model) | m/s |")
     for name, side, delay, contact in found:
         cases = [("stiffness", {"damping": b}, f"k_e at b_e = {b:g} N s/m") for b in TABLE]
         for vary, held, text in [*cases, ("mass", {}, "m_e")]:
