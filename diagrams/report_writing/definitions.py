@@ -30,7 +30,8 @@ DEFINITIONS = read_definitions(__package__)
 def definition(path: str, more: Mapping[str, str] = MappingProxyType({})) -> tuple[str, str] | None:
     """Return the term that defines a number, and its definition; None where none is known.
 
-    A term stands for the names that go on behind it, too: ``gain_crossover`` for ``gain_crossover_1``.
+    A term stands for the names that go on behind it, too: ``gain_crossover`` for ``gain_crossover_1``. A term of two
+    parts, such as ``gain_crossover.phase_margin_deg``, comes before those of one.
 
     Parameters
     ----------
@@ -50,6 +51,10 @@ def definition(path: str, more: Mapping[str, str] = MappingProxyType({})) -> tup
         del parts[1:2]  # the wire's name
     elif parts[0] == "steps":
         parts = ["effort"] if "effort" in parts else parts[2:]  # without the names of wires
+    for pair in (f"{name}.{parts[-1]}" for name in _beginnings(parts[-2])) if len(parts) > 1 else ():
+        for known in (more, DEFINITIONS):
+            if pair in known:
+                return pair, known[pair]
     for part in reversed(parts):
         for name in _beginnings(part):
             for known in (more, DEFINITIONS):

@@ -176,3 +176,41 @@ def test_interconnected_systems_come_in_and_go_out():
     back = block.to_control()
     assert np.allclose(back(1j), closed(1j))
     assert back.input_labels == ["r"]
+
+
+def test_interconnected_systems_of_several_signals_in_any_sample_time_come_in_and_go_out():
+    """Two channels, dt=True: the run is python-control's response at the subsystem's own sample time."""
+    from loopwright.blocks import DiscreteStateSpace
+
+    plant = control.ss(
+        [[0.5, 0.1], [0.0, 0.8]], [[1.0, 0.0], [0.0, 0.2]], [[1.0, 1.0], [0.0, 1.0]], 0, True,
+        name="P", inputs=["u1", "u2"], outputs=["y1", "y2"],
+    )  # fmt: skip
+    gains = control.ss([], [], [], np.diag([0.3, 0.4]), True, name="C", inputs=["e1", "e2"], outputs=["u1", "u2"])
+    errors = control.summing_junction(["r", "-y"], "e", dimension=2, dt=True)
+    closed = control.interconnect(
+        [plant, gains, errors],
+        connections=[
+            *([f"P.u{i}", f"C.u{i}"] for i in (1, 2)),
+            *([f"C.e{i}", f"{errors.name}.e[{i - 1}]"] for i in (1, 2)),
+            *([f"{errors.name}.y[{i - 1}]", f"P.y{i}"] for i in (1, 2)),
+        ],
+        inplist=[f"{errors.name}.r[0]", f"{errors.name}.r[1]"],
+        outlist=["P.y1", "P.y2"],
+        inputs=["r1", "r2"],
+        outputs=["y1", "y2"],
+    )
+    assert closed.dt is True
+    block = DiscreteStateSpace.from_control(closed, name="closed")
+
+    @subsystem(sample_time=0.1)
+    def sampled(r):
+        return block(r).named("y")
+
+    run = Diagram("d", sampled(Constant(value=[1.0, -2.0], name="r"))).simulate(2.0, progress=False)
+    r = np.tile([[1.0], [-2.0]], len(run.t))
+    expected = control.forced_response(control.ss(closed.A, closed.B, closed.C, closed.D, 0.1), U=r).outputs
+    np.testing.assert_allclose(run["sampled.y"], expected.T, atol=1e-12)
+    back = block.to_control()
+    assert (back.dt, back.input_labels, back.output_labels) == (True, ["r1", "r2"], ["y1", "y2"])
+    np.testing.assert_allclose(back(1j), closed(1j), rtol=1e-12)

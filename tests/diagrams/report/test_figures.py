@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Constant, Gain, Integrator, StateSpace, TransferFunction
-from loopwright.diagrams import Diagram, Number, Report, Section, Table, Verdict
+from loopwright.diagrams import Diagram, Number, Report, Section, Table, Verdict, analyse
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.gang import gang_of_four
 from loopwright.diagrams.report_figures import AxisUnits, Measured, measured
 from loopwright.diagrams.report_figures.loop_figures import bode, nyquist
 from loopwright.diagrams.report_writing import Judged
+from loopwright.diagrams.report_writing.definitions import definition
 from loopwright.diagrams.report_writing.figures import embedded
 from loopwright.diagrams.report_writing.html import to_html
 from loopwright.diagrams.results import BLUE
@@ -152,3 +153,20 @@ def test_a_figure_is_laid_out_once_and_drawn_once(monkeypatch):
     assert "<svg" in embedded(figure, "k").screen
     assert (len(draws), len(layouts)) == (1, 1)
     assert figure.get_layout_engine() is engine
+
+
+def test_a_crossings_margin_is_defined_as_that_crossings_own():
+    term, text = definition("inner.u.sampled_d0.gain_crossover_2.phase_margin_deg")
+    assert term == "gain_crossover.phase_margin_deg"
+    assert "this crossing" in text
+    assert definition("inner.u.sampled_d0.phase_margin_deg")[0] == "phase_margin_deg"
+    assert definition("measured.u.interval.ms.low")[0] == "low"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["drive", "crane", "tank"])
+def test_every_number_has_a_definition_and_a_confirmation(name):
+    report = analyse(getattr(reviewed, name)(), only=("subject", "operating_points", "poles", "inner", "steps"))
+    for path, number in report.numbers().items():
+        assert definition(path) is not None, path
+        assert number.confirmed_by.strip(), path

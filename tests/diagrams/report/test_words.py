@@ -143,7 +143,7 @@ def test_a_named_wire_off_all_loops_is_said_to_be_off_them():
         ("inner.u.continuous.control.phase_margin_deg", "control"),
         ("inner.control.continuous.phase_margin_deg", "phase_margin_deg"),
         ("inner.u.continuous.gain_crossover_1.frequency", "frequency"),
-        ("inner.u.continuous.gain_crossover_1.phase_margin_deg", "phase_margin_deg"),
+        ("inner.u.continuous.gain_crossover_1.phase_margin_deg", "gain_crossover.phase_margin_deg"),
         ("poles.par.sampled_d0.pole_1_real", "pole"),
         ("poles.par.sampled_d0.gain_a1", "gain_a1"),
         ("admittance.par.ke_limit_friction.sampled_d0.be_10", "ke_limit_friction"),
