@@ -3,7 +3,7 @@
 from .compliance_loop import SIDES, AdmittanceLoop, control_rate
 from .contact import Contact, make_contact
 from .contact_admittance import ContactAdmittance
-from .contact_confirmation import ContactConfirmation, ContactTrial
+from .contact_confirmation import ContactConfirmation, ContactTrial, try_limit
 from .contact_limits import ContactLimit, ContactMap
 from .contact_trials import TrialMethod
 from .coupled import crossing_frequency, growth_rate, poles
@@ -49,4 +49,5 @@ __all__ = [
     "stability_map",
     "stiffness_limits",
     "target_admittance",
+    "try_limit",
 ]

@@ -20,6 +20,8 @@ FACTORS = (0.97, 1.03)
 """Shares of a limit at which the diagram is run."""
 PUSH = 1e-6
 """Velocity in m/s that the push gives the contact."""
+PUSHES = (1e-6, 1e-8, 1e-10)
+"""Velocities in m/s that are tried one after the other."""
 WITHIN = 0.1
 """Largest difference of measured and predicted growth rate, relative to the larger prediction of the two runs."""
 PERIODS = 40.0
@@ -132,6 +134,22 @@ def confirm_limit(
             block=contact.plant,
         )
     return result
+
+
+def try_limit(contact: TriedContact, limit: ContactLimit) -> ContactConfirmation:
+    """Return the confirmation of a limit by the largest push that leaves the diagram linear.
+
+    Raises
+    ------
+    OptionError, ConfirmationError
+        As `Contact.confirm`: if the runs contradict the limit however small the push.
+    """
+    for push in PUSHES[:-1]:
+        try:
+            return confirm_limit(contact, limit, push)
+        except ConfirmationError:
+            continue  # friction that is linear at smaller amplitudes alone, such as bristles that hold
+    return confirm_limit(contact, limit, PUSHES[-1])
 
 
 def measure_growth(t: np.ndarray, signal: np.ndarray, omega: float, begin: float, window: float) -> float:

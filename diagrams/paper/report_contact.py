@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import ConfirmationError, LoopwrightError, OptionError
-from ..admittance import SIDES, Contact, ContactConfirmation, ContactLimit, StabilityLimit, make_contact
+from ...blocks.core import LoopwrightError, OptionError
+from ..admittance import SIDES, Contact, ContactLimit, StabilityLimit, make_contact, try_limit
 from ..frequency import Number, with_findings
 from ..linearization import StepsOnly
 from ..report import Implementation
@@ -21,8 +21,6 @@ TEXTS = Texts(__package__, "admittance")
 DAMPINGS = (0.0, 10.0, 100.0)
 TRIED_DAMPING = 10.0
 """Damping in N·s/m of the environment at which limits are tried in the nonlinear run."""
-PUSHES = (1e-6, 1e-8, 1e-10)
-"""Velocities in m/s that set it in motion."""
 SPRING = 10.0
 """Spring in N/m that holds a mass where the admittance has no stiffness."""
 Contacts = Mapping[str, Mapping[Implementation, Contact]]
@@ -130,7 +128,7 @@ def _tried(
         if not (math.isfinite(limit.value) and limit.value > 0.0):
             continue
         try:
-            found = _smallest_push(contact, limit)
+            found = try_limit(contact, limit)
         except OptionError as error:
             said[str(error)] = None
             continue
@@ -145,16 +143,6 @@ def _tried(
     columns = ("variant", "of the limit", "k_e", "growth rate, measured", "predicted", "speeds up to")
     title = f"Limits of stiffness at b_e = {TRIED_DAMPING:g} N·s/m, tried in the nonlinear run"
     return ([Table(title, columns, tuple(rows))] if rows else []), list(said)
-
-
-def _smallest_push(contact: Contact, limit: ContactLimit) -> ContactConfirmation:
-    """Return the confirmation by the largest push that leaves the diagram linear."""
-    for push in PUSHES[:-1]:
-        try:
-            return contact.confirm(limit, push=push)
-        except ConfirmationError:
-            continue  # friction that is linear at smaller amplitudes alone, such as bristles that hold
-    return contact.confirm(limit, push=PUSHES[-1])
 
 
 def _masses(

@@ -19,6 +19,7 @@ from .content_hash import content_hash
 from .parts import HasReportKind, MakesSections, ReportKind, ReportPart
 from .points import STEP
 from .review import review
+from .section_contact import check_contacts, contact_sections
 from .section_injection import injected
 from .section_limits import not_modelled
 from .section_loops import inner
@@ -61,6 +62,7 @@ def analyse(
     hertz: bool = False,
     progress: Callable[[str], None] | None = None,
     measured: Mapping[str, Any] | None = None,
+    contacts: Mapping[str, Any] | None = None,
 ) -> Report:
     """Analyse a diagram, and return the content of its report.
 
@@ -97,6 +99,10 @@ def analyse(
         Loops that were measured, by their wires: data as `measured_margins` takes them, or the path of a CSV file (see
         `read_frequency_data`). Their margins, with intervals, stand beside the model's, and requirements hold for them
         as for the model's: passed only if the whole interval is within the limits.
+    contacts : mapping of str to Contact, optional
+        Contacts of an environment with the plant, by names that stand in dotted paths: ``{"tool":
+        diagram.contact(…)}``. Each gets its admittance, the limits of coupled stability, a map of them, and a trial in
+        the nonlinear run.
     progress : callable, optional
         Told the key of each section before it is made, and of the injection check each measurement, too.
 
@@ -110,7 +116,7 @@ def analyse(
     ConfirmationError
         If a number and its independent confirmation disagree.
     OptionError
-        An unknown section.
+        An unknown section; a contact of another diagram.
     UnknownNameError
         If there is no wire with a name in ``loops``, or no loop, variant or wire with one in ``requirements``.
     """
@@ -122,6 +128,7 @@ def analyse(
     for wire in (*(wires or ()), *(measured or ())):
         find_signal(diagram.flatten(None if diagram.has_clock else STEP), wire)
     tell = progress or (lambda key: None)
+    contacts = check_contacts(diagram, contacts or {})
     asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(requirements)
     case, sections = kind.sections(
         diagram, point, experiment, wires, only, tell, stairs, asked, AxisUnits(decibels, hertz), tuple(measured or ())
@@ -129,6 +136,9 @@ def analyse(
     loops_measured = read_measured(case, measured) if measured else ()
     if loops_measured:
         sections = (*sections, measured_loops(case, loops_measured))
+    if contacts:
+        tell("contact")
+        sections = (*sections, contact_sections(contacts))
     made = Report("", sections).numbers()
     reviewed = None if asked is None else review(case, asked, made, loops_measured)
     if only is None or asked is not None:

@@ -1,6 +1,7 @@
 """Figures of a design report, drawn without pyplot."""
 
 from .axes import AxisUnits, set_powers
+from .contact_figures import contact_admittance, contact_map
 from .drawings import with_drawing
 from .loop_figures import bode, gang, nyquist, response, sensitivities
 from .measured_figures import Measured, injected, measured
@@ -10,6 +11,8 @@ __all__ = [
     "AxisUnits",
     "Measured",
     "bode",
+    "contact_admittance",
+    "contact_map",
     "gang",
     "injected",
     "measured",
