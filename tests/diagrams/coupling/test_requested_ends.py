@@ -9,6 +9,7 @@ import pytest
 from loopwright.blocks import Constant, FmuError, FmuRuntimeError, Gain, Integrator
 from loopwright.diagrams import Coupling, Diagram, subsystem
 from loopwright.fmus import Fmu, StepOptions
+from support.eventful import eventful_fmu
 from support.small_fmus import small_fmu, values
 
 _BODY = """
@@ -205,3 +206,44 @@ def test_without_a_run_it_is_an_error_that_tells_the_time(files):
             one.step(0.5, 0.1)
     assert error.value.ends_at == pytest.approx(0.53)
     assert one.ends_run
+
+
+# --- in Event Mode --------------------------------------------------------------------------------------------------------
+
+_EVENTS = """
+typedef struct { double t, y, u, last; int mode; } instance;
+void *fmi3InstantiateCoSimulation() { instance *c = calloc(1, sizeof(instance)); c->mode = 1; return c; }
+int fmi3EnterEventMode(void *p) { ((instance *)p)->mode = 1; return 0; }
+int fmi3EnterStepMode(void *p) { ((instance *)p)->mode = 2; return 0; }
+int fmi3UpdateDiscreteStates(void *p, bool *more, bool *stop, bool *nominals, bool *v, bool *defined, double *next) {
+    instance *c = p; *more = *nominals = *v = false; *stop = c->t >= c->last - 1e-12;
+    *defined = !*stop; *next = c->last; return c->mode == 1 ? 0 : 3; }
+int fmi3DoStep(void *p, double t, double h, bool f, bool *e, bool *stop, bool *early, double *last) {
+    instance *c = p; if (c->mode != 2) return 3;
+    *e = *stop = *early = false; c->y += h * c->u; *last = c->t = t + h; return 0; }
+"""
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.parametrize(("last", "samples"), [(0.0, 1), (0.5, 6), (0.53, 7)])
+def test_an_end_in_event_mode_ends_the_run_there(cache, tmp_path, last, samples, isolate):
+    gets = values("fmi3", "Get", "Float64", "double", {1: "c->y", 2: "c->u", 3: "c->last"})
+    sets = values("fmi3", "Set", "Float64", "double", {2: "c->u", 3: "c->last"})
+    about = _describe("fmi3").replace("<CoSimulation ", '<CoSimulation hasEventMode="true" ')
+    about = about.replace('canGetAndSetFMUState="true" canSerializeFMUState="true"', "")
+    file = small_fmu(tmp_path, "fmi3", _EVENTS + gets + sets, about)
+    run = driven(file, last, isolate=isolate, stepping=StepOptions(event_mode=True)).simulate(
+        1.0, step=0.1, progress=False
+    )
+    check_end(run, last)
+    assert len(run.t) == samples
+
+
+def test_a_linear_model_at_an_end_in_model_exchange_is_refused(cache, tmp_path):
+    file = eventful_fmu(tmp_path, 3)
+    plant = Fmu(file, name="plant", start={"last": -1}, interface="model_exchange")
+    wired = plant(u=Constant(value=0.5), n=Constant(value=0.0))
+    with pytest.raises(
+        FmuError, match=r"^plant: the FMU asks to end the simulation \(terminateSimulation\) at t = 0 s"
+    ):
+        Diagram("d", wired).linearize(outputs="plant.x")
