@@ -61,7 +61,7 @@ class SharedSteps:
 
     def bind_step(self) -> Callable[[float, float], None]:
         """Return `step`, for ports that are Float64 all as one function, which costs less."""
-        instance, call, run = self.instance, self.call, self._step.run
+        instance, call, run = self.instance, self.call, self._step.runner()
         if not (self.ins.is_whole and self.outs.is_whole) or self.ins.has_limits:
             return self.step
         filled, spread = self.ins.views, self.outs.views  # (from, to) each, in the sense of setting

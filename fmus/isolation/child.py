@@ -71,7 +71,7 @@ class Child:
         self.log = os.open(about["log"], os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
         self.library: Any = None
         self.kept: list[Any] = []  # as long as the library may use it
-        self.sequences: list[tuple[tuple[Callable[..., int], tuple[Any, ...]], ...]] = []
+        self.sequences: list[Callable[[], None]] = []
         self.printf = importlib.import_module(".printf", __package__)
         self.before: list[Any] = []
         self.line: Any = None
@@ -82,12 +82,8 @@ class Child:
 
     def serve(self) -> None:
         """Answer requests until the parent is gone."""
-        words, get, last, patience = (
-            self.words,
-            self.words.__getitem__,
-            0,
-            wire.Patience(_LOOKS, may=self.about["watches"]),
-        )
+        words, sequences, last = self.words, self.sequences, 0
+        get, patience = words.__getitem__, wire.Patience(_LOOKS, may=self.about["watches"])
         while True:
             for _ in range(patience.looks):
                 if get(REQUEST) != last:
@@ -103,7 +99,7 @@ class Child:
             if get(SEQUENCE) == MAIL:
                 self._answer()
             else:
-                self._run(get(SEQUENCE))
+                sequences[get(SEQUENCE)]()
             words[REPLY] = last
             wire.order_memory()
             if words[PARENT_SLEEPS] or not self.ordered:
@@ -118,20 +114,25 @@ class Child:
             self.leave()
         words[CHILD_SLEEPS] = 0
 
-    def _run(self, sequence: int) -> None:
-        """Run a bound sequence."""
-        words, status, worst = self.words, 0, 0
-        for place, (function, arguments) in enumerate(self.sequences[sequence]):
-            words[PLACE] = place
-            status = function(*arguments)
-            if not 0 <= status <= 1:
-                break
-            worst |= status
-        else:
-            status = worst
-        if not self.is_own:
-            self._leave_copy()
-        words[STATUS] = status & 0xFFFFFFFF
+    def _bind_run(self, calls: list[tuple[Callable[..., int], tuple[Any, ...]]]) -> Callable[[], None]:
+        """Return a function that runs a bound sequence, with everything looked up before."""
+        words, place_at, status_at = self.words, PLACE, STATUS
+        numbered = tuple((place, function, arguments) for place, (function, arguments) in enumerate(calls))
+
+        def run() -> None:
+            worst = 0
+            for place, function, arguments in numbered:
+                words[place_at] = place
+                status = function(*arguments)
+                if not 0 <= status <= 1:
+                    worst = status
+                    break
+                worst |= status
+            if not self.is_own:
+                self._leave_copy()
+            words[status_at] = worst & 0xFFFFFFFF
+
+        return run
 
     def _leave_copy(self) -> None:
         """End this process if the FMU has made it from the child: the child itself goes on."""
@@ -236,7 +237,7 @@ class Child:
             function = self.library[name]
             function.restype = ctypes.c_int
             bound.append((function, tuple(made)))
-        self.sequences.append(tuple(bound))
+        self.sequences.append(self._bind_run(bound))
         return len(self.sequences) - 1, []
 
     def do_follow(

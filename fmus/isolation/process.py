@@ -46,7 +46,6 @@ _START = (
     "m.__path__ = sys.argv[1:3]; sys.modules[m.__name__] = m; from loopwright_child.child import main; main()"
 )
 _LOOKS = 2000
-_take, _give = wire.ORDER.acquire, wire.ORDER.release
 _LOOK = 0.05  # s between two looks at a process that does not answer
 
 
@@ -74,9 +73,9 @@ class ChildProcess:
         self.folder = Path(tempfile.mkdtemp(prefix="loopwright-fmu-"))
         self._peak = 0
         self._output = ChildOutput(self.folder)
-        self._number, self._allotted = 0, DATA
+        self.number, self._allotted = 0, DATA
         self._watches = wire.ORDERED and count_cores() > 1
-        self._patience = wire.Patience(_LOOKS, may=self._watches)
+        self.patience = wire.Patience(_LOOKS, may=self._watches)
         self._names: list[list[str]] = []
         self._call = ""
         self._process: subprocess.Popen[bytes] | None = None
@@ -101,7 +100,7 @@ class ChildProcess:
         with shared.open("r+b") as file:
             self._memory = mmap.mmap(file.fileno(), self.size)
         self._base = ctypes.addressof(ctypes.c_char.from_buffer(self._memory))
-        self._words = memoryview(self._memory).cast("Q")
+        self.words = memoryview(self._memory).cast("Q")
         about = {
             "size": self.size,
             "parent": os.getpid(),
@@ -186,7 +185,7 @@ class ChildProcess:
         """
         self._call = call
         self._check_alive(call)
-        memory, words, file = self._memory, self._words, str(self.folder / "mail")
+        memory, words, file = self._memory, self.words, str(self.folder / "mail")
         wire.write_message(memory, words, file, [operation, *arguments], blobs)
         self.post(MAIL)
         self.finish(MAIL, seconds)
@@ -207,17 +206,17 @@ class ChildProcess:
 
     def post(self, sequence: int) -> None:
         """Begin to run a bound sequence, or to read the mailbox."""
-        words = self._words
+        words = self.words
         if not self.alive:
             self._check_alive(self._place_name(sequence))
         words[SEQUENCE] = sequence
-        words[REQUEST] = self._number = self._number + 1
-        if _take(False):
-            _give()
+        words[REQUEST] = self.number = self.number + 1
+        wire.order_memory()
         if words[CHILD_SLEEPS] or not wire.ORDERED:
-            self._wake(sequence)
+            self.wake(sequence)
 
-    def _wake(self, sequence: int) -> None:
+    def wake(self, sequence: int) -> None:
+        """Wake the child, which sleeps."""
         try:
             os.write(self._in, WAKE)
         except OSError as error:
@@ -225,7 +224,7 @@ class ChildProcess:
 
     def finish(self, sequence: int, seconds: float) -> int:
         """Return the status of a sequence that was posted; see `failed_place`."""
-        words, number, get, patience = self._words, self._number, self._words.__getitem__, self._patience
+        words, number, get, patience = self.words, self.number, self.words.__getitem__, self.patience
         try:
             for _ in range(patience.looks):
                 if get(REPLY) == number:
@@ -233,20 +232,24 @@ class ChildProcess:
                     break
             else:
                 patience.slept()
-                self._sleep(sequence, number, seconds)
+                self.sleep(sequence, number, seconds)
         except FmuProcessError:
             raise
         except BaseException:  # an interrupt: the reply is still to come
-            self.used = True
-            self.end()
+            self.give_up()
             raise
         if words[MESSAGES]:
             self.fetch_messages()
         return words[STATUS]
 
-    def _sleep(self, sequence: int, number: int, seconds: float) -> None:
+    def give_up(self) -> None:
+        """End the process after an interrupt in a call."""
+        self.used = True
+        self.end()
+
+    def sleep(self, sequence: int, number: int, seconds: float) -> None:
         """Sleep until the reply is there."""
-        words, deadline = self._words, time.monotonic() + seconds
+        words, deadline = self.words, time.monotonic() + seconds
         words[PARENT_SLEEPS] = 1
         wire.order_memory()
         arrived = wire.ORDERED  # else the byte in the pipe says that the reply is written
@@ -282,7 +285,7 @@ class ChildProcess:
     @property
     def failed_place(self) -> int:
         """Place of the call at which the last sequence ended."""
-        return int(self._words[PLACE])
+        return int(self.words[PLACE])
 
     def _place_name(self, sequence: int) -> str:
         if sequence == MAIL:
@@ -294,7 +297,7 @@ class ChildProcess:
 
     def fetch_messages(self) -> None:
         """Give the FMU's log messages to `told`."""
-        self._words[MESSAGES] = 0
+        self.words[MESSAGES] = 0
         for status, text in self._output.read_messages():
             self.told(status, text)
 
@@ -329,7 +332,7 @@ class ChildProcess:
             time.sleep(0.01)
         self.fetch_messages()
         printed = self._output.read_printed()
-        noted, by_itself = int(self._words[CAUSE]), self.has_ended()
+        noted, by_itself = int(self.words[CAUSE]), self.has_ended()
         status = self._finish_process()
         error = None if by_itself else error
         if cause is None:
@@ -394,4 +397,4 @@ class ChildProcess:
         self._names.clear()
         self.told, self.lose = lambda status, text: None, lambda error: error
         self._output.begin_again()
-        self._words[MESSAGES] = 0
+        self.words[MESSAGES] = 0

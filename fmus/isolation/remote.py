@@ -17,6 +17,7 @@ from .library import RemoteLibrary, describe_call, seconds_for
 from .limits import Isolation
 from .pool import give_back
 from .process import ChildProcess
+from .round_trip import bind_round_trip
 
 
 class RemoteBoundCalls(BoundCalls):
@@ -34,12 +35,15 @@ class RemoteBoundCalls(BoundCalls):
             max((seconds_for(name, limits) for name in names), default=limits.step_time)
         )
         self._sequence = process.bind(described, blobs, limits.step_time)
+        self._run = bind_round_trip(process, self._sequence, self._seconds, self._note)
 
     def run(self) -> int:
         """Run them and return the status; see `BoundCalls`."""
-        self._process.post(self._sequence)
-        status = self._process.finish(self._sequence, self._seconds)
-        return status if status <= WARNING else self._note(status)
+        return self._run()
+
+    def runner(self) -> Callable[[], int]:
+        """Return `run` as one function."""
+        return self._run
 
     def start(self) -> None:
         """Let the child begin."""
