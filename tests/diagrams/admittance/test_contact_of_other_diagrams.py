@@ -8,7 +8,17 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from loopwright.blocks import Block, Constant, ForceSensor, Gain, Input, Output, State, TransferFunction
+from loopwright.blocks import (
+    Block,
+    Constant,
+    ForceSensor,
+    Gain,
+    Input,
+    OptionError,
+    Output,
+    State,
+    TransferFunction,
+)
 from loopwright.diagrams import Diagram, TrialMethod, subsystem
 from loopwright.fmus import Fmu, build, scara
 
@@ -109,6 +119,43 @@ def test_a_force_that_is_not_measured_leaves_the_drag():
     assert here.admittance(2.0).rendered == pytest.approx(1 / (M * s + DRAG / (TAU * s + 1)), rel=1e-12)
 
 
+# --- a slow mode of the controller's own, near z = 1 --------------------------------------------------------------------
+
+LEAK, GAIN = 0.13, 0.02
+"""Rate of the mode in 1/s, which is z = 1 - 1.3e-4 at 1 kHz, and gain from the force to it."""
+
+
+def test_a_slow_mode_that_the_environment_moves_is_told_from_a_drift_beside_it():
+    cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
+
+    @subsystem(sample_time=1e-3)
+    def drive(velocity, push):
+        felt = Gain(gain=1.0, name="sensor")(push).named("felt")
+        slow = TransferFunction(numerator=(1.0,), denominator=(1.0, LEAK), name="slow")
+        return -1.0 * Gain(gain=GAIN * 10, name="share")(slow(felt)) - Gain(gain=DRAG, name="drag")(velocity)
+
+    ports = {"position": "cart.position", "velocity": "cart.velocity", "force": "felt"}
+    made = Diagram("cart", cart(motor=drive(cart.velocity, hand), push=hand))
+    here = made.contact("cart.push", direction=[1.0], **ports)
+    found = here.stability_limit("damping")
+    # at s = 0: (DRAG + b) v = g b v / LEAK, with the gain g; the position drifts, whatever the damper
+    g = 10 * GAIN
+    assert found.value == pytest.approx(LEAK * DRAG / (g - LEAK), rel=1e-7)
+    assert found.frequency == pytest.approx(0.0, abs=1e-6)
+    modes = here.loop("damping").modes
+    assert np.min(np.abs(modes.fixed - 1.0)) < 1e-12  # the drift
+    kept = np.linalg.eigvals(modes.reduce(here.loop("damping").close(np.float64(0.0)).A))
+    assert np.min(np.abs(kept - np.exp(-LEAK * 1e-3))) < 1e-9
+    assert found.growth_below < 0.0 < found.growth_above
+
+
+def test_a_scan_goes_from_soft_to_stiff():
+    here = cart_contact()
+    assert here.stability_limit().scanned[1] == 1e8  # N/m
+    with pytest.raises(OptionError, match="found 29 points in a decade; expected at least 30"):
+        here.stability_limit(per_decade=29)
+
+
 # --- an arm: joints that are not the axes of the force ---------------------------------------------------------------
 
 ANGLES, STIFF, DAMPED, AMPLIFIED = np.array([0.07072564, 1.0852782]), 400.0, 30.0, 2.0
@@ -178,11 +225,16 @@ def test_an_arm_has_the_limits_of_its_own_matrices(direction, vary, held):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("method", ["inside", "held"])
 @pytest.mark.parametrize(("vary", "held"), [("stiffness", {"damping": 5.0}), ("mass", {"stiffness": 50.0})])
-def test_an_arms_limits_hold_in_the_nonlinear_run_with_the_environment_inside(vary, held):
+def test_an_arms_limits_hold_in_the_nonlinear_run_with_an_environment(vary, held, method):
     ports = {"position": "arm.position", "velocity": "arm.velocity", "force": "felt"}
     here = arm_diagram().contact("arm.external_force", direction=(0.6, 0.8), **ports)
-    found = here.confirm(here.stability_limit(vary, **held), push=1e-8)
+    found = here.confirm(here.stability_limit(vary, **held), push=1e-8, method=method)
+    assert found.below.measured < 0 < found.above.measured
+    if method == "held":
+        assert found.tried == pytest.approx(found.limit.value, rel=0.1)  # T/10 of more delay
+        return
     names = {"stiffness": 0.0, "damping": 0.0, "mass": 0.0, **held}
     k, b, m = (names | {vary: found.above.value}).values()
     assert found.above.measured == pytest.approx(arm_growth(k, b, m, np.array((0.6, 0.8))), rel=0.02)
