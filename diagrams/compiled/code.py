@@ -120,10 +120,10 @@ def compile_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -
         return _COMPILED[flat]
     code = None if flat.by_block else _compile_straight(flat, acting)
     code = code or _compile_grouped(flat, acting)
-    return _COMPILED.setdefault(flat, replace(code, loops=_compile_loops(flat, acting)))
+    return _COMPILED.setdefault(flat, replace(code, loops=compile_loops(flat, acting)))
 
 
-def _compile_loops(
+def compile_loops(
     flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]
 ) -> dict[frozenset[TickPattern], StraightTick]:
     """Return the equations of the algebraic loops at ticks: their mismatch, and its derivative."""

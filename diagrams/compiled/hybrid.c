@@ -42,6 +42,8 @@ static int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
                 const int where = locate(&h->w, p, m, &h->to);
                 if (where == LOST) return ask(h, ASK_BETWEEN);
                 h->found = where == EVENT;
+                if (h->found && p->loops)
+                    for (int64_t i = 0; i < p->loops->n; i++) h->solved[i] = p->x[p->loops->where[i]];
                 if (h->found && m->t == end && end - h->to <= 4 * ulp(end)) h->to = end;
             }
             h->stepped = 1;
@@ -74,6 +76,8 @@ static int64_t go_between(hybrid *h, progress *g, int64_t *steps) {
         const double t = h->to;
         bool happened = h->found;
         h->stepped = 0;
+        if (h->found && p->loops) /* as the indicators saw them */
+            for (int64_t i = 0; i < p->loops->n; i++) h->l.x[p->loops->where[i]] = h->solved[i];
         if (h->found && fire(h, t, t) == LOST) return ask(h, ASK_BETWEEN);
         h->t = t;
         if (t == edge && edge < end) { /* a discontinuity of a source */

@@ -13,7 +13,7 @@ import numpy as np
 from ..flat import NONE, FlatDiagram, TickPattern
 from .bound import BoundFunction, address
 from .hybrid_code import Compiled, HybridCode, hybrid_master
-from .loop import CompiledLoop, LoopStructure, OutcomeStructure, TickStructure
+from .loop import CompiledLoop, LoopStructure, NewtonOptions, OutcomeStructure, TickStructure
 from .radau import radau_numbers
 from .watch import Fired, Watch, WatchStructure
 
@@ -38,7 +38,8 @@ _INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 class _Problem(ctypes.Structure):
     _fields_ = [
         *_fields(_INT, "n width"), ("where", _AT), ("flow", TickStructure), ("slope", TickStructure),
-        *_fields(_AT, "t x slopes"), *_fields(_REAL, "stop edge left at late"), *_fields(_INT, "rates jacobians"),
+        *_fields(_AT, "t x slopes"), *_fields(_REAL, "stop edge left at late"), *_fields(_AT, "loops here by_loops"),
+        *_fields(_INT, "rates jacobians"),
     ]  # fmt: skip
 
 
@@ -63,7 +64,7 @@ class _Hybrid(ctypes.Structure):
         ("l", LoopStructure), ("p", _Problem), ("w", WatchStructure), ("methods", _AT * 2),
         *_fields(_INT, "active automatic accepts between budget inside begun stepped"), *_fields(_REAL, "t to"),
         *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
-        *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT), ("looked_at", _REAL),
+        *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT), ("solved", _AT), ("looked_at", _REAL),
     ]  # fmt: skip
 
 
@@ -162,6 +163,8 @@ class CompiledHybrid:
         Longest time in s between two instants at which indicators of events are evaluated.
     own : sequence of ndarray
         For each event: the places of its block's states among the integrated ones.
+    loops : NewtonOptions, optional
+        Newton's method for the algebraic loops between ticks, where there are some.
     accepts : bool
         Whether blocks are to be evaluated after every step: they remember something, have guards, or FMUs read them.
     """
@@ -179,6 +182,7 @@ class CompiledHybrid:
         spacing: float,
         own: Sequence[np.ndarray],
         accepts: bool,
+        loops: NewtonOptions | None = None,
     ):
         self._kept: list[Any] = [code, loop, arguments, x_next]
         self.kinds: Mapping[frozenset[TickPattern], int] = loop.kinds
@@ -199,8 +203,17 @@ class CompiledHybrid:
             x=self._own(trial[1]),
             slopes=self._own(slopes),
         )
+        results = [slopes]
+        if loops is not None:
+            m = len(loops.where)
+            solver = loop.bind_loops(code.ticks, NONE, trial, loops)
+            through = np.zeros(2 * n * m)
+            self._kept.append(solver)
+            hybrid.p.loops, hybrid.p.here, hybrid.p.by_loops = ctypes.addressof(solver), address(x), self._own(through)
+            hybrid.solved = self._own(np.zeros(m))
+            results += [through[: n * m], through[n * m :], np.zeros(m * m)]
         if slopes.size:
-            hybrid.p.slope = self._bind(code.between["slope"], trial, [slopes])
+            hybrid.p.slope = self._bind(code.between["slope"], trial, results)
         of = ctypes.addressof(hybrid) + _Hybrid.p.offset
         self.methods = [self._method(options, n, of) for options in methods]
         for i, method in enumerate(self.methods):

@@ -12,7 +12,17 @@ from weakref import WeakKeyDictionary
 import casadi as ca
 
 from ..flat import NONE, FlatDiagram, TickPattern
-from .code import StraightTick, TickCode, address_of, check_size, load_compiled, make_visible, read_sources, rename
+from .code import (
+    StraightTick,
+    TickCode,
+    address_of,
+    check_size,
+    compile_loops,
+    load_compiled,
+    make_visible,
+    read_sources,
+    rename,
+)
 
 _SOURCES = ("newton.c", "master.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
 
@@ -63,8 +73,6 @@ def find_hybrid_obstacle(flat: FlatDiagram, solver: str) -> str | None:
         return f"the transport delay {delayed[0]!r} keeps its past in Python"
     if flat.outside:
         return f"the FMU {flat.outside[0]!r} in model exchange is evaluated by Python"
-    if flat.loops.slices:
-        return "it has an algebraic loop, which is solved by iteration at every instant"
     opaque = sorted(path for path in flat.checked.traced if blocks[path].opaque)
     if opaque:
         return f"the block {opaque[0]!r} is evaluated by Python"
@@ -95,7 +103,8 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
     ticks = {clocks: rename(flat.at_tick(clocks).last.fast, f"tick{i}") for i, clocks in enumerate(kinds)}
     others = {"flow": flat.flow.last.fast}
     if stiff:
-        others["slope"] = flat.jacobian.fast
+        looped = bool(flat.active_loops(NONE))
+        others["slope"] = (flat.jacobian_with_loops if looped else flat.jacobian).fast
     if flat.events:
         others |= {"indicators": flat.indicators.last.fast, "jump": flat.jump.last.fast}
     others = {name: rename(function, name) for name, function in others.items()}
@@ -107,7 +116,7 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
     hybrid_master()  # if it can't be compiled, the run is interpreted
     straight = {c: StraightTick(ticks[c], address_of(library, f"tick{i}")) for i, c in enumerate(kinds)}
     between = {name: Compiled(function, address_of(library, name)) for name, function in others.items()}
-    made = HybridCode(TickCode(straight, exact=False, library=library), between)
+    made = HybridCode(TickCode(straight, exact=False, library=library, loops=compile_loops(flat, kinds)), between)
     return known.setdefault((kinds, stiff), made)
 
 

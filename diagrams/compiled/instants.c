@@ -32,6 +32,7 @@ typedef struct hybrid {
     const int64_t *taken, *taken_first; /* states that a tick of each kind renews */
     double *taken_states;
     int64_t switched;   /* 1: stiff, it seems; 2: no longer */
+    double *solved;     /* values of the algebraic loops at an event */
     double looked_at;   /* step in s at which it seemed so */
 } hybrid;
 
@@ -204,6 +205,7 @@ static int fire(hybrid *h, double t, double at) {
             memcpy(log + 2, h->l.x, (size_t)width * sizeof(double));
             log += row;
         }
+        if (p->loops && !solve_loops(h->l.loops + h->between, h->l.x)) return LOST;
         call(&w->jump);
         memcpy(h->l.x, h->l.x_next, (size_t)width * sizeof(double));
         memcpy(p->x, h->l.x, (size_t)width * sizeof(double));

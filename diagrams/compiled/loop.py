@@ -69,7 +69,9 @@ class LoopStructure(ctypes.Structure):
     ]
 
 
-class _Newton(ctypes.Structure):
+class NewtonStructure(ctypes.Structure):
+    """The algebraic loops of a tick, as C knows them."""
+
     _fields_ = [
         ("n", ctypes.c_int64),
         ("equations", TickStructure),
@@ -190,8 +192,8 @@ class CompiledLoop:
             near=NEAR,
         )
         if code.loops:
-            solvers = [self._newton(code, clocks, arguments, (loops or {}).get(clocks)) for clocks in code.ticks]
-            self.structure.loops = self._address(solvers, _Newton)
+            solvers = [self.bind_loops(code, clocks, arguments, (loops or {}).get(clocks)) for clocks in code.ticks]
+            self.structure.loops = self._address(solvers, NewtonStructure)
         self._outcome, self._run = OutcomeStructure(), master()
 
     def _array(self, values: np.ndarray) -> int | None:
@@ -212,18 +214,19 @@ class CompiledLoop:
         self._kept.append(bound)
         return TickStructure(bound.address, bound.arguments, bound.results, bound.iw, bound.w)
 
-    def _newton(
+    def bind_loops(
         self,
         code: TickCode,
         clocks: frozenset[TickPattern],
         arguments: Sequence[np.ndarray],
         options: NewtonOptions | None,
     ) -> ctypes.Structure:
+        """Return the algebraic loops at a tick, bound to the vectors (t, x, w, p); valid as long as this lives."""
         if clocks not in code.loops or options is None:
-            return _Newton()
+            return NewtonStructure()
         n = len(options.where)
         r, J = np.zeros(n), np.zeros(n * n)
-        return _Newton(
+        return NewtonStructure(
             n=n,
             equations=self._tick(code.loops[clocks], arguments, [r, J]),
             where=self._array(np.array(options.where, dtype=np.int64)),

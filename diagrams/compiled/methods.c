@@ -11,6 +11,9 @@ typedef struct {
     double stop;             /* rates are evaluated no later */
     double edge, left;       /* from the time `edge` on sources are seen at the time `left` before it */
     double at, late;         /* at the time `at` they are seen at the time `late`, just after it */
+    newton *loops;           /* algebraic loops of a trial, with values among the states; NULL: none */
+    const double *here;      /* states of the instant that is reached, from which the loops are sought */
+    double *by_loops;        /* of the slope: ∂f/∂v, then ∂r/∂x, for loops with the values v and r(x, v) = 0 */
     int64_t rates, jacobians;
 } problem;
 
@@ -52,17 +55,23 @@ static inline double smaller(double a, double b) { return a < b ? a : b; }
 static inline double left_of(double t) { return t - 4.0 * TOLERANCE * fabs(t); }
 static inline bool is_before(double a, double b) { return b < INFINITY ? a < b - 2.0 * TOLERANCE * fabs(b) : a < b; }
 
-/* Put the trial to an instant. */
-static inline void look(problem *p, double t, const double *x) {
+/* Put the trial to an instant; false if its algebraic loops are not solved there. */
+static inline bool look(problem *p, double t, const double *x) {
     *p->t = t >= p->edge ? p->left : t == p->at ? p->late : t;
     for (int64_t i = 0; i < p->n; i++) p->x[p->where[i]] = x[i];
+    if (!p->loops) return true;
+    for (int64_t i = 0; i < p->loops->n; i++) p->x[p->loops->where[i]] = p->here[p->loops->where[i]];
+    return solve_loops(p->loops, p->x);
 }
 
 static inline void rate(problem *p, double t, const double *x, double *f) {
     if (!p->n) return;
-    look(p, t < p->stop ? t : p->stop, x);
-    p->flow.results[0] = f;
     p->rates++;
+    if (!look(p, t < p->stop ? t : p->stop, x)) { /* a step that is shorter may have a solution */
+        for (int64_t i = 0; i < p->n; i++) f[i] = NAN;
+        return;
+    }
+    p->flow.results[0] = f;
     call(&p->flow);
 }
 

@@ -87,14 +87,28 @@ static void solve_complex(const double *lu, const int64_t *pivots, int64_t n, do
     }
 }
 
+/* Add to ∂f/∂x what comes through the algebraic loops: −∂f/∂v (∂r/∂v)⁻¹ ∂r/∂x. */
+static bool lead_through_loops(problem *p) {
+    newton *s = p->loops;
+    const double *by_values = p->by_loops, *mismatch = by_values + p->n * s->n;
+    if (!factorize(s)) return false;
+    for (int64_t j = 0; j < p->n; j++) {
+        substitute(s, mismatch + j * s->n, s->column);
+        for (int64_t k = 0; k < s->n; k++)
+            for (int64_t i = 0; i < p->n; i++) p->slopes[j * p->n + i] -= by_values[k * p->n + i] * s->column[k];
+    }
+    return true;
+}
+
 /* Evaluate the derivative of the rates; the last finite one is kept where it is not finite. */
 static bool differentiate(method *m, double t, const double *x) {
     problem *p = m->of;
     const int64_t n = m->n;
-    look(p, t < p->stop ? t : p->stop, x);
     p->jacobians++;
-    call(&p->slope);
     m->slope_is_new = 1;
+    if (!look(p, t < p->stop ? t : p->stop, x)) return m->has_slope;
+    call(&p->slope);
+    if (p->loops && !lead_through_loops(p)) return m->has_slope;
     if (!all_finite(p->slopes, n * n)) return m->has_slope;
     for (int64_t i = 0; i < n; i++)
         for (int64_t j = 0; j < n; j++) m->J[i * n + j] = p->slopes[j * n + i];

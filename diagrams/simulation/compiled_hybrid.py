@@ -23,7 +23,7 @@ from ..compiled import (
     find_hybrid_obstacle,
 )
 from ..coupling import Plant, PlantSteps
-from ..flat import EVERY
+from ..flat import EVERY, NONE
 from ..results import Occurrence, Recorder
 from ..solvers import AutoSolver
 from .compiled_hand_over import (
@@ -35,7 +35,16 @@ from .compiled_hand_over import (
     restore_plans,
     take_back_domains,
 )
-from .compiled_ticks import FIRST, LARGEST_CHUNK, WISHED, acts, find_obstacle_at_ticks, is_exact, kinds_of
+from .compiled_ticks import (
+    FIRST,
+    LARGEST_CHUNK,
+    WISHED,
+    acts,
+    find_obstacle_at_ticks,
+    is_exact,
+    kinds_of,
+    newton_options,
+)
 from .continuous import Continuous
 from .solver_setup import has_guards, remembers
 from .ticks import take_tick
@@ -295,9 +304,10 @@ class HybridTicks:
                 width=workspace.log.size if entries is None else len(entries),
                 every=recorder.every,
                 stops=self._stops,
+                loops={clocks: newton_options(self._flat, clocks) for clocks in self._code.ticks.loops},
             )
             self._recorder = recorder
-            accepts = bool(self._plants) or remembers(self._flat) or has_guards(self._flat)
+            accepts = bool(self._plants) or workspace.looped or remembers(self._flat) or has_guards(self._flat)
             continuous, domains = self._continuous, self._continuous.domains
             self._loop = CompiledHybrid(
                 self._code, self._flat, ticks, arguments, workspace.x_next, self._methods,
@@ -305,6 +315,7 @@ class HybridTicks:
                 spacing=math.inf if domains is None else domains.spacing,
                 own=() if domains is None else domains.own,
                 accepts=accepts,
+                loops=newton_options(self._flat, NONE) if self._flat.active_loops(NONE) else None,
             )  # fmt: skip
             self._kind_of = np.zeros(1 << len(self._flat.distinct), dtype=np.int32)
             for clocks, kind in self._loop.kinds.items():

@@ -143,13 +143,9 @@ class CompiledTicks:
                 width=workspace.log.size if entries is None else len(entries),
                 every=recorder.every,
                 stops=self._stops,
-                loops={clocks: self._newton(clocks) for clocks in self._code.loops},
+                loops={clocks: newton_options(self._flat, clocks) for clocks in self._code.loops},
             )
         return self._loop
-
-    def _newton(self, clocks: frozenset[TickPattern]) -> NewtonOptions:
-        where = self._flat.active_loops(clocks)
-        return NewtonOptions(where, TOLERANCE, ROUNDING, SINGULAR, ITERATIONS, HALVINGS)
 
     def _kinds(self, ticks: np.ndarray) -> np.ndarray:
         """Return the clocks that act at ticks, as places among the compiled functions; −1 where none is."""
@@ -181,6 +177,11 @@ class CompiledTicks:
         workspace.here.t[0] = t
         workspace.tick(self._flat.acting(k))
         recorder.row(t, workspace.log)
+
+
+def newton_options(flat: FlatDiagram, clocks: frozenset[TickPattern]) -> NewtonOptions:
+    """Return Newton's method for the algebraic loops at a tick at which some clocks act."""
+    return NewtonOptions(flat.active_loops(clocks), TOLERANCE, ROUNDING, SINGULAR, ITERATIONS, HALVINGS)
 
 
 def is_exact(flat: FlatDiagram, last: int) -> bool:

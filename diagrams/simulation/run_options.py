@@ -97,8 +97,9 @@ class RunOptions:
     compile : bool
         Go from tick to tick in C, with the same results to the last bit; with continuous states, within the
         tolerances. It needs a compiler (the extra ``build``), and a diagram without transport delays and FMUs in
-        processes of their own; between ticks no algebraic loops and no blocks of Python. Where one of these fails, the
-        run is interpreted, and ``run.messages`` says why.
+        processes of their own; between ticks no blocks of Python and one of the solvers "auto", "RK23", "RK45",
+        "DOP853", "Radau" and those of fixed step. Where one of these fails, the run is interpreted, and
+        ``run.messages`` says why.
     """
 
     step: float | Fraction | None = None
