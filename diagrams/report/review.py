@@ -116,7 +116,7 @@ def _measured(
     dt = actual.model.dt if actual is not None and not actual.problem else 0.0
     for of in measured:
         names = tuple(dict.fromkeys((of.key, wires.get(of.key, of.wire), of.wire)))
-        intervals, own = of.intervals(dt), asked.limits_named(names, MEASURED)
+        intervals, own = of.intervals(dt), asked.limits_of_variant(names, MEASURED)
         for name, limit in asked.limits_of(names, MEASURED).items():
             result = RequirementResult(name, of.key, MEASURED, limit, Verdict.UNDECIDED, Reason.NO_NUMBER)
             if name not in intervals:

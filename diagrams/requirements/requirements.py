@@ -225,6 +225,14 @@ class Requirements(LoopLimits):
                 found |= limits.variants[variant].limits
         return found
 
+    def limits_of_variant(self, names: Iterable[str], variant: str) -> dict[str, Limit]:
+        """Return the limits that are given for a variant of a loop by the variant's own key."""
+        found: dict[str, Limit] = {}
+        for limits in (self, *self._of_loop(names)):
+            if variant in limits.variants:
+                found |= limits.variants[variant].limits
+        return found
+
     def step_of(self, names: Iterable[str], variant: str) -> StepLimits | None:
         """Return the limits of the response to a step at a loop's own wire, None where there are none."""
         found = None

@@ -132,6 +132,16 @@ def test_a_margin_that_the_data_do_not_show_is_not_decided():
     assert report.review.verdict is Verdict.UNDECIDED
 
 
+@pytest.mark.parametrize(("key", "asked"), [("e", False), ("measured", True)])
+def test_a_number_that_data_have_not_is_asked_of_them_only_by_their_own_key(key, asked):
+    limits = {"loops": {"e": {"disk_margin": 0.1}}} if key == "e" else {"variants": {key: {"disk_margin": 0.1}}}
+    report = analyse(
+        drive(), only=("poles", "inner"), measured={"e": data(4.0, 0.01)}, requirements=Requirements(**limits)
+    )
+    found = [r for r in report.review.results if r.variant == "measured"]
+    assert [(r.quantity, r.reason) for r in found] == ([("disk_margin", Reason.NO_NUMBER)] if asked else [])
+
+
 @pytest.mark.parametrize(
     ("interval", "verdict"),
     [
