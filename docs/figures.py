@@ -1,4 +1,4 @@
-"""Make the README's figures anew: python docs/figures.py."""
+"""Make the figures of the README and of the page on sweeps anew: python docs/figures.py."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 HERE = Path(__file__).parent
 
 
-def first_example() -> str:
-    """Return the code that the README opens with."""
-    text = (HERE.parent / "README.md").read_text(encoding="utf-8")
+def first_example(page: Path) -> str:
+    """Return the first code of a page."""
+    text = page.read_text(encoding="utf-8")
     return re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]
 
 
@@ -44,7 +44,8 @@ def main(folder: Path) -> None:
 
     folder.mkdir(parents=True, exist_ok=True)
     with chdir(folder):
-        exec(first_example(), {})  # it writes loop.png
+        exec(first_example(HERE.parent / "README.md"), {})  # it writes loop.png
+        exec(first_example(HERE / "sweeps.md"), {})  # sweep.png
     experiment = experiments.hand_guiding()
     plot_path(experiment, experiment.simulate(progress=False)).savefig(folder / "C_path.png", dpi=120)
     bode().savefig(folder / "frequency.png", dpi=120)

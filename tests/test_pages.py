@@ -93,7 +93,10 @@ def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_pat
     assert f"here {scope['sign'].frequency:.3f} rad/s" in text
 
 
-@pytest.mark.parametrize("page", ["coupling", pytest.param("other_tools", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "page",
+    ["coupling", pytest.param("other_tools", marks=pytest.mark.slow), pytest.param("sweeps", marks=pytest.mark.slow)],
+)
 def test_the_page_runs(cache, tmp_path, page):
     scope = {}
     with chdir(tmp_path):

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import os
+import pickle
 import types
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
 from fractions import Fraction
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ...blocks.core import Value
+from ...blocks.core import OptionError, Value
 from ..simulation import SimulatedDiagram
 from .plan import Plan
 from .reductions import Reduction
@@ -95,12 +99,32 @@ def _text(value: Any) -> str:
         return "{" + ", ".join(sorted(map(_text, value))) + "}"
     if isinstance(value, float):
         return value.hex()
-    if value is None or isinstance(value, str | bool | int | bytes | Fraction | Reduction):
+    if value is None or isinstance(value, str | bool | int | bytes | Fraction | Reduction | Enum):
         return repr(value)
+    if isinstance(value, os.PathLike):
+        return repr(os.fspath(value))
     if isinstance(value, types.CodeType):
         return _text((value.co_name, value.co_code, value.co_names, value.co_consts))
-    if inspect.isfunction(value):
-        closure = [cell.cell_contents for cell in value.__closure__ or ()]
-        return f"function({_text(value.__code__)}, {_text(value.__defaults__)}, {_text(closure)})"
-    fields = dict(getattr(value, "__dict__", {})) or {n: getattr(value, n) for n in getattr(value, "__slots__", ())}
-    return f"{type(value).__module__}.{type(value).__qualname__}({_text(fields)})"
+    if isinstance(value, type) or inspect.ismodule(value) or inspect.isbuiltin(value):
+        return f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', value.__name__)}"
+    if inspect.isfunction(value) or inspect.ismethod(value):
+        return _of_function(value)
+    if is_dataclass(value):
+        inside = ", ".join(f"{f.name}={_text(getattr(value, f.name))}" for f in fields(value) if f.compare)
+        return f"{type(value).__module__}.{type(value).__qualname__}({inside})"
+    try:
+        return hashlib.sha256(pickle.dumps(value, protocol=4)).hexdigest()
+    except Exception as error:
+        raise OptionError(
+            f"found {value!r} in a sweep that is to be kept on disk; its content can't be compared with that of another "
+            f"sweep ({error}). Give it as a value, a dataclass or a function, or leave out to=."
+        ) from error
+
+
+def _of_function(function: Any) -> str:
+    """Return a text of a function's own code, its defaults and the plain values that it takes from around it."""
+    if inspect.ismethod(function):
+        return f"{_text(function.__self__)}.{_of_function(function.__func__)}"
+    around = [cell.cell_contents for cell in function.__closure__ or ()]
+    plain = [_text(value) for value in around if not inspect.isfunction(value)]
+    return f"function({_text(function.__code__)}, {_text(function.__defaults__)}, {plain})"

@@ -1,6 +1,9 @@
 """Sweeps on disk: a sweep that was cut off goes on, and nothing is run twice."""
 
 import json
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -183,3 +186,39 @@ def test_other_files_are_left_alone_and_broken_ones_are_told(tmp_path):
     (tmp_path / "s" / store.HEAD).write_text("{")
     with pytest.raises(OptionError, match="overwrite=True"):
         sweep(tmp_path / "s")
+
+
+@pytest.mark.slow
+def test_the_revision_of_an_experiment_is_equal_in_every_process():
+    code = """
+from loopwright.diagrams import experiments, final
+from loopwright.diagrams.sweeps.plan import Plan
+from loopwright.diagrams.sweeps.revision import revision_of
+diagram = experiments.force_tracking().diagram
+print(revision_of(Plan(diagram, 1.0, {}, ("xi",), {"a": final("xi"), "b": lambda run: run["xi"]})))
+print(revision_of(Plan(diagram.replace({"plant.start.coulomb_scale": 1.5}), 1.0, {}, ("xi",))))
+"""
+    found = []
+    for seed in ("1", "2"):
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            check=True,
+            env={**os.environ, "PYTHONHASHSEED": seed},
+        )
+        found.append(done.stdout.split())
+    assert found[0] == found[1]
+    assert found[0][0] != found[0][1]
+
+
+def test_what_can_not_be_compared_is_told(tmp_path):
+    class Odd:
+        def __init__(self):
+            self.inside = lambda run: 1.0
+
+        def __call__(self, run):
+            return self.inside(run)
+
+    with pytest.raises(OptionError, match=r"found .*Odd.* in a sweep that is to be kept on disk; .* leave out to="):
+        guarded().sweep({"guard.gain": (1.0,)}, 0.1, reduce={"odd": Odd()}, to=tmp_path / "s", **QUIET)
