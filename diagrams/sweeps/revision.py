@@ -116,8 +116,8 @@ def _text(value: Any) -> str:
         return hashlib.sha256(pickle.dumps(value, protocol=4)).hexdigest()
     except Exception as error:
         raise OptionError(
-            f"found {value!r} in a sweep that is to be kept on disk; its content can't be compared with that of another "
-            f"sweep ({error}). Give it as a value, a dataclass or a function, or leave out to=."
+            f"found {value!r} in a sweep that is to be kept on disk; its content can't be compared with another's "
+            f"({error}). Give it as a value, a dataclass or a function, or leave out to=."
         ) from error
 
 
