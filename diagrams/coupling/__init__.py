@@ -7,6 +7,7 @@ from .options import Coupling, Scheme, refuse_exchanged, to_coupling
 from .plant_steps import PlantSteps, step_all
 from .plants import Plant, load_plants, note_fine_steps
 from .report import CoupledConnection, CouplingReport, HeldFrom, LinkKind, report_coupling
+from .rollback import accept_steps, try_steps
 from .search import Search
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
     "PlantSteps",
     "Scheme",
     "Search",
+    "accept_steps",
     "load_plants",
     "note_fine_steps",
     "note_loops",
@@ -30,4 +32,5 @@ __all__ = [
     "step_all",
     "tells_slopes",
     "to_coupling",
+    "try_steps",
 ]

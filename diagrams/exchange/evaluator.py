@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ...blocks.core import SimulationError
 from ...blocks.tracing import GUARDS, NEXT
 from ..flat import INDICATORS, JUMP, FlatDiagram, no_evaluator
 
@@ -26,6 +27,11 @@ class ExchangedBlock(Protocol):
 
     States and inputs are flat, in the order of the block's.
     """
+
+    is_trial: bool
+    """Whether a step may be taken back, so that an input out of its range is kept in `refused`, and no error yet."""
+    refused: SimulationError | None
+    """Error of an input that was out of its range in a trial step."""
 
     @property
     def messages(self) -> Sequence[str]:

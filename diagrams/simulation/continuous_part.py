@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..coupling import accept_steps, try_steps
 from ..exchange import ExchangedBlocks
 from ..results import Occurrence
 from .continuous import Continuous
@@ -61,6 +62,7 @@ class ContinuousPart:
         """Return the present state."""
         here, workspace = self._workspace.here, self._workspace
         continuous = None if self._continuous is None else self._continuous.save()
+        try_steps(self._exchanged.blocks.values())
         exchanged = {path: block.serialize() for path, block in self._exchanged.blocks.items()}
         return _Saved(float(here.t[0]), here.x.copy(), continuous, exchanged, workspace.messages, len(self._events))
 
@@ -72,11 +74,13 @@ class ContinuousPart:
         del self._events[saved.events :]
         for path, block in self._exchanged.blocks.items():
             block.restore_bytes(saved.exchanged[path])
+            block.refused = None
         if self._continuous is not None:
             self._continuous.restore(saved.continuous)
 
     def accept(self) -> None:
-        """Tell the events that have happened."""
+        """Tell the events that have happened, and raise the error of an input that was out of its range."""
+        accept_steps(self._exchanged.blocks.values())
         if self._events:
             for event in self._events:
                 self._tell(event)

@@ -26,6 +26,8 @@ class BoundCalls:
 
     failed = 0
     """Place of the call that has failed last."""
+    warned = 0
+    """Bits of the places of the calls that gave a warning in the last run, the last bit for all behind it."""
 
     def __init__(self, calls: Sequence[Call]):
         self._calls = tuple(calls)
@@ -35,15 +37,21 @@ class BoundCalls:
         worst = 0
         for place, (function, arguments) in enumerate(self._calls):
             status = function(*arguments)
-            if not 0 <= status <= WARNING:
-                self.failed = place
-                return status
-            worst |= status
+            if status:
+                if status != WARNING:
+                    self.failed = place
+                    return status
+                self.warned = bit_of(place) | (self.warned if worst else 0)
+                worst = WARNING
         return worst
 
     def runner(self) -> Callable[[], int]:
         """Return `run` as a function, for a caller to whom each lookup counts."""
         return self.run
+
+    def warned_places(self) -> list[int]:
+        """Return the places of the calls that gave a warning, where `run` has returned 1."""
+        return [place for place in range(len(self._calls)) if self.warned & bit_of(place)]
 
     def start(self) -> None:
         """Begin to run, if that can go on by itself; `finish` ends it."""
@@ -51,6 +59,11 @@ class BoundCalls:
     def finish(self) -> int:
         """Return the status of what `start` has begun."""
         return self.run()
+
+
+def bit_of(place: int) -> int:
+    """Return the bit of a place; the last one of a word is for all places behind it."""
+    return 1 << min(place, 62)
 
 
 @cache

@@ -20,7 +20,7 @@ from .exchange_states import SavedExchange
 from .fmi_calls import WARNING
 from .fmu_block import FmuBlock
 from .loaded_library import MakeCalls
-from .transfer import Transfer, UnfitError
+from .transfer import OutOfRangeError, Transfer, UnfitError
 
 _NOTHING = nullcontext()
 
@@ -140,10 +140,10 @@ class EvaluatedExchange(SavedExchange):
                 return
             direct = made if short is None or not self._is_placed else short
             status, place = direct.run()
-            self._is_placed = not status
+            self._is_placed = status <= WARNING
             if status:
                 self._x[:] = x
-                self._judge(status, direct.actions[place], t[0], into)
+                self._judge(status, direct.warned if status <= WARNING else [direct.actions[place]], t[0], into)
 
         return call
 
@@ -202,18 +202,20 @@ class EvaluatedExchange(SavedExchange):
         except UnfitError as error:
             raise self._unfit(error, t) from None
         if status:
-            self._judge(status, action, t, made.result)
-        elif made.rates is not None:
+            self._judge(status, [action] if action else made.warned, t, made.result)
+        if status <= WARNING and made.rates is not None:
             made.result[made.rates_at][self._order] = self._dx
         return made.result
 
-    def _judge(self, status: int, action: str, t: float, into: np.ndarray) -> None:
-        """Write NaN where the FMU can't compute a result (discard), and raise the error of a status that is worse."""
+    def _judge(self, status: int, actions: Sequence[str], t: float, into: np.ndarray) -> None:
+        """Note a warning; write NaN where the FMU can't compute a result; raise the error of a status that is worse."""
         if status <= WARNING:
+            for action in actions:
+                self.log.warn(action, self.fmi.status_name(status), t)
             return
         if status != DISCARD:
-            raise self._error(action, status, t)
-        self._discarded = f"{action} at t = {t:.9g} s{self._quote_messages().rstrip('.')}"
+            raise self._error(actions[-1], status, t)
+        self._discarded = f"{actions[-1]} at t = {t:.9g} s{self._quote_messages().rstrip('.')}"
         into[:] = math.nan
 
     @property
@@ -259,6 +261,8 @@ class EvaluatedExchange(SavedExchange):
 
     def _unfit(self, error: UnfitError, t: float) -> FmuRuntimeError:
         advice = "Convert the signal before this input, with Quantizer, say, or leave this output out, by ports=."
+        if isinstance(error, OutOfRangeError):
+            advice = "Limit the signal before this input, with Saturation, say."
         return FmuRuntimeError(f"{error.reason}. {advice}", block=self.block.label, port=error.port, t=t)
 
 

@@ -38,7 +38,11 @@ class Evaluation:
         Outputs, derivatives and indicators, one after the other.
     rates_at : slice
         Where the derivatives stand in it.
+    warned : sequence of str
+        Names of the calls that gave a warning in the last run.
     """
+
+    warned: Sequence[str] = ()
 
     def __init__(
         self,
@@ -75,7 +79,7 @@ class Evaluation:
         self._running, self._starting = (_bind(fmi, calls) for calls in ([*at, *more], starting))
 
     def run(self, t: float, u: np.ndarray, *, running: bool) -> tuple[int, str]:
-        """Evaluate it; return the first status that is no success, and the name of that call.
+        """Evaluate it; return the status of a call that has failed, and its name; else 1 after a warning, else 0.
 
         Parameters
         ----------
@@ -94,6 +98,7 @@ class Evaluation:
                 group.check_and_fill(vector)
         calls, actions = self._running if running else self._starting
         status = calls.run()
+        self.warned = [actions[place] for place in calls.warned_places()] if status == WARNING else ()
         if not 0 <= status <= WARNING:
             return status, actions[calls.failed]
         if self._outputs.groups:
@@ -102,7 +107,7 @@ class Evaluation:
             self.result[self._outputs_at] = self._outputs.vector
         if self.indicators is not None:
             self.result[self._indicators_at] = self.indicators.values
-        return 0, ""
+        return status, ""
 
 
 class DirectEvaluation:
@@ -150,14 +155,16 @@ class DirectEvaluation:
         self.actions = [action for _, _, action in calls]
 
     def run(self) -> tuple[int, int]:
-        """Evaluate it; return the first status that is no success, and the place of that call, or 1 after a warning."""
+        """Evaluate it; return the status of a call that has failed, and its place; else 1 after a warning, else 0."""
         self._time.value = self._t[0]
-        worst = 0
+        worst, self.warned = 0, []
         for function, arguments in self._calls:
             if status := function(*arguments):
+                place = next(i for i, (_, made) in enumerate(self._calls) if made is arguments)
                 if status > WARNING:
-                    return status, next(i for i, (_, made) in enumerate(self._calls) if made is arguments)
+                    return status, place
                 worst = status
+                self.warned.append(self.actions[place])
         return worst, 0
 
 

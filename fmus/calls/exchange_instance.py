@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...blocks.core import FmuRuntimeError
+from ...blocks.core import FmuRuntimeError, SimulationError
 from .bound_calls import DISCARD, WARNING, BoundCalls, Call
 from .evaluated_exchange import EvaluatedExchange
 from .evaluation import Evaluation
@@ -53,6 +53,11 @@ class ExchangeInstance(EvaluatedExchange):
         self._bound: dict[tuple[str, int], BoundCalls] = {}
         self._all_inputs: Transfer | None = None
         self._final = True
+        self._limited = any(np.isfinite(side).any() for v in self._wired.values() for side in v.limits)
+        self.is_trial = False
+        """Whether a step may be taken back; an input out of its range is then kept in `refused`, and no error yet."""
+        self.refused: SimulationError | None = None
+        """Error of an input that was out of its range in a trial step."""
         width = sum(v.size for v in self._ports.values())
         self._least, self._relative = np.full(width, math.inf), np.zeros(width)
         """Least change of each input that is a jump, by itself and relative to the input; infinite without a wire."""
@@ -72,12 +77,13 @@ class ExchangeInstance(EvaluatedExchange):
         """In Initialization Mode: set the inputs, and return the continuous states that follow."""
         self._u = u.copy()
         status = self._fill(u, self._began).set() if self._wired else 0
-        if not 0 <= status <= WARNING:
-            raise self._error("setting the inputs", status, self._began)
+        self._check("setting the inputs", status, self._began)
         return self._get("get_states")
 
     def begin_exchange(self) -> np.ndarray:
         """Leave Initialization Mode, settle the events at the start, and return the continuous states."""
+        if self._limited:
+            self._check_limits(self._fill(self._u, self._began), self._began)
         self.begin()
         self._time.value = self._began
         x = self._iterate(self._began)
@@ -119,9 +125,7 @@ class ExchangeInstance(EvaluatedExchange):
             bound = self._bound.get((quantity, len(calls)))
             if bound is None:
                 bound = self._bound[quantity, len(calls)] = self.fmi.bind(calls)
-            status = bound.run()
-            if not 0 <= status <= WARNING:
-                raise self._error(_READING[quantity], status, self.t)
+            self._check(_READING[quantity], bound.run(), self.t)
         if n:
             made[self._order] = self._kept
         return made
@@ -151,10 +155,7 @@ class ExchangeInstance(EvaluatedExchange):
     def handle_event(self, t: float, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Go through Event Mode at an instant, and return the continuous states after it."""
         inputs = self._fill(u, t)
-        try:
-            inputs.check_limits()
-        except UnfitError as error:
-            raise self._unfit(error, t) from None
+        self._check_limits(inputs, t)
         if self._event is None:
             calls = self._events
             sets = [((group.function, group.arguments), "setting the inputs") for group in inputs.groups]
@@ -165,15 +166,30 @@ class ExchangeInstance(EvaluatedExchange):
         self._check_computed(t)
         return self._iterate(t, self._events.updated())
 
+    def _check_limits(self, inputs: Transfer, t: float) -> None:
+        """Refuse inputs out of the range that the FMU states, in a trial step only if it is accepted."""
+        try:
+            inputs.check_limits()
+        except UnfitError as error:
+            refused = self._unfit(error, t)
+            if not self.is_trial:
+                raise refused from None
+            self.refused = self.refused or refused
+
     def _check_computed(self, t: float) -> None:
         """Refuse an instant that the solver has reached, and that the FMU can't compute."""
         if self._discarded:
             raise self._error(f"{self._discarded}, where the solver has arrived:", DISCARD, t)
 
     def _call_bound(self, call: Call, action: str, t: float) -> None:
-        status = self.fmi.bind([call]).run()
+        self._check(action, self.fmi.bind([call]).run(), t)
+
+    def _check(self, action: str, status: int, t: float) -> None:
+        """Note a warning, once for each action; raise the error of a status that is worse."""
         if not 0 <= status <= WARNING:
             raise self._error(action, status, t)
+        if status:
+            self.log.warn(action, self.fmi.status_name(status), t)
 
     def _iterate(self, t: float, made: EventUpdate | None = None) -> np.ndarray:
         """Update the discrete states until they settle, and return to Continuous-Time Mode."""
@@ -206,6 +222,8 @@ class ExchangeInstance(EvaluatedExchange):
 
     def accept(self, t: float, x: np.ndarray, u: np.ndarray) -> bool:
         """Note an instant that the solver has reached; return whether the FMU wants an event there (step event)."""
+        if self._limited:
+            self._check_limits(self._fill(u, t), t)
         discrete = [port for port in self._wired if port not in self._smooth]
         kept = {port: self._u[self._places[port]].copy() for port in discrete}
         self._u, self._discarded = u.copy(), ""

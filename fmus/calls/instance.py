@@ -159,23 +159,23 @@ class FmuInstance(StepFailures):
         has_inputs, has_outputs = ins.plain_call is not None, outs.plain_call is not None
 
         def step(t: float, h: float) -> None:
-            if has_inputs and (status := set_values(*set_arguments)) > 1:
-                raise self.report("setting the inputs", status, t)
+            if has_inputs and (status := set_values(*set_arguments)):
+                self.judge("setting the inputs", status, t)
             now.value, width.value = t, h
-            if (status := do_step(*step_arguments)) > 1:
+            if status := do_step(*step_arguments):
                 self.end_step(status, t, h)
             if any_flag.value or abs(reached.value - t - h) > h * NEAR:
                 self.check_flags(call, t, h)
-            if has_outputs and (status := get_values(*get_arguments)) > 1:
-                raise self.report("reading the outputs", status, t)
+            if has_outputs and (status := get_values(*get_arguments)):
+                self.judge("reading the outputs", status, t)
 
         def read(t: float) -> None:
-            if has_outputs and (status := get_values(*get_arguments)) > 1:
-                raise self.report("reading the outputs", status, t)
+            if has_outputs and (status := get_values(*get_arguments)):
+                self.judge("reading the outputs", status, t)
 
         def exchange() -> None:
-            if has_inputs and (status := set_values(*set_arguments)) > 1:
-                raise self.report("setting the inputs", status, self._began)
+            if has_inputs and (status := set_values(*set_arguments)):
+                self.judge("setting the inputs", status, self._began)
             read(self._began)
 
         return step, exchange, read
@@ -190,21 +190,21 @@ class FmuInstance(StepFailures):
                 status = ins.set()
             except UnfitError as error:
                 raise self.refuse_input(error, t) from None
-            if status > 1:
-                raise self.report("setting the inputs", status, t)
+            if status:
+                self.judge("setting the inputs", status, t)
 
         def read(t: float) -> None:
             try:
                 status = outs.get()
             except UnfitError as error:
                 raise self.refuse_output(error, t) from None
-            if status > 1:
-                raise self.report("reading the outputs", status, t)
+            if status:
+                self.judge("reading the outputs", status, t)
 
         def step(t: float, h: float) -> None:
             write(t, in_step=True)
             self._now.value, self._width.value = t, h
-            if (status := call.function(*call.arguments)) > 1:
+            if status := call.function(*call.arguments):
                 self.end_step(status, t, h)
             if call.any_flag.value or abs(call.reached.value - t - h) > h * NEAR:
                 self.check_flags(call, t, h)

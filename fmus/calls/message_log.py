@@ -35,10 +35,17 @@ class MessageLog:
         self._said: dict[str, int] = {}
         self._last: deque[str] = deque(maxlen=_QUOTED)
         self._left_out = 0
+        self._warned = set[str]()
 
     def note(self, text: str) -> None:
         """Add a note, which is not the FMU's own."""
         self._notes.append(f"{self._label}: {text}")
+
+    def warn(self, action: str, status: str, t: float) -> None:
+        """Note a call that gave a warning, with the FMU's last words: the first time that an action does."""
+        if action not in self._warned:
+            self._warned.add(action)
+            self.note(f"{action} gave {status} at t = {t:.9g} s; further ones are not told{self.quote()}")
 
     def take(self, status: int, text: str) -> None:
         """Take a message of the FMU, of a status that is a warning or worse."""

@@ -73,7 +73,7 @@ class SharedSteps:
             now.value, width.value = t, h
             instance.is_stepping = True
             status = run()
-            if status > 1:
+            if status:
                 self._judge(status, t, h)
             instance.is_stepping = False
             if any_flag.value or abs(reached.value - t - h) > h * _NEAR:
@@ -96,7 +96,7 @@ class SharedSteps:
         """Wait for the end of the step, and get the outputs."""
         instance, t, h, call = self.instance, self._t, self._h, self.call
         status = self._step.finish()
-        if status > 1:
+        if status:
             self._judge(status, t, h)
         instance.is_stepping = False
         if call.any_flag.value or abs(call.reached.value - t - h) > h * _NEAR:
@@ -119,22 +119,26 @@ class SharedSteps:
         self._run(self._read, t, 0)
 
     def _judge(self, status: int, t: float, h: float) -> None:
-        """Wait for a step that is pending and read the outputs, or raise the error of what has failed."""
+        """Wait for a step that is pending and read the outputs; note a warning, or raise the error of a failure."""
+        if status == WARNING:
+            for place in self._step.warned_places():
+                self.instance.judge(self._action(place, self._n_in, "a step"), status, t + h * (place > self._n_in))
+            return
         place = self._step.failed
-        if place < self._n_in:
-            raise self.instance.report("setting the inputs", status, t)
         if place == self._n_in:
             self.instance.end_step(status, t, h)
             status = self._read.run()
-        if status > 1:
-            raise self.instance.report("reading the outputs", status, t)
+        self.instance.judge("setting the inputs" if place < self._n_in else "reading the outputs", status, t)
+
+    @staticmethod
+    def _action(place: int, n_in: int, between: str) -> str:
+        return "setting the inputs" if place < n_in else between if place == n_in else "reading the outputs"
 
     def _run(self, bound: BoundCalls, t: float, n_in: int) -> None:
         status = bound.run()
-        if status > 1:
-            raise self.instance.report(
-                "setting the inputs" if bound.failed < n_in else "reading the outputs", status, t
-            )
+        if status:
+            for place in bound.warned_places() if status == WARNING else [bound.failed]:
+                self.instance.judge(self._action(place, n_in, "reading the outputs"), status, t)
         self._spread(t)
 
     def _fill(self, t: float, *, in_step: bool = False) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...blocks.core import FmuRuntimeError
 from ..archive import FmuVariable
-from .fmi_calls import DISCARD, ERROR, FATAL, PENDING, StepCall
+from .fmi_calls import DISCARD, ERROR, FATAL, PENDING, WARNING, StepCall
 from .loaded_library import LoadedFmu
 from .stepped_instance import SteppedInstance
 from .transfer import OutOfRangeError, Transfer, UnfitError
@@ -68,6 +68,13 @@ class StepFailures(LoadedFmu):
                 raise refused from None
             self.refused = self.refused or refused
 
+    def judge(self, action: str, status: int, t: float) -> None:
+        """Note a warning, once for each action; raise the error of a status that is worse."""
+        if status > WARNING:
+            raise self.report(action, status, t)
+        if status:
+            self.log.warn(action, self.fmi.status_name(status), t)
+
     def refuse_output(self, error: UnfitError, t: float) -> FmuRuntimeError:
         """Return the error of an output that doesn't fit."""
         self.failed = True
@@ -98,6 +105,9 @@ class StepFailures(LoadedFmu):
 
     def end_step(self, status: int, t: float, h: float) -> None:
         """Wait for the end of a step that is pending, and raise the error of one that has failed."""
+        if status == WARNING:
+            self.judge("a step", status, t)
+            return
         status, ends = self.fmi.end_step(status)
         if ends:
             reached = self.fmi.time_after_discard(t, h)

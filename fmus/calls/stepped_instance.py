@@ -54,6 +54,9 @@ class SteppedInstance(Protocol):
     def check_end(self, t: float, h: float, reached: float) -> None:
         """Raise the error of an FMU that has asked to end the simulation before the end of a step."""
 
+    def judge(self, action: str, status: int, t: float) -> None:
+        """Note a warning; raise the error of a status that is worse."""
+
     def check_limits(self, inputs: Transfer, t: float) -> None:
         """Refuse inputs out of the range that the FMU states."""
 

@@ -270,6 +270,8 @@ class CarefulSteps:
             if state is None or self.fmi.end_step(status)[0] != DISCARD or not self._redo(state, t, h):
                 instance.end_step(status, t, h)
             return t + h, False
+        if status:
+            instance.judge("a step", status, t)
         event, ends, early, _ = call.flags
         if early and not ends and allows_early_return(self.about, self.options):
             return min(max(call.reached.value, t), t + h), bool(event)
@@ -294,6 +296,8 @@ class CarefulSteps:
             if ends:
                 return False
             if status <= WARNING:
+                if status:
+                    instance.judge("a step", status, now)
                 now, count = now + part, count + 1
                 if call.any_flag.value:
                     instance.check_flags(call, now - part, part)
@@ -314,16 +318,16 @@ class CarefulSteps:
             status = part.transfer.set()
         except UnfitError as error:
             raise self.instance.refuse_input(error, t) from None
-        if status > 1:
-            raise self.instance.report("setting the inputs", status, t)
+        if status:
+            self.instance.judge("setting the inputs", status, t)
 
     def _get(self, t: float) -> None:
         try:
             status = self.outs.get()
         except UnfitError as error:
             raise self.instance.refuse_output(error, t) from None
-        if status > 1:
-            raise self.instance.report("reading the outputs", status, t)
+        if status:
+            self.instance.judge("reading the outputs", status, t)
 
     def _tell_slopes(self, t: float) -> None:
         """Tell the slopes of the real inputs by their differences from the step before (FMI 2.0, 4.2.1)."""

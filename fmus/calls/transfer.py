@@ -11,7 +11,7 @@ import numpy as np
 from ...blocks.core import Layout
 from ..archive import FmuVariable, inexact
 from .bound_calls import Call
-from .fmi_calls import FmiCalls
+from .fmi_calls import WARNING, FmiCalls
 
 _ROUNDED = 1e-12
 
@@ -115,7 +115,7 @@ class Transfer:
             group.spread(self.vector)
 
     def set(self) -> int:
-        """Set the values of the vector, and return the first status that is no success.
+        """Set the values of the vector; return the first status that is no success, else 1 after a warning, else 0.
 
         Raises
         ------
@@ -123,24 +123,30 @@ class Transfer:
             If a value is none of its port's type; nothing of this type has been set then.
         """
         self.fill()
+        worst = 0
         for group in self.groups:
-            if (status := group.function(*group.arguments)) > 1:
-                return status
-        return 0
+            if status := group.function(*group.arguments):
+                if status > WARNING:
+                    return status
+                worst = status
+        return worst
 
     def get(self) -> int:
-        """Get the values into the vector, and return the first status that is no success.
+        """Get the values into the vector; return the first status that is no success, else 1 after a warning, else 0.
 
         Raises
         ------
         UnfitError
             If a value is an integer that the vector can't hold.
         """
+        worst = 0
         for group in self.groups:
-            if (status := group.function(*group.arguments)) > 1:
-                return status
+            if status := group.function(*group.arguments):
+                if status > WARNING:
+                    return status
+                worst = status
             group.spread(self.vector)
-        return 0
+        return worst
 
 
 class UnfitError(Exception):

@@ -120,14 +120,17 @@ class Child:
         numbered = tuple((place, function, arguments) for place, (function, arguments) in enumerate(calls))
 
         def run() -> None:
-            worst = 0
+            worst = warned = 0
             for place, function, arguments in numbered:
                 words[place_at] = place
                 status = function(*arguments)
                 if not 0 <= status <= 1:
                     worst = status
                     break
-                worst |= status
+                if status:
+                    worst, warned = status, warned | 1 << min(place, 62)
+            else:
+                words[place_at] = warned
             if not self.is_own:
                 self._leave_copy()
             words[status_at] = worst & 0xFFFFFFFF

@@ -52,9 +52,12 @@ class RemoteBoundCalls(BoundCalls):
     def finish(self) -> int:
         """Wait for the child, and return the status."""
         status = self._process.finish(self._sequence, self._seconds)
-        return status if status <= WARNING else self._note(status)
+        return self._note(status) if status else 0
 
     def _note(self, status: int) -> int:
+        if status == WARNING:
+            self.warned = self._process.failed_place
+            return status
         if status >= ERROR:
             self._process.used = True
         self.failed = self._process.failed_place

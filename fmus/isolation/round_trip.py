@@ -6,7 +6,6 @@ from collections.abc import Callable
 from itertools import repeat
 
 from ...blocks.core import FmuProcessError
-from ..calls import WARNING
 from . import wire
 from .process import ChildProcess
 
@@ -28,7 +27,7 @@ def bind_round_trip(
     seconds : float
         Longest time of it in s.
     note_failure : callable
-        Called with a status that is no success; returns it.
+        Called with a status that is not 0, a warning too; returns it.
     """
     words, patience, number_at = process.words, process.patience, wire.REPLY
     read, take, give = words.__getitem__, wire.ORDER.acquire, wire.ORDER.release
@@ -61,6 +60,6 @@ def bind_round_trip(
         if words[messages]:
             process.fetch_messages()
         status = words[status_at]
-        return status if status <= WARNING else note_failure(status)
+        return note_failure(status) if status else 0
 
     return run

@@ -8,6 +8,8 @@ Its next time event, the number of events and the number of accepted steps are o
 at the time event number ``last``, if that is not 0.
 """
 
+import re
+
 from .small_fmus import small_fmu
 
 _SOURCE = r"""
@@ -99,11 +101,12 @@ _INTEGERS = (
 )
 
 
-def eventful_fmu(folder, fmi, *, fault="", following="0.25 * (c->k + 1)"):
+def eventful_fmu(folder, fmi, *, fault="", following="0.25 * (c->k + 1)", largest=None, changes=()):
     """Build it into a folder, for a version of FMI, and return its path.
 
     ``fault`` is a statement in C ahead of the computation of the derivatives, such as ``if (c->t > 0.3) return 3;``.
-    ``following`` is the time of its next time event, in C.
+    ``following`` is the time of its next time event, in C; ``largest`` the maximum of the input u. ``changes`` are
+    further pairs of texts to be replaced in the source.
     """
     prefix = f"fmi{fmi}"
     names = {
@@ -114,11 +117,18 @@ def eventful_fmu(folder, fmi, *, fault="", following="0.25 * (c->k + 1)"):
     head = f"#define FMI {fmi}\n#define PASTE(a, b) a##b\n#define NAME(end) PASTE({prefix}, end)\n"
     source = head + _SOURCE.replace("dx[0] = c->u", f"{fault} dx[0] = c->u")
     source = source.replace("*next = 0.25 * (c->k + 1)", f"*next = {following}")
+    for before, after in changes:
+        assert before in source
+        source = source.replace(before, after)
     for key, end in names.items():
         source = source.replace(f"NAME({key})", f"{prefix}{end}")
     for end in ("EnterInitializationMode", "ExitInitializationMode"):  # small_fmu looks for the whole names
         source = source.replace(f"NAME({end})", f"{prefix}{end}")
-    return small_fmu(folder, prefix, source, _describe2() if fmi == 2 else _describe3(), name="eventful")
+    description = _describe2() if fmi == 2 else _describe3()
+    if largest is not None:
+        description, found = re.subn(r'(name="u"[^/]*?start="0")', rf'\1 max="{largest}"', description)
+        assert found == 1
+    return small_fmu(folder, prefix, source, description, name="eventful")
 
 
 def _attributes(**given):

@@ -1,11 +1,22 @@
 """Events of FMUs in model exchange: of time, of steps, of inputs, and the end that an FMU asks for."""
 
+import re
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, FmuRuntimeError, Gain, Quantizer, SimulationError, Step, Sum, WiringError
+from loopwright.blocks import (
+    Constant,
+    FmuRuntimeError,
+    Gain,
+    Integrator,
+    Quantizer,
+    SimulationError,
+    Step,
+    Sum,
+    WiringError,
+)
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu
 from support.eventful import eventful_fmu
@@ -216,3 +227,43 @@ def test_a_next_event_time_that_is_no_number_is_an_error(cache, tmp_path, fmi):
     with pytest.raises(FmuRuntimeError, match=r"^plant, t = 0.25 s: .*nextEventTime.*NaN") as error:
         diagram.simulate(1.0, step=0.1, progress=False)
     assert error.value.run.t[-1] == 0.2
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_an_input_that_leaves_its_range_between_events_is_refused_at_the_step(tmp_path, cache, fmi, isolate):
+    """u = 4 t leaves the range at t = 0.5, where nothing else happens."""
+    path = eventful_fmu(tmp_path, fmi, following="1e9", largest=2.0)
+    ramp = Integrator(initial_value=0.0, name="ramp")(Constant(value=4.0, name="slope"))
+    plant = Fmu(path, name="plant", isolate=isolate)
+    diagram = Diagram("d", plant(u=ramp, n=Constant(value=0.0, name="n")))
+    text = (
+        r"^plant\.u, t = (\S+) s: found (\S+); expected at most 2\. Limit the signal before this input, with Saturation"
+    )
+    with pytest.raises(FmuRuntimeError, match=text) as caught:
+        diagram.simulate(1.0, step=0.25, max_step=0.0625, progress=False)
+    error = caught.value
+    assert error.port == "u"
+    assert 0.5 < error.t <= 0.5625 + 1e-12
+    assert float(re.match(text, str(error)).group(2)) == pytest.approx(4.0 * error.t, rel=1e-6)
+    np.testing.assert_allclose(error.run["ramp.y"], 4.0 * error.run.t, atol=1e-9)
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_a_warning_of_an_evaluation_is_told_once_for_each_kind_of_call(tmp_path, cache, fmi, isolate):
+    getter = "int NAME(REAL_GET)(void *p, const unsigned r[], size_t n, double v[] SIZE) {\n    instance *c = p;"
+    warns = (getter, getter + " if (c->t > 0.3) { if (!n) return 0; GOT; return 1; }")
+    values = (
+        "for (size_t i = 0; i < n; i++) v[i] = r[i] == 1 ? c->x : r[i] == 2 ? c->u + c->k : r[i] == 3 ? c->u : c->t"
+    )
+    path = eventful_fmu(tmp_path, fmi, changes=[(warns[0], warns[1].replace("GOT", values))])
+    plant = Fmu(path, name="plant", isolate=isolate)
+    run = Diagram("d", plant(u=Constant(value=0.5), n=Constant(value=0.0))).simulate(1.0, step=0.1, progress=False)
+    told = [m for m in run.messages if "Warning" in m]
+    assert len(told) == 1, run.messages
+    found = re.fullmatch(
+        rf"plant: reading the outputs gave fmi{fmi}Warning at t = (\S+) s; further ones are not told.", told[0]
+    )
+    assert 0.3 < float(found.group(1)) <= 0.4
+    np.testing.assert_allclose(run["plant.x"], exact(run.t, 0.5), atol=1e-12)  # its values count
