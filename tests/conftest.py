@@ -19,6 +19,30 @@ sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
+def pytest_addoption(parser):
+    parser.addoption("--both-tiers", action="store_true", help="compile every run as well, and compare the bits")
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    if config.getoption("--both-tiers") and "support.tiers" in sys.modules:
+        told = ", ".join(f"{n} {form}" for form, n in sys.modules["support.tiers"].counts.items())
+        terminalreporter.write_line(f"runs in both tiers: {told}")
+
+
+@pytest.fixture(autouse=True)
+def both_tiers(request):
+    """Compile every run as well with ``--both-tiers``, and in tests that are marked so."""
+    wanted = request.config.getoption("--both-tiers") or request.node.get_closest_marker("both_tiers") is not None
+    if not wanted or request.node.get_closest_marker("one_tier") is not None:
+        yield
+        return
+    from support import tiers
+
+    with pytest.MonkeyPatch.context() as patch:
+        tiers.install(patch)
+        yield
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report(collector):
     """Read the folders backwards in every other worker: each takes what another has compiled before it came there."""

@@ -1,5 +1,6 @@
 """The compiled loop: C code of a diagram's ticks and of what happens between them, and the masters that run it."""
 
+from .background import BackgroundCode
 from .code import TickCode, compile_ticks, find_obstacle
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
 from .hybrid_code import compile_hybrid, find_hybrid_obstacle
@@ -9,6 +10,7 @@ from .watch import RECENT, Fired, Watch
 __all__ = [
     "FIXED",
     "RECENT",
+    "BackgroundCode",
     "CompiledHybrid",
     "CompiledLoop",
     "Fired",

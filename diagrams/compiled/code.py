@@ -6,7 +6,7 @@ import ctypes
 import hashlib
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -20,7 +20,7 @@ import casadi as ca
 from ...blocks.core import CompilerError
 from ...fmus.export import SUFFIXES, compile_shared, describe_compiler
 from ...fmus.platform import cache_folder, native_platform
-from ..flat import FlatDiagram, TickPattern
+from ..flat import EXACT_LOOP, FlatDiagram, TickPattern
 from .grouping import Tables, make_tables
 from .kernels import write_kernels
 
@@ -76,9 +76,9 @@ class TickCode:
     ticks : mapping
         The ticks, by the clocks that act.
     exact : bool
-        Whether all of them are operations on scalars, as they are interpreted: then all bits are those of an
-        interpreted run. Tables and large matrix products are compiled in another form than they are interpreted in;
-        there, signs of zeros may differ.
+        Whether all bits are those of an interpreted run. Tables and large matrix products are compiled in another form
+        than they are interpreted in: there, signs of zeros may differ. Algebraic loops of more than `EXACT_LOOP`
+        values are solved with another rounding.
     library : CDLL
         The library, which is loaded as long as this lives.
     loops : mapping
@@ -118,29 +118,98 @@ def compile_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -
     flat = flat.origin  # other numbers change no code
     if flat in _COMPILED and tuple(_COMPILED[flat].ticks) == tuple(acting):
         return _COMPILED[flat]
-    code = None if flat.by_block else _compile_straight(flat, acting)
-    code = code or _compile_grouped(flat, acting)
-    return _COMPILED.setdefault(flat, replace(code, loops=compile_loops(flat, acting)))
+    return write_ticks(flat, acting).load()
+
+
+@dataclass(frozen=True, eq=False)
+class TickSources:
+    """The C code of a diagram's ticks, written.
+
+    Attributes
+    ----------
+    texts : sequence of str
+        The sources of its libraries.
+    operations : int
+        Operations in them.
+    exact : bool
+        Whether compiled ticks have the bits of interpreted ones; see `TickCode`.
+    make : callable
+        Makes the code of its libraries.
+    """
+
+    texts: Sequence[str]
+    operations: int
+    exact: bool
+    make: Callable[[Sequence[ctypes.CDLL]], TickCode]
+
+    def is_compiled(self) -> bool:
+        """Whether the cache has all libraries, so that none has to be compiled.
+
+        Raises
+        ------
+        CompilerError
+            If there is no compiler.
+        """
+        return all(_library_of(text).is_file() for text in (*self.texts, _master_source()))
+
+    def load(self) -> TickCode:
+        """Return the code; libraries that the cache lacks are compiled.
+
+        Raises
+        ------
+        CompilerError
+            If there is no compiler, or it fails.
+        FmuError
+            If the cache can't be written.
+        """
+        master()
+        return self.make([load_compiled(text) for text in self.texts])
+
+
+def write_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickSources:
+    """Write the C code of the ticks at which these sets of clocks act; see `compile_ticks`."""
+    ticks = None if flat.by_block else _write_straight(flat, acting)
+    ticks = ticks or _write_grouped(flat, acting)
+    loops = _loop_functions(flat, acting)
+    if not loops:
+        return replace(ticks, make=lambda libraries: _COMPILED.setdefault(flat, ticks.make(libraries)))
+    text = _write_loops(loops)
+    exact = ticks.exact and all(len(flat.active_loops(clocks)) <= EXACT_LOOP for clocks in loops)
+
+    def make(libraries: Sequence[ctypes.CDLL]) -> TickCode:
+        found = _find_loops(loops, libraries[-1])
+        return _COMPILED.setdefault(flat, replace(ticks.make(libraries), exact=exact, loops=found))
+
+    count = sum(function.n_instructions() for function in loops.values())
+    return TickSources([*ticks.texts, text], ticks.operations + count, exact, make)
+
+
+def _loop_functions(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> dict[frozenset[TickPattern], Any]:
+    """Return the equations of the algebraic loops at ticks: their mismatch, and its derivative."""
+    found = {clocks: flat.loop_equations(clocks) for clocks in acting} if flat.loops.slices else {}
+    return {c: rename(made.fast, f"loops{i}") for i, (c, made) in enumerate(found.items()) if made is not None}
+
+
+def _write_loops(loops: Mapping[frozenset[TickPattern], Any]) -> str:
+    generator = ca.CodeGenerator("loops.c")
+    for function in loops.values():
+        check_size(function)
+        generator.add(function)
+    return make_visible(generator.dump())
+
+
+def _find_loops(
+    loops: Mapping[frozenset[TickPattern], Any], library: ctypes.CDLL
+) -> dict[frozenset[TickPattern], StraightTick]:
+    return {clocks: StraightTick(f, address_of(library, f.name())) for clocks, f in loops.items()}
 
 
 def compile_loops(
     flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]
 ) -> dict[frozenset[TickPattern], StraightTick]:
-    """Return the equations of the algebraic loops at ticks: their mismatch, and its derivative."""
-    found = {clocks: flat.loop_equations(clocks) for clocks in acting} if flat.loops.slices else {}
-    functions = {
-        clocks: rename(equations.fast, f"loops{i}")
-        for i, (clocks, equations) in enumerate(found.items())
-        if equations is not None
-    }
-    if not functions:
-        return {}
-    generator = ca.CodeGenerator("loops.c")
-    for function in functions.values():
-        check_size(function)
-        generator.add(function)
-    library = load_compiled(make_visible(generator.dump()))
-    return {clocks: StraightTick(f, address_of(library, f.name())) for clocks, f in functions.items()}
+    """Return the equations of the algebraic loops at ticks, compiled: their mismatch, and its derivative."""
+    loops = _loop_functions(flat, acting)
+    return _find_loops(loops, load_compiled(_write_loops(loops))) if loops else {}
 
 
 def check_size(function: Any) -> None:
@@ -159,8 +228,8 @@ def check_size(function: Any) -> None:
         )
 
 
-def _compile_straight(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickCode | None:
-    """Return the code of ticks as one function each; None if they are no scalar operations."""
+def _write_straight(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickSources | None:
+    """Write ticks as one function each; None if they are no scalar operations."""
     found = {clocks: flat.at_tick(clocks).last.fast for clocks in acting}
     if not all(function.is_a("SXFunction") for function in found.values()):
         return None
@@ -168,25 +237,29 @@ def _compile_straight(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]
     for i, (clocks, function) in enumerate(found.items()):
         functions[clocks] = rename(function, f"tick{i}")
         generator.add(functions[clocks])
-    library = load_compiled(make_visible(generator.dump()))
-    ticks = {clocks: StraightTick(f, address_of(library, f.name())) for clocks, f in functions.items()}
-    return TickCode(ticks, True, library)
+
+    def make(libraries: Sequence[ctypes.CDLL]) -> TickCode:
+        ticks = {clocks: StraightTick(f, address_of(libraries[0], f.name())) for clocks, f in functions.items()}
+        return TickCode(ticks, True, libraries[0])
+
+    count = sum(function.n_instructions() for function in functions.values())
+    return TickSources([make_visible(generator.dump())], count, True, make)
 
 
-def _compile_grouped(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickCode:
+def _write_grouped(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> TickSources:
     programs = {clocks: flat.program_at(clocks) for clocks in acting}
     functions = {key: f for tick in programs.values() for key, f in tick.program.functions.items()}
     opaque = {id(flat.blocks.of(path, names)) for path, names in flat.order.steps if flat.table.blocks[path].opaque}
     kernels = write_kernels({key: f for key, f in functions.items() if key not in opaque})
-    library = load_compiled(kernels.source)
-    address = address_of(library, "grouped")
-    ticks = {
-        clocks: GroupedTick(
-            make_tables(tick, kernels.of), {k: f for k, f in tick.program.functions.items() if k in opaque}, address
-        )
-        for clocks, tick in programs.items()
-    }
-    return TickCode(ticks, kernels.exact, library)
+    of_python = {key: f for key, f in functions.items() if key in opaque}
+
+    def make(libraries: Sequence[ctypes.CDLL]) -> TickCode:
+        address = address_of(libraries[0], "grouped")
+        ticks = {clocks: GroupedTick(make_tables(p, kernels.of), of_python, address) for clocks, p in programs.items()}
+        return TickCode(ticks, kernels.exact, libraries[0])
+
+    count = sum(f.n_instructions() for key, f in functions.items() if key not in opaque)
+    return TickSources([kernels.source], count, kernels.exact, make)
 
 
 def rename(function: Any, name: str) -> Any:
@@ -226,9 +299,13 @@ def master() -> Any:
     FmuError
         If the cache can't be written.
     """
-    function = load_compiled(read_sources("newton.c", "master.c"))[_MASTER]
+    function = load_compiled(_master_source())[_MASTER]
     function.restype = None
     return function
+
+
+def _master_source() -> str:
+    return read_sources("newton.c", "master.c")
 
 
 @lru_cache(maxsize=64)
@@ -245,15 +322,20 @@ def load_compiled(source: str) -> ctypes.CDLL:
     FmuError
         If the cache can't be written.
     """
+    library = _library_of(source)
+    if not library.is_file():
+        compile_shared({"code.c": source}, library, more_flags=_FLAGS)
+    return ctypes.CDLL(str(library))
+
+
+def _library_of(source: str) -> Path:
+    """Return the file of a source's library in the cache, whether it is there or not."""
     platform = native_platform()
     key = hashlib.sha256("\0".join((platform, *describe_compiler(platform), *_FLAGS, source)).encode()).hexdigest()
     folder = cache_folder().absolute() / "compiled"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     _check_owner(folder)
-    library = folder / f"{key[:40]}{SUFFIXES[platform.rpartition('-')[2]]}"
-    if not library.is_file():
-        compile_shared({"code.c": source}, library, more_flags=_FLAGS)
-    return ctypes.CDLL(str(library))
+    return folder / f"{key[:40]}{SUFFIXES[platform.rpartition('-')[2]]}"
 
 
 def _check_owner(folder: Path) -> None:

@@ -4,7 +4,7 @@ from ...blocks.core import Layout
 from .announced import Announcer, Times, announcers
 from .clocks import EVERY, NONE, TickPattern
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator
-from .flat_diagram import FlatDiagram
+from .flat_diagram import EXACT_LOOP, FlatDiagram
 from .flatten import renumber
 from .functions import indicators_of
 from .layout import FlatEvent, StateLayout
@@ -22,6 +22,7 @@ __all__ = [
     "CHOOSE",
     "COPY",
     "EVERY",
+    "EXACT_LOOP",
     "INDICATORS",
     "JUMP",
     "NONE",

@@ -28,6 +28,8 @@ T = TypeVar("T")
 
 LARGEST = 2_000
 """Operations of a tick up to which it is simplified as a whole: a C compiler's time grows faster than they do."""
+EXACT_LOOP = 4
+"""Values of algebraic loops up to which interpreted and compiled runs solve them alike, to the last bit."""
 
 
 class _shared(cached_property[T]):  # noqa: N801 (a decorator)
@@ -116,8 +118,13 @@ class FlatDiagram(FlatLayout):
         """
         if any(self.table.blocks[path].opaque for path in self.checked.traced):
             return True
+        return self.operations > LARGEST
+
+    @cached_property
+    def operations(self) -> int:
+        """Number of operations of all blocks together."""
         functions = (self.blocks.of(path, names) for path, names in self.order.steps)
-        return sum(int(function.n_instructions()) for function in functions) > LARGEST
+        return sum(int(function.n_instructions()) for function in functions)
 
     @_shared
     def _ticks(self) -> dict[frozenset[TickPattern], Schedule]:

@@ -52,6 +52,8 @@ class Run:
         Whether the states were recorded, which `at` needs.
     elapsed : float
         Elapsed time of the loop in s.
+    tier : str
+        Form of the loop over ticks: "interpreted", "compiled", or "both", where C has taken over within the run.
 
     Examples
     --------
@@ -72,6 +74,7 @@ class Run:
     units: dict[str, PortUnit] = field(repr=False)
     diagram: CheckedDiagram | None = field(repr=False)
     elapsed: float = float("nan")
+    tier: str = "interpreted"
     messages: tuple[str, ...] = ()
     texts: Mapping[str, TextSignal] = field(default_factory=dict, repr=False)
     events: Sequence[Occurrence] = field(default=(), repr=False)
@@ -122,6 +125,7 @@ class Run:
             units=stored.units,
             diagram=None,
             elapsed=end.get("elapsed", float("nan")),
+            tier=str(end.get("tier", "interpreted")),
             messages=tuple(end.get("messages", ())),
             texts={name: TextSignal.from_json(rows) for name, rows in end.get("texts", {}).items()},
             events=stored.events,
@@ -161,7 +165,7 @@ class Run:
             residual=self.residual is not None,
         )
         parts = [self.t[:, None], self.data, *([] if self.residual is None else [self.residual[:, None]])]
-        end = {"elapsed": self.elapsed, "messages": self.messages, "stopped": self.stopped}
+        end = {"elapsed": self.elapsed, "tier": self.tier, "messages": self.messages, "stopped": self.stopped}
         texts = {name: text.to_json() for name, text in self.texts.items()}
         write(folder, head, parts, self.events, **end, texts=texts)
 

@@ -1,10 +1,9 @@
 """The loop over ticks, and between them."""
 
-from .duration import default_step, refuse_rest, ticks_in
 from .engine import Engine
 from .initialize import find_initial_state, find_start_values, values_from_left
 from .progress import Interrupted, progress_bar
-from .run_options import KeptKeywords, RunKeywords, RunOptions
+from .run_options import KeptKeywords, RunKeywords, RunOptions, default_step, refuse_rest, ticks_in
 from .simulated_diagram import SimulatedDiagram
 from .simulation import Simulation, simulate
 from .start_at_point import apply_point, copy_states

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ...blocks.core import SimulationError
+from ..flat import EXACT_LOOP
 
 TOLERANCE = 1e-9
 """Largest residual of an algebraic loop that counts as solved, relative to 1 + the size of its values."""
@@ -18,8 +19,6 @@ ROUNDING = 1e-14
 """Relative residual up to which it is solved no further."""
 ITERATIONS, HALVINGS = 50, 30
 """Steps of Newton's method, and halvings of one, at most."""
-EXACT = 4
-"""Values up to which a step is computed here, to the last bit as in C; more are left to LAPACK."""
 SINGULAR = 1e-13
 """Least singular value of J that determines the values, relative to 1 + the loop's gain."""
 _ASIDE = 1e-3  # step along a direction in which J is zero, relative to 1 + the size of the values
@@ -88,7 +87,7 @@ class LoopSolver:
             if not self._size(v) > ROUNDING:
                 break
             try:
-                direction = _eliminate(self.J, r) if len(r) <= EXACT else np.linalg.solve(self.J, r)
+                direction = _eliminate(self.J, r) if len(r) <= EXACT_LOOP else np.linalg.solve(self.J, r)
             except np.linalg.LinAlgError:  # the shortest step, to one of many solutions if there are any
                 direction = np.linalg.lstsq(self.J, r)[0] if np.all(np.isfinite(self.J)) else np.array([math.nan])
             if not np.all(np.isfinite(direction)):

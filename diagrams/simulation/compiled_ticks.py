@@ -11,18 +11,27 @@ import numpy as np
 
 from ...blocks.core import CompilerError, SimulationError
 from ...fmus.calls import FmuInstance, NativeStep
-from ..compiled import CompiledLoop, NewtonOptions, Outcome, Reason, compile_ticks, find_obstacle
+from ..compiled import (
+    BackgroundCode,
+    CompiledLoop,
+    NewtonOptions,
+    Outcome,
+    Reason,
+    TickCode,
+    compile_ticks,
+    find_obstacle,
+)
 from ..coupling import Plant
-from ..flat import FlatDiagram, TickPattern
+from ..flat import EXACT_LOOP, FlatDiagram, TickPattern
 from ..results import Recorder
-from .algebraic_loops import EXACT, HALVINGS, ITERATIONS, ROUNDING, SINGULAR, TOLERANCE
+from .algebraic_loops import HALVINGS, ITERATIONS, ROUNDING, SINGULAR, TOLERANCE
 from .diagnosis import forget_trials
 from .workspace import Workspace
 
-FIRST, LARGEST_CHUNK = 1000, 2**20
+FIRST, LARGEST_CHUNK = 64, 2**20
 """Ticks of a chunk: the first one, and at most."""
 WISHED = 0.05
-"""Seconds that a chunk takes at least; Ctrl-C and the progress bar have their turn after it."""
+"""Seconds that a chunk takes, half or double; Ctrl-C and the progress bar have their turn after it."""
 _EXACT = 2**53  # up to which every integer is a float64
 CLOCKS = 16
 """Clocks up to which sets of them are numbered by their bits."""
@@ -49,6 +58,8 @@ class CompiledTicks:
         Entries of the log that end the run where they are true.
     every : bool
         Visit every tick, not only those at which a subsystem acts.
+    code : TickCode, optional
+        Their code; without it they are compiled.
 
     Raises
     ------
@@ -56,10 +67,18 @@ class CompiledTicks:
         If there is no compiler, or it fails.
     """
 
-    def __init__(self, workspace: Workspace, plants: Mapping[str, FmuInstance], stops: Sequence[int], *, every: bool):
+    def __init__(
+        self,
+        workspace: Workspace,
+        plants: Mapping[str, FmuInstance],
+        stops: Sequence[int],
+        *,
+        every: bool,
+        code: TickCode | None = None,
+    ):
         flat = self._flat = workspace.flat
         self._workspace, self._plants, self._every, self._stops = workspace, [*plants.values()], every, stops
-        self._code = compile_ticks(flat, kinds_of(flat, every=every))
+        self._code = compile_ticks(flat, kinds_of(flat, every=every)) if code is None else code
         self._loop: CompiledLoop | None = None
         self._recorder: Recorder | None = None
         self._kind_of = np.full(1 << len(flat.distinct), -1, dtype=np.int32)
@@ -71,8 +90,9 @@ class CompiledTicks:
     def messages(self) -> tuple[str, ...]:
         """How far results may differ from those of an interpreted run; empty where every bit is the same."""
         largest = max((len(self._flat.active_loops(clocks)) for clocks in self._code.loops), default=0)
-        loops = () if largest <= EXACT else (_LOOPS.format(largest),)
-        return loops if self._code.exact else (_SIGNS, *loops)
+        if largest > EXACT_LOOP:
+            return (_LOOPS.format(largest),)
+        return () if self._code.exact else (_SIGNS,)
 
     def reaches(self, last: int) -> bool:
         """Whether times up to a tick are quotients of integers that a float64 holds."""
@@ -121,8 +141,10 @@ class CompiledTicks:
                 k, rest = following, rest[1:]
                 if arrived(k):
                     return
-            elif perf_counter() - started < WISHED:
+            elif (took := perf_counter() - started) < WISHED:
                 self._chunk = min(2 * self._chunk, LARGEST_CHUNK)
+            elif took > 2 * WISHED:
+                self._chunk = max(1, self._chunk // 2)
             progress(k * n / d)
 
     def _bind(self, recorder: Recorder) -> CompiledLoop:
@@ -216,9 +238,7 @@ def make_compiled(
     regular : bool
         Whether every plant steps once from each tick to the next.
     """
-    native = {
-        path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance) and plant.native is not None
-    }
+    native = _native(plants)
     reason = find_obstacle(workspace.flat) or find_obstacle_at_ticks(workspace.flat, plants, native, regular=regular)
     if reason is None:
         try:
@@ -228,6 +248,60 @@ def make_compiled(
         else:
             return found, found.messages
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)
+
+
+class LaterTicks:
+    """Interpreted ticks that C takes over from once its code is there: to the last bit it makes no difference when.
+
+    Parameters
+    ----------
+    workspace, plants, stops, every
+        See `CompiledTicks`.
+
+    Attributes
+    ----------
+    code : BackgroundCode
+        The code that is being made.
+    """
+
+    def __init__(self, workspace: Workspace, plants: Mapping[str, Plant], stops: Sequence[int], *, every: bool):
+        self._workspace, self._native, self._stops, self._every = workspace, _native(plants), stops, every
+        self.code = BackgroundCode(workspace.flat, kinds_of(workspace.flat, every=every))
+
+    def take_over(self) -> CompiledTicks | None:
+        """Return the ticks in C; None while there is no code."""
+        if self.code.code is None:
+            return None
+        return CompiledTicks(self._workspace, self._native, self._stops, every=self._every, code=self.code.code)
+
+    def tell_failure(self) -> tuple[str, ...]:
+        """Return a message that there is no compiler, or one that fails; once in a process."""
+        failure = self.code.failure
+        if failure is None or _TOLD:
+            return ()
+        _TOLD.append(failure)
+        reason = str(failure).rstrip(".")
+        return (f"Interpreted, though the run is long enough for C: {reason}. compile=False asks for no compiler.",)
+
+
+_TOLD: list[Exception] = []  # the failure that this process has told
+
+
+def make_later(
+    workspace: Workspace, plants: Mapping[str, Plant], stops: Sequence[int], *, every: bool, regular: bool
+) -> LaterTicks | None:
+    """Return ticks that C takes over from where a run is long enough; None where it can't. See `make_compiled`."""
+    flat = workspace.flat
+    if find_obstacle(flat) or find_obstacle_at_ticks(flat, plants, _native(plants), regular=regular):
+        return None
+    return LaterTicks(workspace, plants, stops, every=every)
+
+
+def _native(plants: Mapping[str, Plant]) -> dict[str, FmuInstance]:
+    """Return the plants that C can step, by path."""
+    return {
+        path: plant for path, plant in plants.items() if isinstance(plant, FmuInstance) and plant.native is not None
+    }
 
 
 def find_obstacle_at_ticks(

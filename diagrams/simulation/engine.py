@@ -16,11 +16,12 @@ from ..exchange import ExchangedBlock, ExchangedBlocks
 from ..flat import FlatDiagram
 from ..results import Occurrence, OperatingPoint, Recorder, Stopped, TextSignal
 from ..solvers import solver_name
+from .change_over import ChangeOver
 from .continuous import Continuous
 from .continuous_part import ContinuousPart
 from .diagnosis import opaque_failure
 from .initialize import initialize
-from .run_options import RunOptions, check_start_exchange
+from .run_options import RunOptions, check_compile, check_start_exchange
 from .start_at_point import start_at, take_over
 from .stops import StopConditions
 from .ticks import Progress, Row, end_between_ticks, run_hybrid, run_ticks, take_tick
@@ -30,6 +31,8 @@ from .workspace import Workspace
 if TYPE_CHECKING:
     from .compiled_hybrid import HybridTicks
     from .compiled_ticks import CompiledTicks
+
+_FEW = 100  # ticks that are interpreted under "auto" though there is code: C takes some 50 µs to begin
 
 
 class Engine:
@@ -69,7 +72,8 @@ class Engine:
         self.continuous: Continuous | None = None
         self._stops = StopConditions(flat, self.workspace.log, self._find_asking)
         self._passes_on = check_start_exchange(options.start_exchange)
-        self._compile = options.compile
+        self._compile = check_compile(options.compile)
+        self._changed = False  # whether C has taken over within the run
         self._compiled: CompiledTicks | HybridTicks | None = None
         self.messages: tuple[str, ...] = ()
         self._can_stop = self._stops.exist or bool(self.exchanged)
@@ -99,6 +103,10 @@ class Engine:
             self.workspace.here.w,
             self.position.time_of,
             every_tick=self.every_tick,
+        )
+        stops, plain = self._stops.entries, self.coupling.is_plain
+        self._change_over = ChangeOver(
+            self.workspace, self.position, self.plants, self.steps, stops, every=self.every_tick, plain=plain
         )
         if not self.coupling.is_plain and flat.plant_ticks and Links(flat).exist:
             refuse_exchanged(self.coupling, {path: flat.table.blocks[path] for path in flat.outside})
@@ -136,7 +144,7 @@ class Engine:
         """Find values of everything at t = 0; the plants are then ready to be stepped."""
         self.steps.bind()
         self._find_start(None)
-        if self._compile:
+        if self._compile is True:
             self._compiled = self._make_compiled()
 
     def _find_start(self, set_start: Callable[[Workspace], None] | None) -> None:
@@ -147,6 +155,12 @@ class Engine:
             plant.begin()
         self.exchanged.begin(self.workspace.here.x)
         self.workspace.begun = True
+
+    def take_tier(self) -> str:
+        """Return in which form the run has gone on since the last call: "interpreted", "compiled" or "both"."""
+        found = "both" if self._changed else "interpreted" if self._compiled is None else "compiled"
+        self._changed = False
+        return found
 
     @property
     def is_compiled(self) -> bool:
@@ -225,16 +239,24 @@ class Engine:
         """
         workspace, plants, position, row = self.workspace, self.plants, self.position, recorder.row
         try:
-            if self._compiled is not None and self._compiled.reaches(last):
+            few = self._compile == "auto" and last - position.tick < _FEW
+            if self._compiled is not None and not few and self._compiled.reaches(last):
                 ended = self._compiled.run(position.tick, last, recorder, arrived=self._arrive, progress=progress)
                 if ended is not None:
                     position.stopped = self._stops.met_at(ended)
                 return
             if self.continuous is None:
+                auto = self._compile == "auto" and self._compiled is None and not few
                 run_ticks(
-                    workspace, plants, self.steps, self.coupled, position.tick, last,
-                    every=self.every_tick, row=row, arrived=self._arrive, progress=progress,
+                    workspace, plants, self.steps, self.coupled, position.tick, last, every=self.every_tick, row=row,
+                    arrived=self._arrive_or_change if auto else self._arrive,
+                    progress=self._change_over.watch(last, progress) if auto else progress,
                 )  # fmt: skip
+                self.messages += self._change_over.tell_failure()
+                if auto and (ticks := self._change_over.take_over()) is not None:
+                    self._compiled, self._changed = ticks, True
+                    if position.stopped is None and position.tick < last:
+                        self.go(last, recorder, progress)
                 return
             ended = run_hybrid(
                 workspace, self.continuous, plants, self.steps, self.coupled, position, last,
@@ -273,6 +295,11 @@ class Engine:
                 found[f"{path}.{port}"] = TextSignal.of(changes)
                 del changes[:-1]
         return found
+
+    def _arrive_or_change(self, k: int) -> bool:
+        """Take note of a tick that has been recorded; return whether interpreted ticks end there."""
+        self.position.tick = k
+        return (self._can_stop and self._is_over()) or self._change_over.is_due
 
     def _arrive(self, k: int) -> bool:
         """Take note of a tick that has been recorded; return whether it ends the run."""

@@ -1,7 +1,8 @@
-"""Options of a run: their defaults and their meaning, in one place."""
+"""Options of a run: their defaults and their meaning, its ticks, and the step between them."""
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -10,10 +11,13 @@ from typing import Any, Self, TypedDict
 
 from ...blocks.core import OptionError, near
 from ..coupling import Coupling
+from ..flat import FlatDiagram, WiredDiagram, takes_any_step
 from ..results import OperatingPoint, RunState
+from ..wiring import stepped_blocks
 
 START_EXCHANGES = ("agree", "once", "none")
 """Exchanges of values with FMUs while they initialize; the first one is the default."""
+FIXED_STEP = ("euler", "heun", "rk4")
 
 
 def check_start_exchange(value: str) -> str:
@@ -31,6 +35,19 @@ def check_start_exchange(value: str) -> str:
     return value
 
 
+def check_compile(value: bool | str) -> bool | str:
+    """Return when ticks are compiled: True, False or "auto".
+
+    Raises
+    ------
+    OptionError
+        For anything else.
+    """
+    if value is True or value is False or value == "auto":
+        return value
+    raise OptionError(f'found {value!r}; expected True, False or "auto". Give one.', port="compile")
+
+
 class KeptKeywords(TypedDict, total=False):
     """The options of a run that is kept in memory, as keywords, for type checkers; see `RunOptions`."""
 
@@ -45,7 +62,7 @@ class KeptKeywords(TypedDict, total=False):
     start: RunState | OperatingPoint | None
     coupling: str | Coupling
     start_exchange: str
-    compile: bool
+    compile: bool | str
 
 
 class RunKeywords(KeptKeywords, total=False):
@@ -94,12 +111,14 @@ class RunOptions:
     start_exchange : {"agree", "once", "none"}
         Exchange of values with FMUs while they initialize: until inputs and outputs agree, one pass, or none, where
         inputs keep their start values until the first step. Tools differ in this.
-    compile : bool
-        Go from tick to tick in C, with the same results to the last bit; with continuous states, within the
-        tolerances. It needs a compiler (the extra ``build``), and a diagram without transport delays and FMUs in
-        processes of their own; between ticks no blocks of Python and one of the solvers "auto", "RK23", "RK45",
-        "DOP853", "Radau" and those of fixed step. Where one of these fails, the run is interpreted, and
-        ``run.messages`` says why.
+    compile : {"auto", True, False}
+        Go from tick to tick in C. "auto": a diagram of sampled subsystems is interpreted at first; a compiler works
+        beside it if the run is long enough, and C takes over at some tick, with the same results to the last bit. Where
+        results could differ, with tables or continuous states, it is interpreted. True: in C from the beginning; with
+        continuous states the results are the same within the tolerances. It needs a compiler (the extra ``build``), and
+        a diagram without transport delays and FMUs in processes of their own; between ticks no blocks of Python and one
+        of the solvers "auto", "RK23", "RK45", "DOP853", "Radau" and those of fixed step. Where one of these fails, the
+        run is interpreted, and ``run.messages`` says why.
     """
 
     step: float | Fraction | None = None
@@ -115,7 +134,7 @@ class RunOptions:
     start: RunState | OperatingPoint | None = None
     coupling: str | Coupling = "jacobi"
     start_exchange: str = START_EXCHANGES[0]
-    compile: bool = False
+    compile: bool | str = "auto"
 
     @classmethod
     def of(cls, options: Mapping[str, Any], *, block: str) -> Self:
@@ -158,3 +177,62 @@ class RunOptions:
         found = {name: value for name in names if (value := getattr(self, name)) is not None}
         chosen = {"coupling": (self.coupling, "jacobi"), "start_exchange": (self.start_exchange, START_EXCHANGES[0])}
         return found | {name: value for name, (value, default) in chosen.items() if value != default}
+
+
+def ticks_in(duration: Any, base: Fraction, name: str) -> tuple[int, Fraction]:
+    """Return the number of ticks in a duration, and the seconds that are left after them.
+
+    Rounding of a few ulps, as in 0.1 + 0.2, is forgiven: nothing is left then.
+    """
+    try:
+        span = float(duration)
+    except (TypeError, ValueError):
+        span = math.nan
+    if not 0 < span < math.inf or isinstance(duration, str | bool):
+        raise OptionError(f"found a duration of {duration!r}; expected seconds, positive.", block=name, port="duration")
+    exact = Fraction(span)
+    n = round(exact / base)
+    if n and abs(exact - n * base) <= exact * Fraction(1, 10**12):
+        return n, Fraction(0)
+    n = exact // base
+    return n, exact - n * base
+
+
+def refuse_rest(flat: FlatDiagram, n: int, duration: Any, name: str) -> None:
+    """Refuse an end between two ticks where an FMU takes steps of one length only."""
+    for path, plant in stepped_blocks(flat.table).items():
+        if not takes_any_step(plant):
+            raise OptionError(
+                f"found a duration of {duration!r} s, no multiple of the {float(flat.base):g} s between ticks, and "
+                f"{path} takes steps of one length only; take {float(max(n, 1) * flat.base)!r} s.",
+                block=name,
+                port="duration",
+            )
+
+
+def default_step(diagram: WiredDiagram, step: Any, duration: float | None, solver: str, start: Any = None) -> Any:
+    """Return the seconds between two samples of a run that has neither a ``step`` nor a clock.
+
+    That of the run that is gone on from; else a thousandth of the duration, in whole nanoseconds where it has them,
+    where the diagram has no FMU and the solver chooses its own steps.
+    """
+    if step is not None or diagram.has_clock:
+        return step
+    if start is not None and hasattr(start, "base"):
+        return start.base
+    if duration is None:
+        return step
+    from ..solvers import solver_name
+
+    if diagram.has_fmu or solver_name(solver) in FIXED_STEP:
+        return step
+    try:
+        span = Fraction(repr(float(duration)))
+    except (TypeError, ValueError):
+        span = Fraction(0)
+    if not span > 0:
+        ticks_in(duration, Fraction(1), diagram.name)  # refused
+    ticks = span / Fraction(1, 10**9)
+    if ticks.denominator != 1:
+        return span / 1000
+    return next((span / n for n in (1000, 500, 200, 100, 10, 1) if (ticks / n).denominator == 1), span)

@@ -28,10 +28,9 @@ from ..results import (
     check_fits,
     not_open_error,
 )
-from .duration import default_step, refuse_rest, ticks_in
 from .engine import Engine
 from .progress import Interrupted, progress_bar
-from .run_options import RunOptions
+from .run_options import RunOptions, default_step, refuse_rest, ticks_in
 from .save import can_save, restore_state, save_state
 from .start_at_point import apply_point
 from .view import SimulationView
@@ -135,8 +134,7 @@ class Simulation:
         if self._recorder.is_open:
             cut = [] if error is None else [f"This run was cut off at t = {self.t:g} s: {kind.__name__}: {error}"]
             texts = {name: text.to_json() for name, text in self._engine.take_texts().items()}
-            messages = (*self._messages, *cut)
-            self._recorder.finish(elapsed=self._elapsed, messages=messages, stopped=self.stopped, texts=texts)
+            self._recorder.finish(**self._take_facts(*cut), texts=texts)
 
     def _begin(self) -> None:
         engine = self._engine
@@ -306,9 +304,9 @@ class Simulation:
         texts = self._engine.take_texts()
         if last:
             self._loaded.close()
-        messages = self._messages
+        facts = self._take_facts()
         written = {name: text.to_json() for name, text in texts.items()}
-        t, data = recorder.finish(elapsed=self._elapsed, messages=messages, stopped=self.stopped, texts=written)
+        t, data = recorder.finish(**facts, texts=written)
         run = Run(
             t=t,
             data=data,
@@ -316,11 +314,9 @@ class Simulation:
             wires=dict(self.flat.table.names),
             units=self._recording.units,
             diagram=self.diagram,
-            elapsed=self._elapsed,
-            messages=messages,
+            **facts,
             texts=texts,
             events=recorder.events,
-            stopped=self.stopped,
             residual=recorder.residual,
             columns=recorder.columns,
             has_states=self._recording.states,
@@ -334,6 +330,10 @@ class Simulation:
     def record_instant(self) -> None:
         """Record the instant that it has reached: after `run`, as the first sample of what comes."""
         self._recorder.row(self.t, self._engine.workspace.log)
+
+    def _take_facts(self, *more: str) -> dict[str, Any]:
+        tier, messages = self._engine.take_tier(), (*self._messages, *more)
+        return {"elapsed": self._elapsed, "tier": tier, "messages": messages, "stopped": self.stopped}
 
     @property
     def _messages(self) -> tuple[str, ...]:

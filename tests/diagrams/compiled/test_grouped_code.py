@@ -1,5 +1,7 @@
 """Grouped code: one C function for each kind of block, with the bits of the blocks evaluated one by one."""
 
+from time import sleep
+
 import numpy as np
 import pytest
 
@@ -200,6 +202,19 @@ def test_an_exception_in_a_block_of_python_says_the_same_in_both_forms():
             with_python(fails).simulate(1.0, compile=form, **QUIET)
         texts.append((type(caught.value), str(caught.value), caught.value.run.data.tobytes()))
     assert texts[0] == texts[1]
+
+
+def test_slow_ticks_come_back_to_python_often():
+    """A tick of 1 ms: Ctrl-C and the progress bar have their turn after 0.1 s of them, which are at most 100."""
+
+    def slow(x, u):
+        sleep(1e-3)
+        return u
+
+    told = [0.0]
+    with with_python(slow).simulation(compile=True) as simulation:
+        simulation.advance(4.0, progress=told.append)
+    assert np.max(np.diff(told)) < 1.3  # s of simulated time: 128 ticks
 
 
 def test_an_interrupt_in_a_block_of_python_ends_the_run():

@@ -25,6 +25,8 @@ from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, bouncing_ball
 from support.hybrid_blocks import TIGHT, Falls, Lag, counting, decay
 
+pytestmark = pytest.mark.both_tiers
+
 
 def ideal(t0, t1):
     """Return a logic signal that is true from t0 on and false from t1 on."""

@@ -20,6 +20,8 @@ from loopwright.blocks import (
 from loopwright.diagrams import Diagram, experiments
 from loopwright.fmus import Fmu, gantry
 
+pytestmark = pytest.mark.one_tier  # it counts calls
+
 CALLS = ("instantiate", "exitInitializationMode", "terminate", "freeInstance", "freeLibrary")
 REST = {"motor_force": (0.0, 0.0), "external_force": (0.0, 0.0)}
 

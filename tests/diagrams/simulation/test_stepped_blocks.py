@@ -10,6 +10,8 @@ from loopwright.blocks import Block, Gain, Input, Output, Ramp, parameter
 from loopwright.diagrams import Diagram, check_block, subsystem
 from loopwright.diagrams.wiring.structure import stepped_blocks
 
+pytestmark = pytest.mark.one_tier  # it counts calls
+
 
 class Tank(Block):
     """Level of a tank, held in Python: y(t + h) = y(t) + h u(t) / area."""

@@ -27,6 +27,8 @@ from loopwright.blocks import (
 from loopwright.diagrams import Diagram, subsystem
 from loopwright.fmus import Fmu, mass_spring_damper
 
+pytestmark = pytest.mark.both_tiers
+
 ONE = Constant(value=1.0, name="one")
 
 

@@ -1,0 +1,101 @@
+"""Code that is compiled beside a run that is interpreted meanwhile."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from threading import Thread
+
+from ...blocks.core import LoopwrightError
+from ..flat import FlatDiagram, TickPattern
+from .code import TickCode, TickSources, write_ticks
+
+_WRITING = 3e-5  # s to write the C code of an operation
+_COMPILING = 1e-3  # s to compile it
+_SHARE = 0.2  # of the time that a run still takes, at most, for writing code
+_LEAST = 0.1  # s that a run still takes at least, for code that is in the cache; beside a compiler ten times as much
+
+
+class BackgroundCode:
+    """C code of a diagram's ticks, made while they are interpreted, as soon as the run is long enough for it.
+
+    A run that is short never waits, and starts no compiler. The compiler is a process of its own.
+
+    Parameters
+    ----------
+    flat : FlatDiagram
+        The diagram.
+    acting : sequence of frozenset
+        The sets of clocks that act together at some tick.
+
+    Attributes
+    ----------
+    ready : bool
+        Whether ``code`` is there.
+    code : TickCode or None
+        The code; None before, and where it can't replace interpreted ticks to the last bit.
+    failure : LoopwrightError or None
+        Why there is none: no compiler, or one that fails.
+    """
+
+    def __init__(self, flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]):
+        self._flat, self._acting = flat.origin, acting  # other numbers change no code
+        self._sources: TickSources | None = None
+        self._thread: Thread | None = None
+        self._over = False
+        self.ready = False
+        self.code: TickCode | None = None
+        self.failure: LoopwrightError | None = None
+
+    def look(self, spent: float, rest: float) -> None:
+        """Begin to make the code where it pays.
+
+        Parameters
+        ----------
+        spent, rest : float
+            Seconds that interpreted ticks have taken so far, and those that the ticks asked for still take. A run that
+            has taken long is taken to go on for as long.
+        """
+        if self._over:
+            return
+        rest = max(spent, rest)
+        if self._sources is None:
+            if rest < max(_LEAST, _WRITING * self._flat.operations / _SHARE):
+                return
+            try:
+                self._sources = write_ticks(self._flat, self._acting)
+            except LoopwrightError as error:
+                self._end(error)
+                return
+            if not self._sources.exact:
+                self._end()
+                return
+        try:
+            cached = self._sources.is_compiled()
+        except LoopwrightError as error:
+            self._end(error)
+            return
+        compiling = _COMPILING * min(self._flat.operations, self._sources.operations)
+        crowded = 1.0 if (os.cpu_count() or 1) > 1 else 4.0  # the compiler takes time from the run itself
+        if cached:
+            self._load(self._sources)
+        elif rest > crowded * (10 * _LEAST + compiling):
+            self._over = True
+            self._thread = Thread(target=self._load, args=(self._sources,), name="loopwright-compiler", daemon=True)
+            self._thread.start()
+
+    def wait(self) -> None:
+        """Wait until a compiler that runs has ended."""
+        if self._thread is not None:
+            self._thread.join()
+
+    def _load(self, sources: TickSources) -> None:
+        try:
+            self.code = sources.load()
+        except LoopwrightError as error:
+            self._end(error)
+            return
+        self._over = self.ready = True
+
+    def _end(self, error: LoopwrightError | None = None) -> None:
+        self._over, self.failure = True, error
