@@ -247,3 +247,17 @@ def test_a_linear_model_at_an_end_in_model_exchange_is_refused(cache, tmp_path):
         FmuError, match=r"^plant: the FMU asks to end the simulation \(terminateSimulation\) at t = 0 s"
     ):
         Diagram("d", wired).linearize(outputs="plant.x")
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+@pytest.mark.parametrize("last", [0.5, 0.53])
+@pytest.mark.parametrize("fmi", ["fmi2", "fmi1"])
+def test_an_end_in_a_part_of_a_discarded_step_ends_the_run_there(cache, tmp_path, fmi, last, isolate):
+    """It discards steps above 0.03 s, and says that it has not gone on; parts of them are taken until the end."""
+    real, source = _REAL[fmi], _SOURCES[fmi].replace("c->ended ? 3 :", "c->ended ? 3 : h > 0.03 ? 2 :")
+    gets = values(fmi, "Get", real, "double", {1: "c->y", 2: "c->u", 3: "c->last"})
+    sets = values(fmi, "Set", real, "double", {2: "c->u", 3: "c->last"})
+    file = small_fmu(tmp_path, fmi, _BODY + source + gets + sets, _describe(fmi))
+    run = driven(file, last, isolate=isolate).simulate(1.0, step=0.1, progress=False)
+    check_end(run, last)
+    assert any("discarded a step" in m for m in run.messages)
