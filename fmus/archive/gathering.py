@@ -89,7 +89,7 @@ def _array(
 
 
 def _kind(v: FmuVariable) -> tuple[Any, ...]:
-    return v.type, v.causality, v.variability, v.initial, v.unit, v.start is None, tuple(v.items.items())
+    return v.type, v.causality, v.variability, v.initial, v.unit, v.start is None, tuple(v.items.items()), v.clocks
 
 
 def _common(values: list[Any], default: float, shape: tuple[int, ...]) -> Any:

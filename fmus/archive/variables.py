@@ -49,6 +49,8 @@ class FmuVariable:
     """Values of an enumeration by their names."""
     intermediate: bool = False
     """Whether it can be set or read within a step (intermediateUpdate of FMI 3.0)."""
+    clocks: tuple[str, ...] = ()
+    """Names of the clocks at whose ticks alone it may be set (FMI 3.0)."""
 
     @property
     def reference(self) -> int:
@@ -226,6 +228,7 @@ def read_variable(v: Any, dropped: Mapping[str, str], units: FmuUnits) -> FmuVar
         type_,
         items if type_ == "Enumeration" else {},
         dropped.get("intermediateUpdate") in ("true", "1"),
+        tuple(clock.name for clock in getattr(v, "clocks", None) or ()),
     )
 
 

@@ -38,6 +38,7 @@ class StepMemory:
     added: float | None
     fresh: bool
     clocks: tuple[tuple[float, float, int, float], ...]
+    clocked: tuple[np.ndarray, ...]
     jumping: np.ndarray
 
 

@@ -14,14 +14,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from ...blocks.core import FmuRuntimeError, Layout
+from ...blocks.core import FmuRuntimeError
 from ..archive import FmuVariable, OtherVariable
 from .fmi_calls import DISCARD, MOST_ROUNDS, WARNING, StepCall
 from .fmu_block import check_next_time
 from .saved_state import FmuState, StepMemory
 from .step_options import StepTime, allows_early_return, uses_event_mode
-from .stepped_instance import SavedInstance, SteppedInstance
-from .transfer import Transfer, UnfitError
+from .stepped_instance import SavedInstance
+from .transfer import PartTransfer, Transfer, UnfitError
 
 _ROUNDED = 1e-9
 """Part of a step within which two times are one."""
@@ -58,30 +58,6 @@ class _Clock:
             self.next = math.inf  # until the FMU says it anew
 
 
-class _Part:
-    """Some of the inputs, in a vector of their own."""
-
-    def __init__(
-        self, instance: SteppedInstance, ports: Mapping[str, FmuVariable], vector: np.ndarray, chosen: list[str]
-    ):
-        places = Layout.of({port: v.shape for port, v in ports.items()}).slices
-        where = [np.arange(places[port].start, places[port].stop) for port in chosen]
-        self.ports = {port: ports[port] for port in chosen}
-        self.places = Layout.of({port: v.shape for port, v in self.ports.items()}).slices
-        self.index = np.concatenate(where) if where else np.zeros(0, dtype=int)
-        self.source = vector
-        self.values = np.array(vector[self.index])
-        self.transfer = Transfer(instance.fmi, "Set", self.ports, self.values)
-
-    def take(self) -> bool:
-        """Copy the values of the diagram; return whether they have changed."""
-        fresh = self.source[self.index]
-        if np.array_equal(fresh, self.values):
-            return False
-        self.values[:] = fresh
-        return True
-
-
 class CarefulSteps:
     """Steps of an instance with events; its ``step`` has the face of a plain one.
 
@@ -113,8 +89,16 @@ class CarefulSteps:
         self.old = not self.about.fmi.startswith("3")
         self.has_events = uses_event_mode(self.about, self.options)
         jumping = [port for port, v in inputs.items() if self.has_events and v.variability != "continuous"]
-        self.smooth = _Part(instance, inputs, vector, [port for port in inputs if port not in jumping])
-        self.jumping = _Part(instance, inputs, vector, jumping)
+        self.smooth = PartTransfer(instance.fmi, inputs, vector, [port for port in inputs if port not in jumping])
+        ours = {v.name: v for v in self.about.other.values() if v.type_is_clock and v.causality == "input"}
+        by_clocks: dict[tuple[str, ...], list[str]] = {}
+        for port in jumping:
+            by_clocks.setdefault(tuple(name for name in inputs[port].clocks if name in ours), []).append(port)
+        self.jumping = PartTransfer(instance.fmi, inputs, vector, by_clocks.pop((), []))
+        self.clocked = [
+            (names, PartTransfer(instance.fmi, inputs, vector, ports)) for names, ports in by_clocks.items()
+        ]
+        self.triggered = {name: v for name, v in ours.items() if v.interval_variability == "triggered"}
         self.clocks = [
             _Clock(v)
             for v in self.about.other.values()
@@ -139,13 +123,15 @@ class CarefulSteps:
             if clock.variable.is_periodic and clock.variable.interval is not None:
                 clock.start(t, clock.variable.interval, clock.variable.shift)
         self._read_intervals(t, [c for c in self.clocks if not c.variable.is_periodic or c.variable.interval is None])
-        self._activate([clock for clock in self.clocks if clock.next <= t])
+        self._activate(t, [clock for clock in self.clocks if clock.next <= t], set())
         self._settle(t)
 
     def memory(self) -> StepMemory:
         """Return what the steps keep beside the FMU's own state."""
         clocks = tuple((clock.interval, clock.next, clock.count, clock.origin) for clock in self.clocks)
-        return StepMemory(self.next_event, self._last, self._added, self._fresh, clocks, self.jumping.values.copy())
+        clocked = tuple(part.values.copy() for _, part in self.clocked)
+        jumping = self.jumping.values.copy()
+        return StepMemory(self.next_event, self._last, self._added, self._fresh, clocks, clocked, jumping)
 
     def return_to(self, t: float, memory: StepMemory | None) -> None:
         """Go on from a restored state at a time in s; without a memory Event Mode tells the next events anew."""
@@ -153,6 +139,8 @@ class CarefulSteps:
             self.next_event, self._last = memory.next_event, memory.last
             self._added, self._fresh = memory.added, memory.fresh
             self.jumping.values[:] = memory.jumping
+            for (_, part), values in zip(self.clocked, memory.clocked, strict=True):
+                part.values[:] = values
             for clock, kept in zip(self.clocks, memory.clocks, strict=True):
                 clock.interval, clock.next, clock.count, clock.origin = kept
             return
@@ -174,8 +162,10 @@ class CarefulSteps:
             self._added = start + h
         changed = self.jumping.take()
         due = [c for c in self.clocks if c.next <= start + _ROUNDED * h]
-        if self.has_events and (changed or self._fresh or due or self.next_event <= start + _ROUNDED * h):
-            self._handle_events(start, due, set_inputs=True)
+        waiting = {name for names, part in self.clocked if part.differs for name in names if name in self.triggered}
+        soon = waiting or due or self.next_event <= start + _ROUNDED * h
+        if self.has_events and (changed or self._fresh or soon):
+            self._handle_events(start, due, waiting, set_inputs=True)
             instance.check_end(start, h, start)
         self._fresh = False
         self.smooth.take()
@@ -217,7 +207,7 @@ class CarefulSteps:
                 self._look_for_pile(instants, h)
             due = [c for c in self.clocks if c.next <= now + _ROUNDED * h and now < end]
             if self.has_events and (event or due or self.next_event <= now + _ROUNDED * h):
-                self._handle_events(now, due, set_inputs=False)
+                self._handle_events(now, due, set(), set_inputs=False)
                 if self._check_end(t, h, now):
                     return
 
@@ -310,7 +300,7 @@ class CarefulSteps:
 
     # ---- values ----
 
-    def _set(self, part: _Part, t: float) -> None:
+    def _set(self, part: PartTransfer, t: float) -> None:
         if not part.index.size:
             return
         self.instance.check_limits(part.transfer, t)
@@ -345,21 +335,28 @@ class CarefulSteps:
 
     # ---- events ----
 
-    def _handle_events(self, t: float, due: list[_Clock], *, set_inputs: bool) -> None:
+    def _handle_events(self, t: float, due: list[_Clock], triggered: set[str], *, set_inputs: bool) -> None:
         """Enter Event Mode, let clocks tick, and settle (FMI 3.0, 2.3.5 and 4.2.1)."""
         instance = self.instance
         instance.call("entering Event Mode", self.fmi.enter_event_mode)
         if set_inputs:
             self._set(self.jumping, t)
-        self._activate(due)
+        self._activate(t, due, triggered)
         self._settle(t)
 
-    def _activate(self, due: list[_Clock]) -> None:
-        if due:
-            references = [clock.variable.reference for clock in due]
+    def _activate(self, t: float, due: list[_Clock], triggered: set[str]) -> None:
+        """Let clocks tick, and set the inputs that may be set at these ticks alone."""
+        ticking = {clock.variable.name: clock.variable for clock in due}
+        ticking |= {name: self.triggered[name] for name in sorted(triggered)}
+        if ticking:
+            references = [clock.reference for clock in ticking.values()]
             self.instance.call("activating its clocks", self.fmi.activate_clocks, references)
         for clock in due:
             clock.tick()
+        for names, part in self.clocked:
+            if not ticking.keys().isdisjoint(names):
+                part.take()
+                self._set(part, t)
 
     def _settle(self, t: float) -> None:
         """Update the discrete states until nothing changes, and go back to Step Mode."""

@@ -38,11 +38,16 @@ def list_limits(label: str, about: FmuDescription) -> list[str]:
     parts = [f"the outputs {', '.join(map(str, outs))} are not recorded"] if outs else []
     parts += [f"the inputs {', '.join(map(str, ins))} keep their start values"] if ins else []
     found = [f"{label}: no wire carries texts, binaries and clocks: {'; '.join(parts)}"] if parts else []
-    still = [v for v in clocks if not about.has_event_mode or v.interval_variability == "triggered"]
+    driven = {name for v in about.of("input").values() for name in v.clocks}
+    still = [
+        v
+        for v in clocks
+        if not about.has_event_mode or (v.interval_variability == "triggered" and v.name not in driven)
+    ]
     if still:
         why = (
-            "no wire carries a triggered clock, so what waits for it keeps its start value. Export it with a periodic "
-            "clock, or with a Boolean input in its place"
+            "a triggered clock ticks where an input that it clocks changes, and it clocks none. Export it with such an "
+            "input, or with a periodic clock"
             if about.has_event_mode
             else "the FMU has no Event Mode (hasEventMode)"
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -221,3 +221,30 @@ class TypeGroup:
     def _split(self) -> Sequence[np.ndarray]:
         ends = np.cumsum([v.size for v in self.ports.values()])[:-1]
         return np.split(self.buffer[: self.size], ends)
+
+
+class PartTransfer:
+    """Some of the inputs, in a vector of their own."""
+
+    def __init__(self, fmi: FmiCalls, ports: Mapping[str, FmuVariable], vector: np.ndarray, chosen: list[str]):
+        places = Layout.of({port: v.shape for port, v in ports.items()}).slices
+        where = [np.arange(places[port].start, places[port].stop) for port in chosen]
+        self.ports = {port: ports[port] for port in chosen}
+        self.places = Layout.of({port: v.shape for port, v in self.ports.items()}).slices
+        self.index = np.concatenate(where) if where else np.zeros(0, dtype=int)
+        self.source = vector
+        self.values = np.array(vector[self.index])
+        self.transfer = Transfer(fmi, "Set", self.ports, self.values)
+
+    @property
+    def differs(self) -> bool:
+        """Whether the values of the diagram are others than those that were taken last."""
+        return not np.array_equal(self.source[self.index], self.values)
+
+    def take(self) -> bool:
+        """Copy the values of the diagram; return whether they have changed."""
+        fresh = self.source[self.index]
+        if np.array_equal(fresh, self.values):
+            return False
+        self.values[:] = fresh
+        return True

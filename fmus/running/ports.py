@@ -108,8 +108,8 @@ def _check_chosen(description: FmuDescription, chosen: tuple[str, ...], label: s
         if other is not None and other.type_is_clock:
             raise ParameterError(
                 f"found {name!r}, a {other.interval_variability} {other.causality} clock; expected a number, as no "
-                "wire carries a clock. Leave it out: input clocks tick by themselves, but for triggered ones, in whose "
-                "place the FMU needs a Boolean input.",
+                "wire carries a clock. Leave it out: input clocks tick by themselves, triggered ones where an input "
+                "that they clock changes.",
                 block=label,
                 port="ports",
             )

@@ -174,12 +174,64 @@ def test_a_tunable_parameter_changes_in_event_mode(folder):
     assert run["plant.seen"].tolist() == [*[1.0] * 4, *[2.0] * 7]
 
 
+CLOCKED = (
+    """
+typedef struct { double t, level, seen; int mode, active, sets, beats; } instance;
+void *fmi3InstantiateCoSimulation() { instance *c = calloc(1, sizeof(instance)); c->active = 1; return c; }
+int fmi3ExitInitializationMode(void *p) { instance *c = p; c->active = 0; c->mode = 1; return 0; }
+int fmi3EnterEventMode(void *p) { ((instance *)p)->mode = 1; return 0; }
+int fmi3EnterStepMode(void *p) { instance *c = p; c->mode = 2; c->active = 0; return 0; }
+int fmi3UpdateDiscreteStates(void *p, bool *more, bool *stop, bool *nominals, bool *v, bool *defined, double *next) {
+    instance *c = p; if (c->active) c->seen = c->level; *more = *stop = *nominals = *v = *defined = false; return 0; }
+int fmi3SetClock(void *p, const unsigned vr[], size_t n, const bool v[]) {
+    instance *c = p; if (c->mode != 1) return 3; c->active = v[0]; c->beats += v[0]; return 0; }
+int fmi3DoStep(void *p, double t, double h, bool f, bool *e, bool *stop, bool *early, double *last) {
+    instance *c = p; *e = *stop = *early = false; *last = c->t = t + h; return c->mode == 2 ? 0 : 3; }
+"""
+    + values("fmi3", "Get", "Float64", "double", {1: "c->seen"})
+    + values("fmi3", "Get", "Int32", "int32_t", {2: "c->level", 3: "c->beats"})
+    + values("fmi3", "Set", "Int32", "int32_t", {2: "if (!c->active) return 3; c->level"})
+)
+CLOCKED_MODEL = """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="true" hasEventMode="true"/>
+<ModelVariables><Float64 name="seen" valueReference="1" causality="output"/>
+<Int32 name="level" valueReference="2" causality="input" variability="discrete" start="0" clocks="8"/>
+<Int32 name="beats" valueReference="3" causality="output"/>{clock}</ModelVariables>
+<ModelStructure><Output valueReference="1"/><Output valueReference="3"/></ModelStructure>"""
+
+
+class Stairs(Block):
+    """0 until 0.3 s, 1 until 0.6 s, then 2."""
+
+    y = Output()
+
+    def output(self, t, x, u):
+        return np.where(t < 0.299, 0.0, np.where(t < 0.599, 1.0, 2.0))
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_a_triggered_clock_ticks_where_an_input_that_it_clocks_changes(folder, isolate):
+    """The FMU refuses to set the input while its clock does not tick (FMI 3.0: clocked variables)."""
+    clock = CLOCK.replace('"constant" intervalDecimal="0.15"', '"triggered"')
+    file = small_fmu(folder, "fmi3", CLOCKED, CLOCKED_MODEL.format(clock=clock), name="triggered")
+    run = Diagram("d", Fmu(file, name="plant", isolate=isolate)(level=Stairs())).simulate(1.0, step=0.1, progress=False)
+    assert run["plant.beats"].tolist() == [*[0.0] * 4, *[1.0] * 3, *[2.0] * 4]
+    assert run["plant.seen"].tolist() == [*[0.0] * 4, *[1.0] * 3, *[2.0] * 4]
+    assert not any("never tick" in m for m in run.messages)
+
+
+def test_an_input_of_a_periodic_clock_is_set_at_its_ticks_alone(folder):
+    file = small_fmu(folder, "fmi3", CLOCKED, CLOCKED_MODEL.format(clock=CLOCK.replace("0.15", "0.4")), name="periodic")
+    run = Diagram("d", Fmu(file, name="plant")(level=Stairs())).simulate(1.0, step=0.1, progress=False)
+    assert run["plant.beats"].tolist() == [1.0, *[1.0] * 4, *[2.0] * 4, *[3.0] * 2]
+    assert run["plant.seen"].tolist() == [*[0.0] * 5, *[1.0] * 4, *[2.0] * 2]
+
+
 def test_clocks_that_never_tick_are_told(folder):
     clock = CLOCK.replace('"constant" intervalDecimal="0.15"', '"triggered"')
     file = small_fmu(folder, "fmi3", EVENTS, MODEL.format(clock=clock, outputs=OUTPUTS, variable="true"), name="still")
     run = simulate(Fmu(file, name="plant"), level=Constant(value=0.0))
     assert run["plant.beats"][-1] == 0.0
-    text = "plant: the clocks beat (triggered Clock) never tick: no wire carries a triggered clock, so what waits"
+    text = "plant: the clocks beat (triggered Clock) never tick: a triggered clock ticks where an input that"
     assert any(message.startswith(text) for message in run.messages)
     with pytest.raises(
         ParameterError, match=r"^plant\.ports: found 'beat', a triggered input clock; expected a number"
