@@ -38,7 +38,8 @@ _INT, _REAL, _AT = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 class _Problem(ctypes.Structure):
     _fields_ = [
         *_fields(_INT, "n width"), ("where", _AT), ("flow", TickStructure), ("slope", TickStructure),
-        *_fields(_AT, "t x slopes"), *_fields(_REAL, "stop edge left at late"), *_fields(_AT, "loops here by_loops"),
+        *_fields(_AT, "t x slopes"), ("entries", _INT), *_fields(_AT, "row column"),
+        *_fields(_REAL, "stop edge left at late"), *_fields(_AT, "loops here by_loops"),
         *_fields(_INT, "rates jacobians"),
     ]  # fmt: skip
 
@@ -190,7 +191,8 @@ class CompiledHybrid:
         _, x, w, p = arguments
         trial = [np.zeros(1), x.copy(), w, p]
         where = self._own(flat.continuous.astype(np.int64))
-        slopes = np.zeros(n * n if "slope" in code.between else 0)
+        slope = code.between.get("slope")
+        slopes = np.zeros(0 if slope is None else slope.function.numel_out(0) if loops else slope.function.nnz_out(0))
         self._hybrid = hybrid = _Hybrid(l=loop.structure, automatic=len(methods) > 1, accepts=accepts)
         hybrid.budget = _budget(code.between["flow"].function, methods, n)
         hybrid.between = self.kinds[NONE]
@@ -212,8 +214,12 @@ class CompiledHybrid:
             hybrid.p.loops, hybrid.p.here, hybrid.p.by_loops = ctypes.addressof(solver), address(x), self._own(through)
             hybrid.solved = self._own(np.zeros(m))
             results += [through[: n * m], through[n * m :], np.zeros(m * m)]
-        if slopes.size:
-            hybrid.p.slope = self._bind(code.between["slope"], trial, results)
+        if slope is not None:
+            hybrid.p.slope = self._bind(slope, trial, results)
+            if loops is None:
+                rows, columns = slope.function.sparsity_out(0).get_triplet()
+                hybrid.p.entries = len(rows)
+                hybrid.p.row, hybrid.p.column = (self._own(np.array([*v, 0], dtype=np.int64)) for v in (rows, columns))
         of = ctypes.addressof(hybrid) + _Hybrid.p.offset
         self.methods = [self._method(options, n, of) for options in methods]
         for i, method in enumerate(self.methods):

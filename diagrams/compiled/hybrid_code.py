@@ -104,7 +104,7 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
     others = {"flow": flat.flow.last.fast}
     if stiff:
         looped = bool(flat.active_loops(NONE))
-        others["slope"] = (flat.jacobian_with_loops if looped else flat.jacobian).fast
+        others["slope"] = flat.jacobian_with_loops.fast if looped else _sparse_slope(flat)
     if flat.events:
         others |= {"indicators": flat.indicators.last.fast, "jump": flat.jump.last.fast}
     others = {name: rename(function, name) for name, function in others.items()}
@@ -118,6 +118,14 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
     between = {name: Compiled(function, address_of(library, name)) for name, function in others.items()}
     made = HybridCode(TickCode(straight, exact=False, library=library, loops=compile_loops(flat, kinds)), between)
     return known.setdefault((kinds, stiff), made)
+
+
+def _sparse_slope(flat: FlatDiagram) -> Any:
+    """Return the derivative of the rates by the integrated states, of which only entries that may not be 0 are made."""
+    function = flat.flow.last.fast
+    symbols = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
+    rates = function.call(symbols)[0]
+    return ca.Function("slope", symbols, [ca.jacobian(rates, symbols[1])[:, flat.continuous.tolist()]])
 
 
 @lru_cache(maxsize=1)

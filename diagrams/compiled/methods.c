@@ -8,6 +8,8 @@ typedef struct {
     const int64_t *where;
     tick flow, slope;        /* the rates at (t, x), and their derivative by the integrated states */
     double *t, *x, *slopes;
+    int64_t entries;         /* of the slope that may not be 0, which stand in slopes; else all of them do, by columns */
+    const int64_t *row, *column;
     double stop;             /* rates are evaluated no later */
     double edge, left;       /* from the time `edge` on sources are seen at the time `left` before it */
     double at, late;         /* at the time `at` they are seen at the time `late`, just after it */

@@ -109,9 +109,14 @@ static bool differentiate(method *m, double t, const double *x) {
     if (!look(p, t < p->stop ? t : p->stop, x)) return m->has_slope;
     call(&p->slope);
     if (p->loops && !lead_through_loops(p)) return m->has_slope;
-    if (!all_finite(p->slopes, n * n)) return m->has_slope;
-    for (int64_t i = 0; i < n; i++)
-        for (int64_t j = 0; j < n; j++) m->J[i * n + j] = p->slopes[j * n + i];
+    if (!all_finite(p->slopes, p->row ? p->entries : n * n)) return m->has_slope;
+    if (p->row) {
+        memset(m->J, 0, n * n * sizeof(double));
+        for (int64_t k = 0; k < p->entries; k++) m->J[p->row[k] * n + p->column[k]] = p->slopes[k];
+    } else {
+        for (int64_t i = 0; i < n; i++)
+            for (int64_t j = 0; j < n; j++) m->J[i * n + j] = p->slopes[j * n + i];
+    }
     m->has_slope = 1;
     m->has_lu = 0;
     return true;

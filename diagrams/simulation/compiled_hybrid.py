@@ -390,8 +390,8 @@ def make_hybrid(
             reason = str(error)
         else:
             told = (
-                f"Compiled: {found.solver} runs in C, with the step control of solver={continuous.solver.name!r}; its "
-                "values differ from those of an interpreted run within the tolerances."
+                f"Compiled: {found.solver} runs in C as solver={continuous.solver.name!r}, by the same rules as "
+                "interpreted; values differ from those of an interpreted run by rounding and within the tolerances."
             )
             return found, (told,) if continuous.where.size else ()
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)

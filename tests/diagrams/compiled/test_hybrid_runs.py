@@ -80,6 +80,7 @@ def oscillator(omega=5.0):
     return Diagram("oscillator", x(v(Gain(gain=-(omega**2))(x.y))))
 
 
+@pytest.mark.drawn
 @pytest.mark.parametrize("solver", ["RK23", "RK45", "DOP853"])
 @pytest.mark.parametrize("rtol", [1e-4, 1e-7, 1e-10])
 def test_samples_between_steps_are_those_of_the_closed_form(solver, rtol):
