@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks import Constant, Hold, Step, Sum
-from ...blocks.core import Array, Block, Input, OptionError, Output, State, parameter
+from ...blocks.core import AlgebraicLoopError, Array, Block, Input, OptionError, Output, State, parameter
 from ...fmus.running import Fmu
 from ..linearization import PlantEquations
 from ..wiring import Structure, SubsystemSettings, Wire
@@ -206,8 +206,10 @@ def attach_environment(
         table.blocks[total], table.subsystem_of[total] = Sum(signs="+" * (1 + len(terms)), name=total), ""
         for i, wire in enumerate((Wire(*measured.port), *terms), 1):
             table.wires[total, f"u{i}"] = wire
-    solves = not held and (tick is None or mooring.mass > 0.0)
-    return diagram.with_structure(table, loops="solve" if solves else None)
+    try:
+        return diagram.with_structure(table)
+    except AlgebraicLoopError:  # by a mass, a continuous controller, or an FMU that does not list its dependencies
+        return diagram.with_structure(table, loops="solve")
 
 
 def _add(table: Structure, block: Block, port: str, subsystem: str = "") -> Wire:

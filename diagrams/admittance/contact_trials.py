@@ -121,7 +121,12 @@ class Trials:
         model = None
         if chosen is not TrialMethod.INSIDE:
             model = linearize_plant(contact.diagram, contact.point, contact.plant)
-        return cls(contact, limit, chosen, hold_sources(contact.diagram, contact.point.values), model)
+        made = cls(contact, limit, chosen, hold_sources(contact.diagram, contact.point.values), model)
+        stepped = contact.diagram.blocks[contact.plant].stepped and contact.sample_time > 0.0
+        open_choice = method is None and chosen is TrialMethod.SOLVER and stepped
+        if open_choice and made._diagram(limit.value, 0.0).loops == "solve":
+            made.method = TrialMethod.HELD  # the FMU does not list its dependencies: each evaluation would be a loop
+        return made
 
     def find_rates(self, value: float) -> np.ndarray:
         """Return the poles of the loop in 1/s that are predicted for a run."""

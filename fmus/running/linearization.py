@@ -16,6 +16,7 @@ from ..isolation import open_fmu
 from .derivation import Derivation, DerivativeMethod
 from .differences import Column, differentiate
 from .restored_point import RestoredPoint
+from .start_values import check_state
 
 EQUATIONS, STEP = 1e-5, 1e-4
 """Relative distances of differences: of equations, and of steps, which an adaptive solver makes less smooth."""
@@ -87,7 +88,13 @@ class _OperatingPoint:
             state, {name: name for name in self.states}, "state", block.description.discrete_states
         )
         given_inputs = self._match_names(inputs, ports, "inputs", ())
-        self.given = {n: block.start_value(about, n, v) for n, v in {**given_state, **given_inputs}.items()}
+        # model exchange sets states that have no start value of their own, as those that other tools compute
+        self.given = {
+            n: check_state(about.find(n), v, block.label)
+            if n in about.states and about.find(n).start is None
+            else block.start_value(about, n, v)
+            for n, v in {**given_state, **given_inputs}.items()
+        }
 
     def _match_names(self, given: Any, names: Mapping[str, str], port: str, more: tuple[str, ...]) -> dict[str, Any]:
         if given is None:

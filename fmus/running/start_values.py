@@ -42,6 +42,25 @@ def check_start(description: FmuDescription, start: Mapping[str, Any], label: st
     return found
 
 
+def check_state(variable: FmuVariable, value: Any, label: str) -> np.ndarray:
+    """Return a state's value in its shape; it need not be one that can be set at the start.
+
+    Raises
+    ------
+    ParameterError
+        For another shape, and numbers that are not finite.
+    """
+    try:
+        found = np.array(np.broadcast_to(np.asarray(value, dtype=float), variable.shape))
+    except (TypeError, ValueError):
+        found = np.array(np.nan)
+    if not np.all(np.isfinite(found)):
+        raise ParameterError(
+            f"found {value!r}; expected finite numbers of shape {variable.shape}.", block=label, port=variable.name
+        )
+    return found
+
+
 def check_value(description: FmuDescription, name: str, value: Any, label: str) -> Any:
     """Return one start value in its variable's shape, or a text, after checking it; see `check_start`."""
     port = f"start.{name}"

@@ -219,6 +219,22 @@ def test_states_with_guessed_start_values_are_set_in_model_exchange_alone(motor,
         plant.step_difference(1e-3)
 
 
+def test_states_that_are_computed_at_the_start_are_set_in_model_exchange(motor, tmp_path):
+    def compute(text):  # as of Dymola's FMUs, whose states start from parameters
+        return re.sub(
+            r'(name="(?:current|speed)"[^>]*)initial="exact"([^>]*?) start="[^"]*"', r'\1initial="calculated"\2', text
+        )
+
+    plant = Fmu(edited(motor, tmp_path, compute))
+    assert plant.description.find("current").start is None
+    for exact in (True, False):
+        model = plant.linear_model(state={"current": 2.0, "speed": 3.0, "angle": 4.0}, exact=exact)
+        assert model.x0.tolist() == [2.0, 3.0, 4.0]
+        assert np.abs(got(model) - WANT_MOTOR).max() < bound(exact) * np.abs(WANT_MOTOR).max()
+    with pytest.raises(ParameterError, match=r"fmu.current: found 'much'; expected finite numbers of shape \(\)"):
+        plant.linear_model(state={"current": "much"})
+
+
 def test_an_fmu_that_hides_its_states_has_no_linear_model_but_a_step(motor, tmp_path):
     hidden = edited(motor, tmp_path, lambda s: re.sub(r"<ContinuousStateDerivative[^>]*/>", "", s))
     plant = Fmu(hidden)
