@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 PAGE = "page.html.j2"
 
 _LONG_WORD = re.compile(r"\b[0-9a-f]{32,}\b|(?<![<&])[\w./\\-]{40,}")
+_SYMBOL = re.compile(r"(?<![\w.])([MTFbkm])_([stcdemk])(?![\w.]*\w)")
+"""Symbols with an index, such as M_s and b_e; parts of dotted paths and of longer names are none."""
 _PIECES = re.compile(r"[^/\\._-]{1,16}[/\\._-]?|[/\\._-]")
 """Words that are too long for a column, such as digests and paths of files, and where they may break."""
 
@@ -39,10 +41,12 @@ def _environment() -> Environment:
 
 
 def marked(text: str) -> Markup:
-    """Escape a text; what stands between backticks is code."""
+    """Escape a text; what stands between backticks is code, and symbols such as M_s get their index below the line."""
     from markupsafe import Markup, escape
 
-    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
+    parts = re.split(r"`([^`]+)`", str(escape(text)))
+    shown = (f"<code>{part}</code>" if i % 2 else _SYMBOL.sub(r"\1<sub>\2</sub>", part) for i, part in enumerate(parts))
+    return Markup("".join(shown))
 
 
 def broken(text: str) -> Markup:

@@ -17,7 +17,7 @@ from loopwright.diagrams.frequency.number import Number
 from loopwright.diagrams.report_figures.drawings import with_drawing
 from loopwright.diagrams.report_writing.definitions import definition
 from loopwright.diagrams.report_writing.files import check_files, write_report
-from loopwright.diagrams.report_writing.html import to_html
+from loopwright.diagrams.report_writing.html import marked, to_html
 from loopwright.diagrams.report_writing.json import to_json
 from loopwright.diagrams.report_writing.model import Plot, Section, Table
 from loopwright.diagrams.report_writing.report import Report
@@ -148,7 +148,7 @@ def test_a_unit_that_a_whole_column_shares_stands_in_its_heading():
         "phase margin (°)",
         "gain margin",
         "delay (s)",
-        "M_s",
+        "Ms",
     ]
 
 
@@ -382,3 +382,17 @@ def test_a_pdf_is_on_the_paper_that_is_asked_for(tmp_path):
     document.close()
     with pytest.raises(OptionError, match="paper: found 'A5'; expected one of A4, letter"):
         write_report(small, tmp_path / "r.html", pdf=True, paper="A5")
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("M_s at the peak", "M<sub>s</sub> at the peak"),
+        ("k_e ≈ (d + b_e)/T_d.", "k<sub>e</sub> ≈ (d + b<sub>e</sub>)/T<sub>d</sub>."),
+        ("the wire controller.k_e", "the wire controller.k_e"),
+        ("k_e_limit and `M_s`", "k_e_limit and <code>M_s</code>"),
+        ("M_s < 1", "M<sub>s</sub> &lt; 1"),
+    ],
+)
+def test_symbols_have_their_index_below_the_line_and_names_stay(text, shown):
+    assert str(marked(text)) == shown
