@@ -1,9 +1,9 @@
 """A run beside C that was written by hand: python benchmarks/handwritten.py [--instructions].
 
 Experiment C, 12,000 ticks, from `handwritten/experiment_c.c`, which gcc compiles with -O3 and FMA (zig where there is
-no gcc), and by `simulate`, interpreted and compiled, everything recorded. All forms take turns, 15 times; a figure is
-the ratio of the smallest times, which other work on the machine disturbs least, with the median of the ratios within a
-turn. The trajectories are compared, too: the program ends with status 1 if they differ by more than 1e-9 of a signal's
+no gcc), and by `simulate`, interpreted, compiled and fused (docs/diagrams.md), everything recorded. All forms take
+turns, 15 times; a figure is the ratio of the smallest times, which other work on the machine disturbs least, with the
+median of the ratios within a turn. The trajectories are compared, too: the program ends with status 1 if they differ by more than 1e-9 of a signal's
 largest value.
 
 With --instructions, valgrind counts the instructions of a tick of the hand-written C.
@@ -32,6 +32,7 @@ SOURCE = Path(__file__).parent / "handwritten" / "experiment_c.c"
 FLAGS = ("-O3", "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast", "-std=gnu11")
 TICKS, ROW, TERMS = 12_000, 57, 40
 TURNS = 15
+OURS = {"interpreted": {"compile": False}, "compiled": {"compile": True}, "fused": {"compile": True, "fuse": True}}
 COLUMNS = {  # where the recorded values stand in a row of the hand-written C
     "position": (16, 17),
     "velocity": (20, 21),
@@ -153,12 +154,12 @@ def main() -> int:
         rows = np.zeros((TICKS + 1, ROW))
         run_by_hand(library, FORMS["5 substeps, 2 projections, everything recorded"], rows)
         by_hand: dict[str, list[float]] = {name: [] for name in FORMS}
-        ours: dict[bool, list[float]] = {False: [], True: []}
+        ours: dict[str, list[float]] = {name: [] for name in OURS}
         found, same = {}, True
         for turn in range(TURNS + 1):
             seconds = {name: run_by_hand(library, form, rows) for name, form in FORMS.items()}
             for form in ours:
-                with diagram.simulation(compile=form) as simulation:
+                with diagram.simulation(**OURS[form]) as simulation:
                     simulation.advance(1e-3)  # the set-up, and the first chunk's memory
                     started = time.perf_counter()
                     simulation.advance((TICKS - 1) * 1e-3)
@@ -173,11 +174,11 @@ def main() -> int:
         for form, run in found.items():
             difference = largest_difference(run, rows)
             same &= difference < 1e-9
-            print(f"  {'compiled' if form else 'interpreted':12} {difference:.1e}")
+            print(f"  {form:12} {difference:.1e}")
         print(
             "\nratio = time by hand / time of the run, of the smallest times (median of the turns); 1 is as fast as C"
         )
-        print(f"{'C by hand':48} {'µs/tick':>8}  {'interpreted':>22}  {'compiled':>22}")
+        print(f"{'C by hand':48} {'µs/tick':>8}" + "".join(f"{name:>22}" for name in OURS))
         for name, values in by_hand.items():
             line = f"{name:48} {min(values) / TICKS * 1e6:8.3f}"
             for times in ours.values():
@@ -185,8 +186,7 @@ def main() -> int:
                 line += f"  {min(values) / min(times):14.2f} ({statistics.median(ratios):4.2f}) "
             print(line)
         for form, times in ours.items():
-            text = "compiled" if form else "interpreted"
-            print(f"{text:48} {min(times) / TICKS * 1e6:8.3f}")
+            print(f"{form:48} {min(times) / TICKS * 1e6:8.3f}")
         if "--instructions" in sys.argv[1:]:
             print("\ninstructions a tick")
             for name, form in FORMS.items():

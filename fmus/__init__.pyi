@@ -1,7 +1,7 @@
 from .archive import ArchiveLimits, FmuDescription, FmuFault, FmuFinding, FmuSeverity, FmuVariable, read_description
 from .calls import FmuInstance, FmuState, StepOptions, StepTime
 from .checks import FmuDiagnosis, FmuTrial, FmuVerdict, doctor
-from .export import ModelSpec, Variable, build, build_fmu, build_python, clear_cache, model_spec
+from .export import ModelSpec, Variable, build, build_fmu, build_python, clear_cache, model_spec, tune
 from .isolation import Isolation
 from .models import (
     bouncing_ball,
@@ -49,4 +49,5 @@ __all__ = [
     "model_spec",
     "read_description",
     "scara",
+    "tune",
 ]

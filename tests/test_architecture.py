@@ -217,7 +217,7 @@ PUBLIC = {
         ArchiveLimits Fmu FmuDescription FmuDiagnosis FmuFault FmuFinding FmuInstance FmuLinearization FmuSeverity FmuState
         FmuTrial FmuVariable FmuVerdict Isolation ModelSpec StepOptions StepTime Variable bouncing_ball
         build build_fmu build_python clear_cache dc_motor doctor gantry gantry_contact gantry_elastic gantry_stiction
-        mass_spring_damper model_spec read_description scara
+        mass_spring_damper model_spec read_description scara tune
     """,
     "diagrams": """
         AdmittanceLoop BlockReport Box Channel Comparison Contact ContactAdmittance ContactConfirmation ContactLimit ContactMap

@@ -2,6 +2,7 @@
 
 from .background import BackgroundCode
 from .code import TickCode, compile_ticks, find_obstacle
+from .fused import fuse
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
 from .hybrid_code import compile_hybrid, find_hybrid_obstacle
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
@@ -27,4 +28,5 @@ __all__ = [
     "compile_ticks",
     "find_hybrid_obstacle",
     "find_obstacle",
+    "fuse",
 ]

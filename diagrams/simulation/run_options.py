@@ -63,6 +63,7 @@ class KeptKeywords(TypedDict, total=False):
     coupling: str | Coupling
     start_exchange: str
     compile: bool | str
+    fuse: bool
 
 
 class RunKeywords(KeptKeywords, total=False):
@@ -135,6 +136,7 @@ class RunOptions:
     coupling: str | Coupling = "jacobi"
     start_exchange: str = START_EXCHANGES[0]
     compile: bool | str = "auto"
+    fuse: bool = False
 
     @classmethod
     def of(cls, options: Mapping[str, Any], *, block: str) -> Self:
@@ -165,6 +167,20 @@ class RunOptions:
                 port="start",
             )
         return cls(**options)
+
+    def apply_fuse(self, diagram: WiredDiagram) -> tuple[WiredDiagram, tuple[str, ...]]:
+        """Return the diagram that is run, and messages: with ``fuse`` its FMUs are compiled for this processor.
+
+        Raises
+        ------
+        CompilerError
+            If there is no compiler, or it fails.
+        """
+        if not self.fuse:
+            return diagram, ()
+        from ..compiled import fuse  # only such a run needs a compiler
+
+        return fuse(diagram)
 
     def with_step(self, step: float | Fraction | None) -> Self:
         """Return the options with another step."""

@@ -71,6 +71,7 @@ class Simulation:
             diagram = apply_point(diagram, self._point)
             if not diagram.is_continuous and not diagram.has_base:
                 step = step or self._point.base
+        diagram, fused = options.apply_fuse(diagram)
         self.diagram = diagram
         saved = None if isinstance(start, OperatingPoint) else start
         base = default_step(diagram, step, duration, options.solver, saved)
@@ -94,7 +95,7 @@ class Simulation:
             self._recording.check_memory(count, every_tick=every_tick)
         self._engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=self._on_event)
         fine = note_fine_steps(self.flat) if base is None else ()
-        self._notes = (*fine, *note_loops(self.flat, self._engine.coupling))
+        self._notes = (*fused, *fine, *note_loops(self.flat, self._engine.coupling))
         self._elapsed, self._begun = 0.0, False
         self._open: bool | None = None  # until it begins; False once it has ended
         self._recorder = self._new_recorder()

@@ -5,6 +5,7 @@ from .from_block import build, model_spec
 from .model import Integrator, ModelSpec, Variable
 from .package import build_fmu, clear_cache
 from .python_fmu import build_python
+from .tuning import tune
 
 __all__ = [
     "SUFFIXES",
@@ -19,4 +20,5 @@ __all__ = [
     "compile_shared",
     "describe_compiler",
     "model_spec",
+    "tune",
 ]

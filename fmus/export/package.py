@@ -36,7 +36,7 @@ from .xml_fmi3 import build_description, model_description, package_version
 _TOKEN = "{instantiation-token}"
 _DATE = (1980, 1, 1, 0, 0, 0)
 # Folders of binaries in FMI 2.0 (2.3.1), where they differ from FMI 3.0's platform tuples.
-_FOLDERS2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"}
+FOLDERS2 = {"x86_64-linux": "linux64", "x86_64-windows": "win64", "x86_64-darwin": "darwin64"}
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def _text(value: Any) -> str:
 def _code_parts(fmi: int) -> list[str]:
     """Return the text of the modules that write the files, so that a change of them builds anew."""
     folder = Path(__file__).parent
-    written = ("c_code", "html_page", "package", "quantities", "scalars", "xml_fmi2", "xml_fmi3")
+    written = ("c_code", "elementary_tables", "html_page", "package", "quantities", "scalars", "xml_fmi2", "xml_fmi3")
     modules = [(folder / f"{name}.py").read_text(encoding="utf-8") for name in written]
     return [package_version(), *(text for _, text in sorted(runtime(fmi).items())), *modules]
 
@@ -104,7 +104,7 @@ def build_key(spec: ModelSpec, options: Options, compiler: Compiler) -> str:
     return _hash(*made, compiler.identity, fmi_headers()[1], *toolchain)
 
 
-def _zip(files: Mapping[str, bytes]) -> bytes:
+def zip_files(files: Mapping[str, bytes]) -> bytes:
     """Zip files with fixed dates, in sorted order: same content, same bytes (FMI 3.0, 2.5.1)."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -125,7 +125,7 @@ def _binary(
         library = Path(folder) / f"{spec.name}{suffix}"
         headers = fmi_headers()[0]
         compile_shared(sources, library, platform=platform, compiled=["model.c"], include=[headers], compiler=compiler)
-        name = _FOLDERS2.get(platform, platform) if fmi == 2 else platform
+        name = FOLDERS2.get(platform, platform) if fmi == 2 else platform
         return {f"binaries/{name}/{library.name}": library.read_bytes()}
 
 
@@ -151,7 +151,7 @@ def _archive(spec: ModelSpec, options: Options, compiler: Compiler, notify: Call
     for platform in options.platforms:
         notify(f"compiling {spec.name} for {platform} (the first build on a machine takes {_first_build(platform)})")
         files |= _binary(spec, fmi, platform, sources, compiler)
-    return _zip(files)
+    return zip_files(files)
 
 
 def write_atomically(path: Path, data: bytes) -> None:

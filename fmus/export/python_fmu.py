@@ -30,7 +30,7 @@ from ...blocks.tracing import bundle, traced_parameters
 from ..platform import record_build
 from .html_page import block_text
 from .model import check_file_name
-from .package import _zip, write_atomically
+from .package import write_atomically, zip_files
 from .xml_fmi3 import _unit, package_version
 
 NEEDS = "Needs Python where it runs, with NumPy and Loopwright {version}: its equations are Python code."
@@ -373,7 +373,7 @@ def _complete(file: Path, about: dict[str, Any], values: dict[str, dict[str, Any
         f"<body><h1>{escape(about['name'])}</h1>\n<p>{escape(about['description'])}</p>\n"
         f"<pre>{escape(block_text(block))}</pre></body></html>\n"
     ).encode()
-    return _zip(files)
+    return zip_files(files)
 
 
 def _unit_of(port: Port | Any, index: int) -> str | None:
