@@ -224,9 +224,10 @@ PUBLIC = {
         ContactTrial Coupling CouplingReport Diagram DiskMargin Drawing Failure Fig3Diagram FlatDiagram FrequencyResponse
         GainCrossover GangOfFour Interrupted InterruptedSweep Kink Layout Linearization Margins MeanSlope MeasuredMargins Number
         NyquistCount Occurrence OperatingPoint Passivity PeriodicMargins PhaseCrossover Plot Reduction Report Requirements Review
-        Rig Run RunOptions RunState Sample SampledDesign Samples Section Simulation SimulationView Snapshot StabilityLimit
+        Rig Run RunConfirmation RunOptions RunState Sample SampledDesign Samples Section Sensitivities Sensitivity Simulation SimulationView Snapshot StabilityLimit
         StabilityMap StepResponse StepsOnly Stopped Subsystem SubsystemSettings Sweep Table TextSignal TrialMethod Verdict Wire
-        ZeroSlope analyse check_block compare_with_control complementary crossing_frequency delayed_hold delayed_hold_margin
+        WorstCase ZeroSlope analyse check_block compare_with_control complementary
+        confirm_sensitivity crossing_frequency delayed_hold delayed_hold_margin
         disk_margin experiments fig3 final gang_of_four growth_rate loop_at margins maximum mean measured_margins mimo_disk_margin
         minimum nyquist_count passivity periodic_margins place poles read_frequency_data rendered_admittance rendered_response
         rendered_system rule_of_thumb sampled_gains sampled_poles sensitivity settling_time stability_limit stability_map

@@ -120,6 +120,9 @@ class RunOptions:
         a diagram without transport delays and FMUs in processes of their own; between ticks no blocks of Python and one
         of the solvers "auto", "RK23", "RK45", "DOP853", "Radau" and those of fixed step. Where one of these fails, the
         run is interpreted, and ``run.messages`` says why.
+    fuse : bool
+        Compile FMUs that Loopwright has built on this machine anew for its processor, with products and sums fused
+        (FMA): faster, and other in the last digits, as ``run.messages`` says; see `loopwright.fmus.tune`.
     """
 
     step: float | Fraction | None = None
