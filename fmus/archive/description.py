@@ -223,13 +223,6 @@ def _read(
         raise unknown_version(path, version)
     model, complaints = read_model(path, text, root, limits)
     interface = model.coSimulation or model.modelExchange
-    if version == "1.0" and model.coSimulation is None:
-        raise FmuFileError(
-            f"{str(path)!r} is an FMU of FMI 1.0 for model exchange; expected one for co-simulation, or of FMI 2.0 or "
-            "3.0. Export it again.",
-            fault=FmuFault.VERSION,
-            subject=version,
-        )
     if interface is None:
         raise FmuFileError(
             f"{str(path)!r} has neither a co-simulation nor a model-exchange interface; export it with one of them.",
@@ -305,6 +298,7 @@ def _capabilities(root: Any, version: str) -> dict[str, Any]:
     steps, exchange = root.find("CoSimulation"), root.find("ModelExchange")
     if version == "1.0":
         steps = root.find("Implementation//Capabilities")
+        exchange = root if root.find("Implementation/*") is None else None  # such an FMU has one interface
     two = not version.startswith("3.")
     state = "FMUstate" if two else "FMUState"
     derivative = "providesDirectionalDerivative" if two else "providesDirectionalDerivatives"

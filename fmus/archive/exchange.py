@@ -84,8 +84,8 @@ def read_exchange(root: ET.Element, model: Any, binary: str) -> ExchangeInfo:
     binary : str
         The library for this platform.
     """
-    two = model.fmiVersion.startswith("2.")
-    given = root.find("ModelExchange")
+    two = not model.fmiVersion.startswith("3.")
+    given = root if model.fmiVersion.startswith("1.") else root.find("ModelExchange")
     assert given is not None
     state = "FMUstate" if two else "FMUState"
     derivative = "providesDirectionalDerivative" if two else "providesDirectionalDerivatives"
@@ -105,11 +105,28 @@ def read_exchange(root: ET.Element, model: Any, binary: str) -> ExchangeInfo:
         state_count=int(model.numberOfContinuousStates),
         indicators=_indicators(model),
         time=next((_key(v) for v in model.modelVariables if v.causality == "independent"), None),
-        dependencies={
-            _key(unknown.variable): None if unknown.dependencies is None else frozenset(map(_key, unknown.dependencies))
-            for unknown in (*model.outputs, *model.derivatives)
-        },
+        dependencies=_read_dependencies(root, model),
     )
+
+
+def _read_dependencies(root: ET.Element, model: Any) -> dict[Key, frozenset[Key] | None]:
+    """Return what outputs and derivatives depend on; in FMI 1.0 outputs name the inputs that they follow."""
+    if model.fmiVersion.startswith("1."):
+        known = {v.name: v for v in model.modelVariables}
+        given = {
+            element.get("name"): [name.text for name in found.findall("Name")]
+            for element in root.findall("ModelVariables/ScalarVariable")
+            if (found := element.find("DirectDependency")) is not None
+        }
+        return {
+            _key(known[name]): frozenset(_key(known[of]) for of in names if of in known)
+            for name, names in given.items()
+            if name in known
+        }
+    return {
+        _key(unknown.variable): None if unknown.dependencies is None else frozenset(map(_key, unknown.dependencies))
+        for unknown in (*model.outputs, *model.derivatives)
+    }
 
 
 def _key(variable: Any) -> Key:

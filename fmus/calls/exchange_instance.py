@@ -86,7 +86,7 @@ class ExchangeInstance(EvaluatedExchange):
             self._check_limits(self._fill(self._u, self._began), self._began)
         self.begin()
         self._time.value = self._began
-        x = self._iterate(self._began)
+        x = self._iterate(self._began, self._events.first())
         self.nominals = self._read_nominals()
         for text in self.call("reading its texts", self._texts.go_back, self._began):
             self.add_note(text)
@@ -159,7 +159,9 @@ class ExchangeInstance(EvaluatedExchange):
         if self._event is None:
             calls = self._events
             sets = [((group.function, group.arguments), "setting the inputs") for group in inputs.groups]
-            more = [(calls.enter, "entering Event Mode"), *sets, (calls.update, "the event iteration")]
+            more = [*sets, (calls.update, "the event iteration")]
+            if calls.enter is not None:
+                more.insert(0, (calls.enter, "entering Event Mode"))
             self._event = self._bind((), False, bool(self.about.indicators), tuple(more))
         self._u, self._discarded = u.copy(), ""
         self._run(self._event, t, x, u)
@@ -214,7 +216,7 @@ class ExchangeInstance(EvaluatedExchange):
             )
         assert made is not None
         self.next_time = check_next_time(self.block, made.next_time, t)
-        x = self._get("get_states", calls.leave)
+        x = self._get("get_states", *([] if calls.leave is None else [calls.leave]))
         if nominals:
             self.nominals = self._read_nominals()
         self._note_texts(t)

@@ -1,4 +1,4 @@
-"""Calls of FMI 1.0 for co-simulation."""
+"""Calls of FMI 1.0, for co-simulation and for model exchange."""
 
 from __future__ import annotations
 
@@ -9,20 +9,27 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
-from ...blocks.core import FmuError
-from .fmi_calls import DISCARD, PENDING, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
+from .fmi_calls import DISCARD, PENDING, EventCalls, EventUpdate, FmiCalls, Log, StepCall, TypeCalls
 from .printf import Logger, format_message
 
 _LONGEST_WAIT = 0.01  # s between two looks at a step that is pending
 _STEP_STATUS, _LAST_SUCCESSFUL_TIME, _TERMINATED = 0, 2, 3  # fmiStatusKind
 _REQUIRED = ("GetVersion", "InstantiateSlave", "InitializeSlave", "FreeSlaveInstance", "DoStep")
+_REQUIRED_OF_MODELS = (
+    *("GetVersion", "InstantiateModel", "Initialize", "FreeModelInstance", "SetTime", "EventUpdate"),
+    *("GetDerivatives", "GetContinuousStates", "SetContinuousStates"),
+)
+_NO_STATUS = {
+    *("GetVersion", "GetTypesPlatform", "GetModelTypesPlatform", "InstantiateSlave", "FreeSlaveInstance"),
+    *("InstantiateModel", "FreeModelInstance"),
+}
 
 
 class Fmi1Calls(FmiCalls):
-    """Functions of a library of FMI 1.0 for co-simulation; clauses are those of its document for co-simulation.
+    """Functions of a library of FMI 1.0; clauses are those of its document for co-simulation.
 
-    It has no Initialization Mode: entering it initializes the FMU, and leaving it does nothing. Names of the library's
-    functions begin with the model identifier.
+    It has no modes: entering Initialization Mode initializes the FMU, and leaving it does nothing; the same functions
+    set inputs at events and between them. Names of the library's functions begin with the model identifier.
     """
 
     prefix = "fmi1"
@@ -32,16 +39,24 @@ class Fmi1Calls(FmiCalls):
         "Boolean": TypeCalls("Boolean", ctypes.c_bool),
         "Enumeration": TypeCalls("Integer", ctypes.c_int32),
     }
-    exchange_names: ClassVar = {}
+    exchange_names: ClassVar = {
+        "set_time": "SetTime",
+        "set_states": "SetContinuousStates",
+        "get_states": "GetContinuousStates",
+        "derivatives": "GetDerivatives",
+        "indicators": "GetEventIndicators",
+        "nominals": "GetNominalContinuousStates",
+    }
+    _initialized: EventUpdate | None = None
 
     def __init__(self, *, name: str, token: str, folder: Path, library: Path, model_exchange: bool):
-        from fmpy.fmi1 import FMU1Slave
+        from fmpy.fmi1 import FMU1Model, FMU1Slave
 
-        if model_exchange:
-            raise FmuError("model exchange of FMI 1.0 is not supported. Export it for co-simulation, or with FMI 2.0.")
+        self._is_model = model_exchange
+        self.freeing = "FreeModelInstance" if model_exchange else "FreeSlaveInstance"
         self.fmu = self._open(
-            FMU1Slave,
-            _REQUIRED,
+            FMU1Model if model_exchange else FMU1Slave,
+            _REQUIRED_OF_MODELS if model_exchange else _REQUIRED,
             guid=token,
             modelIdentifier=library.stem,
             unzipDirectory=str(folder),
@@ -49,9 +64,7 @@ class Fmi1Calls(FmiCalls):
             libraryPath=str(library),
         )
         for kind, function in self.fmu._functions.items():  # FMPy takes the statuses of some for texts
-            if not any(
-                kind.endswith(end) for end in ("GetVersion", "Platform", "InstantiateSlave", "FreeSlaveInstance")
-            ):
+            if kind.removeprefix("fmi1") not in _NO_STATUS:
                 function.restype = ctypes.c_int
 
     def instantiate(self, log: Log) -> None:
@@ -76,14 +89,21 @@ class Fmi1Calls(FmiCalls):
         callbacks.stepFinished = None
         self.fmu.instantiate(functions=callbacks, loggingOn=True)
         if not self.fmu.component:
-            raise RuntimeError("fmiInstantiateSlave returned nothing")
+            raise RuntimeError(f"fmiInstantiate{'Model' if self._is_model else 'Slave'} returned nothing")
 
     def set_up(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
         """Do nothing: `enter_initialization_mode` takes the times, and tolerances are not told."""
 
     def enter_initialization_mode(self, start_time: float, stop_time: float | None, tolerance: float | None) -> None:
-        """Initialize the FMU (3.3)."""
-        self.fmu.initialize(start_time, stop_time)
+        """Initialize the FMU (3.3); one for model exchange with the start values of its inputs."""
+        if not self._is_model:
+            self.fmu.initialize(start_time, stop_time)
+            return
+        self.fmu.setTime(start_time)
+        converged, names, _, terminate, defined, t = self.fmu.initialize(
+            b"\0" if tolerance is None else b"\1", tolerance or 0.0
+        )
+        self._initialized = EventUpdate(not converged, terminate, names, True, t if defined else math.inf)
 
     def exit_initialization_mode(self) -> None:
         """Do nothing: the FMU is ready to be stepped."""
@@ -174,6 +194,32 @@ class Fmi1Calls(FmiCalls):
     def update_discrete_states(self) -> bool:
         """Refuse: FMI 1.0 has no Event Mode in co-simulation."""
         raise NotImplementedError("FMI 1.0 has no Event Mode in co-simulation")
+
+    def event_calls(self) -> EventCalls:
+        """Return the functions of events in model exchange, with memory of their own."""
+        from fmpy.fmi1 import fmi1EventInfo
+
+        info, wanted, final = self.variable(fmi1EventInfo), self.variable(ctypes.c_uint8), self.variable(ctypes.c_int)
+        instance = self.instance_argument
+
+        def updated() -> EventUpdate:
+            def flag(name: str) -> bool:
+                return bool(getattr(info, name) != b"\0")
+
+            t = info.nextEventTime if flag("upcomingTimeEvent") else math.inf
+            names, states = flag("stateValueReferencesChanged"), flag("stateValuesChanged")
+            return EventUpdate(not flag("iterationConverged"), flag("terminateSimulation"), names, states, t)
+
+        return EventCalls(
+            None,
+            (self._function("fmi1EventUpdate"), (instance, ctypes.c_bool(False), ctypes.byref(info))),
+            None,
+            (self._function("fmi1CompletedIntegratorStep"), (instance, ctypes.byref(wanted))),
+            final,
+            updated,
+            lambda: (bool(wanted.value), False),
+            lambda: self._initialized,
+        )
 
     def update_events(self) -> EventUpdate:
         """Refuse: FMI 1.0 has no Event Mode in co-simulation."""

@@ -36,9 +36,9 @@ class TypeCalls:
 class EventCalls:
     """Functions of events in model exchange with their arguments, to be bound, and what they have said."""
 
-    enter: Call
+    enter: Call | None  # None without modes, as in FMI 1.0
     update: Call
-    leave: Call
+    leave: Call | None
     complete: Call
     """It tells a step of the solver that was accepted."""
     final: Any
@@ -47,6 +47,7 @@ class EventCalls:
     """Answer of the last ``update``."""
     completed: Callable[[], tuple[bool, bool]]
     """Answer of the last ``complete``: whether Event Mode is wanted, and the end of the run."""
+    first: Callable[[], EventUpdate | None] = lambda: None  # answer of the initialization, in FMI 1.0
 
 
 @dataclass
@@ -86,11 +87,11 @@ class FmiCalls(ABC):
         FMPy's object for the library.
     """
 
-    prefix: ClassVar[str]
-    """Prefix of the names of functions and statuses: ``fmi2`` or ``fmi3``."""
+    prefix: ClassVar[str]  # of the names of functions and statuses: ``fmi2``, say
     types: ClassVar[dict[str, TypeCalls]]
     """Functions by type, as FMI 3.0 names types."""
     fmu: Any
+    freeing = "FreeInstance"  # end of the name of the function that frees an instance
     patience: float = 60.0
     """Longest time in s for which a step may be pending."""
 
@@ -164,8 +165,7 @@ class FmiCalls(ABC):
         """
         if running:
             self.terminate()
-        free = {"fmi1": "fmi1FreeSlaveInstance"}.get(self.prefix, f"{self.prefix}FreeInstance")
-        getattr(self.fmu, free)(self.fmu.component)
+        getattr(self.fmu, f"{self.prefix}{self.freeing}")(self.fmu.component)
         self.instantiate(log)
 
     def terminate(self) -> None:

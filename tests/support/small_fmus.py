@@ -67,11 +67,11 @@ def values(prefix, verb, suffix, type_, cases):
     return GET.format(prefix=prefix, verb=verb, suffix=suffix, type=type_, cases=text, const=const, size=size)
 
 
-def small_fmu(folder, prefix, source, description, *, name="small"):
+def small_fmu(folder, prefix, source, description, *, name="small", states=0, indicators=0):
     """Build an FMU into a folder, and return its path.
 
     ``source`` begins with the definition of ``instance``; ``description`` is the content of ``fmiModelDescription``
-    after its attributes.
+    after its attributes. ``states`` and ``indicators`` are their numbers in FMI 1.0, where attributes state them.
     """
     more = "".join(
         f"{text.replace('NAME', prefix + end).replace('VERSION', _VERSIONS[prefix])}\n"
@@ -85,7 +85,8 @@ def small_fmu(folder, prefix, source, description, *, name="small"):
     if not library.exists():
         compile_shared({"small.c": text}, library)
     token = "instantiationToken" if prefix == "fmi3" else "guid"
-    more = f' modelIdentifier="{name}" numberOfContinuousStates="0" numberOfEventIndicators="0"' * (prefix == "fmi1")
+    more = f' modelIdentifier="{name}" numberOfContinuousStates="{states}" numberOfEventIndicators="{indicators}"'
+    more *= prefix == "fmi1"
     xml = (
         f'<?xml version="1.0" encoding="UTF-8"?>\n<fmiModelDescription fmiVersion="{_VERSIONS[prefix]}" '
         f'modelName="{name}" {token}="x"{more}>{description}</fmiModelDescription>'

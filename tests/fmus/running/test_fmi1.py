@@ -1,11 +1,9 @@
 """FMUs of FMI 1.0 for co-simulation, in this process and in one of their own."""
 
-import re
-
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, FmuFileError, FmuRuntimeError, Sine
+from loopwright.blocks import Constant, FmuRuntimeError, Sine
 from loopwright.diagrams import Diagram
 from loopwright.fmus import Fmu, StepOptions
 from support.small_fmus import small_fmu, values
@@ -100,9 +98,3 @@ def test_its_failures_are_told(file):
         diagram.simulate(0.5, step=0.1, progress=False)
     with pytest.raises(ValueError, match="found 10"):
         Fmu(file, start={"gain": 10.0})
-
-
-def test_model_exchange_of_this_version_is_refused(cache, tmp_path):
-    model = re.sub("<Implementation>.*</Implementation>", "", MODEL, flags=re.DOTALL)
-    with pytest.raises(FmuFileError, match=r"is an FMU of FMI 1\.0 for model exchange; expected one for co-simulation"):
-        Fmu(small_fmu(tmp_path, "fmi1", SOURCE, model))
