@@ -58,7 +58,7 @@ class VariedDiagram(SimulatedDiagram):
         seed : int
             Seed of the sweep; each sample has one of its own, which depends on this one and its place alone.
         seeds : list of str
-            Parameters that take the sample's seed, such as ``"noise.seed"``.
+            Parameters that take the sample's seed, such as ``"noise.seed"``; these runs are interpreted by default.
         signals : list of str
             Signals whose samples are kept.
         reduce : mapping of str to callable, optional
@@ -75,7 +75,7 @@ class VariedDiagram(SimulatedDiagram):
         progress : bool, optional
             Show a progress bar; see `simulate`.
         **options
-            Options of each run, as for `simulate`; ``compile=True`` is the default.
+            Options of each run, as for `simulate`; ``compile=True`` is the default, but with ``seeds``.
 
         Returns
         -------

@@ -19,7 +19,7 @@ from ..wiring import Checked, Structure
 from . import functions
 from .block_functions import BlockFunctions
 from .clocks import TickPattern
-from .layout import FlatEvent, FlatLayout, sample_time_of
+from .layout import FlatLayout, sample_time_of
 from .program import TickProgram
 from .stages import Schedule
 from .total_derivative import Derivative
@@ -67,14 +67,12 @@ class FlatDiagram(FlatLayout):
         """Return the same diagram with some blocks evaluated from outside, in stages of their own."""
         return replace(self, apart=frozenset(paths) | frozenset(self.outside))
 
-    def with_numbers(
-        self, table: Structure, p: np.ndarray, x0: np.ndarray, events: tuple[FlatEvent, ...]
-    ) -> FlatDiagram:
+    def with_numbers(self, table: Structure, p: np.ndarray, x0: np.ndarray) -> FlatDiagram:
         """Return a diagram with other blocks, parameters and start values, which shares the functions of this one."""
         found = copy.copy(self)
         for values in (p, x0):
             values.setflags(write=False)
-        found.__dict__.update(table=table, p=p, x0=x0, events=events, _origin=self.origin)
+        found.__dict__.update(table=table, p=p, x0=x0, _origin=self.origin)
         return found
 
     @property

@@ -139,7 +139,7 @@ def renumber(flat: FlatDiagram, blocks: Mapping[str, Block]) -> FlatDiagram:
         inputs = flat.checked.traced[path].inputs
         if values := [np.ravel(port.start_value(block, inputs)) for port in block.states.values()]:
             x0[flat.states.slices[path]] = np.concatenate(values)
-    return flat.with_numbers(table, p, x0, tuple(_events(table, flat.checked)) if flat.events else ())
+    return flat.with_numbers(table, p, x0)
 
 
 def _input_shape(table: Structure, checked: Checked, path: str, port: str) -> Shape:

@@ -138,7 +138,8 @@ def make_plan(
             block=name,
         )
     paths = [find_parameter(diagram, path) for path in ((seeds,) if isinstance(seeds, str) else seeds)]
-    plan = Plan(diagram, duration, {"compile": True, **options}, chosen, reductions, tuple(paths))
+    compiled = not paths  # a seed is a fixed number in the code, which would be compiled anew for every sample
+    plan = Plan(diagram, duration, {"compile": compiled, **options}, chosen, reductions, tuple(paths))
     flat = Simulation(diagram, plan.run_options, duration=duration).flat  # it checks the options
     for signal in [*chosen, *(f.signal for f in reductions.values() if isinstance(f, Reduction))]:
         resolve(signal, flat.table.names, flat.log.slices)

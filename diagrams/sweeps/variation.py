@@ -155,7 +155,7 @@ class Variation(Generic[D]):
     def _is_numbers(self, path: str, block: Block) -> bool:
         """Whether a block differs from that of the diagram in numbers alone: its functions are those of that."""
         old, wires = self._diagram.scheduled.blocks[path], self._diagram.scheduled.wires
-        if block.opaque or structure(block) != self._structure(path, old) or [*block.events] != [*old.events]:
+        if block.opaque or structure(block) != self._structure(path, old):
             return False
         free = [port for port in old.inputs if (path, port) not in wires]
         return all(identity(block.inputs[q].default) == identity(old.inputs[q].default) for q in free)

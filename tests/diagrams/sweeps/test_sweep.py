@@ -172,9 +172,9 @@ def test_a_worker_binds_a_diagram_once_for_parameters_that_are_numbers(monkeypat
 
     monkeypatch.setattr(plan, "BoundRun", Counted)
     monkeypatch.setattr(plan, "simulate", lambda *_, **__: pytest.fail("a run of its own"))
-    found = many_rates().sweep({"start.factor": np.linspace(1.0, 2.0, 9)}, 0.1, signals="g", workers=1, **QUIET)
+    found = many_rates().sweep({"start.factor": np.linspace(1.0, 2.0, 9)}, 0.1, signals="start.y", workers=1, **QUIET)
     assert len(made) == 1
-    assert not found.failures
+    np.testing.assert_array_equal(found["start.y"][:, 0], 0.25 * np.linspace(1.0, 2.0, 9))  # each has its own start
     zero = many_rates().sweep({"start.factor": (0.0, 1.0, 0.0)}, 0.1, signals="g", workers=1, **QUIET)  # 0 is structure
     assert len(made) == 3
     assert not zero.failures
@@ -343,7 +343,13 @@ def test_seeds_belong_to_samples_and_not_to_workers():
 
     noise = BandLimitedNoise(sample_time=T, name="noise")
     diagram = Diagram("noisy", box(noise.y).named("y"))
-    sweep = {"parameters": {"gain.gain": (1.0, 1.0, 2.0)}, "duration": 0.2, "signals": "y", "seeds": "noise.seed"}
+    sweep = {
+        "parameters": {"gain.gain": (1.0, 1.0, 2.0)},
+        "duration": 0.2,
+        "signals": "y",
+        "seeds": "noise.seed",
+        "compile": True,
+    }
     one = diagram.sweep(**sweep, workers=1, **QUIET)
     two = diagram.sweep(**sweep, workers=2, **QUIET)
     other = diagram.sweep(**sweep, workers=1, seed=1, **QUIET)
@@ -352,6 +358,20 @@ def test_seeds_belong_to_samples_and_not_to_workers():
     assert not np.array_equal(one["y"][0], one["y"][1])  # the parameters are equal, the seeds are not
     longer = diagram.sweep(**{**sweep, "parameters": {"gain.gain": (1.0, 1.0, 2.0, 3.0)}}, workers=1, **QUIET)
     assert longer["y"][:3].tobytes() == one["y"].tobytes()
+
+
+def test_a_sweep_with_seeds_compiles_nothing_by_default(monkeypatch):
+    from loopwright.diagrams.compiled import code
+
+    @subsystem(sample_time=T, name="box")
+    def box(u):
+        return Gain(gain=0.731, name="gain")(u)
+
+    monkeypatch.setattr(code, "load_compiled", lambda *_: pytest.fail("it compiles"))
+    diagram = Diagram("noisy", box(BandLimitedNoise(sample_time=T, name="noise").y).named("y"))
+    found = diagram.sweep({"gain.gain": (1.0, 1.0)}, 0.1, seeds="noise.seed", signals="y", workers=1, **QUIET)
+    assert not found.failures
+    assert not np.array_equal(found["y"][0], found["y"][1])
 
 
 @pytest.mark.parametrize(
