@@ -10,6 +10,7 @@ from typing import Any
 
 from ...blocks.core import SimulationError
 from ...fmus.calls import FmuInstance
+from ..coupling import note_fine_steps, note_loops
 from ..flat import EVERY, FlatDiagram, renumber
 from ..results import Recorder, Recording, Run
 from ..simulation import Engine, RunOptions, SimulatedDiagram, default_step, refuse_rest, ticks_in
@@ -52,6 +53,9 @@ class BoundRun:
         self._engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=lambda event: None)
         rows = self._count + 2 if self._engine.every_tick else None
         self._recorder: Recorder = self._recording.begin(rows)
+        fine = note_fine_steps(self.flat) if base is None else ()
+        self._notes: tuple[str, ...] = (*fine, *note_loops(self.flat, self._engine.coupling))
+        self._told: dict[str, int] = {}
         self._start = StartValues(self._engine.workspace)
         self._stack = ExitStack()
 
@@ -59,7 +63,9 @@ class BoundRun:
         with LOADING:
             try:
                 self._engine.load(self._stack, 0.0)
+                self._notes += tuple(self._take_messages())
                 self._engine.initialize()
+                self._take_messages()  # of numbers that are no sample's
             except BaseException:
                 self._stack.close()
                 raise
@@ -83,11 +89,6 @@ class BoundRun:
     def is_broken(self) -> bool:
         """Whether an FMU of it has failed for good, so that it can't be reset."""
         return any(isinstance(p, FmuInstance) and p.fatal for p in self._engine.plants.values())
-
-    @property
-    def messages(self) -> tuple[str, ...]:
-        """Messages about all of its runs."""
-        return self._engine.messages
 
     def run(self, numbers: Numbers[Any], tell: Tell) -> Run:
         """Run with the numbers of a sample.
@@ -139,9 +140,18 @@ class BoundRun:
             units=self._recording.units,
             diagram=None,
             elapsed=perf_counter() - started,
-            messages=(*engine.messages, *engine.workspace.messages),
+            messages=(*self._notes, *engine.messages, *engine.workspace.messages, *self._take_messages()),
             stopped=engine.position.stopped,
             columns=recorder.columns,
             has_states=self._recording.states,
             diagram_name=self._name,
         )
+
+    def _take_messages(self) -> list[str]:
+        """Return what the FMUs have told since the last run."""
+        found: list[str] = []
+        for path, plant in self._engine.plants.items():
+            texts = plant.messages
+            found += texts[self._told.get(path, 0) :]
+            self._told[path] = len(texts)
+        return found

@@ -49,6 +49,11 @@ class StepFailures(LoadedFmu):
         """Length of the step in s, as the argument of the FMU's function."""
         return self._width
 
+    def reset(self) -> None:
+        """Return to the state before the initialization; see `LoadedFmu.reset`."""
+        super().reset()
+        self.ends_run, self.refused = False, None
+
     def set_span(self, t: float, h: float) -> None:
         """Set start and length of the next step in s."""
         self._now.value, self._width.value = t, h

@@ -425,3 +425,40 @@ def test_an_experiment_is_swept_to_its_end():
     np.testing.assert_allclose(found.t, [0.0, 0.01, 0.02, 0.03, 0.04, 0.05])
     with pytest.raises(OptionError, match=r"C.tool_mass: it is no option of a run. Give it to the experiment"):
         experiment.sweep({"plant.coulomb_scale": (1.0, 2.0)}, signals="xi", tool_mass=1.0)
+
+
+def test_messages_of_runs_are_told_once(monkeypatch):
+    from loopwright.fmus.calls.loaded_library import LoadedFmu
+
+    begin = LoadedFmu.begin
+
+    def warn(self):
+        self.add_note(f"stiffness {self._given['coulomb_scale']:g} is odd")
+        begin(self)
+
+    monkeypatch.setattr(LoadedFmu, "begin", warn)
+    diagram = experiments.hand_guiding().diagram
+    found = diagram.sweep({"plant.coulomb_scale": (2.0, 3.0, 2.0)}, 0.01, signals="xi", workers=1, **QUIET)
+    told = [message for message in found.messages if message.endswith("is odd")]
+    single = diagram.replace({"plant.start.coulomb_scale": 3.0}).simulate(0.01, **QUIET)
+    assert found.outcomes[1].messages[-1] == single.messages[-1]
+    assert [message.rpartition("stiffness ")[2] for message in told] == ["2 is odd", "3 is odd"]
+
+
+def test_an_fmu_that_has_asked_for_the_end_is_asked_anew_in_the_next_run(monkeypatch):
+    from loopwright.diagrams.sweeps.bound_run import BoundRun
+
+    run, seen = BoundRun.run, []
+
+    def spy(self, numbers, tell):
+        made = run(self, numbers, tell)
+        seen.append(made.t[-1])
+        self._engine.plants["plant"].ends_run = True  # as its flag leaves it
+        return made
+
+    monkeypatch.setattr(BoundRun, "run", spy)
+    diagram = experiments.hand_guiding().diagram
+    found = diagram.sweep({"plant.coulomb_scale": (1.0, 1.5)}, 0.01, signals="xi", workers=1, **QUIET)
+    assert seen == [0.01, 0.01]
+    assert not found.failures
+    assert found.outcomes[1].stopped == ""
