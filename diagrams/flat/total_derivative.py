@@ -138,13 +138,20 @@ class Derivative:
         evaluators : mapping, optional
             As of a call.
         """
-        schedule, values = self.schedule, self(*arguments, evaluators=evaluators)
+        schedule = self.schedule
         if not schedule.opaque:
-            function = self._functions[id(schedule.last)]
-            made = function.call([*arguments])
-            slopes = [np.array(v) for v in self._forward.call([*arguments, *made, *direction])]
-            slopes = slopes[len(slopes) - len(values) :]
-            return values, [slope.reshape(v.shape) for slope, v in zip(slopes, values, strict=True)], 0.0
+            made = self._functions[id(schedule.last)].call([*arguments])
+            slopes = self._forward.call([*arguments, *made, *direction])
+            many = len(schedule.results)
+            skipped, count = (0, many) if self.values else (many, 0)
+            values = [np.array(v).reshape(v.shape) for v in made[skipped:]]
+            along = [np.array(v).reshape(v.shape) for v in slopes[skipped:]]
+            return (
+                [*map(np.ravel, values[:count]), *values[count:]],
+                [*map(np.ravel, along[:count]), *along[count:]],
+                0.0,
+            )
+        values = self(*arguments, evaluators=evaluators)
         sizes = [np.abs(d) / (1.0 + np.abs(a)) for a, d in zip(arguments, direction, strict=True)]
         size = max(float(np.max(s, initial=0.0)) for s in sizes)
         if size == 0.0:

@@ -31,6 +31,8 @@ KINK = 1e-6
 NEAR_POLE = 1e-13
 """Distance of a point from a pole, relative to its size and the pole's, at which L is infinite."""
 
+LOW = 1e-5
+"""Frequency that stands for 0, in parts of the slowest pole that is not 0."""
 PLACES = ("ms_frequency", "mt_frequency")
 """Numbers that tell where a peak lies; they have no slopes here."""
 
@@ -123,14 +125,21 @@ class _Response:
 
     def at(self, omega: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Return L, dL/dω and dL along each change; None at a pole of L."""
-        A, B, C, D = self.matrices
+        A, *_, D = self.matrices
         if np.isinf(omega):
             return D + 0j, np.zeros_like(D, dtype=complex), np.array([d + 0j for *_, d in self.changes])
         n, T = len(A), self.dt
+        if n and not omega > 0:
+            M = -(A - np.eye(n) if T else A)
+            if np.linalg.svd(M, compute_uv=False)[-1] <= NEAR_POLE * self._size:
+                return None
+        return self._value(omega)
+
+    def _value(self, omega: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        A, B, C, D = self.matrices
+        n, T = len(A), self.dt
         p, rate = (np.expm1(1j * omega * T), 1j * T * np.exp(1j * omega * T)) if T else (1j * omega, 1j)
         M = p * np.eye(n) - (A - np.eye(n) if T else A)
-        if n and np.linalg.svd(M, compute_uv=False)[-1] <= NEAR_POLE * (abs(p) + self._size) and not omega > 0:
-            return None
         x = np.linalg.solve(M, B)
         left = np.linalg.solve(M.T, C.T).T
         L, by_omega = D + C @ x, -rate * (left @ x)
@@ -140,6 +149,12 @@ class _Response:
             by_omega = shift * (by_omega - 1j * T * self.delay * L)
             L, along = shift * L, shift * along
         return L, by_omega, along.reshape(len(self.changes), *D.shape)
+
+    def _find_low_frequency(self) -> float:
+        """Return a frequency far below all poles that are not 0."""
+        poles = np.linalg.eigvals(self.matrices[0] - (np.eye(len(self.matrices[0])) if self.dt else 0.0))
+        sizes = np.abs(poles) / (self.dt or 1.0)
+        return LOW * float(np.min(sizes[sizes > 1e-6 * np.max(sizes)], initial=np.max(sizes)) or 1.0)
 
     def sensitivity(self, omega: float) -> tuple[np.ndarray, np.ndarray]:
         """Return S = (I + L)⁻¹ and its derivatives along the changes; both are finite at a pole of L, too."""
@@ -151,6 +166,12 @@ class _Response:
         direct = np.linalg.inv(np.eye(len(D)) + D)
         p = np.expm1(1j * omega * self.dt) if self.dt else 1j * omega
         M = p * np.eye(len(A)) - (A - np.eye(len(A)) if self.dt else A) + B @ direct @ C
+        values = np.linalg.svd(M, compute_uv=False)
+        if len(M) and values[-1] <= NEAR_POLE * (values[0] + self._size):  # a pole at 0 that the loop doesn't move
+            low = self._find_low_frequency()
+            L, _, changes = self._value(low)
+            S = np.linalg.inv(np.eye(len(D)) + L)
+            return S, -S @ changes @ S
         x, left = np.linalg.solve(M, B @ direct), np.linalg.solve(M.T, (direct @ C).T).T
         S = direct - direct @ C @ x
         along = [S @ c @ x + left @ a @ x + left @ b @ S + S @ d @ S for a, b, c, d in self.changes]

@@ -17,7 +17,7 @@ from .kinks import find_kinks_between
 from .linear_model import Linearization, linearize, linearize_batch
 from .loops_over_a_period import ticks_between_renewals, ticks_to_renewal
 from .operating_points import PointLike, capture, check_options, copy_point, operating_point, run_to
-from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop
+from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop, loop_of_variant
 from .plant_equations import PlantEquations, linearize_plant, moves_between_ticks
 from .trim_search import point_from_states, trim
 
@@ -47,6 +47,7 @@ __all__ = [
     "linearize",
     "linearize_batch",
     "linearize_plant",
+    "loop_of_variant",
     "moves_between_ticks",
     "operating_point",
     "point_from_states",

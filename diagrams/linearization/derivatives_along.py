@@ -23,6 +23,8 @@ from .plant_models import PlantModel, model_equations, model_step
 
 STEP = 2.0**-9
 """Step of a difference of fourth order between models of an FMU, relative to 1 + the size of what moves."""
+ROUNDING = 1e-13
+"""Change of an FMU's states and inputs by a change of the parameter as large as itself that is rounding alone."""
 STILL = 1e3 * EQUILIBRIUM
 """Largest slope of an FMU's rates at which it stays at rest."""
 
@@ -44,6 +46,8 @@ class DerivativesAlong(LocalDerivatives):
     ----------
     direction : ndarray
         Direction of the diagram's vector of parameters p.
+    scale : float
+        Size of the parameter.
     error : float
         Largest estimated error of a slope that is made of differences; 0 if all are exact.
     """
@@ -51,7 +55,8 @@ class DerivativesAlong(LocalDerivatives):
     def __init__(self, flat: FlatDiagram, *taps: Any):
         super().__init__(flat, *taps)
         self.direction = np.zeros(flat.p.size)
-        self.error = 0.0
+        self.scale, self.error = 1.0, 0.0
+        self._plants: dict[tuple[Any, ...], PlantModel] = {}
         self._closed_slopes: dict[frozenset[TickPattern], Derivative] = {}
 
     def _trace_closed_slopes(self, acting: frozenset[TickPattern]) -> Derivative:
@@ -104,7 +109,7 @@ class DerivativesAlong(LocalDerivatives):
 
     def model_step(self, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None) -> PlantModel:
         """Return the linear model of one communication step of an FMU, with its slopes."""
-        middle = model_step(self.flat, _without_slopes(at), path, np.real(z), h, way)
+        middle = self._model_step_once(at, path, np.real(z), h, way)
 
         def follow(way: str) -> PlantModel:
             def model(point: OperatingPoint, inputs: np.ndarray) -> PlantModel:
@@ -117,6 +122,17 @@ class DerivativesAlong(LocalDerivatives):
         made = follow("equations")
         moves = np.max(np.abs(slope_of(made.f - made.x0)), initial=0.0) > STILL
         return follow("step") if moves else made
+
+    def _model_step_once(self, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None) -> PlantModel:
+        """Return the linear model of a step without slopes; one that is known from another direction is taken."""
+        still = _without_slopes(at)
+        point = still.plants[path]
+        numbers = [np.ravel(v) for kind in ("state", "inputs") for v in point[kind].values()]
+        kept = tuple(v.tobytes() if v.dtype.kind != "O" else tuple(v) for v in numbers)
+        key = (path, h, way, point["t"], z.tobytes(), still.w.tobytes(), kept)
+        if key not in self._plants:
+            self._plants[key] = model_step(self.flat, still, path, z, h, way)
+        return self._plants[key]
 
     def model_equations(self, at: OperatingPoint, way: str | None) -> list[PlantModel]:
         """Return the linear models of the equations of all FMUs, with their slopes."""
@@ -144,7 +160,7 @@ class DerivativesAlong(LocalDerivatives):
         moving.append(at.w[middle.outputs])
         sizes = [np.max(np.abs(slope_of(v)) / (1.0 + np.abs(v)), initial=0.0) for v in moving]
         size = float(max(sizes, default=0.0))
-        if size == 0.0:
+        if size * self.scale <= ROUNDING:
             return middle
 
         def shift(s: float) -> PlantModel:

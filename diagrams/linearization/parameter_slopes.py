@@ -9,24 +9,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ...blocks.core import ParameterError, elements
+from ...blocks.core import LoopwrightError, ParameterError, elements
 from ..flat import NONE, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
 from .checks import replace_stairs
-from .derivatives import find_signal
+from .derivatives import LocalDerivatives, find_signal
 from .derivatives_along import DerivativesAlong, join_slope, slope_of
 from .exchanged import evaluators_at
-from .flow_model import Four, model_continuous
-from .linear_model import Linearization, linearize
+from .flow_model import EQUILIBRIUM, Four, Model, model_continuous
+from .linear_model import Linearization
 from .loops_over_a_period import advance_point, find_slower_clocks, model_loop, ticks_to_renewal
 from .over_a_period import Chain, model_period, period_of
 from .plant_models import join_matrices, plant_layout
 from .trim_request import Free, difference, free_parameters, locate, read_value, spread_nodes
+
+if TYPE_CHECKING:
+    from control import StateSpace
 
 STEP = 2.0**-8
 """Step of a difference of fourth order between models or points, relative to the parameter's size."""
@@ -75,6 +78,7 @@ def differentiate_loop(
     *,
     find: PointFinder | None = None,
     slow: Literal["closed", "open"] = "closed",
+    left_out: dict[str, str] | None = None,
 ) -> list[LoopSlope]:
     """Return the derivatives of a loop's matrices by parameters, one result for each of their numbers.
 
@@ -92,6 +96,9 @@ def differentiate_loop(
     slow : {"closed", "open"}
         As of `Linearization.loop`.
 
+    left_out : dict, optional
+        Takes the messages of parameters that have no derivative, by their paths; without it they are errors.
+
     Raises
     ------
     UnknownNameError, ParameterError
@@ -100,10 +107,68 @@ def differentiate_loop(
     cut = _Cut(model, tuple(wires), slow)
     found = []
     for name in dict.fromkeys(parameters):
-        (free,), diagram = free_parameters(model.diagram, {name: None})
-        kind = _StartValues if free.where is None else _Traced
-        found += kind(cut, free, diagram, find).slopes()
+        try:
+            (free,), diagram = free_parameters(model.diagram, {name: None})
+            kind = _StartValues if free.where is None else _Traced
+            found += kind(cut, free, diagram, find).slopes()
+        except LoopwrightError as error:
+            if left_out is None:
+                raise
+            left_out[name] = error.message
     return found
+
+
+def loop_of_variant(
+    model: Linearization,
+    wires: Iterable[str],
+    diagram: WiredDiagram,
+    at: OperatingPoint,
+    *,
+    slow: Literal["closed", "open"] = "closed",
+) -> tuple[StateSpace, bool]:
+    """Return L of a changed diagram at a point, and whether it rests there.
+
+    It is made as by `Linearization.loop`, with the options of a linear model, but not compared with the diagram's
+    poles, and without findings: one of many that are compared with one that is.
+    """
+    from control import StateSpace as System
+
+    diagram = diagram.replace(at.parameters) if at.parameters else diagram
+    flat = diagram.flatten_like(at)
+    at.check_fits(flat, diagram.name)
+    taps = [find_signal(flat, w) for w in wires]
+    outside, means = evaluators_at(flat, at), replace_stairs(diagram, flat, at, model.stairs)
+    local, closed = (LocalDerivatives(flat, t, t, t, outside, means) for t in (taps, []))
+    made = _model_at(model, flat, diagram, at, local, closed, slow)
+    rests = bool(np.max(np.abs(made.affine), initial=0.0) <= EQUILIBRIUM)
+    return System(*_loop_matrices(made), made.dt, remove_useless_states=False), rests
+
+
+def _loop_matrices(made: Model) -> Four:
+    A, B, C, D = made.matrices
+    n, m = len(A), len(D)
+    return A, B.reshape(n, m), -C.reshape(m, n), -D
+
+
+def _model_at(
+    model: Linearization,
+    flat: FlatDiagram,
+    diagram: WiredDiagram,
+    at: OperatingPoint,
+    local: LocalDerivatives,
+    closed: LocalDerivatives,
+    slow: Literal["closed", "open"],
+) -> Model:
+    """Return the model of a cut loop; ``closed`` are the derivatives with nothing cut."""
+    if not model.dt:
+        return model_continuous(diagram, flat, local, at, model.plants)
+    ports, frozen = [tap.port for tap in local.inputs], NONE
+    if slow == "open":
+        frozen = find_slower_clocks(flat, ports, diagram.name)
+    if period_of(flat) == 1:
+        return model_period(flat, local, at, model.plants, frozen)
+    at = advance_point(flat, at, model.plants, ticks_to_renewal(flat, ports, at.tick), closed)
+    return model_loop(flat, local, at, model.plants, lifted=False, frozen=frozen)[0]
 
 
 class _Cut:
@@ -126,25 +191,9 @@ class _Cut:
 
     def loop(self, flat: FlatDiagram, diagram: WiredDiagram, at: OperatingPoint, direction: np.ndarray) -> Four:
         """Return A, B, C, D of L with slopes along a direction of the parameters, at a point with slopes."""
-        model = self.model
         local, closed = self.derivatives(flat, diagram)
         local.direction = closed.direction = direction
-        ports, frozen = [tap.port for tap in local.inputs], NONE
-        if model.dt:
-            if self.slow == "open":
-                frozen = find_slower_clocks(flat, ports, diagram.name)
-            many = period_of(flat) > 1
-            if many:
-                shift = ticks_to_renewal(flat, ports, at.tick)
-                at = advance_point(flat, at, model.plants, shift, closed)
-            if many:
-                made, _ = model_loop(flat, local, at, model.plants, lifted=False, frozen=frozen)
-            else:
-                made = model_period(flat, local, at, model.plants, frozen)
-        else:
-            made = model_continuous(diagram, flat, local, at, model.plants)
-        A, B, C, D = made.matrices
-        return A, B, -C, -D
+        return _loop_matrices(_model_at(self.model, flat, diagram, at, local, closed, self.slow))
 
     def rest(self, flat: FlatDiagram, diagram: WiredDiagram, direction: np.ndarray) -> OperatingPoint | None:
         """Return the point with the slopes of the equilibrium that follows a parameter; None if none follows.
@@ -284,10 +333,8 @@ class _StartValues:
 
     def _loop(self, diagram: WiredDiagram, at: OperatingPoint) -> tuple[Four, bool]:
         """Return A, B, C, D of the loop of a diagram, and whether its point is an equilibrium."""
-        model = self.cut.model
-        made = linearize(diagram, at, plants=model.plants, stairs=model.stairs, step=model.step)
-        L = made.loop(*self.cut.wires, slow=self.cut.slow)
-        return (L.A, L.B, L.C, L.D), made.is_equilibrium
+        L, rests = loop_of_variant(self.cut.model, self.cut.wires, diagram, at, slow=self.cut.slow)
+        return (L.A, L.B, L.C, L.D), rests
 
 
 class _Traced:
@@ -321,8 +368,9 @@ class _Traced:
         for i, name in enumerate(elements(free.name, self.shape)):
             direction = np.zeros(self.flat.p.size)
             direction[free.where] = packed[:, i]
-            at, own, lost = self._point(direction, i)
             local, closed = cut.derivatives(self.flat, self.diagram)
+            local.scale = closed.scale = abs(float(self.value[i])) or 1.0
+            at, own, lost = self._point(direction, i)
             local.error = closed.error = 0.0
             four = cut.loop(self.flat, self.diagram, at, direction)
             if not all(np.isfinite(np.concatenate([np.ravel(M) for M in four]))):

@@ -208,6 +208,10 @@ class Fig3Case(Case):
         """Return the virtual inputs."""
         return {side: f"controller.{name}" for side, name in SIDES.items()}
 
+    def sensitivity_wires(self) -> dict[str, str]:
+        """Return the virtual inputs, and both motor forces at once, whose margin is the weakest."""
+        return {**self.loop_wires(), "motor_force": "motor_force"}
+
     def extra_loops(self) -> tuple[str, ...]:
         """Return the loop at both motor forces."""
         return ("motor_force",)

@@ -25,6 +25,7 @@ from .section_limits import not_modelled
 from .section_loops import inner
 from .section_measured import measured_loops, read_measured
 from .section_poles import closed_loops, memory
+from .section_sensitivity import sensitivity
 from .section_steps import steps
 from .section_subject import operating_points, remarks, subject, versions
 from .section_summary import summary
@@ -36,12 +37,13 @@ CLOSED_LOOPS = ReportPart("poles", closed_loops)
 MEMORY = ReportPart("poles", memory)
 INNER_LOOPS = ReportPart("inner", inner)
 STEPS = ReportPart("steps", steps)
+SENSITIVITY = ReportPart("sensitivity", sensitivity)
 INJECTION = ReportPart("injection", injected)
 LIMITS = ReportPart("limits", not_modelled)
 
 ANY_DIAGRAM = ReportKind(
     Case,
-    (SUBJECT, REMARKS, OPERATING_POINTS, CLOSED_LOOPS, MEMORY, INNER_LOOPS, STEPS, INJECTION, LIMITS),
+    (SUBJECT, REMARKS, OPERATING_POINTS, CLOSED_LOOPS, MEMORY, INNER_LOOPS, STEPS, SENSITIVITY, INJECTION, LIMITS),
     DEFINITIONS,
 )
 """The report of a diagram of which nothing is known but its structure."""

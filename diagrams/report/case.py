@@ -132,6 +132,10 @@ class Case:
         """Return the wires at which loops are looked at, by their keys in the report."""
         return wires_on_loops(self.diagram, self.wires)
 
+    def sensitivity_wires(self) -> dict[str, str]:
+        """Return the wires whose loops' sensitivities to parameters are told, by their keys."""
+        return dict(self.loop_wires())
+
     def extra_loops(self) -> tuple[str, ...]:
         """Return the keys of loops that a part of its own adds to those at the wires."""
         return ()

@@ -5,6 +5,7 @@ from .contact_figures import contact_admittance, contact_map
 from .drawings import with_drawing
 from .loop_figures import bode, gang, nyquist, response, sensitivities
 from .measured_figures import Measured, injected, measured
+from .sensitivity_figures import sensitivity_bars
 from .step_figures import step_responses
 
 __all__ = [
@@ -19,6 +20,7 @@ __all__ = [
     "nyquist",
     "response",
     "sensitivities",
+    "sensitivity_bars",
     "set_powers",
     "step_responses",
     "with_drawing",

@@ -1,7 +1,7 @@
 """Studies of a design's margins over its parameters: sensitivities, worst cases."""
 
 from .cases import Case, CaseOrigin, CaseState, Goal
-from .confirmation import ConfirmationKind, RunConfirmation, confirm_sensitivity
+from .confirmation import ConfirmationKind, RunConfirmation, confirm_parameter, confirm_sensitivity
 from .sensitivity import Sensitivities, Sensitivity, find_sensitivities, sensitivities_of
 from .worst_case import WorstCase, find_worst_case
 
@@ -15,6 +15,7 @@ __all__ = [
     "Sensitivities",
     "Sensitivity",
     "WorstCase",
+    "confirm_parameter",
     "confirm_sensitivity",
     "find_sensitivities",
     "find_worst_case",

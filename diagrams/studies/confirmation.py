@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any
@@ -12,10 +13,9 @@ import numpy as np
 from ...blocks.core import ConfirmationError, LoopwrightError, OptionError, SimulationError
 from ..admittance import hold_sources
 from ..flat import WiredDiagram
-from ..frequency import Margins, Realization, disk_margin, margins, mimo_disk_margin, mu_bound
-from ..linearization import Linearization, find_signal, linearize, trim
+from ..frequency import Margins, Number, Realization, disk_margin, margins, mimo_disk_margin, mu_bound
+from ..linearization import Linearization, find_signal, linearize, loop_of_variant, trim
 from ..measure import frequency_response, step_response
-from ..results import OperatingPoint
 from .numbers import numbers_of
 from .parameters import changed_entry
 
@@ -246,32 +246,47 @@ def confirm_sensitivity(found: Sensitivities, row: Sensitivity, *, delay: int = 
     ConfirmationError
         If the two disagree.
     """
-    model = found.model
-    if model is None or not math.isfinite(row.slope.value):
-        return row
-    h = STEP * (abs(row.value) or 1.0)
-
-    def number(change: float) -> float:
-        diagram = model.diagram.replace(changed_entry(model.diagram, row.parameter, row.value + change))
-        made = linearize(diagram, model.point, plants=model.plants, stairs=model.stairs, step=model.step)
-        if model.is_equilibrium and not made.is_equilibrium and not row.rest_lost:
-            made = linearize(diagram, _trim(diagram, model.point), plants=model.plants, stairs=model.stairs)
-        return numbers_of(made.loop(*found.wires), delay, skew)[row.quantity].value
-
-    a, b, c, d = (number(s * h) for s in (1.0, -1.0, 2.0, -2.0))
-    other = (8.0 * (a - b) - (c - d)) / (12.0 * h)
-    error = abs((a - b) / (2 * h) - (c - d) / (4 * h)) + 10 * row.number.tolerance / h
-    off = abs(other - row.slope.value)
-    if not off <= max(AGREEMENT * abs(row.slope.value), error, row.slope.tolerance):
-        raise ConfirmationError(
-            f"found {row.slope.value:.9g} as the derivative of {row.quantity} by {row.parameter}, but differences of "
-            f"the margin give {other:.9g}; expected the same to {AGREEMENT:g}. Look at the crossings near it: the "
-            "margin may have a kink there.",
-            block=model.diagram.name,
-        )
-    how = f"{row.slope.confirmed_by}; differences of the margin of the changed diagram give {other:.6g}"
-    return replace(row, slope=replace(row.slope, confirmed_by=how))
+    return confirm_parameter(found, row.parameter, [row.quantity], delay=delay, skew=skew)[0]
 
 
-def _trim(diagram: WiredDiagram, at: OperatingPoint) -> OperatingPoint:
-    return trim(diagram, None, None, rates=None, fixed=(), at=at, tolerance=1e-9)
+def confirm_parameter(
+    found: Sensitivities, parameter: str, quantities: Iterable[str], *, delay: int = 0, skew: float = 0.0
+) -> list[Sensitivity]:
+    """Return the sensitivities of some numbers to one parameter, confirmed as by `confirm_sensitivity`.
+
+    Raises
+    ------
+    ConfirmationError
+        If a slope and the differences disagree.
+    """
+    model, rows = found.model, [found[parameter, quantity] for quantity in quantities]
+    if model is None or not rows:
+        return rows
+    h = STEP * (abs(rows[0].value) or 1.0)
+
+    def numbers(change: float) -> dict[str, Number]:
+        diagram = model.diagram.replace(changed_entry(model.diagram, parameter, rows[0].value + change))
+        L, rests = loop_of_variant(model, found.wires, diagram, model.point)
+        if model.is_equilibrium and not rests and not rows[0].rest_lost:
+            point = trim(diagram, None, None, rates=None, fixed=(), at=model.point, tolerance=1e-9)
+            L, rests = loop_of_variant(model, found.wires, diagram, point)
+        return numbers_of(L, delay, skew)
+
+    high, low = numbers(h), numbers(-h)
+    made = []
+    for row in rows:
+        if not math.isfinite(row.slope.value):
+            made.append(row)
+            continue
+        other = (high[row.quantity].value - low[row.quantity].value) / (2.0 * h)
+        rounding = 10 * row.number.tolerance / h + AGREEMENT * abs(row.number.value * STEP) / h
+        if not abs(other - row.slope.value) <= max(AGREEMENT * abs(row.slope.value), rounding, row.slope.tolerance):
+            raise ConfirmationError(
+                f"found {row.slope.value:.9g} as the derivative of {row.quantity} by {parameter}, but differences of "
+                f"the margin give {other:.9g}; expected the same to {AGREEMENT:g}. Look at the crossings near it: the "
+                "margin may have a kink there.",
+                block=model.diagram.name,
+            )
+        how = f"{row.slope.confirmed_by}; differences of the margin of the changed diagram give {other:.6g}"
+        made.append(replace(row, slope=replace(row.slope, confirmed_by=how)))
+    return made

@@ -13,7 +13,8 @@ import numpy as np
 from ...blocks.core import LoopwrightError, OptionError
 from ..flat import WiredDiagram
 from ..frequency import Number, Realization, find_hidden_unstable, margin_slopes
-from ..linearization import Linearization, differentiate_loop, linearize
+from ..linearization import Linearization, differentiate_loop, linearize, loop_of_variant, operating_point
+from ..results import OperatingPoint
 from ..sweeps import Box
 from .cases import Case, CaseOrigin, CaseState, Goal, describe
 from .numbers import numbers_of
@@ -51,7 +52,8 @@ class Study:
         self.cases: list[Case] = []
         self.names = [(name, i) for name, box in boxes.items() for i in range(box.size)]
         self.smooth = {name for name in boxes if not _is_start_value(diagram, name)}
-        self._models: dict[int, Linearization] = {}
+        self._bases: dict[int, Linearization] = {}
+        self._asked: dict[int, tuple[WiredDiagram, OperatingPoint]] = {}
 
     # --- cases --------------------------------------------------------------------------------------------------------
 
@@ -72,21 +74,27 @@ class Study:
             diagram = self.diagram.replace(parameters) if parameters else self.diagram
             point = self.points[place]
             asked = point(diagram) if callable(point) else point
-            model = linearize(diagram, asked, **self.options)
-            case = self._judge(start, model)
+            if not parameters:
+                self._bases[place] = linearize(diagram, asked, **self.options)
+            base = self._bases.get(place)
+            if base is None:
+                raise OptionError("the diagram as it is can't be analysed at this operating point.", block=diagram.name)
+            run = {name: value for name, value in self.options.items() if name not in ("plants", "stairs")}
+            at = base.point if not parameters else operating_point(diagram, asked, run)
+            self._asked[start.index] = (diagram, at)
+            return self._judge(start, base, diagram, at)
         except LoopwrightError as error:
             return replace(start, reason=str(error))
-        self._models[case.index] = model
-        return case
 
-    def _judge(self, case: Case, model: Linearization) -> Case:
+    def _judge(self, case: Case, base: Linearization, diagram: WiredDiagram, at: OperatingPoint) -> Case:
         """Return a case with its numbers and its goodness."""
         numbers: dict[tuple[str, ...], dict[str, Number]] = {}
         worst: tuple[float, tuple[str, ...], str] = (math.inf, (), "")
         unstable: tuple[str, ...] = ()
-        growth = -math.inf
+        growth, rests = -math.inf, True
         for wires in self.goal.loops:
-            L = model.loop(*wires)
+            L, still = loop_of_variant(base, wires, diagram, at)
+            rests = rests and still
             r = Realization.of(L, delay=self.delay)
             own = r.logarithm(r.eigenvalues()) if r.order and not r.is_stable() else np.zeros(0)
             hidden = np.array(find_hidden_unstable(r))  # poles of other loops, which this one does not move
@@ -109,14 +117,8 @@ class Study:
             )  # fmt: skip
         if not worst[1]:
             return replace(case, reason="none of its loops has any of the numbers that are asked for")
-        rests = model.is_equilibrium or not self._starts_at_rest(case.point)
-        state = CaseState.STABLE if rests else CaseState.MOVING
+        state = CaseState.STABLE if rests or not base.is_equilibrium else CaseState.MOVING
         return replace(case, state=state, goodness=worst[0], loop=worst[1], quantity=worst[2], numbers=numbers)
-
-    def _starts_at_rest(self, place: int) -> bool:
-        """Whether the diagram as it is rests at a point."""
-        model = self._models.get(place)
-        return model is not None and model.is_equilibrium
 
     # --- ranges -------------------------------------------------------------------------------------------------------
 
@@ -202,21 +204,22 @@ class Study:
 
     def gradient(self, case: Case, fractions: np.ndarray) -> np.ndarray:
         """Return the derivative of a case's goodness by the fractions, exact where the parameters are traced."""
-        model, found = self._models[case.index], np.zeros(fractions.size)
+        diagram, at = self._asked[case.index]
+        model, found = linearize(diagram, at, **self.options), np.zeros(fractions.size)
         L = model.loop(*case.loop)
-        slopes: list[LoopSlope | None] = []
         point = self.points[case.point]
         find = point if callable(point) else None
-        for name in self.boxes:
-            try:
-                if name not in self.smooth:
-                    raise OptionError("no traced parameter")
-                slopes += differentiate_loop(model, case.loop, [name], find=find)
-            except LoopwrightError:
-                slopes += [None] * self.boxes[name].size
+        names = [name for name in self.boxes if name in self.smooth]
+        made = differentiate_loop(model, case.loop, names, find=find, left_out={})
+        by_name: dict[str, list[LoopSlope]] = {}
+        for one in made:
+            by_name.setdefault(one.parameter.partition("[")[0], []).append(one)
+        slopes: list[LoopSlope | None] = []
+        for name, box in self.boxes.items():
+            mine = by_name.get(name, [])
+            slopes += mine if len(mine) == box.size else [None] * box.size
         known = [s for s in slopes if s is not None]
-        made = margin_slopes(L, [s.slopes for s in known], delay=self.delay)[case.quantity].slopes
-        exact = iter(made)
+        exact = iter(margin_slopes(L, [s.slopes for s in known], delay=self.delay)[case.quantity].slopes)
         by_number = self.goal.slope(case.loop, case.quantity, case.value)
         widths = self._widths(case.parameters)
         for i, slope in enumerate(slopes):

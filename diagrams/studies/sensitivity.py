@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, UnknownNameError, near
+from ...blocks.core import UnknownNameError, near
 from ..flat import WiredDiagram
 from ..frequency import MarginSlope, Number, margin_slopes
 from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize
@@ -237,14 +237,8 @@ def sensitivities_of(
         given = [parameters] if isinstance(parameters, str) else list(parameters)
         names = list(dict.fromkeys(find_parameter(diagram, name) for name in given))
     L = model.loop(*wires)
-    slopes: list[LoopSlope] = []
-    for name in names:
-        try:
-            slopes += differentiate_loop(model, wires, [name], find=find)
-        except LoopwrightError as error:
-            if parameters is not None:
-                raise
-            left_out[name] = error.message
+    refused = left_out if parameters is None else None
+    slopes: list[LoopSlope] = differentiate_loop(model, wires, names, find=find, left_out=refused)
     acting = [one for one in slopes if any(np.any(M) for M in one.slopes)]
     found = margin_slopes(L, [one.slopes for one in acting], delay=delay, skew=skew)
     bounds = _bound_errors(L, acting, found, delay, skew)

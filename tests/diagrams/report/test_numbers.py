@@ -244,7 +244,7 @@ def test_other_experiments_have_the_same_inner_loops(start):
 
 def test_a_users_loop_around_an_fmu_gets_a_report_without_the_sections_of_fig3():
     report = speed_report()
-    keys = ["summary", "subject", "operating_points", "poles", "inner", "steps", "injection", "limits"]
+    keys = ["summary", "subject", "operating_points", "poles", "inner", "steps", "sensitivity", "injection", "limits"]
     assert [s.key for s in report.sections] == keys
     numbers = report.numbers()
     # u = (kp + ki/s) e, ω = K/((L s + R)(J s + b) + K²) u

@@ -6,13 +6,47 @@ import numpy as np
 import pytest
 
 from loopwright.blocks import Constant, Gain, OptionError, UnknownNameError
-from loopwright.diagrams import Diagram
+from loopwright.diagrams import Diagram, experiments
+from loopwright.diagrams.linearization import loop_of_variant
 from loopwright.diagrams.requirements import Requirements
 from loopwright.diagrams.studies import CaseOrigin, CaseState, ConfirmationKind
 from loopwright.diagrams.sweeps import Box
 from support.tuned_loops import Tank, make_pi_loop, pi_phase_margin
 
 RANGES = {"p.gain": (0.5, 2.0), "ki.gain": (0.2, 4.0), "rate.gain": (1.0, 3.0)}
+
+
+@pytest.mark.slow
+def test_the_worst_disk_margin_of_fig3_is_no_better_than_of_1000_random_points():
+    """The random points' margins are read from a grid of frequencies; the worst case is confirmed by a run."""
+    robot = experiments.compliance().diagram
+    ranges = {"pid_perp.a2": (90.0, 150.0), "pid_perp.a1": (3600.0, 6000.0), "pid_perp.a0": (48e3, 80e3)}
+    ranges["feedback_linearization.model.coulomb_scale"] = (0.8, 1.02)
+    found = robot.worst_case(ranges, "v_perp", quantity="disk_margin", count=20, seed=1)
+    rng, worst = np.random.default_rng(3), math.inf
+    model = robot.linearize()
+    omega = np.geomspace(1.0, 0.999 * np.pi / model.dt, 400)
+    for _ in range(1000):
+        changed = robot.replace({name: rng.uniform(low, high) for name, (low, high) in ranges.items()})
+        L, _ = loop_of_variant(model, ["v_perp"], changed, model.point)
+        values = L(np.exp(1j * omega * model.dt))
+        worst = min(worst, float(np.min(np.abs(2 * (1 + values) / (1 - values)))))
+    assert found.worst.value <= worst * (1 + 1e-9)
+    confirmed = found.confirm()
+    assert confirmed.agrees, confirmed
+
+
+@pytest.mark.slow
+def test_friction_that_is_compensated_twofold_is_unstable_in_linear_model_and_run():
+    robot = experiments.compliance().diagram
+    found = robot.worst_case(
+        {"plant.coulomb_scale": (0.5, 2.0), "plant.viscous_scale": (0.5, 2.0)}, "v_perp", count=4, seed=1
+    )
+    assert found.worst.state is CaseState.UNSTABLE
+    assert found.parameters == {"plant.start.coulomb_scale": 0.5, "plant.start.viscous_scale": 0.5}
+    confirmed = found.confirm()
+    assert confirmed.kind is ConfirmationKind.GROWTH
+    assert confirmed.agrees, confirmed
 
 
 def draw(count, seed=5):
@@ -54,6 +88,7 @@ def test_the_gradient_of_the_search_is_that_of_the_margin():
     boxes = {"p.gain": Box(0.5, 2.0), "ki.gain": Box(0.2, 4.0, "log")}
     goal = make_goal("u", "phase_margin_deg", None, "pi")
     study = Study(diagram, goal, boxes, (None,), 0, {}, lambda text: None)
+    study.run({}, CaseOrigin.NOMINAL)
     at = np.array([0.4, 0.6])
     case = study.run(study.parameters_at(at), CaseOrigin.SEARCH)[0]
     found = study.gradient(case, at)

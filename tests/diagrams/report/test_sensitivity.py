@@ -1,0 +1,32 @@
+"""The section on sensitivity to parameters, of a loop with a closed form."""
+
+import numpy as np
+import pytest
+
+from loopwright.diagrams import analyse
+from loopwright.diagrams.report_writing.definitions import definition
+from support.tuned_loops import make_pi_loop, pi_phase_margin
+
+
+def test_the_section_tells_the_change_of_a_margin_per_percent_and_how_it_was_confirmed():
+    report = analyse(make_pi_loop(1.0, 0.5, 2.0), only=("sensitivity",))
+    (section,) = (s for s in report.sections if s.key == "sensitivity")
+    (part,) = section.sections
+    numbers = report.numbers()
+    for i, name in enumerate(("p_gain", "ki_gain", "rate_gain")):
+        number = numbers[f"sensitivity.u.{name}.phase_margin_deg_per_percent"]
+        values, h = np.array([1.0, 0.5, 2.0]), 1e-4
+        up, down = values.copy(), values.copy()
+        up[i], down[i] = values[i] * (1 + h), values[i] * (1 - h)
+        expected = (pi_phase_margin(*up) - pi_phase_margin(*down)) / (200 * h)
+        assert number.value == pytest.approx(expected, rel=1e-6)
+        assert "differences of the margin" in number.confirmed_by
+        assert number.unit == "deg"
+    assert len(part.tables[0].rows) == 3
+    assert len(part.plots) == 1
+    assert all(definition(path) is not None for path in numbers if path.startswith("sensitivity."))
+
+
+def test_a_diagram_with_an_unstable_loop_has_no_such_section():
+    report = analyse(make_pi_loop(kp=-2.0), only=("sensitivity",))
+    assert [s.key for s in report.sections if s.key == "sensitivity"] == []
