@@ -6,6 +6,7 @@ from .fused import fuse
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
 from .hybrid_code import compile_hybrid, find_hybrid_obstacle
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
+from .native_tick import bind_call
 from .watch import RECENT, Fired, Watch
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "Span",
     "TickCode",
     "Watch",
+    "bind_call",
     "compile_hybrid",
     "compile_ticks",
     "find_hybrid_obstacle",

@@ -13,6 +13,7 @@ from ..flat import bind_function
 from .code import GroupedTick, StraightTick
 from .grouping import PythonCall, Tables
 
+_Tick = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4, ctypes.c_int)
 _Python = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64)
 
 
@@ -72,6 +73,19 @@ def bind_native(
     return NativeTick(
         tick.address, ctypes.addressof(given), ctypes.addressof(made), ctypes.addressof(group), at(v), kept
     )
+
+
+def bind_call(
+    tick: StraightTick | GroupedTick, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
+) -> Callable[[], None]:
+    """Return a tick bound to the vectors of a run as a call from Python."""
+    bound = bind_native(tick, arguments, results)
+    function = _Tick(bound.address)
+
+    def call() -> None:
+        function(bound.arguments, bound.results, bound.iw, bound.w, 0)
+
+    return call
 
 
 def _group(tables: Tables, arguments: Sequence[np.ndarray], python: Any) -> _Group:

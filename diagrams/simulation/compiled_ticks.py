@@ -18,6 +18,7 @@ from ..compiled import (
     Outcome,
     Reason,
     TickCode,
+    bind_call,
     compile_ticks,
     find_obstacle,
 )
@@ -226,6 +227,25 @@ def kinds_of(flat: FlatDiagram, *, every: bool) -> list[frozenset[TickPattern]]:
         bits |= acts(clock, ticks).astype(np.int64) << i
     found = [frozenset(c for i, c in enumerate(clocks) if mask >> i & 1) for mask in np.unique(bits).tolist()]
     return [acting for acting in found if acting or every or not clocks]
+
+
+def bind_evaluations(workspace: Workspace, *, every: bool) -> dict[frozenset[TickPattern], Callable[[], None]]:
+    """Return the evaluations of ticks in C, with the bits of interpreted ones; empty where they can't be had.
+
+    The functions of a large diagram take seconds to trace as a whole, and its grouped code needs none of them.
+    """
+    flat, here = workspace.flat, workspace.here
+    if find_obstacle(flat) or len(flat.distinct) > CLOCKS or flat.loops.slices:
+        return {}
+    try:
+        code = compile_ticks(flat, kinds_of(flat, every=every))
+    except CompilerError:  # told by `make_compiled`
+        return {}
+    if not code.exact:
+        return {}
+    results = [workspace.x_next, workspace.z, workspace.log, workspace.ok]
+    vectors = [here.t, here.x, here.w, here.p]
+    return {clocks: bind_call(tick, vectors, results) for clocks, tick in code.ticks.items()}
 
 
 def make_compiled(

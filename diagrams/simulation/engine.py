@@ -143,6 +143,10 @@ class Engine:
     def initialize(self) -> None:
         """Find values of everything at t = 0; the plants are then ready to be stepped."""
         self.steps.bind()
+        if self._compile is True and self.continuous is None and self.flat.by_block:
+            from .compiled_ticks import bind_evaluations
+
+            self.workspace.native = bind_evaluations(self.workspace, every=self.every_tick)
         self._find_start(None)
         if self._compile is True:
             self._compiled = self._make_compiled()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ class Workspace:
         residual.
     ok : ndarray
         Shape (1,); 0 where a value was not finite or a guard failed.
+    native : mapping
+        Evaluations of ticks at ``here`` that need no traced function of the whole diagram, by the clocks that act.
     begun : bool
         Whether the start has been found: algebraic loops must determine their values from then on.
     messages : tuple of str
@@ -54,6 +56,7 @@ class Workspace:
         self._evaluations: dict[frozenset[TickPattern], Callable[[], None]] = {}
         self._ticks: dict[frozenset[TickPattern], Callable[[], None]] = {}
         self._kept: list[Bound] = []
+        self.native: Mapping[frozenset[TickPattern], Callable[[], None]] = {}
         self.begun = False
         self.messages: tuple[str, ...] = ()
         self._solved: dict[tuple[frozenset[TickPattern], int], LoopSolver] = {}
@@ -124,7 +127,8 @@ class Workspace:
     def _evaluation(self, acting: frozenset[TickPattern]) -> Callable[[], None]:
         if acting not in self._evaluations:
             results = [self.x_next, self.z, self.log, self.ok]
-            call = self._bind(self.flat.at_tick(acting), self.here, results).call
+            native = self.native.get(acting)
+            call = self._bind(self.flat.at_tick(acting), self.here, results).call if native is None else native
             solve = self.loop_solver(acting, self.here)
             self._evaluations[acting] = call if solve is None else _one_after_the_other(solve, call)
         return self._evaluations[acting]

@@ -81,6 +81,15 @@ def test_large_diagrams_have_the_bits_of_their_interpreted_runs(make):
     assert_same_bits(*both(made, 1.0))
 
 
+def test_a_large_diagram_is_never_traced_as_a_whole(monkeypatch):
+    def refused(*_, **__):
+        raise AssertionError("traced as a whole")
+
+    expected = loops(100).simulate(0.2, compile=False, **QUIET)
+    monkeypatch.setattr(flat_diagram.functions, "trace_tick", refused)
+    assert_same_bits(expected, loops(100).simulate(0.2, compile=True, **QUIET))
+
+
 def test_the_code_knows_neither_the_number_of_blocks_nor_their_parameters(monkeypatch, tmp_path):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
     code.load_compiled.cache_clear()
