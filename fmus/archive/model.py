@@ -10,7 +10,7 @@ from typing import Any
 from ...blocks.core import FmuFileError
 from .faults import FmuFault
 from .limits import ArchiveLimits
-from .repair import repair
+from .repair import counts_from_zero, repair
 from .rules import check_schema, check_structure, check_variables, check_version
 from .zip_file import DESCRIPTION
 
@@ -53,6 +53,8 @@ def read_model(path: Path, text: bytes, root: Any, limits: ArchiveLimits | None 
     try:
         schema = check_schema(root)
         try:
+            if counts_from_zero(root):
+                raise IndexError
             model = _read_model(text)
         except Exception:  # FMPy raises bare exceptions
             repaired = repair(root)

@@ -46,6 +46,18 @@ def repair(root: Any) -> list[str]:
     return complaints
 
 
+def counts_from_zero(root: Any) -> bool:
+    """Whether a model structure of FMI 2.0 has an index below 1, which FMPy takes for one from the end of the list."""
+    if not root.get("fmiVersion", "").startswith("2."):
+        return False
+    texts = (
+        text
+        for unknown in root.iterfind("ModelStructure/*/Unknown")
+        for text in (unknown.get("index", ""), *unknown.get("dependencies", "").split())
+    )
+    return any(text.lstrip("+-").isdecimal() and int(text) < 1 for text in texts)
+
+
 _GROUPS = {"ModelStructure", "Outputs", "Derivatives", "InitialUnknowns", "DiscreteStates"}
 Known = Callable[[str | None], bool]
 

@@ -23,6 +23,7 @@ from loopwright.fmus import Fmu
 from loopwright.fmus.archive.units import FmuUnits
 from loopwright.fmus.models import mass_spring_damper
 from loopwright.fmus.platform import native_platform
+from support.small_fmus import small_fmu
 from support.typed_fmus import description2, description3
 
 COUNT = b'<Binary name="count" valueReference="9001" causality="output" variability="discrete"/>'
@@ -257,3 +258,23 @@ def test_a_file_that_may_not_be_read(tmp_path, monkeypatch):
     monkeypatch.setattr(type(path), "read_bytes", read_bytes)
     with pytest.raises(FmuFileError, match=r"can't be read: .*Permission denied"):
         Fmu(path)
+
+
+@pytest.mark.parametrize("index", [0, -1])
+@pytest.mark.parametrize("place", ["index", "dependencies"])
+def test_an_index_below_one_in_the_model_structure_is_told_and_not_taken_from_the_end(tmp_path, cache, index, place):
+    """Taken for the last variable, the parameter ``last``, the output would have no feedthrough from u."""
+    unknown = f'<Unknown index="2" dependencies="{index}"/>'
+    if place == "index":
+        unknown = f'<Unknown index="2" dependencies="1"/><Unknown index="{index}" dependencies="1"/>'
+    model = f"""<CoSimulation modelIdentifier="small"/><ModelVariables>
+<ScalarVariable name="u" valueReference="1" causality="input"><Real start="0"/></ScalarVariable>
+<ScalarVariable name="x" valueReference="2" causality="output"><Real/></ScalarVariable>
+<ScalarVariable name="last" valueReference="3" causality="parameter" variability="fixed"><Real start="0"/></ScalarVariable>
+</ModelVariables><ModelStructure><Outputs>{unknown}</Outputs></ModelStructure>"""
+    path = small_fmu(tmp_path, "fmi2", "typedef struct { double t; } instance;", model)
+    about = Fmu(path).description
+    assert any(str(index) in complaint and "exist" in complaint for complaint in about.complaints), about.complaints
+    known = about.dependencies["Float64", 2]
+    assert known is None or known == {("Float64", 1)}
+    assert ("Float64", 3) not in about.dependencies
