@@ -126,11 +126,14 @@ def confirm_limit(
         measured = measure_growth(t, speed, abs(mode.imag), begin, window)
         found.append(ContactTrial(factor, value, float(mode.real), measured, fastest))
     result = ContactConfirmation(limit, found[0], found[1], within, duration, trials.method, tried)
+    coarse = ""
+    if trials.method is TrialMethod.HELD:  # errors of the FMU's own solver damp or drive the motion
+        coarse = ", or a finer solver of the FMU: Fmu(…, stepping=StepOptions(tolerance=1e-10))"
     if any(not abs(t.measured - t.predicted) <= within for t in found) or not found[0].measured < 0 < found[1].measured:
         raise ConfirmationError(
             f"{limit.vary} {limit.value:.6g} {limit.unit} is refuted: {result}; expected differences of at most "
             f"{within:.3g} 1/s, decay below the limit and growth above it. The linear model does not hold at this "
-            f"amplitude: try a smaller push, such as push={push / 100:g}.",
+            f"amplitude: try a smaller push, such as push={push / 100:g}{coarse}.",
             block=contact.plant,
         )
     return result

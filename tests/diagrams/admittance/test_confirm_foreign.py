@@ -9,8 +9,9 @@ import pytest
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
-from loopwright.blocks import Block, Constant, Gain, Input, OptionError, Output, State
+from loopwright.blocks import Block, ConfirmationError, Constant, Gain, Input, OptionError, Output, State
 from loopwright.diagrams import Diagram, TrialMethod, subsystem
+from loopwright.diagrams.admittance.contact_trials import Trials
 from loopwright.fmus import Fmu, build
 
 M, SHARE, DRAG, T, SUBSTEPS = 0.5, 8.0, 40.0, 5e-3, 10
@@ -157,3 +158,16 @@ def test_a_method_that_a_plant_does_not_allow_is_refused(tmp_path):
         here.confirm(limit, method="solver")
     with pytest.raises(OptionError, match=r"found 'hold'. Did you mean 'held'"):
         here.confirm(limit, method="hold")
+
+
+def test_a_run_that_an_fmus_solver_damps_refutes_its_limit_and_says_what_to_try(tmp_path, monkeypatch):
+    here = contact(Fmu(without("ModelExchange", tmp_path), name="cart", isolate=False))
+    limit = here.stability_limit(damping=B)
+
+    def damped(trials, value, push, duration):
+        t = np.arange(0.0, duration + T, T)
+        return t, 1e-6 * np.exp(-9.0 * t) * np.cos(limit.frequency * t), 1e-6
+
+    monkeypatch.setattr(Trials, "run", damped)
+    with pytest.raises(ConfirmationError, match=r"cart: stiffness .* is refuted.*StepOptions\(tolerance=1e-10\)"):
+        here.confirm(limit)
