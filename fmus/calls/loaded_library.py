@@ -22,7 +22,7 @@ from .fmu_block import FmuBlock
 from .message_log import MessageLog, clean_text, describe_end
 from .shared_steps import SharedReading
 from .step_options import choose_modes
-from .texts import is_readable, list_limits, read_text, write_text
+from .texts import is_readable, list_limits, read_text, waits_for_initialization, write_text
 
 CALLS: dict[str, type[FmiCalls]] = {"1": Fmi1Calls, "2": Fmi2Calls, "3": Fmi3Calls}
 """Functions by the major version of FMI."""
@@ -34,10 +34,7 @@ _OPEN: WeakSet[LoadedFmu] = WeakSet()
 
 
 class LoadedFmu:
-    """Instance of an FMU: log, initialization, variables, end.
-
-    ``make_calls`` makes its functions, with the library in another process, say; by default it is loaded in this one.
-    """
+    """Instance of an FMU: log, initialization, variables, end; ``make_calls`` makes its functions, else here."""
 
     def __init__(self, block: FmuBlock, *, model_exchange: bool = False, make_calls: MakeCalls | None = None):
         self.block, self.description = block, block.description
@@ -160,8 +157,11 @@ class LoadedFmu:
             self._configure(given)
             tolerance = self.block.stepping.tolerance
             self.fmi.set_up(start_time, stop_time, tolerance)
-            self.set_values({n: v for n, v in given.items() if n not in self.description.structural})
+            in_mode = {n: v for n, v in given.items() if waits_for_initialization(self.description, n)}
+            early = {n: v for n, v in given.items() if n not in (*self.description.structural, *in_mode)}
+            self.set_values(early)
             self.fmi.enter_initialization_mode(start_time, stop_time, tolerance)
+            self.set_values(in_mode)
             lost = self._find_lost(given)
             if lost:  # some tools' FMUs drop parameters that are set before this mode
                 self.set_values(lost)

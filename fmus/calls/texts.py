@@ -30,6 +30,11 @@ def write_text(fmi: FmiCalls, variable: OtherVariable, value: Text) -> None:
     put([variable.reference], elements)
 
 
+def waits_for_initialization(about: FmuDescription, name: str) -> bool:
+    """Whether a start value is set in Initialization Mode, as FMI 2.0 asks for inputs (3.2.3 and 4.2.4)."""
+    return about.fmi.startswith("2") and (about.texts.get(name) or about.find(name)).causality == "input"
+
+
 def list_limits(label: str, about: FmuDescription) -> list[str]:
     """Return messages on ports that are neither read nor set, and on a file or description that breaks rules."""
     ins, outs = (about.other_ports(causality) for causality in ("input", "output"))

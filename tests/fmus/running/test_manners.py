@@ -128,3 +128,28 @@ def test_warnings_without_words_are_told_once_for_each_kind_of_call(tmp_path, ca
         "plant: a step gave fmi2Warning",
     ], run.messages
     np.testing.assert_allclose(run["plant.time"], run.t, atol=1e-15)
+
+
+STRICT = (
+    """
+typedef struct { double t, u, p; int ready; } instance;
+int fmi2EnterInitializationMode(void *p) { ((instance *)p)->ready = 1; return 0; }
+int fmi2DoStep(void *p, double t, double h, int f) { ((instance *)p)->t = t + h; return 0; }
+"""
+    + values("fmi2", "Get", "Real", "double", {1: "c->p * c->u", 2: "c->u", 3: "c->p"})
+    + values("fmi2", "Set", "Real", "double", {2: "if (!c->ready) return 3; c->u", 3: "if (c->ready) return 3; c->p"})
+)
+STRICT_MODEL = """<CoSimulation modelIdentifier="small" canHandleVariableCommunicationStepSize="true"/><ModelVariables>
+<ScalarVariable name="y" valueReference="1" causality="output"><Real/></ScalarVariable>
+<ScalarVariable name="u" valueReference="2" causality="input"><Real start="0"/></ScalarVariable>
+<ScalarVariable name="p" valueReference="3" causality="parameter" variability="fixed"><Real start="1"/></ScalarVariable>
+</ModelVariables><ModelStructure><Outputs><Unknown index="1"/></Outputs></ModelStructure>"""
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_start_values_of_inputs_are_set_in_initialization_mode(tmp_path, isolate):
+    """FMI 2.0 allows inputs there and later, parameters before; an FMU refuses them elsewhere."""
+    file = small_fmu(tmp_path, "fmi2", STRICT, STRICT_MODEL)
+    plant = Fmu(file, name="plant", start={"u": 3.0, "p": 2.0}, isolate=isolate)
+    run = Diagram("d", plant()).simulate(0.2, step=0.1, progress=False)
+    assert run["plant.y"].tolist() == [6.0] * 3
