@@ -14,6 +14,7 @@ from ..linearization import find_signal
 from ..report_figures import AxisUnits
 from ..report_writing import DEFINITIONS, Report
 from ..requirements import Requirements, read_requirements
+from ..studies import WorstCase
 from .case import Case, ReportedExperiment
 from .content_hash import content_hash
 from .parts import HasReportKind, MakesSections, ReportKind, ReportPart
@@ -25,7 +26,7 @@ from .section_limits import not_modelled
 from .section_loops import inner
 from .section_measured import measured_loops, read_measured
 from .section_poles import closed_loops, memory
-from .section_sensitivity import sensitivity
+from .section_sensitivity import sensitivity, worst_case_of
 from .section_steps import steps
 from .section_subject import operating_points, remarks, subject, versions
 from .section_summary import summary
@@ -64,6 +65,7 @@ def analyse(
     hertz: bool = False,
     progress: Callable[[str], None] | None = None,
     measured: Mapping[str, Any] | None = None,
+    worst_case: WorstCase | None = None,
     contacts: Mapping[str, Any] | None = None,
 ) -> Report:
     """Analyse a diagram, and return the content of its report.
@@ -105,6 +107,8 @@ def analyse(
         Contacts of an environment with the plant, by names that stand in dotted paths: ``{"tool":
         diagram.contact(…)}``. Each gets its admittance, the limits of coupled stability, a map of them, and a trial in
         the nonlinear run.
+    worst_case : WorstCase, optional
+        A worst case of this diagram, of `Diagram.worst_case`: it gets a section, with a run that confirms it.
     progress : callable, optional
         Told the key of each section before it is made, and of the injection check each measurement, too.
 
@@ -138,6 +142,8 @@ def analyse(
     loops_measured = read_measured(case, measured) if measured else ()
     if loops_measured:
         sections = (*sections, measured_loops(case, loops_measured))
+    if worst_case is not None:
+        sections = (*sections, worst_case_of(worst_case))
     if contacts:
         tell("contact")
         sections = (*sections, contact_sections(contacts))

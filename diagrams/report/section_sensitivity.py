@@ -1,15 +1,17 @@
-"""Sensitivity of the loops' margins to the parameters of the diagram as it is."""
+"""Margins over parameters: sensitivity of the loops of the diagram as it is, and a worst case over ranges."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import replace
 
+import numpy as np
+
 from ...blocks.core import LoopwrightError
 from .. import report_figures as figures
 from ..frequency import Number
-from ..report_writing import Section, Table, Texts
-from ..studies import Sensitivities, Sensitivity, confirm_parameter, sensitivities_of
+from ..report_writing import Plot, Section, Table, Texts
+from ..studies import CaseState, Sensitivities, Sensitivity, WorstCase, confirm_parameter, sensitivities_of
 from .case import Case
 from .section_loops import ROWS
 
@@ -84,3 +86,35 @@ def _acts(row: Sensitivity) -> bool:
 def _path(parameter: str) -> str:
     """Return a parameter's part of dotted paths."""
     return re.sub(r"\W+", "_", parameter).strip("_")
+
+
+def worst_case_of(found: WorstCase) -> Section:
+    """Return the section on a worst case: its parameters, its number beside the nominal one, its run, and a scatter."""
+    worst, nominal = found.worst, min(found.nominal, key=lambda case: case.goodness)
+    text = [TEXTS.line("worst", cases=len(found.cases), unstable=len(found.unstable), failed=len(found.failures))]
+    confirmed = ""
+    try:
+        made = found.confirm()
+        confirmed = str(made) if made.agrees else ""
+        text.append(str(made) + ".")
+    except LoopwrightError as error:
+        text.append(TEXTS.line("left_out", wire=", ".join(worst.loop) or "worst case", message=error.message))
+    numbers: dict[str, Number] = {}
+    for name, case in (("as_it_is", nominal), ("worst", worst)):
+        if case.state is CaseState.UNSTABLE:
+            numbers[f"{name}.worst_growth"] = Number(case.growth, "1/s", 1e-6 * abs(case.growth), confirmed)
+        elif case.quantity:
+            number = case.numbers[case.loop][case.quantity]
+            how = f"{number.confirmed_by}; {confirmed}" if confirmed and case is worst else number.confirmed_by
+            numbers[f"{name}.{case.quantity}"] = replace(number, confirmed_by=how)
+    rows = [
+        (path.partition(".")[0].replace("_", " "), path.partition(".")[2], number) for path, number in numbers.items()
+    ]
+    tables = [Table("Worst case, beside the diagram as it is", ("case", "number", "value"), tuple(rows), digits=4)]
+    given = tuple((name, str(value) if np.ndim(value) else f"{value:.6g}") for name, value in worst.parameters.items())
+    if given:
+        tables.append(Table("Parameters of the worst case", ("parameter", "value"), given))
+    plots = []
+    if any(np.ndim(value) == 0 for value in worst.parameters.values()):
+        plots.append(Plot("worst_case", TEXTS.line("scatter"), found.plot()))
+    return Section("worst_case", "Worst case", tuple(text), tuple(tables), tuple(plots), numbers)

@@ -30,3 +30,15 @@ def test_the_section_tells_the_change_of_a_margin_per_percent_and_how_it_was_con
 def test_a_diagram_with_an_unstable_loop_has_no_such_section():
     report = analyse(make_pi_loop(kp=-2.0), only=("sensitivity",))
     assert [s.key for s in report.sections if s.key == "sensitivity"] == []
+
+
+def test_a_worst_case_gets_a_section_with_the_run_that_confirms_it():
+    diagram = make_pi_loop()
+    found = diagram.worst_case({"p.gain": (0.5, 2.0)}, "u", quantity="phase_margin_deg", count=2, starts=1, steps=2)
+    report = analyse(diagram, only=("subject",), worst_case=found)
+    (section,) = (s for s in report.sections if s.key == "worst_case")
+    number = report.numbers()["worst_case.worst.phase_margin_deg"]
+    assert number.value == pytest.approx(pi_phase_margin(0.5, 0.5, 2.0), rel=1e-9)
+    assert "injection" in number.confirmed_by
+    assert ("p.gain", "0.5") in section.tables[1].rows
+    assert definition("worst_case.worst.worst_growth") is not None
