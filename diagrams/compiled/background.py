@@ -34,8 +34,8 @@ class BackgroundCode:
         Whether ``code`` is there.
     code : TickCode or None
         The code; None before, and where it can't replace interpreted ticks to the last bit.
-    failure : LoopwrightError or None
-        Why there is none: no compiler, or one that fails.
+    failure : Exception or None
+        Why there is none: no compiler, one that fails, or a cache that does.
     """
 
     def __init__(self, flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]):
@@ -45,7 +45,7 @@ class BackgroundCode:
         self._over = False
         self.ready = False
         self.code: TickCode | None = None
-        self.failure: LoopwrightError | None = None
+        self.failure: Exception | None = None
 
     def look(self, spent: float, rest: float) -> None:
         """Begin to make the code where it pays.
@@ -72,7 +72,7 @@ class BackgroundCode:
                 return
         try:
             cached = self._sources.is_compiled()
-        except LoopwrightError as error:
+        except (LoopwrightError, OSError) as error:
             self._end(error)
             return
         compiling = _COMPILING * min(self._flat.operations, self._sources.operations)
@@ -92,10 +92,10 @@ class BackgroundCode:
     def _load(self, sources: TickSources) -> None:
         try:
             self.code = sources.load()
-        except LoopwrightError as error:
+        except (LoopwrightError, OSError) as error:  # the cache's folder may be gone, or hold what can't be loaded
             self._end(error)
             return
         self._over = self.ready = True
 
-    def _end(self, error: LoopwrightError | None = None) -> None:
+    def _end(self, error: Exception | None = None) -> None:
         self._over, self.failure = True, error

@@ -146,6 +146,17 @@ def test_a_missing_compiler_is_told_once(eager, no_compiler):
     assert_same_bits(sums().simulate(20.0, compile=False, **QUIET), runs[0])
 
 
+def test_a_cache_that_fails_leaves_the_run_interpreted_and_is_told(eager, monkeypatch, tmp_path):
+    code.load_compiled.cache_clear()
+    code.master.cache_clear()
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path / "file"))
+    run = sums().simulate(20.0, compile="auto", **QUIET)
+    assert run.tier == "interpreted"
+    assert any(str(tmp_path) in message for message in run.messages)
+    assert_same_bits(sums().simulate(20.0, compile=False, **QUIET), run)
+
+
 def test_a_short_run_asks_for_no_code():
     with mock.patch.object(background, "write_ticks", side_effect=AssertionError("written")):
         assert len(sums().simulate(20.0, compile="auto", **QUIET).t) == 2001

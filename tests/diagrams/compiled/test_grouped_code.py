@@ -74,9 +74,9 @@ def test_a_chain_of_800_blocks_has_the_bits_of_numpy():
         assert np.array_equal(run[f"box.b{last}.y"], expected)
 
 
-@pytest.mark.parametrize("make", [chain, loops])
-def test_large_diagrams_have_the_bits_of_their_interpreted_runs(make):
-    made = make(600)
+@pytest.mark.parametrize(("make", "n"), [(chain, 600), (loops, 70), pytest.param(loops, 600, marks=pytest.mark.slow)])
+def test_large_diagrams_have_the_bits_of_their_interpreted_runs(make, n):
+    made = make(n)
     assert made.flattened(None).by_block
     assert_same_bits(*both(made, 1.0))
 
@@ -85,18 +85,18 @@ def test_a_large_diagram_is_never_traced_as_a_whole(monkeypatch):
     def refused(*_, **__):
         raise AssertionError("traced as a whole")
 
-    expected = loops(100).simulate(0.2, compile=False, **QUIET)
+    expected = loops(70).simulate(0.2, compile=False, **QUIET)
     monkeypatch.setattr(flat_diagram.functions, "trace_tick", refused)
-    assert_same_bits(expected, loops(100).simulate(0.2, compile=True, **QUIET))
+    assert_same_bits(expected, loops(70).simulate(0.2, compile=True, **QUIET))
 
 
 def test_the_code_knows_neither_the_number_of_blocks_nor_their_parameters(monkeypatch, tmp_path):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
     code.load_compiled.cache_clear()
-    loops(100).simulate(0.1, compile=True, **QUIET)
+    loops(70).simulate(0.1, compile=True, **QUIET)
     built = sorted((tmp_path / "compiled").iterdir())
     code.load_compiled.cache_clear()
-    loops(150).replace({"box.pid7.kp": 3.5}).simulate(0.1, compile=True, **QUIET)
+    loops(80).replace({"box.pid7.kp": 3.5}).simulate(0.1, compile=True, **QUIET)
     assert sorted((tmp_path / "compiled").iterdir()) == built
 
 
@@ -121,7 +121,7 @@ def test_random_linear_diagrams_have_the_same_bits(spec):
         assert_same_bits(*both(diagram(spec.scaled(0.1)), PERIOD * BASE, step=BASE))
 
 
-@pytest.mark.parametrize("mode", ["held", "reset"])
+@pytest.mark.parametrize("mode", ["reset", pytest.param("held", marks=pytest.mark.slow)])
 def test_enabled_boxes_count_while_they_are_enabled(grouped, mode):
     enable = PulseTrain(period=1.0, duty=0.5)
     interpreted, compiled = both(Diagram("d", counting(0.1, enabled=mode, start=0.0)(enable=enable).named("n")), 2.0)
@@ -130,7 +130,7 @@ def test_enabled_boxes_count_while_they_are_enabled(grouped, mode):
     assert compiled["n"][[4, 8, 10]].tolist() == [5, 5, after]
 
 
-@pytest.mark.parametrize("edge", ["rising", "falling", "both"])
+@pytest.mark.parametrize("edge", ["both", *(pytest.param(e, marks=pytest.mark.slow) for e in ("rising", "falling"))])
 def test_triggered_boxes_have_the_same_bits(grouped, edge):
     @subsystem(sample_time=0.02, name="outer")
     def outer(u):

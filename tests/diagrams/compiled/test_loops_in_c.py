@@ -50,7 +50,7 @@ def matrix_loop(n, seed=3):
     return Diagram("d", box(Sine(frequency=1.0, name="source")), loops="solve"), A, b
 
 
-@pytest.mark.parametrize("n", [2, 3, 4, 7])
+@pytest.mark.parametrize("n", [4, 7, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))])
 def test_loops_of_several_values_satisfy_their_equations(n):
     made, A, b = matrix_loop(n)
     interpreted, compiled = both(made, 1.0)
