@@ -95,7 +95,12 @@ def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_pat
 
 @pytest.mark.parametrize(
     "page",
-    ["coupling", pytest.param("other_tools", marks=pytest.mark.slow), pytest.param("sweeps", marks=pytest.mark.slow)],
+    [
+        "coupling",
+        pytest.param("other_tools", marks=pytest.mark.slow),
+        pytest.param("worst_case", marks=pytest.mark.slow),
+        pytest.param("sweeps", marks=pytest.mark.slow),
+    ],
 )
 def test_the_page_runs(cache, tmp_path, page):
     scope = {}
