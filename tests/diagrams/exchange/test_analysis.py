@@ -6,6 +6,7 @@ from scipy.linalg import expm
 
 from loopwright.blocks import Constant, FmuError, Gain
 from loopwright.diagrams import Diagram, experiments, subsystem
+from loopwright.diagrams.report import analyse
 from loopwright.fmus import Fmu, bouncing_ball, gantry, mass_spring_damper
 
 K, D, M = 100.0, 1.0, 1.0
@@ -143,3 +144,20 @@ def test_co_simulation_tends_to_model_exchange_as_its_internal_step_goes_to_zero
     np.testing.assert_allclose(reference, np.array(states)[:, 0], atol=1e-9)
     errors = [np.abs(positions(f"s{n}", 0.1 / n, "co_simulation") - reference).max() for n in (4, 8)]
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.3)  # rk4
+
+
+@pytest.mark.slow
+def test_a_report_of_fig3_has_the_numbers_of_co_simulation(cache, tmp_path):
+    """The gantry is linear between its steps, and the controller's inputs are held: both interfaces mean one model."""
+    file = gantry.build(out=tmp_path / "gantry.fmu")
+    numbers = []
+    for interface in ("co_simulation", "model_exchange"):
+        diagram = experiments.compliance(plant=Fmu(file, interface=interface)).diagram
+        made = analyse(diagram, only=("operating_points", "poles", "inner", "admittance"))
+        assert {"inner", "admittance"} <= {section.key for section in made.sections}
+        numbers.append({f"{s.key}.{name}": number.value for s in made.sections for name, number in s.numbers.items()})
+    stepped, exchanged = numbers
+    assert stepped.keys() == exchanged.keys()
+    assert len(stepped) > 50
+    for name, value in stepped.items():
+        assert exchanged[name] == pytest.approx(value, rel=1e-9, abs=1e-12), name
