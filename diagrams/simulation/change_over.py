@@ -54,13 +54,13 @@ class ChangeOver:
         self._later: LaterTicks | None = None
         self._spent = 0.0
 
-    @property
-    def is_due(self) -> bool:
-        """Whether the code is there."""
-        return self._later is not None and self._later.code.ready
+    def watch(
+        self, last: int, progress: Callable[[float], Any], note_due: Callable[[], None]
+    ) -> Callable[[float], Any]:
+        """Return a ``progress`` for interpreted ticks from here up to a tick, which has the code made in time.
 
-    def watch(self, last: int, progress: Callable[[float], Any]) -> Callable[[float], Any]:
-        """Return a ``progress`` for interpreted ticks from here up to a tick, which has the code made in time."""
+        It calls ``note_due`` once the code is there: nothing is looked at in every tick.
+        """
         position, started, before = self._position, perf_counter(), self._spent
         first = position.tick
 
@@ -69,6 +69,8 @@ class ChangeOver:
             self._spent = before + spent
             if self._possible and self._spent > _PATIENCE and done:
                 self._look(spent * (last - position.tick) / done)
+                if self._later is not None and self._later.code.ready:
+                    note_due()
             progress(t)
 
         return tell

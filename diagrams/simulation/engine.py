@@ -77,6 +77,7 @@ class Engine:
         self._compiled: CompiledTicks | HybridTicks | None = None
         self.messages: tuple[str, ...] = ()
         self._can_stop = self._stops.exist or bool(self.exchanged)
+        self._due = False  # whether C takes over at the next tick
         self._tell = on_event
         if flat.hybrid:
             self.continuous = Continuous(
@@ -253,9 +254,10 @@ class Engine:
                 auto = self._compile == "auto" and self._compiled is None and not few
                 run_ticks(
                     workspace, plants, self.steps, self.coupled, position.tick, last, every=self.every_tick, row=row,
-                    arrived=self._arrive_or_change if auto else self._arrive,
-                    progress=self._change_over.watch(last, progress) if auto else progress,
+                    arrived=self._arrive,
+                    progress=self._change_over.watch(last, progress, self._note_due) if auto else progress,
                 )  # fmt: skip
+                self._due = False
                 self.messages += self._change_over.tell_failure()
                 if auto and (ticks := self._change_over.take_over()) is not None:
                     self._compiled, self._changed = ticks, True
@@ -300,10 +302,9 @@ class Engine:
                 del changes[:-1]
         return found
 
-    def _arrive_or_change(self, k: int) -> bool:
-        """Take note of a tick that has been recorded; return whether interpreted ticks end there."""
-        self.position.tick = k
-        return (self._can_stop and self._is_over()) or self._change_over.is_due
+    def _note_due(self) -> None:
+        """Let interpreted ticks end at the next one: C takes over."""
+        self._due = self._can_stop = True
 
     def _arrive(self, k: int) -> bool:
         """Take note of a tick that has been recorded; return whether it ends the run."""
@@ -315,7 +316,7 @@ class Engine:
         if position.stopped is None and self._stops.is_met():
             position.stopped = self._stops.met_at(position.t)
             self._note_end(position.t)
-        return position.stopped is not None
+        return position.stopped is not None or self._due
 
     # --- ends that FMUs ask for ---------------------------------------------------------------------------------------
 
