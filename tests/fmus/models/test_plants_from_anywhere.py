@@ -95,7 +95,7 @@ def test_a_gantry_that_another_tool_has_exported(tmp_path, tool, letter):
     if importlib.util.find_spec(tool) is None:
         pytest.skip(f"{tool} is not installed (extra: test)")
     run, own = run_experiment(TOOLS[tool](tmp_path), letter=letter), run_experiment(gantry.build(), letter=letter)
-    assert max(largest_differences(run, own, SIGNALS).values()) < 1e-13
+    assert max(largest_differences(run, own, SIGNALS).values()) < 1e-12  # tanh of two libraries: 1 ulp, in a loop
 
 
 @pytest.mark.slow
