@@ -67,13 +67,13 @@ static int step(const plant *p) {
 
 /* Step one FMU; return DONE, or why it can't go on. */
 static int64_t step_plant(const plant *p, double now, double width, outcome *out) {
-    unsigned status; /* a negative one is no success */
+    unsigned status; /* Python tells a warning, and what is worse; a negative one is no success */
     out->stage = INPUTS;
-    if (p->inputs.function && (status = (unsigned)move(p, &p->inputs)) > 1) return out->status = (int)status, FMU_FAILED;
+    if (p->inputs.function && (status = (unsigned)move(p, &p->inputs)) > 0) return out->status = (int)status, FMU_FAILED;
     *p->now = now;
     *p->width = width;
     out->stage = STEP;
-    if ((status = (unsigned)step(p)) > 1) return out->status = (int)status, FMU_FAILED;
+    if ((status = (unsigned)step(p)) > 0) return out->status = (int)status, FMU_FAILED;
     return p->flags[1] | p->flags[2] ? FMU_FLAGS : DONE; /* a flag for an event is for event mode alone */
 }
 
@@ -81,7 +81,7 @@ static int64_t read_plant(const plant *p, double now, double width, double near,
     unsigned status; /* a negative one is no success */
     if (fabs(*p->reached - now - width) > width * near) return FMU_FLAGS;
     out->stage = OUTPUTS;
-    if (p->outputs.function && (status = (unsigned)move(p, &p->outputs)) > 1) return out->status = (int)status, FMU_FAILED;
+    if (p->outputs.function && (status = (unsigned)move(p, &p->outputs)) > 0) return out->status = (int)status, FMU_FAILED;
     return DONE;
 }
 

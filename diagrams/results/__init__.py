@@ -1,6 +1,6 @@
 """Results of runs: recording, storage, plots and exports."""
 
-from .memory import memory
+from .memory import machine_memory
 from .operating_point import FreeDirection, OperatingPoint, PointOrigin
 from .plots import (
     BLUE,
@@ -51,8 +51,8 @@ __all__ = [
     "index_of",
     "layout_of",
     "limit_time",
+    "machine_memory",
     "marker_of",
-    "memory",
     "new_figure",
     "not_open_error",
     "resolve",

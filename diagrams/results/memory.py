@@ -10,7 +10,7 @@ from pathlib import Path
 from ...blocks.core import OptionError
 
 
-def memory() -> int:
+def machine_memory() -> int:
     """Return the bytes of memory of this machine."""
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -45,7 +45,7 @@ def check_memory(
     """
     needed = -(-samples // every) * 8 * (width + 1)
     if to is None:
-        there, most, place = memory(), 0.8 * memory(), "this machine has"
+        there, most, place = machine_memory(), 0.8 * machine_memory(), "this machine has"
         remedy = "record less with record=[…] or every=…, or stream to disk with to=path"
     else:
         there = most = free_on_disk(Path(to))

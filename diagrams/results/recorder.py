@@ -13,7 +13,7 @@ import numpy as np
 
 from ...blocks.core import Layout, OptionError, SimulationError, UnknownNameError
 from ..wiring import Wire
-from .memory import memory
+from .memory import machine_memory
 from .signal_names import entries, resolve
 from .stored import END, Occurrence, PathLike, create, event_line, prepare, read, split, write_json
 
@@ -193,11 +193,11 @@ class Recorder:
         row = 8 * self._width
         rows = min(2 * self._limit, max(_LARGEST // row, 1)) if self._limit else (self._expected or _FIRST)
         held = sum(chunk.nbytes for chunk in self._done)
-        if self._done and held + rows * row > 0.8 * memory():
+        if self._done and held + rows * row > 0.8 * machine_memory():
             self._chunk, self._k, self._limit = self._chunk[:0], 0, 0  # the full one is among the chunks done
             raise SimulationError(
-                f"the samples fill {held / 2**30:.1f} GiB, and this machine has {memory() / 2**30:.0f}. Record less "
-                "with record=[…] or every=…, or stream to disk with to=path.",
+                f"the samples fill {held / 2**30:.1f} GiB, and this machine has {machine_memory() / 2**30:.0f}. Record "
+                "less with record=[…] or every=…, or stream to disk with to=path.",
                 t=t,
             )
         self._begin_chunk(rows)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...blocks.core import OptionError, one_thread
 from ..flat import FlatDiagram
-from ..results import Run, entries, memory, resolve
+from ..results import Run, entries, machine_memory, resolve
 from ..simulation import SimulatedDiagram, Simulation, progress_bar
 from .names import find_parameter
 from .outcome import Outcome
@@ -184,7 +184,7 @@ def _check_room(plan: Plan, flat: FlatDiagram, count: int) -> None:
     names = flat.table.names
     width = sum(entries(resolve(name, names, flat.log.slices), flat.log, names).size for name in plan.signals)
     rows = int(plan.duration / float(flat.base)) // int(plan.run_options.every) + 2
-    needed, there = 2 * 8 * (width + 1) * rows * count, memory()
+    needed, there = 2 * 8 * (width + 1) * rows * count, machine_memory()
     if plan.signals and needed > 0.8 * there:
         raise OptionError(
             f"found {count} samples of {rows} instants with {width} numbers each; they need {needed / 2**30:.0f} GiB, "

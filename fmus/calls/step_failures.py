@@ -217,10 +217,15 @@ class StepFailures(LoadedFmu):
             Status of that.
         """
         assert self._call is not None
-        if stage != 1 and status > 1:
+        if stage == 0 and status == WARNING:  # nothing is lost by setting the inputs once more
+            self.step(t, h)
+            return
+        if stage != 1 and status > WARNING:
             raise self.report("setting the inputs" if stage == 0 else "reading the outputs", status, t)
-        if status > 1:
+        if stage == 1 and status > WARNING:
             self.end_step(status, t, h)
+        elif stage == 1:
+            self.judge("a step", status, t)
         self.check_flags(self._call, t, h)
 
     def note_retry(self, t: float, h: float, count: int) -> None:

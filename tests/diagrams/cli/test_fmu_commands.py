@@ -20,7 +20,7 @@ from loopwright.fmus.archive import read_library
 from loopwright.fmus.checks import summary as _summary
 from loopwright.fmus.checks import trial as _trial
 from loopwright.fmus.export.compiler import find_compiler
-from loopwright.fmus.export.package import _zip
+from loopwright.fmus.export.package import zip_files
 from loopwright.fmus.platform import native_platform
 from support.zoo import zoo_fmu
 
@@ -140,7 +140,7 @@ def altered(lag, tmp_path):
             content["modelDescription.xml"] = etree.tostring(root)
         content.update(files or {})
         path = tmp_path / "altered.fmu"
-        path.write_bytes(_zip({k: v for k, v in content.items() if k not in drop}))
+        path.write_bytes(zip_files({k: v for k, v in content.items() if k not in drop}))
         return path
 
     return alter
@@ -464,7 +464,7 @@ FMI1 = """<?xml version="1.0" encoding="UTF-8"?>
 
 def test_inspect_fmi_1(tmp_path, capsys):
     file = tmp_path / "old.fmu"
-    file.write_bytes(_zip({"modelDescription.xml": FMI1.encode(), "binaries/win32/old.dll": b"MZ"}))
+    file.write_bytes(zip_files({"modelDescription.xml": FMI1.encode(), "binaries/win32/old.dll": b"MZ"}))
     assert main(["inspect", str(file)]) == 0
     out = capsys.readouterr().out
     assert "FMI            1.0\n" in out
@@ -506,13 +506,13 @@ def test_files_that_are_no_fmu(command, tmp_path, capsys):
         b"not a zip archive",
         "is no FMU: it is no zip archive (it starts with b'not a zi')",
     )
-    says(_zip({"a.txt": b""}), "is a zip archive without modelDescription.xml, so it is no FMU.")
+    says(zip_files({"a.txt": b""}), "is a zip archive without modelDescription.xml, so it is no FMU.")
     says(
-        _zip({"a/modelDescription.xml": b""}),
+        zip_files({"a/modelDescription.xml": b""}),
         "There is a/modelDescription.xml: pack the files in that folder, not the folder.",
     )
-    says(_zip({"modelDescription.xml": b"<a>"}), "is no XML")
-    says(_zip({"modelDescription.xml": b'<fmiModelDescription fmiVersion="9.0"/>'}), "9.0")
+    says(zip_files({"modelDescription.xml": b"<a>"}), "is no XML")
+    says(zip_files({"modelDescription.xml": b'<fmiModelDescription fmiVersion="9.0"/>'}), "9.0")
 
 
 # --- libraries that are broken --------------------------------------------------------------------------------------

@@ -137,7 +137,7 @@ def test_a_run_on_disk_holds_one_chunk_in_memory(tmp_path):
 
 
 def test_memory_that_fills_up_ends_the_run_with_what_was_kept(monkeypatch):
-    monkeypatch.setattr(_recorder, "memory", lambda: 2**20)
+    monkeypatch.setattr(_recorder, "machine_memory", lambda: 2**20)
     recorder = Recorder(WIDTH)
     n = 0
 
@@ -329,7 +329,7 @@ def test_a_selection_refuses_a_name_that_is_not_there():
 
 
 def test_memory_is_checked_against_what_is_really_recorded(monkeypatch):
-    monkeypatch.setattr(_memory, "memory", lambda: 10**9)
+    monkeypatch.setattr(_memory, "machine_memory", lambda: 10**9)
     tick = Fraction(1, 1000)
     with pytest.raises(
         OptionError, match=r"^d\.duration: found 999999 ticks of 0\.001 s; 100 numbers each need .*record=.*every=.*to="
@@ -342,7 +342,7 @@ def test_memory_is_checked_against_what_is_really_recorded(monkeypatch):
 
 
 def test_a_run_to_disk_is_checked_against_what_is_free_there(monkeypatch, tmp_path):
-    monkeypatch.setattr(_memory, "memory", lambda: 1)
+    monkeypatch.setattr(_memory, "machine_memory", lambda: 1)
     monkeypatch.setattr(_memory, "free_on_disk", lambda path: 10**9)
     tick = Fraction(1, 1000)
     check_memory(10**6, 100, tick, "d", to=tmp_path / "run")

@@ -113,15 +113,17 @@ def test_an_impossible_default_experiment_does_not_change_a_run(tmp_path, experi
     assert run["plant.time"] == pytest.approx([0.0, 0.1, 0.2, 0.3], abs=1e-15)
 
 
-@pytest.mark.parametrize("isolate", [False, True])
-def test_warnings_without_words_are_told_once_for_each_kind_of_call(tmp_path, cache, isolate):
+@pytest.mark.parametrize(("isolate", "compiled"), [(False, False), (True, False), (False, True)])
+def test_warnings_without_words_are_told_once_for_each_kind_of_call(tmp_path, cache, isolate, compiled):
     """Readings warn from t = 0.4 s on, steps from 0.6 s on; their values count."""
     getter = values("fmi2", "Get", "Real", "double", {1: "c->t"})
     warns = CHANGES.replace(getter, getter.replace("return 0;", "return c->t > 0.35;"))
     step = "pthread_join(one, NULL); }\n    return 0; }"
     assert warns.count(step) == 1
     path = small_fmu(tmp_path, "fmi2", warns.replace(step, step.replace("return 0", "return c->t > 0.65")), MODEL)
-    run = Diagram("d", Fmu(path, name="plant", isolate=isolate)()).simulate(1.0, step=0.1, progress=False)
+    diagram = Diagram("d", Fmu(path, name="plant", isolate=isolate)())
+    run = diagram.simulate(1.0, step=0.1, progress=False, compile=compiled)
+    assert run.tier == ("compiled" if compiled else "interpreted")
     told = [m for m in run.messages if "Warning" in m]
     assert [m.rpartition(" at t = ")[0] for m in told] == [
         "plant: reading the outputs gave fmi2Warning",
