@@ -24,6 +24,9 @@ ROUNDED = 1e-9
 class StepFailures(LoadedFmu):
     """Part of an instance that judges its steps."""
 
+    step: Callable[[float, float], None]
+    """Set the inputs, take a step from a time over a length, both in s, and get the outputs."""
+
     _inputs: dict[str, FmuVariable]
     _vector: np.ndarray
     _now: ctypes.c_double
