@@ -66,6 +66,7 @@ class _Hybrid(ctypes.Structure):
         *_fields(_INT, "active automatic accepts between budget inside begun stepped"), *_fields(_REAL, "t to"),
         *_fields(_INT, "found hits misses easy"), ("before", _AT), ("outputs", _INT),
         *_fields(_AT, "taken taken_first taken_states"), ("switched", _INT), ("solved", _AT), ("looked_at", _REAL),
+        *_fields(_AT, "z held"), ("inputs", _INT),
     ]  # fmt: skip
 
 
@@ -168,6 +169,9 @@ class CompiledHybrid:
         Newton's method for the algebraic loops between ticks, where there are some.
     accepts : bool
         Whether blocks are to be evaluated after every step: they remember something, have guards, or FMUs read them.
+    held : pair of ndarray
+        Inputs of FMUs as they are now, and as they are held from a tick to the next one; one array where nothing
+        changes them between ticks.
     """
 
     def __init__(
@@ -183,6 +187,7 @@ class CompiledHybrid:
         spacing: float,
         own: Sequence[np.ndarray],
         accepts: bool,
+        held: tuple[np.ndarray, np.ndarray],
         loops: NewtonOptions | None = None,
     ):
         self._kept: list[Any] = [code, loop, arguments, x_next]
@@ -194,6 +199,9 @@ class CompiledHybrid:
         slope = code.between.get("slope")
         slopes = np.zeros(0 if slope is None else slope.function.numel_out(0) if loops else slope.function.nnz_out(0))
         self._hybrid = hybrid = _Hybrid(l=loop.structure, automatic=len(methods) > 1, accepts=accepts)
+        z, inputs = held
+        if inputs is not z:
+            hybrid.z, hybrid.held, hybrid.inputs = self._own(z), self._own(inputs), z.size
         hybrid.budget = _budget(code.between["flow"].function, methods, n)
         hybrid.between = self.kinds[NONE]
         hybrid.p = _Problem(

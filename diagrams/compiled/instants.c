@@ -34,6 +34,9 @@ typedef struct hybrid {
     int64_t switched;   /* 1: stiff, it seems; 2: no longer */
     double *solved;     /* values of the algebraic loops at an event */
     double looked_at;   /* step in s at which it seemed so */
+    const double *z;    /* inputs of all plants as they are now, and as they are held between ticks */
+    double *held;
+    int64_t inputs;
 } hybrid;
 
 typedef struct {
@@ -312,6 +315,7 @@ static int64_t land(hybrid *h, progress *g) {
                 states[h->taken[j]] = h->taken_states[h->taken[j]];
     }
     h->inside = 0;
+    for (int64_t j = 0; j < h->inputs; j++) h->held[j] = h->z[j];
     g->out->rows = record(l, t, g->rows, g->out->rows);
     g->i++;
     return is_stopped(l) ? STOPPED : DONE;

@@ -47,12 +47,14 @@ class PlantSteps:
         time_of: Callable[[int], float],
         *,
         every_tick: bool,
+        coupled: bool = False,
     ) -> None:
         self._flat, self._plants, self._time_of = flat, plants, time_of
         self._z, self._w = z, w
         self._visited = {EVERY} if every_tick else {*flat.visited}
         self.regular = all(map(self.is_regular, flat.plant_ticks))
-        self.inputs = z if self.regular else z.copy()
+        moves = flat.hybrid and bool(flat.plant_ticks) and not coupled  # z follows states between ticks
+        self.inputs = z.copy() if moves or not self.regular else z
         self.reached: dict[str, int] = {}
         self._even = {path for path in flat.plant_ticks if not takes_any_step(flat.table.blocks[path])}
         self._own = {path: part_of(flat, flat.plant_inputs, path) for path in flat.plant_ticks}
@@ -67,8 +69,8 @@ class PlantSteps:
         bind(self._flat, self._plants, self.inputs, self._w)
 
     def take_inputs(self) -> None:
-        """Let every plant see its inputs as they are in z."""
-        if not self.regular:
+        """Let every plant hold its inputs as they are in z."""
+        if self.inputs is not self._z:
             self.inputs[:] = self._z
 
     def begin(self, k: int) -> None:
@@ -110,6 +112,9 @@ class PlantSteps:
 
     def hold(self, k: int) -> None:
         """Let the plants of which a tick is a communication point hold their inputs from there on."""
+        if self.regular:
+            self.take_inputs()
+            return
         for path, own in self._own.items():
             if self._flat.steps_at(path, k):
                 self.inputs[own] = self._z[own]

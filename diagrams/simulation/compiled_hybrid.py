@@ -256,6 +256,7 @@ class HybridTicks:
             raise error.at(t=end) from error.__cause__
         if ended is None:
             take_tick(workspace, continuous, self._plants, end, flat.acting(following))
+            self._steps.hold(following)
             recorder.row(end, workspace.log)
         self._hand_over(loop, end if ended is None else ended)
         return ended
@@ -315,6 +316,7 @@ class HybridTicks:
                 spacing=math.inf if domains is None else domains.spacing,
                 own=() if domains is None else domains.own,
                 accepts=accepts,
+                held=(workspace.z, self._steps.inputs),
                 loops=newton_options(self._flat, NONE) if self._flat.active_loops(NONE) else None,
             )  # fmt: skip
             self._kind_of = np.zeros(1 << len(self._flat.distinct), dtype=np.int32)

@@ -95,6 +95,7 @@ class Engine:
             solver_name(options.solver)  # an unknown one is an error here, too
         self.every_tick = every_tick or (self.continuous is not None and self.continuous.fixed)
         self.coupling = to_coupling(options.coupling, block=name)
+        is_coupled = not self.coupling.is_plain and bool(flat.plant_ticks) and Links(flat).exist
         self.coupled: CoupledSteps | None = None
         """Steps of the plants by another scheme than the default."""
         self.steps = PlantSteps(
@@ -104,12 +105,13 @@ class Engine:
             self.workspace.here.w,
             self.position.time_of,
             every_tick=self.every_tick,
+            coupled=is_coupled,
         )
         stops, plain = self._stops.entries, self.coupling.is_plain
         self._change_over = ChangeOver(
             self.workspace, self.position, self.plants, self.steps, stops, every=self.every_tick, plain=plain
         )
-        if not self.coupling.is_plain and flat.plant_ticks and Links(flat).exist:
+        if is_coupled:
             refuse_exchanged(self.coupling, {path: flat.table.blocks[path] for path in flat.outside})
             self.coupled = CoupledSteps(
                 flat,

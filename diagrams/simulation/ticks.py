@@ -143,8 +143,7 @@ def run_hybrid(
         if coupled is None:
             steps.go(k, following, last=following == last)
         take_tick(workspace, continuous, plants, time_of(following), flat.acting(following))
-        if not steps.regular:
-            steps.hold(following)
+        steps.hold(following)
         row(time_of(following), workspace.log)
         if arrived(following):
             return None
