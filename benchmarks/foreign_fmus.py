@@ -35,11 +35,14 @@ CLOSE = 1e-9
 """Difference of two runs, relative to the signal's size, up to which they agree."""
 MARKS = "<!-- written by benchmarks/foreign_fmus.py -->", "<!-- up to here -->"
 REASONS = (
-    ("hybrid-cosim|singlewatertank-20sim|watertankcontroller-c", "",
-     "the library is not named for the model identifier; it is the only one in its folder"),
     ("rollback-", "",
      ("it wants its state of before restored before a shorter step; Loopwright goes on from its "
      "`lastSuccessfulTime`")),
+    ("cannot open shared object file", "",
+     ("shared libraries are missing (`liblapack.so.3`, `libgfortran.so.3` or `.so.4`); the error and "
+     "`loopwright doctor` name them")),
+    ("Cannot find shared library", "CoSimulation",
+     "the library is not named for the model identifier; it is the only one in its folder"),
     ("uart", "",
      "the library lacks `fmi2DeSerializeFMUstate`, which no run calls"),
     ("FMI4j.*BouncingBall", "",
@@ -56,9 +59,6 @@ REASONS = (
      "places for each importer")),
     ("PumpAndValve", "",
      "its output `CPUtime` is the time that it took"),
-    ("Linear|JModelica", "",
-     ("shared libraries are missing (`liblapack.so.3`, `libgfortran.so.3` or `.so.4`); the error and "
-     "`loopwright doctor` name them")),
     ("Sensor_Block", "CoSimulation",
      "an output in 255 steps differs by one of them"),
     ("FMI4j.*VanDerPol|periodic_clock", "ModelExchange",
@@ -69,14 +69,12 @@ REASONS = (
      "it wants Event Mode, which Loopwright uses where an FMU has clocks"),
     ("fmi3functiontest", "",
      "FMI 3.0-beta.3"),
-    ("PyFMI.*bouncingBall", "ModelExchange",
-     "FMI 1.0 is taken for co-simulation only"),
     ("ModelicaGym_CartPole", "",
      "it crashes in its instantiation: it requires a licence"),
     ("fuelrail|OSOM|Roberts", "CoSimulation",
      "slow"),
 )  # fmt: skip
-"""Reasons of differences: a pattern for source and file, an interface or none, and the reason as it was found."""
+"""Reasons of differences: a pattern for source, file and outcomes, an interface or none, and the reason."""
 INTERFACES = {"CoSimulation": "co_simulation", "ModelExchange": "model_exchange"}
 
 
@@ -316,7 +314,10 @@ def as_page(rows: list[dict[str, object]]) -> str:
 def explain(row: dict[str, object]) -> str:
     """Return the reason of a difference, as far as it is known."""
     for pattern, interface, reason in REASONS:
-        if re.search(pattern, f"{row['source']}/{row['path']}") and interface in ("", row["interface"]):
+        if re.search(pattern, f"{row['source']}/{row['path']} {row['ours']} {row['fmpy']}") and interface in (
+            "",
+            row["interface"],
+        ):
             return reason
     return "not known"
 
