@@ -300,7 +300,7 @@ class Simulation:
         """
         recorder = self._recorder
         state = self.save() if final and self.can_save else None
-        if final and self._begun:
+        if final and self._begun and not self._engine.is_ahead:
             recorder.last(self.t, self._engine.workspace.log)
         texts = self._engine.take_texts()
         if last:

@@ -306,7 +306,7 @@ def _try(
     folders = binaries_of(archive.files)
     if hopeless:
         return FmuTrial(kind, ran=False, left="it can't run here"), None
-    left = reason_not_to_run(kind, attributes, folders, summary["fmi_version"])
+    left = reason_not_to_run(kind, attributes, folders)
     if not left and run is None and _needs_tool(attributes, summary):
         left = "it needs another program, and may take a licence; --run tries it"
     if not left and run is False:

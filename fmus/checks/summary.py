@@ -137,8 +137,7 @@ def _notes(fmi: str, entries: Iterable[str], interfaces: Mapping[str, Mapping[st
     notes = []
     if fmi == "1.0":
         notes.append(
-            "FMI 1.0 runs here for co-simulation alone, without saved states and derivatives. Export it with FMI 3.0 "
-            "where you can."
+            "FMI 1.0 runs here without saved states and exact derivatives. Export it with FMI 3.0 where you can."
         )
     if _needs_python(entries, tool):
         notes.append(

@@ -91,7 +91,7 @@ def validate(file: Path, *, run: bool = True, limits: ArchiveLimits | None = Non
         elements = {"ModelExchange" if not root.xpath("Implementation") else "CoSimulation": root}
     for kind, element in elements.items() if run else ():
         name = INTERFACES[kind]
-        reason = reason_not_to_run(kind, element, folders, fmi)
+        reason = reason_not_to_run(kind, element, folders)
         if reason:
             left.append(f"{name} was not run: {reason}")
             continue
@@ -253,7 +253,7 @@ def _binaries(archive: FmuArchive, root: Any, tool: str) -> Iterator[FmuProblem]
 # --- running --------------------------------------------------------------------------------------------------------
 
 
-def reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]], version: str) -> str:
+def reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]]) -> str:
     """Return the reason why an interface can't be run here; empty if there is none.
 
     Parameters
@@ -264,13 +264,9 @@ def reason_not_to_run(kind: str, element: Any, folders: Mapping[str, list[str]],
         Its attributes; an XML element serves.
     folders : mapping
         Libraries by folder, as `binaries_of` returns them.
-    version : str
-        Version of FMI.
     """
     if kind == "ScheduledExecution":
         return "scheduled execution needs a scheduler"
-    if kind == "ModelExchange" and version == "1.0":
-        return "model exchange of FMI 1.0 is not supported"
     native = native_platform()
     if native_libraries(native, folders, [element.get("modelIdentifier") or ""]) is not None:
         return ""

@@ -119,9 +119,20 @@ def test_with_a_solver_it_ends_at_a_communication_point(files, last, isolate, co
     )
     assert not (compiled and any("Interpreted" in m for m in run.messages)), run.messages
     check_end(run, 0.5, at=last)
+    np.testing.assert_allclose(run.t, np.arange(6) * 0.1, rtol=0, atol=1e-15)  # none of the step that was given up
     held = np.concatenate([[0.0], np.cumsum(0.1 * run["plant.y"][:-1])])  # outputs are held over a step
     np.testing.assert_allclose(run["area.y"], held, rtol=0, atol=1e-12)
     assert any("last communication point" in m for m in run.messages) == (last == 0.53)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_the_last_of_every_few_samples_is_none_of_the_step_that_was_given_up(files, compiled):
+    plant = Fmu(files["fmi3"], name="plant", start={"last": 0.53}, isolate=False)
+    area = Integrator(name="area")(plant(u=Constant(value=1.0)).y)
+    run = Diagram("d", area).simulate(1.0, step=0.1, rtol=1e-8, every=4, compile=compiled, progress=False)
+    kept = 2 if compiled else 3  # C has gone beyond the end, and keeps no other sample
+    np.testing.assert_allclose(run.t, [0.0, 0.4, 0.5][:kept], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(run["area.y"], [0.0, 0.06, 0.1][:kept], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("last", [0.5, 0.53])

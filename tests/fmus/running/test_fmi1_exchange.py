@@ -6,7 +6,8 @@ import pytest
 
 from loopwright.blocks import AlgebraicLoopError, Constant, FmuFileError, Gain
 from loopwright.diagrams import Diagram
-from loopwright.fmus import Fmu
+from loopwright.fmus import Fmu, FmuVerdict, doctor
+from loopwright.fmus.checks.validation import validate
 from support.small_fmus import small_fmu, values
 
 G, E = 9.81, 0.7
@@ -121,6 +122,12 @@ def test_what_fmi_1_lacks_is_told(file):
     np.testing.assert_allclose(model.A, [[0.0, 1.0], [0.0, 0.0]], atol=1e-8)
     np.testing.assert_allclose(model.B, [[0.0], [1.0]], atol=1e-8)
     assert diagram.simulate(0.1, progress=False).final_state is None
+
+
+def test_the_doctor_and_the_validator_try_it(file):
+    found = doctor(file)
+    assert found.verdict == FmuVerdict.RUNS
+    assert any("model exchange evaluated at its start" in done for done in validate(file).done)
 
 
 def test_a_library_without_the_functions_of_model_exchange_is_refused(tmp_path, cache):
