@@ -241,9 +241,11 @@ def _choose(contact: TriedContact, limit: ContactLimit, method: TrialMethod | st
     if (
         library_class(block) is not None
         and contact.direction.shape == (2,)
-        and (contact.sample_time > 0.0 if block.stepped else not has_mass)
+        and (contact.sample_time > 0.0 if block.stepped else not (has_mass or isinstance(block, Fmu)))
     ):
-        possible.append(TrialMethod.INSIDE)  # but where the mass's force would act in a circle through the tick
+        # but where the environment's force would act in a circle through the tick: that of a mass, or any that an FMU
+        # in model exchange states to depend on its inputs, as the environment inside may have a mass
+        possible.append(TrialMethod.INSIDE)
     if equations:
         possible.append(TrialMethod.SOLVER)
     if block.stepped and contact.sample_time > 0.0:

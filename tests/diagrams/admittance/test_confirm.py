@@ -79,6 +79,16 @@ def test_what_cannot_be_confirmed_says_why():
 
 
 @pytest.mark.slow
+def test_a_plant_of_the_library_in_model_exchange_is_tried_with_the_environment_in_the_solver():
+    made = experiments.compliance(plant=gantry.build()).diagram
+    here = made.replace(plant=made["plant"].replace(interface="model_exchange")).contact()
+    found = here.confirm(here.stability_limit())
+    assert "in the solver" in found.method.value
+    for trial in found.trials:
+        assert trial.measured == pytest.approx(trial.predicted, abs=0.01 * abs(trial.predicted))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["inside", "held"])
 @pytest.mark.parametrize("side", ["par", "perp"])
 def test_a_limit_under_a_static_force_on_a_curved_path_holds(side, method):
