@@ -39,7 +39,7 @@ class LoadedFmu:
     def __init__(self, block: FmuBlock, *, model_exchange: bool = False, make_calls: MakeCalls | None = None):
         self.block, self.description = block, block.description
         self.model_exchange, self.failed, self.fatal = model_exchange, False, False
-        self.log = MessageLog(block.label, list_limits(block.label, self.description))
+        self.log = MessageLog(block.label, list_limits(block.label, self.description, model_exchange=model_exchange))
         self._open = self._running = False
         self._began, self._given = 0.0, dict[str, Any]()
         description, self.host = self.description, HostState(self.add_note)

@@ -35,7 +35,7 @@ def waits_for_initialization(about: FmuDescription, name: str) -> bool:
     return about.fmi.startswith("2") and (about.texts.get(name) or about.find(name)).causality == "input"
 
 
-def list_limits(label: str, about: FmuDescription) -> list[str]:
+def list_limits(label: str, about: FmuDescription, *, model_exchange: bool = False) -> list[str]:
     """Return messages on ports that are neither read nor set, and on a file or description that breaks rules."""
     ins, outs = (about.other_ports(causality) for causality in ("input", "output"))
     outs, clocks = [v for v in outs if not v.is_text], [v for v in ins if v.type_is_clock]
@@ -47,12 +47,16 @@ def list_limits(label: str, about: FmuDescription) -> list[str]:
     still = [
         v
         for v in clocks
-        if not about.has_event_mode or (v.interval_variability == "triggered" and v.name not in driven)
+        if model_exchange
+        or not about.has_event_mode
+        or (v.interval_variability == "triggered" and v.name not in driven)
     ]
     if still:
         why = (
-            "a triggered clock ticks where an input that it clocks changes, and it clocks none. Export it with such an "
-            "input, or with a periodic clock"
+            "input clocks are driven in co-simulation alone, and this is model exchange. Take an FMU with co-simulation"
+            if model_exchange
+            else "a triggered clock ticks where an input that it clocks changes, and it clocks none. Export it with such "
+            "an input, or with a periodic clock"
             if about.has_event_mode
             else "the FMU has no Event Mode (hasEventMode)"
         )

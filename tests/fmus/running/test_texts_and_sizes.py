@@ -7,7 +7,8 @@ import pytest
 
 from loopwright.blocks import Constant, OptionError, ParameterError, UnknownNameError
 from loopwright.diagrams import Diagram, Run
-from loopwright.fmus import Fmu
+from loopwright.fmus import Fmu, read_description
+from loopwright.fmus.calls.texts import list_limits
 from support.small_fmus import small_fmu
 
 SOURCE = """
@@ -70,6 +71,13 @@ DESCRIPTION = """<CoSimulation modelIdentifier="small" canHandleVariableCommunic
 @pytest.fixture(scope="module")
 def file(cache, tmp_path_factory):
     return small_fmu(tmp_path_factory.mktemp("texts"), "fmi3", SOURCE, DESCRIPTION)
+
+
+def test_a_periodic_clock_in_model_exchange_is_told(file):
+    told = list_limits("p", read_description(file), model_exchange=True)
+    assert any(
+        "the clocks beat (constant Clock) never tick: input clocks are driven in co-simulation" in m for m in told
+    )
 
 
 def run_of(plant, duration=0.5, **options):
