@@ -78,9 +78,8 @@ class Engine:
         self.messages: tuple[str, ...] = ()
         self._can_stop = self._stops.exist or bool(self.exchanged)
         self._due = False  # whether C takes over at the next tick
-        self._log_at_tick = self.workspace.log.copy()  # as recorded: the solver goes ahead of the plants from there
         self.is_ahead = False
-        """Whether the run has ended at a tick beyond which C has gone, so that its signals are not those of the end."""
+        """Whether the run has ended at a tick beyond which the solver has gone: signals are not those of the end."""
         self._tell = on_event
         if flat.hybrid:
             self.continuous = Continuous(
@@ -230,7 +229,6 @@ class Engine:
         take_tick(self.workspace, self.continuous, self.plants, now, self.flat.acting(first))
         self.steps.begin(first)
         row(now, self.workspace.log)
-        self._keep_log()
         self._arrive(first)
 
     def go(self, last: int, recorder: Recorder, progress: Progress) -> None:
@@ -249,6 +247,7 @@ class Engine:
             With the block that is to blame.
         """
         workspace, plants, position, row = self.workspace, self.plants, self.position, recorder.row
+        self.is_ahead = False
         try:
             few = self._compile == "auto" and last - position.tick < _FEW
             if self._compiled is not None and not few and self._compiled.reaches(last):
@@ -315,12 +314,7 @@ class Engine:
     def _arrive(self, k: int) -> bool:
         """Take note of a tick that has been recorded; return whether it ends the run."""
         self.position.tick = k
-        self._keep_log()
         return self._can_stop and self._is_over()
-
-    def _keep_log(self) -> None:
-        if self.continuous is not None and self.plants:
-            self._log_at_tick[:] = self.workspace.log
 
     def _is_over(self) -> bool:
         position = self.position
@@ -354,9 +348,7 @@ class Engine:
         if at is None or plant is None:
             return False
         end = position.t
-        if self.continuous is not None and self._compiled is None:
-            self.workspace.log[:] = self._log_at_tick
-        self.is_ahead = self.continuous is not None and self._compiled is not None
+        self.is_ahead = self.continuous is not None
         if self.continuous is None and self.coupled is None and at > end:
             try:
                 plant.read(at)

@@ -55,8 +55,8 @@ def list_limits(label: str, about: FmuDescription, *, model_exchange: bool = Fal
         why = (
             "input clocks are driven in co-simulation alone, and this is model exchange. Take an FMU with co-simulation"
             if model_exchange
-            else "a triggered clock ticks where an input that it clocks changes, and it clocks none. Export it with such "
-            "an input, or with a periodic clock"
+            else "a triggered clock ticks where an input that it clocks changes, and it clocks none. Export it with "
+            "such an input, or with a periodic clock"
             if about.has_event_mode
             else "the FMU has no Event Mode (hasEventMode)"
         )
