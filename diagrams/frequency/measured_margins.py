@@ -69,7 +69,8 @@ class MeasuredMargins:
     delay_margin_s : Interval
         The smallest delay that does so.
     modulus_margin, ms : Interval
-        Smallest distance of L from −1 among the data, and its inverse, the largest |S|.
+        Smallest distance of L from −1, and its inverse, the largest |S|; NaN where |L| does not fall below 1 among the
+        data. Beyond the last point |L| is taken to stay below its last value.
     crossover : Interval
         Gain crossover of the phase margin, in rad/s.
     notes : tuple of str
@@ -130,7 +131,9 @@ def measured_margins(data: Any, uncertainty: ArrayLike | None = None) -> Measure
     notes = []
     phase = _phase_margin(curve)
     if math.isnan(phase[0][0]):
-        notes.append(f"|L| does not cross 1 between {w[0]:.4g} and {w[-1]:.4g} rad/s: no phase and delay margin.")
+        crossed = np.any((curve.gain[1:] > 0.0) != (curve.gain[:-1] > 0.0))
+        how = "may cross 1 outside the points between" if crossed else "does not cross 1 between"
+        notes.append(f"|L| {how} {w[0]:.4g} and {w[-1]:.4g} rad/s: no phase and delay margin.")
     low, high = _gain_margins(curve)
     if math.isnan(low[0]) and math.isnan(high[0]):
         notes.append(f"L is not real and negative between {w[0]:.4g} and {w[-1]:.4g} rad/s: no gain margin.")
@@ -142,7 +145,13 @@ def measured_margins(data: Any, uncertainty: ArrayLike | None = None) -> Measure
         max(0.0, float(np.min(distance - beyond))),
         float(np.min(distance + beyond)),
     )
-    ms = (1.0 / modulus[0], 1.0 / modulus[2], 1.0 / modulus[1] if modulus[1] > 0.0 else math.inf)
+    modulus = _with_the_rest(modulus, curve, int(np.argmin(distance)))
+    if math.isnan(modulus[0]):
+        notes.append(
+            f"the smallest distance from −1 need not lie between {w[0]:.4g} and {w[-1]:.4g} rad/s: "
+            "no modulus margin and M_s."
+        )
+    ms = (1.0 / modulus[0], 1.0 / modulus[2], 1.0 / modulus[1] if modulus[1] != 0.0 else math.inf)
     return MeasuredMargins(
         Interval(*low, "1"),
         Interval(*high, "1"),
@@ -153,6 +162,18 @@ def measured_margins(data: Any, uncertainty: ArrayLike | None = None) -> Measure
         Interval(*phase[2], "rad/s"),
         tuple(notes),
     )
+
+
+def _with_the_rest(modulus: tuple[float, float, float], curve: _Curve, least: int) -> tuple[float, float, float]:
+    """Return the distance from −1 and its bounds, with what the loop can do beyond the last point.
+
+    From there on |L| is taken to stay below its last value, so that 1 − |L| bounds the distance. Where |L| has not
+    fallen below 1, or the distance is smallest at the first point, the data don't have the smallest one.
+    """
+    last = float(np.exp(curve.gain[-1] + curve.gain_error[-1]))
+    if last >= 1.0 or (least == 0 and modulus[0] < 1.0):
+        return NOTHING
+    return modulus[0], min(modulus[1], 1.0 - last), modulus[2]
 
 
 def _read(data: Any, uncertainty: ArrayLike | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -220,6 +241,8 @@ def _phase_margin(curve: _Curve) -> tuple[tuple[float, float, float], ...]:
     def at(y: np.ndarray) -> np.ndarray:
         return np.asarray(y[crossed] + part * (y[crossed + 1] - y[crossed]))
 
+    if found[0] or found[-1]:  # a crossing may lie beyond the data
+        return NOTHING, NOTHING, NOTHING
     rotation, w = np.abs(at(turn)), at(curve.w)
     least, most = np.maximum(np.abs(turn) - curve.turn_error, 0.0), np.abs(turn) + curve.turn_error
     forward = at(turn) % (2.0 * np.pi)  # a delay turns one way only

@@ -156,3 +156,27 @@ def test_a_measured_diagram_has_the_margins_of_its_linear_model():
     assert got.phase_margin_deg.high - got.phase_margin_deg.low < 3.0
     assert float(exact.ms) in got.ms
     assert float(exact.delay_margin_s) in got.delay_margin_s
+
+
+def test_the_largest_sensitivity_beyond_the_data_is_not_in_the_data():
+    w = np.geomspace(0.05, 0.125, 10)  # far below the crossover: |S| is at most 0.26 here, and 1.57 later
+    lag = control.tf([1.0], [1.0, 3.0, 2.0, 0.0])
+    found = measured_margins(control.frd(lag(1j * w), w), uncertainty=0.02)
+    assert math.isnan(found.ms.value)
+    assert math.isnan(found.modulus_margin.value)
+    assert "no modulus margin" in found.notes[-1]
+
+
+def test_an_uncertain_crossing_at_the_end_of_the_data_is_not_in_the_data():
+    w = np.geomspace(0.05, 1.01, 40)
+    found = measured_margins(control.frd(np.exp(-1j * w) / (1j * w), w), uncertainty=0.15)
+    assert math.isnan(found.phase_margin_deg.value)  # 32.7°, but 1.12 exp(−0.09j) L has 20.7°, beyond the data
+    assert math.isnan(found.crossover.value)
+    assert "may cross 1 outside the points between 0.05 and 1.01 rad/s" in found.notes[0]
+
+
+def test_beyond_the_last_point_the_gain_stays_below_its_last_value():
+    w = np.geomspace(0.05, 1.5, 40)
+    lag = control.tf([1.0], [1.0, 1.0, 0.0])
+    found = measured_margins(control.frd(lag(1j * w), w), uncertainty=0.01)
+    assert found.ms.high >= 1.0 / (1.0 - abs(lag(1.5j)))
