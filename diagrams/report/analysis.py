@@ -26,7 +26,7 @@ from .section_limits import not_modelled
 from .section_loops import inner
 from .section_measured import measured_loops, read_measured
 from .section_poles import closed_loops, memory
-from .section_sensitivity import sensitivity, worst_case_of
+from .section_sensitivity import check_worst_case, sensitivity, worst_case_of
 from .section_steps import steps
 from .section_subject import operating_points, remarks, subject, versions
 from .section_summary import summary
@@ -135,6 +135,8 @@ def analyse(
         find_signal(diagram.flatten(None if diagram.has_clock else STEP), wire)
     tell = progress or (lambda key: None)
     contacts = check_contacts(diagram, contacts or {})
+    if worst_case is not None:
+        check_worst_case(diagram, worst_case)
     asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(requirements)
     case, sections = kind.sections(
         diagram, point, experiment, wires, only, tell, stairs, asked, AxisUnits(decibels, hertz), tuple(measured or ())

@@ -7,12 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError
+from ...blocks.core import LoopwrightError, OptionError
 from .. import report_figures as figures
+from ..flat import WiredDiagram
 from ..frequency import Number
 from ..report_writing import Plot, Section, Table, Texts
 from ..studies import CaseState, Sensitivities, Sensitivity, WorstCase, confirm_parameter, sensitivities_of
 from .case import Case
+from .content_hash import content_hash
 from .section_loops import ROWS
 
 TEXTS = Texts(__package__, "sensitivity")
@@ -48,6 +50,7 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities) -> Section:
     first = next((name for name in shown if any(map(_acts, found.of(name)))), shown[0])
     largest = [row for row in found.of(first) if _acts(row)]
     names = [row.parameter for row in largest[:SHOWN]]
+    others = [row.parameter for row in largest[SHOWN:]]
     rows: list[tuple[object, ...]] = []
     numbers: dict[str, Number] = {}
     bars: dict[str, float] = {}
@@ -69,6 +72,8 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities) -> Section:
         value = found[name, first]
         rows.append((name, Number(value.value, value.unit or "1", 0.0, "", given=True), *cells))
     text += [TEXTS.line(kind, wire=wire, names=", ".join(dict.fromkeys(mine))) for kind, mine in marked.items() if mine]
+    if others:
+        text.append(TEXTS.line("others", wire=wire, names=", ".join(others), number=ROWS[first]))
     small = [row.parameter for row in found.of(first) if not _acts(row)]
     none = sorted({*found.without_effect, *small})
     if none:
@@ -88,6 +93,24 @@ def _path(parameter: str) -> str:
     return re.sub(r"\W+", "_", parameter).strip("_")
 
 
+def check_worst_case(diagram: WiredDiagram, found: WorstCase) -> None:
+    """Check that a worst case is one of this diagram.
+
+    Raises
+    ------
+    OptionError
+        If there is something else, or a worst case of another diagram.
+    """
+    if not isinstance(found, WorstCase):
+        raise OptionError(f"found {found!r}; expected a worst case. Give diagram.worst_case(…).", port="worst_case")
+    if content_hash(found.base) != content_hash(diagram):
+        raise OptionError(
+            f"found a worst case of another diagram; expected one of {diagram.name!r} with its present parameters. "
+            "Make it by diagram.worst_case(…).",
+            port="worst_case",
+        )
+
+
 def worst_case_of(found: WorstCase) -> Section:
     """Return the section on a worst case: its parameters, its number beside the nominal one, its run, and a scatter."""
     worst, nominal = found.worst, min(found.nominal, key=lambda case: case.goodness)
@@ -95,7 +118,7 @@ def worst_case_of(found: WorstCase) -> Section:
     confirmed = ""
     try:
         made = found.confirm()
-        confirmed = str(made) if made.agrees else ""
+        confirmed = str(made).removeprefix("confirmed by ") if made.agrees else ""
         text.append(str(made) + ".")
     except LoopwrightError as error:
         text.append(TEXTS.line("left_out", wire=", ".join(worst.loop) or "worst case", message=error.message))

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from loopwright.blocks import OptionError
 from loopwright.diagrams import analyse
 from loopwright.diagrams.report_writing.definitions import definition
 from support.tuned_loops import make_pi_loop, pi_phase_margin
@@ -42,3 +43,9 @@ def test_a_worst_case_gets_a_section_with_the_run_that_confirms_it():
     assert "injection" in number.confirmed_by
     assert ("p.gain", "0.5") in section.tables[1].rows
     assert definition("worst_case.worst.worst_growth") is not None
+
+
+def test_a_worst_case_of_another_diagram_is_refused():
+    other = make_pi_loop(1.0, 0.5, 2.0).worst_case({"p.gain": (0.5, 2.0)}, "u", count=2, starts=0)
+    with pytest.raises(OptionError, match="worst_case: found a worst case of another diagram"):
+        analyse(make_pi_loop(2.0, 0.5, 2.0), only=("subject",), worst_case=other)
