@@ -21,6 +21,7 @@ from .feedthrough import Feedthrough, feeds_through, read_feedthrough
 from .gathering import Elements, gather
 from .limits import ArchiveLimits
 from .model import read_model
+from .negated import judge_negated, read_negated
 from .rules import KNOWN_VERSIONS, check_dimensions, unknown_version
 from .sizes import resize
 from .states import find_states
@@ -51,7 +52,7 @@ class FmuDescription:
     variables: dict[str, FmuVariable]
     """Variables with numbers as values; scalars ``s[1]``, ``s[2]`` are gathered into an array ``s``."""
     other: dict[str, OtherVariable]
-    """Other variables, by name: texts, binaries and clocks, which no wire carries."""
+    """Other variables, by name: texts, binaries, clocks and negated aliases, which no wire carries."""
     elements: Elements = field(default_factory=dict)
     """Array and index, from 0 on, of each scalar that was gathered."""
     complaints: tuple[str, ...] = ()
@@ -244,9 +245,10 @@ def _read(
             fault=FmuFault.DESCRIPTION,
             subject=DESCRIPTION,
         ) from error
+    findings = (*archive.findings, *judge_name(binary, identifier), *judge_negated(found["other"].values()))
     return FmuDescription(
         version, path, archive.digest, model.modelName, identifier, model.instantiationToken or "",
-        binary, complaints=complaints, limits=limits, findings=(*archive.findings, *judge_name(binary, identifier)),
+        binary, complaints=complaints, limits=limits, findings=findings,
         generation_tool=root.get("generationTool", ""), model_version=root.get("version", ""), **found,
     )  # fmt: skip
 
@@ -264,11 +266,13 @@ def _read_variables(path: Path, entries: set[str], root: Any, model: Any) -> dic
             flags["exchange"] = read_exchange(root, model, flags["model_exchange_binary"])
     flags["co_simulation"] = model.coSimulation is not None
     dropped, units = _dropped_attributes(root), FmuUnits({u.name: u for u in model.unitDefinitions})
-    scalars, other = {}, {}
+    scalars, other, negated = {}, {}, read_negated(root, model)
     for v in model.modelVariables:
         if v.causality == "independent" or v.name in scalars or v.name in other:  # a local of a name that is taken
             continue
-        if fmi3_type(v.type) in WIRE_TYPES:
+        if v.name in negated:
+            other[v.name] = negated[v.name]
+        elif fmi3_type(v.type) in WIRE_TYPES:
             try:
                 scalars[v.name] = read_variable(v, dropped.get(v.name, {}), units)
             except ValueError as error:

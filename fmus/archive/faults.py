@@ -37,6 +37,7 @@ class FmuFault(StrEnum):
     EXPERIMENT = "impossible default experiment"
     STANDARD = "violation of the standard"
     NAME = "name with another meaning elsewhere"
+    NEGATED = "negated alias"
     # the libraries
     NO_BINARY = "no binary for this platform"
     OTHER_NAME = "library with another name"

@@ -135,7 +135,7 @@ class FmuVariable:
 
 @dataclass(frozen=True)
 class OtherVariable:
-    """Variable of an FMU that no wire carries: a text, binary data or a clock."""
+    """Variable of an FMU that no wire carries: a text, binary data, a clock, or a negated alias of FMI 1.0."""
 
     name: str
     type: str
@@ -149,6 +149,8 @@ class OtherVariable:
     """Interval of a periodic clock in s, where the description states one."""
     shift: float = 0.0
     """First tick of a periodic clock in s."""
+    negated_of: str = ""
+    """Variable whose value a negated alias of FMI 1.0 has with the opposite sign; empty for other variables."""
 
     @property
     def size(self) -> int:
@@ -156,9 +158,19 @@ class OtherVariable:
         return math.prod(self.shape)
 
     @property
+    def refusal(self) -> str:
+        """The reason why no wire carries it, as the end of an error's text."""
+        if not self.negated_of:
+            return f"of type {self.type}; expected numbers, which alone a wire carries."
+        return (
+            f"a negated alias of FMI 1.0: it has the value of {self.negated_of} with the opposite sign, which is not "
+            f"applied here; expected a variable with its own sign. Take {self.negated_of} and negate it (Gain)."
+        )
+
+    @property
     def is_text(self) -> bool:
         """Whether it is a text or binary data, which can be set at the start and is recorded."""
-        return self.type in TEXT_TYPES
+        return self.type in TEXT_TYPES and not self.negated_of
 
     @property
     def type_is_clock(self) -> bool:
@@ -171,6 +183,8 @@ class OtherVariable:
         return self.type_is_clock and self.interval_variability in ("constant", "fixed", "tunable")
 
     def __str__(self) -> str:
+        if self.negated_of:
+            return f"{self.name} (negated alias)"
         kind = f"{self.interval_variability} Clock" if self.interval_variability else self.type
         return f"{self.name} ({kind})"
 

@@ -38,8 +38,8 @@ def waits_for_initialization(about: FmuDescription, name: str) -> bool:
 def list_limits(label: str, about: FmuDescription, *, model_exchange: bool = False) -> list[str]:
     """Return messages on ports that are neither read nor set, and on a file or description that breaks rules."""
     ins, outs = (about.other_ports(causality) for causality in ("input", "output"))
-    outs, clocks = [v for v in outs if not v.is_text], [v for v in ins if v.type_is_clock]
-    ins = [v for v in ins if not v.type_is_clock]
+    outs, clocks = [v for v in outs if not v.is_text and not v.negated_of], [v for v in ins if v.type_is_clock]
+    ins = [v for v in ins if not v.type_is_clock and not v.negated_of]
     parts = [f"the outputs {', '.join(map(str, outs))} are not recorded"] if outs else []
     parts += [f"the inputs {', '.join(map(str, ins))} keep their start values"] if ins else []
     found = [f"{label}: no wire carries texts, binaries and clocks: {'; '.join(parts)}"] if parts else []

@@ -282,7 +282,8 @@ def _judge_rules(path: Path, archive: FmuArchive, known: list[FmuFinding]) -> li
     found: list[FmuFinding] = []
     seen = {a.fault for a in known if a.severity == FmuSeverity.ERROR}
     try:
-        read_description(path, limits=archive.limits)
+        description = read_description(path, limits=archive.limits)
+        found += [a for a in description.findings if a.fault == FmuFault.NEGATED]
     except FmuFileError as error:
         if error.fault not in seen:
             found.append(_as_error(error, path))

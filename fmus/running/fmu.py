@@ -154,7 +154,7 @@ class Fmu(ExchangeMembers):
 
     @property
     def left_out(self) -> Mapping[str, str]:
-        """Types of the variables that no wire carries, by name: texts, binaries and clocks."""
+        """Types of the variables that no wire carries, by name: texts, binaries, clocks, negated aliases."""
         return {name: v.type for name, v in self.description.other.items()}
 
     def __repr__(self) -> str:
@@ -275,7 +275,7 @@ class Fmu(ExchangeMembers):
         other = self.description.other.get(name)
         if other is None:
             return f"it has no output {name!r}. {near(name, self.outputs)}"
-        return f"its {other.causality} {name!r} is of type {other.type}; expected numbers, which alone a wire carries."
+        return f"its {other.causality} {name!r} is {other.refusal}"
 
     def __getitem__(self, name: Any) -> Signal:
         if isinstance(name, str):

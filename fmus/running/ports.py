@@ -113,6 +113,8 @@ def _check_chosen(description: FmuDescription, chosen: tuple[str, ...], label: s
                 block=label,
                 port="ports",
             )
+        if other is not None and other.negated_of:
+            raise ParameterError(f"found {name!r}, {other.refusal}", block=label, port="ports")
         if other is not None:
             raise ParameterError(
                 f"found {name!r}, a {other.causality} of type {other.type}, which no wire carries; expected a "

@@ -113,6 +113,8 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
 def _check_text(description: FmuDescription, name: str, value: Any, label: str) -> Any:
     """Return a text or binary data; those of an array as a tuple of its elements, in C order."""
     variable, port = description.other[name], f"start.{name}"
+    if variable.negated_of:
+        raise ParameterError(f"found {value!r} for {variable.refusal}", block=label, port=port)
     if not variable.is_text:
         raise ParameterError(
             f"found {value!r} for a {variable.interval_variability} clock, which ticks in a run alone. Leave it out.",

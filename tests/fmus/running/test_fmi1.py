@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, FmuRuntimeError, Sine
+from loopwright.blocks import Constant, FmuRuntimeError, ParameterError, Sine, UnknownNameError
 from loopwright.diagrams import Diagram
-from loopwright.fmus import Fmu, StepOptions
+from loopwright.fmus import Fmu, FmuFault, StepOptions, doctor
 from support.small_fmus import small_fmu, values
 
 # x' = gain u with the inputs held, or along their slope; it logs by a format, and discards steps above `longest`.
@@ -98,3 +98,42 @@ def test_its_failures_are_told(file):
         diagram.simulate(0.5, step=0.1, progress=False)
     with pytest.raises(ValueError, match="found 10"):
         Fmu(file, start={"gain": 10.0})
+
+
+NEGATED = (
+    MODEL.replace('name="x" valueReference="1"', 'name="x" valueReference="1" alias="noAlias"')
+    .replace(
+        "</ModelVariables>",
+        """<ScalarVariable name="fall" valueReference="1" causality="output" alias="negatedAlias"><Real/></ScalarVariable>
+<ScalarVariable name="pull" valueReference="2" causality="input" alias="negatedAlias"><Real start="0"/></ScalarVariable>
+<ScalarVariable name="loss" valueReference="3" variability="parameter" alias="negatedAlias"><Real start="-1"/></ScalarVariable>
+<ScalarVariable name="again" valueReference="1" causality="output" alias="alias"><Real/></ScalarVariable></ModelVariables>""",
+    )
+)  # fmt: skip
+
+
+def test_negated_aliases_are_left_out_and_told(cache, tmp_path):
+    made = small_fmu(tmp_path, "fmi1", SOURCE, NEGATED)
+    plant = Fmu(made, name="plant", start={"gain": 3.0}, isolate=False)
+    assert [*plant.inputs, *plant.outputs] == ["u", "on", "x", "count", "shown", "again"]
+    assert {"fall", "pull", "loss"} <= {*plant.left_out}
+    run = Diagram("d", plant(u=Constant(value=2.0), on=Constant(value=0.0))).simulate(0.5, step=0.1, progress=False)
+    for port in ("x", "again"):
+        assert run[f"plant.{port}"] == pytest.approx(6.0 * run.t, abs=1e-14)
+    (told,) = [m for m in run.messages if "negated alias" in m]
+    assert "'fall' (of 'x'), 'pull' (of 'u'), 'loss' (of 'gain')" in told
+    (finding,) = [a for a in doctor(made, run=False).findings if a.fault == FmuFault.NEGATED]
+    assert finding.subject == "fall"
+
+
+def test_asking_for_a_negated_alias_is_an_error(cache, tmp_path):
+    made = small_fmu(tmp_path, "fmi1", SOURCE, NEGATED)
+    plant, text = Fmu(made, name="plant"), "negated alias of FMI 1.0: it has the value of '{}' with the opposite sign"
+    with pytest.raises(ParameterError, match=text.format("gain")):
+        Fmu(made, start={"loss": -3.0})
+    with pytest.raises(ParameterError, match=text.format("x")):
+        Fmu(made, ports=["u", "fall"])
+    with pytest.raises(UnknownNameError, match=text.format("x")):
+        plant["fall"]
+    with pytest.raises(UnknownNameError, match=text.format("u")):
+        plant(pull=Constant(value=1.0), on=Constant(value=0.0))
