@@ -40,6 +40,7 @@ class BoundRun:
 
     def __init__(self, diagram: SimulatedDiagram, duration: float, options: RunOptions):
         self._name = diagram.name
+        diagram, fused = options.apply_fuse(diagram)
         base = default_step(diagram, options.step, duration, options.solver)
         self.flat: FlatDiagram = diagram.flatten(base) if base is options.step else diagram.flattened(base)
         self._count, rest = ticks_in(duration, self.flat.base, diagram.name)
@@ -54,7 +55,7 @@ class BoundRun:
         rows = self._count + 2 if self._engine.every_tick else None
         self._recorder: Recorder = self._recording.begin(rows)
         fine = note_fine_steps(self.flat) if base is None else ()
-        self._notes: tuple[str, ...] = (*fine, *note_loops(self.flat, self._engine.coupling))
+        self._notes: tuple[str, ...] = (*fused, *fine, *note_loops(self.flat, self._engine.coupling))
         self._told: dict[str, int] = {}
         self._start = StartValues(self._engine.workspace)
         self._stack = ExitStack()

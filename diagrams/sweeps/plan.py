@@ -194,7 +194,10 @@ class Worker:
 
     def _reduce(self, name: str, function: Callable[[Run], Any], run: Run) -> np.ndarray:
         try:
-            return np.array(function(run), dtype=float)
+            found = function(run)
+            if found is None:
+                raise TypeError("it returned None; expected a number, or an array. Is a return missing?")
+            return np.array(found, dtype=float)
         except LoopwrightError:
             raise
         except Exception as error:

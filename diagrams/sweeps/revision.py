@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dis
 import hashlib
 import inspect
 import os
@@ -127,4 +128,24 @@ def _of_function(function: Any) -> str:
         return f"{_text(function.__self__)}.{_of_function(function.__func__)}"
     around = [cell.cell_contents for cell in function.__closure__ or ()]
     plain = [_text(value) for value in around if not inspect.isfunction(value)]
-    return f"function({_text(function.__code__)}, {_text(function.__defaults__)}, {plain})"
+    defaults = _text((function.__defaults__, function.__kwdefaults__))
+    return f"function({_text(function.__code__)}, {defaults}, {plain}, {_globals(function)})"
+
+
+def _globals(function: Any) -> str:
+    """Return a text of the global numbers, texts and arrays, and lists of them, that a function's code names."""
+    names, codes = set[str](), [function.__code__]
+    while codes:
+        code = codes.pop()
+        names.update(step.argval for step in dis.get_instructions(code) if step.opname == "LOAD_GLOBAL")
+        codes += [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    around = function.__globals__
+    return _text({name: around[name] for name in names if name in around and _is_plain(around[name])})
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, list | tuple | set | frozenset):
+        return all(map(_is_plain, value))
+    if isinstance(value, dict):
+        return all(map(_is_plain, value.values()))
+    return isinstance(value, str | bytes | bool | int | float | complex | Fraction | np.ndarray | np.generic)

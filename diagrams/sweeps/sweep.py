@@ -70,6 +70,7 @@ def sweep(
     started, name = perf_counter(), diagram.name
     found = read_samples(diagram, parameters, samples, count=count, seed=seed)
     plan = make_plan(diagram, duration, signals, reduce, seeds, options, count=len(found))
+    _check_names(plan, found.names)
     count_workers = _check_workers(workers)
     store, known = None, dict[str, Outcome]()
     if to is not None:
@@ -169,6 +170,28 @@ def _run(plan: Plan, samples: Sequence[Sample], workers: int, client: Any) -> Ge
     run = run_in_threads if compiled else run_in_processes
     with closing(run(plan, samples, min(workers, len(samples)))) as stream:
         yield from stream
+
+
+_TAKEN = ("failed", "failure", "end_time", "sample", "step", "t")
+"""Names that the data set of a sweep has for itself."""
+
+
+def _check_names(plan: Plan, swept: Sequence[str]) -> None:
+    """Refuse a seed for a parameter that has values, and reductions whose names the data set needs."""
+    if twice := [path for path in plan.seeds if path in swept]:
+        raise OptionError(
+            f"found {twice[0]!r} among the parameters and in seeds; it would take the seed, and not its values. Give "
+            "it in one of them.",
+            block=plan.diagram.name,
+            port="seeds",
+        )
+    if taken := [name for name in plan.reductions if name in swept or name in _TAKEN]:
+        raise OptionError(
+            f"found a reduction called {taken[0]!r}; the results have something else by that name. Give it another "
+            "name.",
+            block=plan.diagram.name,
+            port="reduce",
+        )
 
 
 def _check_workers(workers: int | None) -> int:

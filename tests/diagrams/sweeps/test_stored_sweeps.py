@@ -222,3 +222,27 @@ def test_what_can_not_be_compared_is_told(tmp_path):
 
     with pytest.raises(OptionError, match=r"found .*Odd.* in a sweep that is to be kept on disk; .* leave out to="):
         guarded().sweep({"guard.gain": (1.0,)}, 0.1, reduce={"odd": Odd()}, to=tmp_path / "s", **QUIET)
+
+
+SCALE = 1.0
+
+
+def scaled(run):
+    return SCALE * run["y"].max()
+
+
+def test_other_numbers_that_a_reduction_takes_are_another_sweep(tmp_path, monkeypatch):
+    def by_keyword(factor):
+        def found(run, *, factor=factor):
+            return factor * run["y"].max()
+
+        return found
+
+    for place, reduce in (("global", scaled), ("keyword", by_keyword(1.0))):
+        guarded().sweep({"guard.gain": (1.0,)}, 0.1, reduce={"e": reduce}, to=tmp_path / place, **QUIET)
+    again = guarded().sweep({"guard.gain": (1.0,)}, 0.1, reduce={"e": scaled}, to=tmp_path / "global", **QUIET)
+    assert again.reused == 1
+    monkeypatch.setattr(sys.modules[__name__], "SCALE", 2.0)
+    for place, reduce in (("global", scaled), ("keyword", by_keyword(2.0))):
+        with pytest.raises(OptionError, match="differs from this one"):
+            guarded().sweep({"guard.gain": (1.0,)}, 0.1, reduce={"e": reduce}, to=tmp_path / place, **QUIET)

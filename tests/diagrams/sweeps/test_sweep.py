@@ -383,6 +383,9 @@ def test_a_sweep_with_seeds_compiles_nothing_by_default(monkeypatch):
         ({"reduce": {"end": "y"}}, r"lag.reduce: found 'y' for 'end'; expected final\(signal\)"),
         ({"reduce": [final("y")]}, r"lag: found reduce=.*expected reductions by name"),
         ({"reduce": {"y": final("y")}, "signals": "y"}, r"found 'y' among signals and reductions"),
+        ({"reduce": {"failed": final("y")}}, r"lag.reduce: found a reduction called 'failed'"),
+        ({"reduce": {"step.values": final("y")}}, r"lag.reduce: found a reduction called 'step.values'"),
+        ({"signals": "y", "seeds": "step.values"}, r"lag.seeds: found 'step.values' among the parameters and in seeds"),
         ({"signals": "y", "workers": 0}, r"found workers=0; expected a positive integer"),
         ({"signals": "y", "evry": 2}, r"lag.evry: it is no option of a run"),
         ({"signals": "y", "client": "tcp://there"}, r"lag.client: found client='tcp://there'; expected a distributed"),
@@ -462,3 +465,18 @@ def test_an_fmu_that_has_asked_for_the_end_is_asked_anew_in_the_next_run(monkeyp
     assert seen == [0.01, 0.01]
     assert not found.failures
     assert found.outcomes[1].stopped == ""
+
+
+def test_a_reduction_that_returns_nothing_is_a_failure():
+    found = sampled_lag().sweep({"step.values": (1.0,)}, 0.1, reduce={"none": lambda run: None}, **QUIET)
+    assert "it returned None" in found.failures[0].message
+
+
+@pytest.mark.parametrize("how", [{"workers": 1}, {"workers": 2}, {"workers": 1, "compile": False}])
+def test_fused_runs_have_the_bits_of_fused_single_runs(how):
+    experiment = experiments.hand_guiding()
+    single = experiment.simulate(fuse=True, compile=True, **QUIET)
+    found = experiment.sweep({"plant.coulomb_scale": (1.0, 0.5)}, signals="plant.position", fuse=True, **how, **QUIET)
+    assert not np.array_equal(single["plant.position"], experiment.simulate(**QUIET)["plant.position"])
+    assert np.array_equal(found["plant.position"][0], single["plant.position"])
+    assert any("Fused: plant" in message for message in found.messages)
