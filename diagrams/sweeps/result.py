@@ -45,6 +45,8 @@ class Sweep:
     elapsed: float = float("nan")
     reused: int = 0
     messages: tuple[str, ...] = ()
+    asked: tuple[str, ...] = field(default=(), repr=False)
+    """Names of the reductions that were asked for; one that no run has is NaN."""
 
     def __repr__(self) -> str:
         missing = sum(outcome is None for outcome in self.outcomes)
@@ -69,7 +71,8 @@ class Sweep:
 
     @cached_property
     def _reductions(self) -> list[str]:
-        return list(dict.fromkeys(name for o in self.outcomes if o is not None for name in o.numbers))
+        found = (name for o in self.outcomes if o is not None for name in o.numbers)
+        return list(dict.fromkeys([*self.asked, *found]))
 
     @cached_property
     def _signals(self) -> list[str]:

@@ -87,7 +87,7 @@ def sweep(
 
     def result() -> Sweep:
         messages = tuple(dict.fromkeys(m for o in outcomes if o is not None for m in o.messages))
-        return Sweep(found, tuple(outcomes), name, perf_counter() - started, reused, messages)
+        return Sweep(found, tuple(outcomes), name, perf_counter() - started, reused, messages, tuple(plan.reductions))
 
     try:
         run = _run(plan, left, count_workers, client)

@@ -470,6 +470,8 @@ def test_an_fmu_that_has_asked_for_the_end_is_asked_anew_in_the_next_run(monkeyp
 def test_a_reduction_that_returns_nothing_is_a_failure():
     found = sampled_lag().sweep({"step.values": (1.0,)}, 0.1, reduce={"none": lambda run: None}, **QUIET)
     assert "it returned None" in found.failures[0].message
+    assert np.array_equal(found["none"], [math.nan], equal_nan=True)  # as where another run did not fail
+    assert np.isnan(found.dataset["none"]).all()
 
 
 @pytest.mark.parametrize("how", [{"workers": 1}, {"workers": 2}, {"workers": 1, "compile": False}])
