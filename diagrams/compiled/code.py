@@ -6,6 +6,7 @@ import ctypes
 import hashlib
 import os
 import re
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -323,9 +324,25 @@ def load_compiled(source: str) -> ctypes.CDLL:
         If the cache can't be written.
     """
     library = _library_of(source)
-    if not library.is_file():
+    if not _is_whole(library):
         compile_shared({"code.c": source}, library, more_flags=_FLAGS)
+        size = _size_file(library)
+        made = size.with_suffix(f".{os.getpid()}")
+        made.write_text(str(library.stat().st_size))
+        os.replace(made, size)
     return ctypes.CDLL(str(library))
+
+
+def _size_file(library: Path) -> Path:
+    return library.with_suffix(".size")
+
+
+def _is_whole(library: Path) -> bool:
+    """Whether a library is in the cache with its full length: to load a part of one ends Python."""
+    try:
+        return library.stat().st_size == int(_size_file(library).read_text())
+    except (OSError, ValueError):
+        return False
 
 
 def _library_of(source: str) -> Path:
@@ -342,6 +359,7 @@ def _check_owner(folder: Path) -> None:
     """Refuse a folder that others than the user can write to: what stands there is run."""
     if os.name != "posix":
         return
+    was_open = folder.stat().st_mode & 0o022
     with suppress(OSError):
         folder.chmod(0o700)
     found = folder.stat()
@@ -351,3 +369,6 @@ def _check_owner(folder: Path) -> None:
             f"{found.st_mode & 0o777:o}; expected user {os.getuid()} and 700, since what stands there is run. Remove "
             "it, or set LOOPWRIGHT_CACHE to a folder of your own."
         )
+    if was_open:  # what others may have left there would be run, too
+        shutil.rmtree(folder)
+        folder.mkdir(mode=0o700)

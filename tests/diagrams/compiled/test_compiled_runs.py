@@ -263,6 +263,21 @@ def test_a_folder_that_others_can_write_is_not_trusted(tmp_path, monkeypatch, fr
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
     folder = tmp_path / "compiled"
     folder.mkdir()
+    (folder / "left_by_others.so").touch()
     folder.chmod(0o777)
     assert_same_bits(*both(one_rate(), 1.0))
     assert folder.stat().st_mode & 0o777 == 0o700
+    assert not (folder / "left_by_others.so").exists()
+
+
+def test_a_library_that_was_cut_off_is_compiled_again(tmp_path, monkeypatch, fresh):
+    monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
+    source = code._master_source()
+    library = code._library_of(source)
+    code.load_compiled(source)
+    part = library.read_bytes()[: library.stat().st_size // 2]
+    library.unlink()  # it is loaded, and must not change under this process
+    library.write_bytes(part)
+    code.load_compiled.cache_clear()
+    assert code._MASTER in str(code.load_compiled(source)[code._MASTER].__name__)
+    assert library.stat().st_size > len(part)
