@@ -350,7 +350,12 @@ def _library_of(source: str) -> Path:
     platform = native_platform()
     key = hashlib.sha256("\0".join((platform, *describe_compiler(platform), *_FLAGS, source)).encode()).hexdigest()
     folder = cache_folder().absolute() / "compiled"
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise CompilerError(
+            f"the folder of compiled diagrams can't be made: {error}. Set LOOPWRIGHT_CACHE to a folder of your own."
+        ) from error
     _check_owner(folder)
     return folder / f"{key[:40]}{SUFFIXES[platform.rpartition('-')[2]]}"
 

@@ -154,6 +154,9 @@ def test_a_cache_that_fails_leaves_the_run_interpreted_and_is_told(eager, monkey
     run = sums().simulate(20.0, compile="auto", **QUIET)
     assert run.tier == "interpreted"
     assert any(str(tmp_path) in message for message in run.messages)
+    at_once = sums().simulate(20.0, compile=True, **QUIET)
+    assert at_once.tier == "interpreted"
+    assert any("Set LOOPWRIGHT_CACHE" in message for message in at_once.messages)
     assert_same_bits(sums().simulate(20.0, compile=False, **QUIET), run)
 
 
