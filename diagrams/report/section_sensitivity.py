@@ -118,7 +118,7 @@ def worst_case_of(found: WorstCase) -> Section:
     confirmed = ""
     try:
         made = found.confirm()
-        confirmed = str(made).removeprefix("confirmed by ") if made.agrees else ""
+        confirmed = made.trial if made.agrees else ""
         text.append(str(made) + ".")
     except LoopwrightError as error:
         text.append(TEXTS.line("left_out", wire=", ".join(worst.loop) or "worst case", message=error.message))

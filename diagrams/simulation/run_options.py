@@ -176,9 +176,15 @@ class RunOptions:
 
         Raises
         ------
+        OptionError
+            If ``fuse`` is neither True nor False.
         CompilerError
             If there is no compiler, or it fails.
         """
+        if self.fuse is not True and self.fuse is not False:
+            raise OptionError(
+                f"found {self.fuse!r}; expected True or False. Give one.", block=diagram.name, port="fuse"
+            )
         if not self.fuse:
             return diagram, ()
         from ..compiled import fuse  # only such a run needs a compiler

@@ -80,13 +80,14 @@ class RunConfirmation:
     agrees: bool
     uncertainty: float = math.nan
 
-    def __str__(self) -> str:
-        verdict = "confirmed" if self.agrees else "NOT confirmed"
+    @property
+    def trial(self) -> str:
+        """The trial in words: its kind, place and values."""
         at = "" if math.isnan(self.omega) else f" at {self.omega:.6g} rad/s"
-        return (
-            f"{verdict} by {self.kind.value} at {self.wire!r}{at}: predicted {self.predicted:.6g}, measured "
-            f"{self.measured:.6g}"
-        )
+        return f"{self.kind.value} at {self.wire!r}{at}: predicted {self.predicted:.6g}, measured {self.measured:.6g}"
+
+    def __str__(self) -> str:
+        return f"{'confirmed' if self.agrees else 'NOT confirmed'} by {self.trial}"
 
 
 def confirm_case(diagram: WiredDiagram, case: Case, at: Any, amplitude: float | None, delay: int) -> RunConfirmation:

@@ -8,7 +8,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from loopwright.blocks import FmuError
+from loopwright.blocks import FmuError, OptionError
 from loopwright.diagrams import experiments
 from loopwright.fmus import Fmu, gantry, tune
 
@@ -59,3 +59,8 @@ def test_a_foreign_fmu_runs_as_it_is_and_the_run_says_so(tmp_path):
     diagram = experiments.hand_guiding(plant=Fmu(other)).diagram
     run = diagram.simulate(0.01, progress=False, fuse=True)
     assert [m for m in run.messages if m.startswith("Not fused: plant")]
+
+
+def test_fuse_is_true_or_false():
+    with pytest.raises(OptionError, match="expected True or False"):
+        experiments.hand_guiding().diagram.simulate(0.01, progress=False, fuse="no")
