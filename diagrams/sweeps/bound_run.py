@@ -40,9 +40,9 @@ class BoundRun:
 
     def __init__(self, diagram: SimulatedDiagram, duration: float, options: RunOptions):
         self._name = diagram.name
-        diagram, fused = options.apply_fuse(diagram)
-        base = default_step(diagram, options.step, duration, options.solver)
-        self.flat: FlatDiagram = diagram.flatten(base) if base is options.step else diagram.flattened(base)
+        run, fused = options.apply_fuse(diagram)
+        base = default_step(run, options.step, duration, options.solver)
+        self.flat: FlatDiagram = run.flatten(base) if base is options.step else run.flattened(base)
         self._count, rest = ticks_in(duration, self.flat.base, diagram.name)
         if rest:
             refuse_rest(self.flat, self._count, duration, diagram.name)
