@@ -260,7 +260,9 @@ class EvaluatedExchange(SavedExchange):
         )
 
     def _unfit(self, error: UnfitError, t: float) -> FmuRuntimeError:
-        advice = "Convert the signal before this input, with Quantizer, say, or leave this output out, by ports=."
+        advice = "Leave this output out, by ports=."
+        if error.port in self._ports:
+            advice = "Convert the signal before this input, with Quantizer, say."
         if isinstance(error, OutOfRangeError):
             advice = "Limit the signal before this input, with Saturation, say."
         return FmuRuntimeError(f"{error.reason}. {advice}", block=self.block.label, port=error.port, t=t)

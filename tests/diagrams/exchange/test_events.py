@@ -65,6 +65,13 @@ def test_a_discrete_input_is_set_in_event_mode_and_taken_over_at_once(file):
     np.testing.assert_allclose(run["plant.x"], exact(run.t, 1.0), atol=1e-12)
 
 
+def test_an_input_that_is_no_integer_is_refused_with_the_way_to_convert_it(file):
+    diagram = Diagram("d", plant(file)(u=Constant(value=0.5, name="u"), n=Constant(value=1.5, name="n")))
+    with pytest.raises(FmuRuntimeError, match=r"^plant\.n.*: found 1\.5; expected an integer") as error:
+        diagram.simulate(0.2, step=0.1, progress=False)
+    assert error.value.message.endswith("Convert the signal before this input, with Quantizer, say.")
+
+
 def test_a_sampled_integer_output_reaches_the_fmu_at_its_tick(file):
     @subsystem(sample_time=0.1)
     def sampler(x):
