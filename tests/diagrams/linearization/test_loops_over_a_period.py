@@ -134,7 +134,7 @@ def test_an_injection_at_a_box_with_an_offset_measures_the_loop():
 def test_a_report_has_the_margins_of_a_periodic_wire_with_slow_loops_open_and_closed_and_does_not_inject_there():
     report = cascade().report(only=("inner", "injection"))
     text = [line for s in report.sections for line in (*s.text, *(t for part in s.sections for t in part.text))]
-    assert sum("'current_loop.voltage' is renewed 5 times" in line for line in text) >= 2
+    assert sum("current_loop.voltage" in line and "renewed several times" in line for line in text) >= 2
     assert sum("the loop is periodic" in line for line in text) == 1
     numbers = report.numbers()
     assert "inner.voltage.sampled_d0.gain_margin_high" not in numbers
