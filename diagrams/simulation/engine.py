@@ -320,7 +320,7 @@ class Engine:
         position = self.position
         if position.stopped is None and self._stops.is_met():
             position.stopped = self._stops.met_at(position.t)
-            self._note_end(position.t)
+            self._note_end(position.t, position.t)
         return position.stopped is not None or self._due
 
     # --- ends that FMUs ask for ---------------------------------------------------------------------------------------
@@ -360,16 +360,16 @@ class Engine:
                     if flat.ports[name][0] == path:
                         self.workspace.log[flat.log.slices[name]] = self.workspace.here.w[where]
         position.stopped = Stopped(end, path)
-        self._note_end(at)
+        self._note_end(at, at if error.t is None else error.t)
         return True
 
-    def _note_end(self, t: float) -> None:
-        """Tell of an FMU in co-simulation that has ended the run; one in model exchange tells it itself."""
-        position = self.position
-        plant: Any = None if position.stopped is None else self.plants.get(position.stopped.block)
-        if plant is not None and position.stopped is not None and getattr(plant, "ends_run", False):
-            end = position.stopped.t
-            last = "" if end == t else f"; the run ends at its last communication point, t = {end:.9g} s"
+    def _note_end(self, t: float, since: float) -> None:
+        """Tell of an FMU in co-simulation: its time, its step's start; one in model exchange tells it itself."""
+        stopped = self.position.stopped
+        plant: Any = None if stopped is None else self.plants.get(stopped.block)
+        if stopped is not None and getattr(plant, "ends_run", False):
+            point = f"; its last communication point is t = {since:.9g} s, and the run ends at t = {stopped.t:.9g} s"
+            last = "" if stopped.t == t else point
             plant.add_note(f"it asks to end the simulation at t = {t:.9g} s (terminateSimulation){last}")
 
     def _on_event(self, event: Occurrence) -> None:

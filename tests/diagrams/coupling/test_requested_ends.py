@@ -180,6 +180,21 @@ def test_an_fmu_with_communication_points_of_its_own_ends_at_one(files):
     np.testing.assert_allclose(run["plant.y"], np.floor(run.t / 0.25 + 1e-9) * 0.25, rtol=0, atol=1e-14)
 
 
+def test_ticks_beside_longer_steps_have_gone_on_and_the_message_has_each_time(files):
+    plant = Fmu(files["fmi3"], name="plant", start={"last": 0.5034}, stepping=StepOptions(communication_step=0.01))
+
+    @subsystem(sample_time=0.001)
+    def clock(u):
+        return Gain(gain=1.0)(u)
+
+    run = Diagram("d", plant(u=Constant(value=1.0)), clock(Constant(value=1.0))).simulate(1.0, progress=False)
+    assert run.stopped.t == run.t[-1] == pytest.approx(0.509, abs=1e-14)
+    np.testing.assert_allclose(run["plant.y"], np.floor(run.t / 0.01 + 1e-9) * 0.01, rtol=0, atol=1e-13)
+    (told,) = [m for m in run.messages if "asks to end" in m]
+    assert "at t = 0.5034 s" in told
+    assert "its last communication point is t = 0.5 s, and the run ends at t = 0.509 s" in told
+
+
 # --- after the end ------------------------------------------------------------------------------------------------------
 
 
