@@ -196,7 +196,7 @@ def read_description(
     Raises
     ------
     FmuFileError
-        If the file is missing, is no FMU, has neither co-simulation nor model exchange of FMI 2.0 or 3.0, or no binary
+        If the file is missing, is no FMU, has neither co-simulation nor model exchange of FMI 1.0 to 3.0, or no binary
         for this platform; if its archive is unsafe, damaged or beyond the limits. Its ``fault`` is an `FmuFault`.
     """
     path = Path(file).expanduser()
