@@ -26,7 +26,7 @@ from .section_limits import not_modelled
 from .section_loops import inner
 from .section_measured import measured_loops, read_measured
 from .section_poles import closed_loops, memory
-from .section_sensitivity import check_worst_case, sensitivity, worst_case_of
+from .section_sensitivity import check_worst_case, sensitivity, worst_case_of, worst_case_outcomes
 from .section_steps import steps
 from .section_subject import operating_points, remarks, subject, versions
 from .section_summary import summary
@@ -108,7 +108,8 @@ def analyse(
         diagram.contact(…)}``. Each gets its admittance, the limits of coupled stability, a map of them, and a trial in
         the nonlinear run.
     worst_case : WorstCase, optional
-        A worst case of this diagram, of `Diagram.worst_case`: it gets a section, with a run that confirms it.
+        A worst case of this diagram, of `Diagram.worst_case`: it gets a section, with a run that confirms it,
+        and a line on the first page. Limits of its numbers fail where it is unstable.
     progress : callable, optional
         Told the key of each section before it is made, and of the injection check each measurement, too.
 
@@ -150,9 +151,10 @@ def analyse(
         tell("contact")
         sections = (*sections, contact_sections(contacts))
     made = Report("", sections).numbers()
-    reviewed = None if asked is None else review(case, asked, made, loops_measured)
+    outcomes = {} if worst_case is None else worst_case_outcomes(worst_case)
+    reviewed = None if asked is None else review(case, asked, made, loops_measured, outcomes)
     if only is None or asked is not None:
-        sections = (summary(case, reviewed, made), *sections)
+        sections = (summary(case, reviewed, made, worst_case), *sections)
     name = diagram.name if experiment is None else f"Experiment {experiment.letter}: {diagram.name}"
     lines = {str(key): str(text) for key, text in (about or {}).items()}
     title = lines.pop("title", f"Design report: {name}")

@@ -10,6 +10,7 @@ from ...blocks.core import LoopwrightError, UnknownNameError, near
 from ..frequency import Number
 from ..linearization import find_signal
 from ..requirements import (
+    SENSES,
     Limit,
     Reason,
     RequirementResult,
@@ -20,6 +21,8 @@ from ..requirements import (
     judge,
     judge_interval,
 )
+from ..studies import Case as StudyCase
+from ..studies import CaseState
 from .case import Case
 from .points import STEP
 from .section_injection import REFUTED
@@ -60,7 +63,11 @@ def check_names(case: Case, asked: Requirements, measured: Collection[str] = ())
 
 
 def review(
-    case: Case, asked: Requirements, numbers: Mapping[str, Number], measured: Sequence[MeasuredLoop] = ()
+    case: Case,
+    asked: Requirements,
+    numbers: Mapping[str, Number],
+    measured: Sequence[MeasuredLoop] = (),
+    outcomes: Mapping[str, StudyCase] | None = None,
 ) -> Review:
     """Return the verdicts on requirements.
 
@@ -74,8 +81,11 @@ def review(
         All numbers of the report by their dotted paths.
     measured : sequence of MeasuredLoop
         Loops that were measured; limits of their margins hold for the measured ones, too.
+    outcomes : mapping of str to Case, optional
+        Cases of a worst case, by the path that their numbers stand below.
     """
-    return Review((*_results(case, asked, numbers), *_measured(case, asked, numbers, measured)))
+    plain = (_plain(path, limit, numbers, outcomes or {}) for path, limit in asked.numbers.items())
+    return Review((*_results(case, asked, numbers), *plain, *_measured(case, asked, numbers, measured)))
 
 
 def _results(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> Iterator[RequirementResult]:
@@ -104,8 +114,6 @@ def _results(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> 
                 yield from _step(case, v, state, key, step, numbers)
         for step in asked.steps:
             yield from _step(case, v, state, key_of_step(step), step, numbers, loop="")
-    for path, limit in asked.numbers.items():
-        yield _plain(path, limit, numbers)
 
 
 def _measured(
@@ -252,9 +260,19 @@ def _step(
         yield _with(state, result, None if number is None else (path, number))
 
 
-def _plain(path: str, limit: Limit, numbers: Mapping[str, Number]) -> RequirementResult:
+def _plain(
+    path: str, limit: Limit, numbers: Mapping[str, Number], outcomes: Mapping[str, StudyCase]
+) -> RequirementResult:
     result = RequirementResult(path, "", "", limit, Verdict.UNDECIDED, Reason.NO_NUMBER)
-    return result if path not in numbers else _with(_State(), result, (path, numbers[path]))
+    if path in numbers:
+        return _with(_State(), result, (path, numbers[path]))
+    start, _, name = path.rpartition(".")
+    of = outcomes.get(start) if name in SENSES else None
+    if of is not None and of.state is CaseState.UNSTABLE:
+        return replace(result, verdict=Verdict.FAILED, reason=Reason.UNSTABLE)
+    if of is not None and of.state is CaseState.FAILED:
+        return replace(result, reason=Reason.NOT_ANALYSED, detail=of.reason)
+    return result
 
 
 def weakest(numbers: Mapping[str, Number], variants: Iterable[str]) -> tuple[str, Number] | None:

@@ -12,7 +12,8 @@ from .. import report_figures as figures
 from ..flat import WiredDiagram
 from ..frequency import Number
 from ..report_writing import Plot, Section, Table, Texts
-from ..studies import CaseState, Sensitivities, Sensitivity, WorstCase, confirm_parameter, sensitivities_of
+from ..studies import Case as StudyCase
+from ..studies import CaseOrigin, CaseState, Sensitivities, Sensitivity, WorstCase, confirm_parameter, sensitivities_of
 from .case import Case
 from .content_hash import content_hash
 from .section_loops import ROWS
@@ -111,10 +112,38 @@ def check_worst_case(diagram: WiredDiagram, found: WorstCase) -> None:
         )
 
 
+def worst_case_outcomes(found: WorstCase) -> dict[str, StudyCase]:
+    """Return the diagram as it is and the worst case, by the paths that their numbers stand below."""
+    nominal = min(found.nominal, key=lambda case: case.goodness)
+    return {"worst_case.as_it_is": nominal, "worst_case.worst": found.worst}
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _ranges(found: WorstCase) -> Table:
+    """Return the table of the ranges that were searched, or of the samples that were given in their place."""
+    rows: list[tuple[str, str, str, str]] = []
+    for name in dict.fromkeys(name for case in found.cases for name in case.parameters):
+        box = found.boxes.get(name)
+        if box is not None:
+            rows.append((name, _text(box.low), _text(box.high), f"range, {box.scale}"))
+            continue
+        values = [case.parameters[name] for case in found.cases if name in case.parameters]
+        plain = all(isinstance(value, float | int) and not isinstance(value, bool) for value in values)
+        low, high = (_text(min(values)), _text(max(values))) if plain else ("–", "–")
+        rows.append((name, low, high, "given samples"))
+    return Table("Ranges of the parameters", ("parameter", "from", "to", "values"), tuple(rows))
+
+
 def worst_case_of(found: WorstCase) -> Section:
     """Return the section on a worst case: its parameters, its number beside the nominal one, its run, and a scatter."""
-    worst, nominal = found.worst, min(found.nominal, key=lambda case: case.goodness)
-    text = [TEXTS.line("worst", cases=len(found.cases), unstable=len(found.unstable), failed=len(found.failures))]
+    nominal, worst = worst_case_outcomes(found).values()
+    origins = {case.origin for case in found.cases}
+    facts = {"corners": CaseOrigin.CORNER in origins, "searched": CaseOrigin.SEARCH in origins}
+    counts = {"cases": len(found.cases), "unstable": len(found.unstable), "failed": len(found.failures)}
+    text = [TEXTS.line("worst", **counts, **facts)]
     confirmed = ""
     try:
         made = found.confirm()
@@ -134,9 +163,10 @@ def worst_case_of(found: WorstCase) -> Section:
         (path.partition(".")[0].replace("_", " "), path.partition(".")[2], number) for path, number in numbers.items()
     ]
     tables = [Table("Worst case, beside the diagram as it is", ("case", "number", "value"), tuple(rows), digits=4)]
-    given = tuple((name, str(value) if np.ndim(value) else f"{value:.6g}") for name, value in worst.parameters.items())
+    given = tuple((name, _text(value)) for name, value in worst.parameters.items())
     if given:
         tables.append(Table("Parameters of the worst case", ("parameter", "value"), given))
+    tables.append(_ranges(found))
     plots = []
     if any(np.ndim(value) == 0 for value in worst.parameters.values()):
         plots.append(Plot("worst_case", TEXTS.line("scatter"), found.plot()))

@@ -11,6 +11,7 @@ from ..frequency import Number
 from ..linearization import Linearization
 from ..report_writing import Judged, Section, Table, Texts, symbol
 from ..requirements import Limit, RequirementResult, Review, Verdict
+from ..studies import WorstCase
 from .case import Case
 from .review import weakest
 from .section_loops import ROWS
@@ -32,7 +33,9 @@ ALIKE = 0.05
 ORDER = (Verdict.FAILED, Verdict.UNDECIDED, Verdict.PASSED)
 
 
-def summary(case: Case, reviewed: Review | None, numbers: Mapping[str, Number]) -> Section:
+def summary(
+    case: Case, reviewed: Review | None, numbers: Mapping[str, Number], worst_case: WorstCase | None = None
+) -> Section:
     """Return the first section of a report.
 
     Parameters
@@ -43,6 +46,8 @@ def summary(case: Case, reviewed: Review | None, numbers: Mapping[str, Number]) 
         The verdicts on its requirements.
     numbers : mapping of str to Number
         All numbers of the report by their dotted paths.
+    worst_case : WorstCase, optional
+        The worst case that has a section.
     """
     unstable = unstable_first(case)
     text = [*(unstable.text if unstable is not None else ())]
@@ -55,6 +60,7 @@ def summary(case: Case, reviewed: Review | None, numbers: Mapping[str, Number]) 
         text.append(Judged(said, reviewed.verdict))
         tables.append(_requirements(case, reviewed))
     text += _weakest(case, numbers)
+    text += [_worst_case(worst_case)] if worst_case is not None else []
     loops = _loops(case, numbers)
     tables += [loops] if loops is not None else []
     missing = list(dict.fromkeys(_not_analysed(case, numbers)))
@@ -130,6 +136,24 @@ def _weakest(case: Case, numbers: Mapping[str, Number]) -> Iterator[str]:
         yield TEXTS.line("why", others=best)
     elif others:
         yield TEXTS.line("why_not", titles=[v.title for v, _ in others])
+
+
+def _worst_case(found: WorstCase) -> str:
+    """Return the line on a worst case: its number, its growth, or the reason why it could not be analysed."""
+    worst = found.worst
+    number = worst.numbers.get(worst.loop, {}).get(worst.quantity)
+    shown = "" if number is None else symbol(number.unit)
+    return TEXTS.line(
+        "worst_case",
+        state=worst.state.name,
+        wire=", ".join(worst.loop),
+        cases=len(found.cases),
+        quantity=words_of(worst.quantity),
+        value=worst.value,
+        unit=f"{'' if shown in ('', '°') else ' '}{shown}",
+        growth=worst.growth,
+        reason=worst.reason.rstrip("."),
+    )
 
 
 def _frequencies(path: str, numbers: Mapping[str, Number]) -> Iterator[Number]:

@@ -1,12 +1,18 @@
 """The section on sensitivity to parameters, of a loop with a closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from loopwright.blocks import OptionError
-from loopwright.diagrams import analyse
+from loopwright.diagrams import Requirements, Verdict, analyse
 from loopwright.diagrams.report_writing.definitions import definition
+from loopwright.diagrams.requirements import Reason
+from loopwright.diagrams.studies import CaseState
 from support.tuned_loops import make_pi_loop, pi_phase_margin
+
+NOTHING = Requirements(stable=False, phase_margin_deg=1.0)
 
 
 def test_the_section_tells_the_change_of_a_margin_per_percent_and_how_it_was_confirmed():
@@ -45,7 +51,47 @@ def test_a_worst_case_gets_a_section_with_the_run_that_confirms_it():
     assert definition("worst_case.worst.worst_growth") is not None
 
 
+def test_a_stable_and_a_failed_worst_case_stand_on_the_first_page():
+    diagram = make_pi_loop()
+    found = diagram.worst_case({"p.gain": (0.5, 2.0)}, "u", quantity="phase_margin_deg", count=2, starts=1, steps=1)
+    text = "\n".join(
+        map(str, analyse(diagram, only=("subject",), worst_case=found, requirements=NOTHING).sections[0].text)
+    )
+    assert f"phase margin {pi_phase_margin(0.5, 0.5, 2.0):.4g}° at u" in text
+    failed = replace(
+        found, worst=replace(found.worst, state=CaseState.FAILED, reason="No point of rest.", loop=(), quantity="")
+    )
+    limits = Requirements(stable=False, numbers={"worst_case.worst.phase_margin_deg": (45.0, np.inf)})
+    report = analyse(diagram, only=("subject",), worst_case=failed, requirements=limits)
+    assert "not analysed. No point of rest." in "\n".join(map(str, report.sections[0].text))
+    (result,) = report.review.results
+    assert (result.verdict, result.reason, result.detail) == (
+        Verdict.UNDECIDED, Reason.NOT_ANALYSED, "No point of rest.",
+    )  # fmt: skip
+
+
 def test_a_worst_case_of_another_diagram_is_refused():
     other = make_pi_loop(1.0, 0.5, 2.0).worst_case({"p.gain": (0.5, 2.0)}, "u", count=2, starts=0)
     with pytest.raises(OptionError, match="worst_case: found a worst case of another diagram"):
         analyse(make_pi_loop(2.0, 0.5, 2.0), only=("subject",), worst_case=other)
+
+
+def test_an_unstable_worst_case_stands_on_the_first_page_and_fails_its_requirements():
+    # s(s + 2) + 2 (kp s + 0.5) has poles with the real part 0.5 at the corner kp = -1.5
+    diagram = make_pi_loop()
+    found = diagram.worst_case({"p.gain": (-1.5, 1.0)}, "u", quantity="ms", count=2, starts=1, steps=1)
+    limits = Requirements(
+        stable=False,
+        numbers={"worst_case.worst.ms": (-np.inf, 2.0), "worst_case.worst.nonsense": (0.0, 1.0)},
+    )
+    report = analyse(diagram, only=("subject",), worst_case=found, requirements=limits)
+    first = "\n".join(map(str, report.sections[0].text))
+    assert "unstable at u" in first
+    assert "it grows by 0.5 1/s" in first
+    (section,) = (s for s in report.sections if s.key == "worst_case")
+    assert ("p.gain", "-1.5", "1", "range, linear") in section.tables[-1].rows
+    by_path = {result.quantity: result for result in report.review.results}
+    failed = by_path["worst_case.worst.ms"]
+    assert (failed.verdict, failed.reason) == (Verdict.FAILED, Reason.UNSTABLE)
+    unknown = by_path["worst_case.worst.nonsense"]
+    assert (unknown.verdict, unknown.reason) == (Verdict.UNDECIDED, Reason.NO_NUMBER)
