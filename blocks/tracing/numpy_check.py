@@ -185,8 +185,9 @@ def evaluate(
         except (LoopwrightError, *_SINGULAR):
             raise
         except Exception as error:
+            failure = f"{type(error).__name__}: {error}".rstrip(".")
             raise TraceError(
-                f"its {equation} can be traced, but not be run with numbers: {type(error).__name__}: {error}. Use "
+                f"its {equation} can be traced, but not be run with numbers: {failure}. Use "
                 "NumPy functions of (t, x, u), which do both."
             ) from error
 

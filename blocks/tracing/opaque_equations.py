@@ -101,9 +101,10 @@ class Foreign:
         except LoopwrightError:
             raise
         except Exception as error:
+            failure = f"{type(error).__name__}: {error}".rstrip(".")
             raise TraceError(
                 f"its {equation} failed when it was tried with 1, 1/2, 1/3, … at each input, for the shape of its "
-                f"outputs: {type(error).__name__}: {error}. Correct it, or declare the outputs' shapes: it is not "
+                f"outputs: {failure}. Correct it, or declare the outputs' shapes: it is not "
                 "tried then."
             ) from error
         if equation == "guards":

@@ -183,4 +183,4 @@ def _line_text(error: BaseException, path: Path) -> str:
 
 
 def _message(error: BaseException) -> str:
-    return error.msg if isinstance(error, SyntaxError) else str(error)
+    return (error.msg if isinstance(error, SyntaxError) else str(error)).rstrip(".")

@@ -278,7 +278,7 @@ class _Slopes:
 
 def _has_near(every: Sequence[float], value: float) -> bool:
     """Whether a second one of all values is nearly as large as ``value``."""
-    return sum(abs(v - value) <= KINK * abs(value) for v in every) > 1
+    return bool(sum(abs(v - value) <= KINK * abs(value) for v in every) > 1)
 
 
 def _disk(loop: LinearSystem, response: _Response, delay: int, skew: float) -> MarginSlope:

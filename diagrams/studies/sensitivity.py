@@ -85,8 +85,8 @@ class Sensitivity:
             "tolerance": self.slope.tolerance,
             "per_percent": self.per_percent.value,
             "relative": self.relative,
-            "kink": self.kink,
-            "rest_lost": self.rest_lost,
+            "kink": bool(self.kink),
+            "rest_lost": bool(self.rest_lost),
         }
 
 

@@ -201,7 +201,8 @@ class Worker:
         except LoopwrightError:
             raise
         except Exception as error:
-            text = f"the reduction {name!r} failed: {type(error).__name__}: {error}. Try it on a single run."
+            said = f"{type(error).__name__}: {error}".rstrip(".")
+            text = f"the reduction {name!r} failed: {said}. Try it on a single run."
             failure = SimulationError(text, block=self.plan.diagram.name, port=name, t=float(run.t[-1]))
             raise failure.keep(run) from error
 

@@ -221,14 +221,14 @@ def _call_at_start(block: Block, name: str, equation: str, x: Any, u: Any, count
         parts = (made,) if count == 1 else tuple(made)
         [np.asarray(part, dtype=float) for part in parts]
     except Exception as error:
+        failure = f"{type(error).__name__}: {error}".rstrip(".")
         step, line = error.__traceback__, ""
         while step is not None:
             if step.tb_frame.f_code.co_name == equation:
                 line = f" in line {step.tb_lineno} of {step.tb_frame.f_code.co_filename}"
             step = step.tb_next
         raise DefinitionError(
-            f"its {equation} fails at the start values{line}: {type(error).__name__}: {error}. Correct it, or the "
-            "start values.",
+            f"its {equation} fails at the start values{line}: {failure}. Correct it, or the start values.",
             block=name,
         ) from error
     if len(parts) != count:
