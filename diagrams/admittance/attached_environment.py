@@ -22,7 +22,7 @@ from ...blocks.core import AlgebraicLoopError, Array, Block, Input, OptionError,
 from ...fmus.running import Fmu
 from ..linearization import PlantEquations
 from ..wiring import Structure, SubsystemSettings, Wire
-from .contact_parts import Ports
+from .contact_ports import Ports
 from .moored_plant import Mooring, copy_table, set_tool
 
 if TYPE_CHECKING:

@@ -17,7 +17,8 @@ from .compliance_loop import SIDES
 from .contact_admittance import ContactAdmittance, compute_admittance, look_again
 from .contact_limits import ContactLimit, ContactMap, CoupledLoop, check_properties, find_limit, map_growth
 from .contact_loop import close_loop, join_environment
-from .contact_parts import ContactParts, Ports, take_apart
+from .contact_parts import ContactParts, take_apart
+from .contact_ports import Ports
 from .rendered import CONTINUOUS, HIGHEST, LOWEST, OFF_PATH, SAMPLED, Passivity, find_negative
 from .stability_limits import PER_DECADE
 

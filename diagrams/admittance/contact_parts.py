@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from ...blocks.core import (
     OptionError,
     ParameterError,
     ShapeError,
-    UnknownNameError,
-    near,
-    same_unit,
 )
 from ...fmus.running import Derivation
 from ..linearization import (
@@ -37,6 +34,7 @@ from ..linearization import (
     moves_between_ticks,
 )
 from .compliance_loop import StateMatrices
+from .contact_ports import Ports, Source, check_command, check_force_wire, check_unit
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram
@@ -92,56 +90,6 @@ class ContactParts:
     derivation: Derivation
     errors: tuple[StateMatrices, StateMatrices]
     findings: tuple[Finding, ...]
-
-
-@dataclass(frozen=True)
-class Ports:
-    """The plant of a contact and its ports, by name."""
-
-    plant: str
-    force: str
-    position: str
-    velocity: str
-
-    @classmethod
-    def find(cls, diagram: WiredDiagram, flat: FlatDiagram, force: str, position: str, velocity: str) -> Ports:
-        """Return the ports that names denote.
-
-        Raises
-        ------
-        UnknownNameError, OptionError
-            If a name denotes none, or position and velocity are not outputs of the block with the force port.
-        """
-        plant, _, port = str(force).rpartition(".")
-        if plant not in diagram.blocks:
-            candidates = [f"{path}.{name}" for path, block in diagram.blocks.items() for name in block.inputs]
-            raise UnknownNameError(
-                f"found no block with the input {force!r}. {near(str(force), candidates)}", block=diagram.name
-            )
-        if port not in diagram.blocks[plant].inputs:
-            raise UnknownNameError(
-                f"it has no input {port!r}. {near(port, diagram.blocks[plant].inputs)}", block=plant, port=port
-            )
-        found = []
-        for name, quantity in ((position, "position"), (velocity, "velocity")):
-            signal = find_signal(flat, name)
-            if signal.port[0] != plant or signal.entry:
-                raise OptionError(
-                    f"found {name!r}, of the block {signal.port[0]!r}; expected the {quantity} of the contact, an "
-                    f"output of {plant!r} that the force acts on. Name that output: {quantity}=….",
-                    block=plant,
-                    port=quantity,
-                )
-            found.append(signal.port[1])
-        return cls(plant, port, *found)
-
-
-class Source(NamedTuple):
-    """Output port, or a part of it, that an input of the plant is wired to."""
-
-    block: str
-    port: str
-    part: int | slice | None
 
 
 def take_apart(
@@ -206,10 +154,11 @@ def take_apart(
     E = StateMatrices(U[:n, :n], U[:n, n:], U[n:, :n], U[n:, n:])
     _check_contact(path, ports, m, E, (pushed, position, velocity))
     if signal is not None:
-        _check_unit(diagram, path, ports, signal)
+        check_unit(diagram, path, ports, signal)
+        check_command(diagram, flat, ports, signal, wires)
         driven = wires.get(ports.force)
         direct = driven is not None and (driven.block, driven.port) == signal.port
-        _check_force_wire(path, ports, signal, K, [wired.index(i) for i in pushed if i in wired], direct=direct)
+        check_force_wire(path, ports, signal, K, [wired.index(i) for i in pushed if i in wired], direct=direct)
     sensor = None if signal is None else _find_sensor(flat, signal.port[0])
     parts = ContactParts(
         plant=plant,
@@ -356,29 +305,6 @@ def _check_contact(
         raise ParameterError(
             f"found a force whose accelerations are {mobility.tolist()} for each newton; expected it to push along "
             f"itself in every direction. Name a position in the axes of the force.",
-            block=path,
-            port=ports.force,
-        )
-
-
-def _check_unit(diagram: WiredDiagram, path: str, ports: Ports, signal: Tap) -> None:
-    """Refuse a measured force in another unit than the force itself, where both are known."""
-    force, measured = diagram.blocks[path].inputs[ports.force].unit, diagram.checked.units.get(signal.port)
-    if isinstance(force, str) and isinstance(measured, str) and not same_unit(force, measured):
-        raise OptionError(
-            f"found {signal.name!r} in {measured}; expected the measured force in {force}, as of {path}.{ports.force}. "
-            "Name the wire that has it: force=….",
-            block=path,
-            port=ports.force,
-        )
-
-
-def _check_force_wire(path: str, ports: Ports, signal: Tap, K: StateMatrices, rows: list[int], *, direct: bool) -> None:
-    """Refuse a measured force that drives the force port itself: the environment's force would act twice."""
-    if direct or (rows and np.any(K.D[rows, -len(signal.entries) :])):
-        raise OptionError(
-            f"found {signal.name!r}, which leads on to {path}.{ports.force}; expected the signal of the force sensor, "
-            "which acts on the controller alone. Name that wire: force=….",
             block=path,
             port=ports.force,
         )

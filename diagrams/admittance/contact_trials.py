@@ -14,7 +14,8 @@ from ...fmus.running import Fmu
 from ..linearization import PlantEquations, copy_point, find_signal, linearize, linearize_plant
 from .attached_environment import attach_environment
 from .contact_limits import ContactLimit, CoupledLoop, to_rates
-from .contact_parts import ContactParts, Ports
+from .contact_parts import ContactParts
+from .contact_ports import Ports
 from .moored_plant import Mooring, hold_sources, library_class, moored_diagram
 
 if TYPE_CHECKING:

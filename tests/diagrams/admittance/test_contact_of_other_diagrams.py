@@ -239,3 +239,19 @@ def test_an_arms_limits_hold_in_the_nonlinear_run_with_an_environment(vary, held
     k, b, m = (names | {vary: found.above.value}).values()
     assert found.above.measured == pytest.approx(arm_growth(k, b, m, np.array((0.6, 0.8))), rel=0.02)
     assert found.below.measured < 0 < found.above.measured
+
+
+@pytest.mark.parametrize("delay", [None, 0, 1])
+def test_a_command_of_the_plant_is_no_measured_force(delay):
+    cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
+    felt = Gain(gain=1.0, name="sensor")(hand).named("felt")
+
+    def drive(f, v):
+        return (Gain(gain=SHARE, name="share")(f) - Gain(gain=DRAG, name="drag")(v)).named("command")
+
+    made = drive if delay is None else subsystem(sample_time=1e-3, delay=delay, name="drive")(drive)
+    here = Diagram("cart", cart(motor=made(felt, cart.velocity), push=hand))
+    name = "command" if delay is None else "drive.command"
+    ports = {"position": "cart.position", "velocity": "cart.velocity"}
+    with pytest.raises(OptionError, match=rf"cart.push: found '{name}', which drives cart.motor; .*force=…"):
+        here.contact("cart.push", direction=[1.0], force=name, **ports)

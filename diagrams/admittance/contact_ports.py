@@ -1,0 +1,112 @@
+"""The ports of a contact at a plant, and the wire of its measured force."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ...blocks.core import OptionError, UnknownNameError, near, same_unit
+from ..linearization import Tap, find_signal
+from .compliance_loop import StateMatrices
+
+if TYPE_CHECKING:
+    from ..flat import FlatDiagram, WiredDiagram
+
+
+@dataclass(frozen=True)
+class Ports:
+    """The plant of a contact and its ports, by name."""
+
+    plant: str
+    force: str
+    position: str
+    velocity: str
+
+    @classmethod
+    def find(cls, diagram: WiredDiagram, flat: FlatDiagram, force: str, position: str, velocity: str) -> Ports:
+        """Return the ports that names denote.
+
+        Raises
+        ------
+        UnknownNameError, OptionError
+            If a name denotes none, or position and velocity are not outputs of the block with the force port.
+        """
+        plant, _, port = str(force).rpartition(".")
+        if plant not in diagram.blocks:
+            candidates = [f"{path}.{name}" for path, block in diagram.blocks.items() for name in block.inputs]
+            raise UnknownNameError(
+                f"found no block with the input {force!r}. {near(str(force), candidates)}", block=diagram.name
+            )
+        if port not in diagram.blocks[plant].inputs:
+            raise UnknownNameError(
+                f"it has no input {port!r}. {near(port, diagram.blocks[plant].inputs)}", block=plant, port=port
+            )
+        found = []
+        for name, quantity in ((position, "position"), (velocity, "velocity")):
+            signal = find_signal(flat, name)
+            if signal.port[0] != plant or signal.entry:
+                raise OptionError(
+                    f"found {name!r}, of the block {signal.port[0]!r}; expected the {quantity} of the contact, an "
+                    f"output of {plant!r} that the force acts on. Name that output: {quantity}=….",
+                    block=plant,
+                    port=quantity,
+                )
+            found.append(signal.port[1])
+        return cls(plant, port, *found)
+
+
+class Source(NamedTuple):
+    """Output port, or a part of it, that an input of the plant is wired to."""
+
+    block: str
+    port: str
+    part: int | slice | None
+
+
+def check_unit(diagram: WiredDiagram, path: str, ports: Ports, signal: Tap) -> None:
+    """Refuse a measured force in another unit than the force itself, where both are known."""
+    force, measured = diagram.blocks[path].inputs[ports.force].unit, diagram.checked.units.get(signal.port)
+    if isinstance(force, str) and isinstance(measured, str) and not same_unit(force, measured):
+        raise OptionError(
+            f"found {signal.name!r} in {measured}; expected the measured force in {force}, as of {path}.{ports.force}. "
+            "Name the wire that has it: force=….",
+            block=path,
+            port=ports.force,
+        )
+
+
+def check_command(
+    diagram: WiredDiagram, flat: FlatDiagram, ports: Ports, signal: Tap, wires: Mapping[str, Source]
+) -> None:
+    """Refuse a measured force that is a command of the plant: it drives another of its inputs, at once or delayed."""
+    for port, source in wires.items():
+        if port == ports.force:
+            continue
+        while source.block not in diagram.blocks:  # the delay of a subsystem
+            (wire,) = (w for (block, _), w in flat.table.wires.items() if block == source.block)
+            source = Source(wire.block, wire.port, wire.index if source.part is None else source.part)
+        if (source.block, source.port) != signal.port:
+            continue
+        shape = flat.checked.shapes[signal.port]
+        every = np.arange(int(np.prod(shape))).reshape(shape)
+        if set(np.ravel(every if source.part is None else every[source.part]).tolist()) & set(signal.entries):
+            raise OptionError(
+                f"found {signal.name!r}, which drives {ports.plant}.{port}; expected the signal of the force sensor, "
+                "which acts on the controller alone. Name that wire: force=….",
+                block=ports.plant,
+                port=ports.force,
+            )
+
+
+def check_force_wire(path: str, ports: Ports, signal: Tap, K: StateMatrices, rows: list[int], *, direct: bool) -> None:
+    """Refuse a measured force that drives the force port itself: the environment's force would act twice."""
+    if direct or (rows and np.any(K.D[rows, -len(signal.entries) :])):
+        raise OptionError(
+            f"found {signal.name!r}, which leads on to {path}.{ports.force}; expected the signal of the force sensor, "
+            "which acts on the controller alone. Name that wire: force=….",
+            block=path,
+            port=ports.force,
+        )
