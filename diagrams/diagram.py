@@ -272,7 +272,7 @@ class Diagram(VariedDiagram):
         pdf, json : bool
             Write ``.pdf`` (which needs ``pip install 'loopwright[pdf]'``) and ``.json`` beside it, too.
         paper : {"A4", "letter"}
-            Paper of the PDF. ``options`` are those of `analyse`, such as ``requirements``, ``point`` and ``loops``.
+            Paper of the PDF. ``options`` are those of `analyse`, such as ``requirements``, ``at`` and ``loops``.
 
         Returns
         -------

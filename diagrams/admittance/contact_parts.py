@@ -155,7 +155,7 @@ def take_apart(
     _check_contact(path, ports, m, E, (pushed, position, velocity))
     if signal is not None:
         check_unit(diagram, path, ports, signal)
-        check_command(diagram, flat, ports, signal, wires)
+        check_command(flat, ports, signal, wires)
         driven = wires.get(ports.force)
         direct = driven is not None and (driven.block, driven.port) == signal.port
         check_force_wire(path, ports, signal, K, [wired.index(i) for i in pushed if i in wired], direct=direct)

@@ -78,16 +78,11 @@ def check_unit(diagram: WiredDiagram, path: str, ports: Ports, signal: Tap) -> N
         )
 
 
-def check_command(
-    diagram: WiredDiagram, flat: FlatDiagram, ports: Ports, signal: Tap, wires: Mapping[str, Source]
-) -> None:
-    """Refuse a measured force that is a command of the plant: it drives another of its inputs, at once or delayed."""
+def check_command(flat: FlatDiagram, ports: Ports, signal: Tap, wires: Mapping[str, Source]) -> None:
+    """Refuse a measured force that is a command of the plant: it drives another of its inputs."""
     for port, source in wires.items():
         if port == ports.force:
             continue
-        while source.block not in diagram.blocks:  # the delay of a subsystem
-            (wire,) = (w for (block, _), w in flat.table.wires.items() if block == source.block)
-            source = Source(wire.block, wire.port, wire.index if source.part is None else source.part)
         if (source.block, source.port) != signal.port:
             continue
         shape = flat.checked.shapes[signal.port]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from ...blocks.core import on_one_thread
+from ...blocks.core import OptionError, on_one_thread
 from ...fmus.running import Fmu
 from ..flat import WiredDiagram
 from ..linearization import find_signal
@@ -54,6 +54,7 @@ ANY_DIAGRAM = ReportKind(
 def analyse(
     diagram: WiredDiagram | ReportedExperiment,
     *,
+    at: Any = None,
     point: Any = None,
     loops: Iterable[str] | None = None,
     experiment: ReportedExperiment | None = None,
@@ -80,9 +81,9 @@ def analyse(
     ----------
     diagram : Diagram or Experiment
         The diagram.
-    point : OperatingPoint, Snapshot or float, optional
+    at : OperatingPoint, Snapshot or float, optional
         Where: a time in s to which each variant is run, ``run.at(t)``, or a point of this diagram; the start without
-        it.
+        it. ``point`` is another name of it.
     loops : iterable of str, optional
         Wires at which loops are looked at, in place of all named ones on loops; not for a diagram of `fig3`.
     experiment : Experiment, optional
@@ -123,10 +124,15 @@ def analyse(
     ConfirmationError
         If a number and its independent confirmation disagree.
     OptionError
-        An unknown section; a contact of another diagram.
+        An unknown section; a contact of another diagram; both ``at`` and ``point``.
     UnknownNameError
         If there is no wire with a name in ``loops``, or no loop, variant or wire with one in ``requirements``.
     """
+    if at is not None and point is not None:
+        raise OptionError(
+            "found at and point, two names of one option; expected one of them. Give at=… alone.", port="at"
+        )
+    point = point if at is None else at
     if not isinstance(diagram, WiredDiagram):
         experiment, diagram = diagram, diagram.diagram
     kind: MakesSections = diagram.report_kind if isinstance(diagram, HasReportKind) else ANY_DIAGRAM

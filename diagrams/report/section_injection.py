@@ -19,7 +19,7 @@ from .variant import Implementation, Variant
 TEXTS = Texts(__package__, "injection")
 
 WIRES = 2
-"""Wires at most at which is measured."""
+"""Wires at most at which is measured: the first that can be."""
 REFUTED = 0.05
 """A relative deviation beyond which a linear model is wrong."""
 CONFIRMED = 1e-3
@@ -31,8 +31,12 @@ def injected(case: Case) -> Section | None:
     rows: list[tuple[Any, ...]] = []
     text: list[str] = []
     plots = []
-    for key, wire in list(case.loop_wires().items())[:WIRES]:
+    taken, skipped = 0, list[str]()
+    for key, wire in case.loop_wires().items():
+        if taken == WIRES:
+            break
         measured = {}
+        refused = False  # by the wire itself: another one may be measured
         for v in case.usable(Implementation.SAMPLED, Implementation.DELAYED):
             if v.implementation.delay and not v.is_design:
                 continue
@@ -48,9 +52,11 @@ def injected(case: Case) -> Section | None:
                 found, model = _measured(case, v, wire)
                 deviation = found.deviation(model, "L")
             except PeriodicLoopError:
+                refused = True
                 text.append(TEXTS.line("periodic", variant=v.title, wire=wire))
                 continue
             except LoopwrightError as error:
+                refused = True
                 text.append(TEXTS.line("failed", variant=v.title, wire=wire, message=error.message))
                 continue
             worst, own = float(np.max(deviation)), float(np.max(found.uncertainty))
@@ -71,8 +77,14 @@ def injected(case: Case) -> Section | None:
             verdict = "yes" if worst <= CONFIRMED and own <= CONFIRMED else "no"
             rows.append((wire, v.title, span, *shown, verdict))
             measured[v.key] = _curve(v.title, found, L)
+        if refused and not measured:
+            skipped.append(wire)
+        else:
+            taken += 1
         if measured:
             plots.append(figures.injected(wire, measured, case.axes, case.looks, f"injection_{key}"))
+    if skipped:
+        text.append(TEXTS.line("skipped", wires=", ".join(skipped), many=WIRES))
     if not rows:
         return Section("injection", "Injection check", tuple(text)) if text else None
     text = [*TEXTS.paragraphs("measurement"), *text]

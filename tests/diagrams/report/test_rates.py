@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Constant, Gain, StateSpace
+from loopwright.blocks import Constant, Gain, OptionError, StateSpace
 from loopwright.diagrams import Diagram, Requirements, Verdict, analyse, subsystem
 from loopwright.diagrams.measure import step_response
 from loopwright.diagrams.requirements import Reason
@@ -105,3 +105,23 @@ def test_the_injection_check_says_in_words_why_a_fast_wire_is_not_measured():
     (section,) = (s for s in report.sections if s.key == "injection")
     assert any("renewed several times in the period of all clocks" in text for text in section.text)
     assert not any("lifted=True" in text for text in section.text)
+
+
+def test_the_injection_check_skips_wires_that_cannot_be_measured_and_names_them():
+    wires = (
+        "voltage",
+        "motor.y",
+        "current_wanted",
+    )  # renewed five times in the period; a vector; as often as the period
+    report = analyse(cascade(), only=("injection",), loops=wires)
+    (section,) = (s for s in report.sections if s.key == "injection")
+    assert "injection.current_wanted.sampled_d0.deviation" in report.numbers()
+    (told,) = (str(line) for line in section.text if "Skipped" in str(line))
+    assert "voltage, motor.y." in told
+
+
+def test_the_operating_point_is_called_at_as_everywhere():
+    at, point = (analyse(cascade(), only=("subject",), **{name: 0.01}) for name in ("at", "point"))
+    assert [s.text for s in at.sections] == [s.text for s in point.sections]
+    with pytest.raises(OptionError, match="at: found at and point, two names of one option"):
+        analyse(cascade(), at=0.01, point=0.01)

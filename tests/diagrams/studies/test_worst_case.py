@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from loopwright.blocks import Constant, Gain, OptionError, UnknownNameError
-from loopwright.diagrams import Diagram, experiments
+from loopwright.blocks import Block, Constant, Gain, Input, Integrator, OptionError, Output, UnknownNameError, parameter
+from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.linearization import loop_of_variant
 from loopwright.diagrams.requirements import Requirements
 from loopwright.diagrams.studies import CaseOrigin, CaseState, ConfirmationKind
@@ -174,3 +174,29 @@ def test_wrong_questions_are_refused():
         diagram.worst_case({"p.gain": (0.5, 2.0)}, quantity="ms")
     with pytest.raises(OptionError, match="limit no number"):
         diagram.worst_case({"p.gain": (0.5, 2.0)}, "u", requirements=Requirements(step={"overshoot": 0.1}))
+
+
+class Switched(Block):
+    u = Input()
+    y = Output()
+    on: bool = parameter(default=True)
+
+    def output(self, t, x, u):
+        return 2.0 * u.u if self.on else u.u
+
+
+@pytest.mark.parametrize("name", ["control.sample_time", "control.switch.on"])
+def test_a_sample_time_and_a_switch_are_no_parameters_of_a_worst_case(name):
+    state, told = Integrator(name="x"), list[str]()
+
+    @subsystem(sample_time=0.1)
+    def control(y):
+        return Switched(name="switch")(Constant(value=0.0, name="r") - y).named("u")
+
+    diagram = Diagram("switched", state(control(state.y)))
+    head, _, last = name.rpartition(".")
+    with pytest.raises(
+        OptionError, match=rf"{head}.{last}: found a .* a worst case; expected numbers .*replace"
+    ) as caught:
+        diagram.worst_case({name: (0.0, 1.0)}, "control.u", progress=told.append)
+    assert (caught.value.block, caught.value.port, told) == (head, last, [])
