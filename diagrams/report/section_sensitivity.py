@@ -55,7 +55,8 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities) -> Section:
     rows: list[tuple[object, ...]] = []
     numbers: dict[str, Number] = {}
     bars: dict[str, float] = {}
-    marked: dict[str, list[str]] = {"kink": [], "lost": []}
+    kinks: list[str] = []
+    lost: list[str] = []
     text: list[str] = []
     for name in names:
         try:
@@ -67,12 +68,15 @@ def _part(case: Case, key: str, wire: str, found: Sensitivities) -> Section:
         bars[name] = next(row for row in made if row.quantity == first).per_percent.value
         for row in made:
             numbers[f"{_path(name)}.{row.quantity}_per_percent"] = row.per_percent
-            marked["kink"] += [name] if row.kink else []
-            marked["lost"] += [name] if row.rest_lost else []
+            kinks += [name] if row.kink else []
+            lost += [name] if row.rest_lost else []
         cells = [row.per_percent for row in made]
         value = found[name, first]
         rows.append((name, Number(value.value, value.unit or "1", 0.0, "", given=True), *cells))
-    text += [TEXTS.line(kind, wire=wire, names=", ".join(dict.fromkeys(mine))) for kind, mine in marked.items() if mine]
+    if kinks:
+        text.append(TEXTS.line("kink", wire=wire, names=", ".join(dict.fromkeys(kinks))))
+    if lost:
+        text.append(TEXTS.line("lost", wire=wire, names=", ".join(dict.fromkeys(lost))))
     if others:
         text.append(TEXTS.line("others", wire=wire, names=", ".join(others), number=ROWS[first]))
     small = [row.parameter for row in found.of(first) if not _acts(row)]
