@@ -19,6 +19,7 @@ import pytest
 from nbclient import NotebookClient
 
 import loopwright.fmus
+from loopwright.diagrams import Run
 from loopwright.diagrams.cli import main
 
 ROOT = Path(__file__).parent.parent
@@ -28,6 +29,23 @@ QUICK = "03_your_own_diagram"  # the notebook of the quick set
 
 def blocks_of_code(text):
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
+def run_page(page, folder):
+    """Run the code of a page of docs/ in a folder and return the names that it leaves.
+
+    It has code, and what its runs have recorded are numbers.
+    """
+    snippets, scope = blocks_of_code((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")), {}
+    assert snippets, f"{page}.md has no code"
+    with chdir(folder):
+        for snippet in snippets:
+            exec(snippet, scope)
+    runs = {name: made for name, made in scope.items() if isinstance(made, Run)}
+    for name, run in runs.items():
+        for signal in run.names:
+            assert run[signal].dtype.kind not in "fc" or np.isfinite(run[signal]).all(), f"{page}.md: {name}[{signal!r}]"
+    return scope
 
 
 def run_commands(text, folder):
@@ -63,10 +81,7 @@ def test_the_readme_opens_with_a_closed_loop_in_ten_lines_that_runs(tmp_path):
 
 @pytest.mark.slow
 def test_the_page_on_diagrams_runs(tmp_path):
-    scope = {}
-    with chdir(tmp_path):
-        for snippet in blocks_of_code((ROOT / "docs" / "diagrams.md").read_text(encoding="utf-8")):
-            exec(snippet, scope)
+    run_page("diagrams", tmp_path)
 
 
 def as_in_a_table(value):
@@ -75,10 +90,7 @@ def as_in_a_table(value):
 
 @pytest.mark.slow
 def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_path):
-    text, scope = (ROOT / "docs" / "frequency.md").read_text(encoding="utf-8"), {}
-    with chdir(tmp_path):
-        for snippet in blocks_of_code(text):
-            exec(snippet, scope)
+    text, scope = (ROOT / "docs" / "frequency.md").read_text(encoding="utf-8"), run_page("frequency", tmp_path)
     for name, cells in re.findall(r"^\| `([\w.]+)` \|(.*)\|$", text, re.MULTILINE):
         told = [c.strip() for c in re.split(r"(?<!\\)\|", cells)]
         if name in scope["limits"]:
@@ -103,10 +115,7 @@ def test_the_page_on_frequencies_runs_and_its_numbers_are_those_it_gives(tmp_pat
     ],
 )
 def test_the_page_runs(cache, tmp_path, page):
-    scope = {}
-    with chdir(tmp_path):
-        for snippet in blocks_of_code((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")):
-            exec(snippet, scope)
+    run_page(page, tmp_path)
 
 
 @pytest.mark.slow

@@ -69,6 +69,16 @@ def test_every_subpackage_is_listed_for_the_wheel():
     assert importlib.metadata.version("loopwright")
 
 
+def test_the_root_holds_what_belongs_there():
+    kept = call("git", "ls-files").stdout.splitlines()
+    assert {path for path in kept if "/" not in path} == {
+        ".gitignore", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE", "README.md", "pyproject.toml",
+    }  # fmt: skip
+    assert {path.partition("/")[0] for path in kept if "/" in path} == {
+        ".ci", "benchmarks", "blocks", "diagrams", "docs", "fmus", "notebooks", "tests",
+    }  # fmt: skip
+
+
 def test_every_file_that_is_no_code_is_listed_for_the_wheel():
     setup = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
     listed = {

@@ -537,7 +537,10 @@ def test_rounding_to_even_is_refused(equation):
     ],
 )
 def test_no_false_alarm(equation):
-    traced(function_block(equation))
+    block = function_block(equation)
+    for point in (np.array([0.7, 1.9]), np.array([-0.3, 2.6])):
+        told = np.broadcast_to(equation(block, 0.0, point), (2,))
+        np.testing.assert_allclose(np.broadcast_to(value(block, u=[point]), (2,)), told, rtol=1e-14)
 
 
 def test_a_wrong_value_at_a_special_point_alone_is_found():
