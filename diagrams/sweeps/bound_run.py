@@ -51,21 +51,21 @@ class BoundRun:
         self._recording = Recording(self.flat, diagram.name, record, every, states, None, False)
         every_tick = base is not None or EVERY in self.flat.visited
         self._recording.check_memory(self._count, every_tick=every_tick)
-        self._engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=lambda event: None)
-        rows = self._count + 2 if self._engine.every_tick else None
+        self.engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=lambda event: None)
+        rows = self._count + 2 if self.engine.every_tick else None
         self._recorder: Recorder = self._recording.begin(rows)
         fine = note_fine_steps(self.flat) if base is None else ()
-        self._notes: tuple[str, ...] = (*fused, *fine, *note_loops(self.flat, self._engine.coupling))
+        self._notes: tuple[str, ...] = (*fused, *fine, *note_loops(self.flat, self.engine.coupling))
         self._told: dict[str, int] = {}
-        self._start = StartValues(self._engine.workspace)
+        self._start = StartValues(self.engine.workspace)
         self._stack = ExitStack()
 
     def __enter__(self) -> BoundRun:
         with LOADING:
             try:
-                self._engine.load(self._stack, 0.0)
+                self.engine.load(self._stack, 0.0)
                 self._notes += tuple(self._take_messages())
-                self._engine.initialize()
+                self.engine.initialize()
                 self._take_messages()  # of numbers that are no sample's
             except BaseException:
                 self._stack.close()
@@ -79,17 +79,17 @@ class BoundRun:
     @property
     def is_possible(self) -> bool:
         """Whether its runs can follow each other: each leaves nothing behind for the next one."""
-        return self._engine.can_begin_anew and StartValues.fits(self.flat)
+        return self.engine.can_begin_anew and StartValues.fits(self.flat)
 
     @property
     def is_compiled(self) -> bool:
         """Whether it goes from tick to tick in C."""
-        return self._engine.is_compiled
+        return self.engine.is_compiled
 
     @property
     def is_broken(self) -> bool:
         """Whether an FMU of it has failed for good, so that it can't be reset."""
-        return any(isinstance(p, FmuInstance) and p.fatal for p in self._engine.plants.values())
+        return any(isinstance(p, FmuInstance) and p.fatal for p in self.engine.plants.values())
 
     def run(self, numbers: Numbers[Any], tell: Tell) -> Run:
         """Run with the numbers of a sample.
@@ -106,15 +106,10 @@ class BoundRun:
         SimulationError
             As of `Diagram.simulate`; ``error.run`` holds what was recorded until then.
         """
-        engine, recorder, started = self._engine, self._recorder, perf_counter()
+        engine, recorder, started = self.engine, self._recorder, perf_counter()
         recorder.begin_anew()
         try:
-            with LOADING:
-                for path, plant in engine.plants.items():
-                    assert isinstance(plant, FmuInstance)
-                    plant.reset()
-                    plant.initialize(None, values=numbers.starts.get(path))
-                engine.begin_anew(renumber(self.flat, numbers.blocks), self._start.set)
+            self.begin(numbers)
             engine.take_first_tick(None, recorder.row)
             if engine.position.stopped is None:
                 if self._count:
@@ -130,8 +125,23 @@ class BoundRun:
         recorder.last(engine.position.t, engine.workspace.log)
         return self._take_record(started)
 
+    def begin(self, numbers: Numbers[Any]) -> None:
+        """Go back to t = 0 with the numbers of a sample: the engine's workspace holds them, and its plants are begun.
+
+        Raises
+        ------
+        SimulationError
+            If the start can't be found with them.
+        """
+        with LOADING:
+            for path, plant in self.engine.plants.items():
+                assert isinstance(plant, FmuInstance)
+                plant.reset()
+                plant.initialize(None, values=numbers.starts.get(path))
+            self.engine.begin_anew(renumber(self.flat, numbers.blocks), self._start.set)
+
     def _take_record(self, started: float) -> Run:
-        recorder, engine = self._recorder, self._engine
+        recorder, engine = self._recorder, self.engine
         t, data = recorder.finish()
         return Run(
             t=t,
@@ -151,7 +161,7 @@ class BoundRun:
     def _take_messages(self) -> list[str]:
         """Return what the FMUs have told since the last run."""
         found: list[str] = []
-        for path, plant in self._engine.plants.items():
+        for path, plant in self.engine.plants.items():
             texts = plant.messages
             found += texts[self._told.get(path, 0) :]
             self._told[path] = len(texts)

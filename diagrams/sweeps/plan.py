@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -71,6 +71,10 @@ class Plan:
         seeds = {path: seed_of(sample.seed, k) % 2**53 for k, path in enumerate(self.seeds)}
         return {**sample.parameters, **seeds}
 
+    def make_worker(self) -> Worker:
+        """Return a worker that runs samples in this thread."""
+        return Worker(self)
+
     @property
     def runs_in_threads(self) -> bool:
         """Whether its FMUs can run in several threads: all were built by Loopwright on this machine."""
@@ -94,6 +98,9 @@ class Worker:
     plan : Plan
         The sweep.
     """
+
+    width = 1
+    """Samples that it is best given at a time."""
 
     def __init__(self, plan: Plan):
         self.plan, self._options = plan, plan.run_options
@@ -119,6 +126,11 @@ class Worker:
         except LoopwrightError:  # of this sample; its run will tell
             return False
         return bound is not None and bound.is_compiled
+
+    def run_all(self, samples: Iterable[Sample], tell: Tell = lambda t: None) -> Iterator[Outcome]:
+        """Yield the outcomes of some samples; see `run`."""
+        for sample in samples:
+            yield self.run(sample, tell)
 
     def run(self, sample: Sample, tell: Tell = lambda t: None) -> Outcome:
         """Run a sample; a run that fails is an outcome, too.

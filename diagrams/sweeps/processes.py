@@ -9,11 +9,11 @@ import sys
 import threading
 from collections.abc import Generator, Iterable
 from contextlib import suppress
-from queue import SimpleQueue
 from typing import Any, BinaryIO
 
 from ...blocks.core import OptionError
 from .child import receive, send
+from .desk import Desk
 from .outcome import WORKER_ENDED, Failure, Outcome
 from .plan import Plan
 from .samples import Sample
@@ -41,43 +41,13 @@ def run_in_processes(plan: Plan, samples: Iterable[Sample], count: int) -> Gener
         If the diagram, or a function of the sweep, can't be sent to a process.
     """
     data = to_bytes(plan, plan.diagram.name)
-    waiting, lock, halted = iter(samples), threading.Lock(), threading.Event()
-    ready: SimpleQueue[Outcome | BaseException | None] = SimpleQueue()
-    processes: list[_Process] = [_Process(data) for _ in range(count)]
+    processes = [_Process(data) for _ in range(count)]
 
-    def take() -> Sample | None:
-        with lock:
-            return None if halted.is_set() else next(waiting, None)
-
-    def work(process: _Process) -> None:
-        try:
-            while (sample := take()) is not None:
-                ready.put(process.run(sample))
-        except BaseException as error:
-            if not halted.is_set():
-                ready.put(error)
-        finally:
-            ready.put(None)
-
-    threads = [threading.Thread(target=work, args=(process,), daemon=True) for process in processes]
-    for thread in threads:
-        thread.start()
-    left = count
-    try:
-        while left:
-            found = ready.get()
-            if found is None:
-                left -= 1
-            elif isinstance(found, BaseException):
-                raise found
-            else:
-                yield found
-    finally:
-        halted.set()
+    def end() -> None:
         for process in processes:
             process.end()
-        for thread in threads:
-            thread.join()
+
+    yield from Desk(samples).serve([process.work for process in processes], end)
 
 
 def to_bytes(plan: object, name: str) -> bytes:
@@ -120,6 +90,11 @@ class _Process:
         self._data = data
         self._process: subprocess.Popen[bytes] | None = None
         self._lock, self._over = threading.Lock(), False
+
+    def work(self, desk: Desk) -> None:
+        """Run the samples of a desk until there are none."""
+        while taken := desk.take():
+            desk.put(self.run(taken[0]))
 
     def run(self, sample: Sample) -> Outcome:
         """Return the outcome of a sample; where the process ends, that is its failure."""

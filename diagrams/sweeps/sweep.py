@@ -18,7 +18,7 @@ from ..results import Run, entries, machine_memory, resolve
 from ..simulation import SimulatedDiagram, Simulation, progress_bar
 from .names import find_parameter
 from .outcome import Outcome
-from .plan import Plan, Worker
+from .plan import Plan
 from .processes import run_in_processes
 from .reductions import Reduction, check_reductions
 from .result import Sweep
@@ -161,10 +161,10 @@ def _run(plan: Plan, samples: Sequence[Sample], workers: int, client: Any) -> Ge
 
         yield from run_on_cluster(plan, samples, client)
         return
-    with Worker(plan) as worker:
+    with plan.make_worker() as worker:
         if workers == 1:
-            for sample in samples:
-                yield worker.run(sample)
+            for k in range(0, len(samples), worker.width):
+                yield from worker.run_all(samples[k : k + worker.width])
             return
         compiled = worker.can_compile(samples[0])
     run = run_in_threads if compiled else run_in_processes

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Generator, Iterable
-from queue import SimpleQueue
 
+from .desk import Desk
 from .outcome import Outcome
-from .plan import Plan, Worker
+from .plan import Plan
 from .samples import Sample
 
 
@@ -29,43 +28,15 @@ def run_in_threads(plan: Plan, samples: Iterable[Sample], count: int) -> Generat
     count : int
         Number of threads.
     """
-    waiting, lock, halted = iter(samples), threading.Lock(), threading.Event()
-    ready: SimpleQueue[Outcome | BaseException | None] = SimpleQueue()
 
-    def take() -> Sample | None:
-        with lock:
-            return None if halted.is_set() else next(waiting, None)
+    def work(desk: Desk) -> None:
+        def tell(t: float) -> None:
+            if desk.is_closed:
+                raise Halt
 
-    def tell(t: float) -> None:
-        if halted.is_set():
-            raise Halt
+        with plan.make_worker() as worker:
+            while taken := desk.take(worker.width):
+                for outcome in worker.run_all(taken, tell):
+                    desk.put(outcome)
 
-    def work() -> None:
-        try:
-            with Worker(plan) as worker:
-                while (sample := take()) is not None:
-                    ready.put(worker.run(sample, tell))
-        except Halt:
-            pass
-        except BaseException as error:
-            ready.put(error)
-        finally:
-            ready.put(None)
-
-    threads = [threading.Thread(target=work, name=f"sweep {k}", daemon=True) for k in range(count)]
-    for thread in threads:
-        thread.start()
-    left = count
-    try:
-        while left:
-            found = ready.get()
-            if found is None:
-                left -= 1
-            elif isinstance(found, BaseException):
-                raise found
-            else:
-                yield found
-    finally:
-        halted.set()
-        for thread in threads:
-            thread.join()
+    yield from Desk(samples).serve([work] * count)

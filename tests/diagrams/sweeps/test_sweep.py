@@ -456,7 +456,7 @@ def test_an_fmu_that_has_asked_for_the_end_is_asked_anew_in_the_next_run(monkeyp
     def spy(self, numbers, tell):
         made = run(self, numbers, tell)
         seen.append(made.t[-1])
-        self._engine.plants["plant"].ends_run = True  # as its flag leaves it
+        self.engine.plants["plant"].ends_run = True  # as its flag leaves it
         return made
 
     monkeypatch.setattr(BoundRun, "run", spy)

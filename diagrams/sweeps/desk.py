@@ -1,0 +1,85 @@
+"""The desk of a sweep: it hands samples out to workers in threads, and takes their outcomes in."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Generator, Iterable, Sequence
+from itertools import islice
+from queue import SimpleQueue
+
+from .outcome import Outcome
+from .samples import Sample
+
+
+class Desk:
+    """Hands out samples, and takes in outcomes.
+
+    Parameters
+    ----------
+    samples : iterable of Sample
+        The samples.
+    """
+
+    def __init__(self, samples: Iterable[Sample]):
+        self._waiting, self._lock, self._closed = iter(samples), threading.Lock(), threading.Event()
+        self._ready: SimpleQueue[Outcome | BaseException | None] = SimpleQueue()
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the sweep is over: nobody waits for outcomes any more."""
+        return self._closed.is_set()
+
+    def take(self, count: int = 1) -> list[Sample]:
+        """Return the next samples, at most ``count``; none once the desk is closed."""
+        with self._lock:
+            return [] if self.is_closed else list(islice(self._waiting, count))
+
+    def put(self, outcome: Outcome) -> None:
+        """Take in the outcome of a sample."""
+        self._ready.put(outcome)
+
+    def serve(
+        self, workers: Sequence[Callable[[Desk], None]], end: Callable[[], None] = lambda: None
+    ) -> Generator[Outcome, None, None]:
+        """Yield the outcomes of workers, each called in a thread of its own, in the order in which they are ready.
+
+        The error of a worker is raised. Where the caller stops, the desk is closed, and the workers are waited for.
+
+        Parameters
+        ----------
+        workers : sequence of callable
+            Each takes samples from this desk, and puts their outcomes to it, until there are none.
+        end : callable
+            Called when the desk has been closed, before the workers are waited for.
+        """
+
+        def work(worker: Callable[[Desk], None]) -> None:
+            try:
+                worker(self)
+            except BaseException as error:
+                if not self.is_closed:
+                    self._ready.put(error)
+            finally:
+                self._ready.put(None)
+
+        threads = [
+            threading.Thread(target=work, args=(worker,), name=f"sweep {k}", daemon=True)
+            for k, worker in enumerate(workers)
+        ]
+        for thread in threads:
+            thread.start()
+        left = len(threads)
+        try:
+            while left:
+                found = self._ready.get()
+                if found is None:
+                    left -= 1
+                elif isinstance(found, BaseException):
+                    raise found
+                else:
+                    yield found
+        finally:
+            self._closed.set()
+            end()
+            for thread in threads:
+                thread.join()
