@@ -44,7 +44,9 @@ def run_page(page, folder):
     runs = {name: made for name, made in scope.items() if isinstance(made, Run)}
     for name, run in runs.items():
         for signal in run.names:
-            assert run[signal].dtype.kind not in "fc" or np.isfinite(run[signal]).all(), f"{page}.md: {name}[{signal!r}]"
+            assert run[signal].dtype.kind not in "fc" or np.isfinite(run[signal]).all(), (
+                f"{page}.md: {name}[{signal!r}]"
+            )
     return scope
 
 

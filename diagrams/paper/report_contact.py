@@ -12,7 +12,7 @@ from ...blocks.core import LoopwrightError, OptionError
 from ..admittance import SIDES, Contact, ContactLimit, StabilityLimit, make_contact, try_limit
 from ..frequency import Number, with_findings
 from ..linearization import StepsOnly
-from ..report import Implementation
+from ..report import Implementation, sign_of_admittance
 from ..report_writing import Plot, Section, Table, Texts
 from .report_case import PLANT, Fig3Case
 from .report_figures import TARGET, draw_admittances
@@ -82,18 +82,9 @@ def _passivity(
 ) -> Table:
     rows = []
     for name, contact in variants.items():
-        p = contact.passivity()
-        known = f"Re Y ≥ 0 on the whole scan up to {p.scanned[1]:.6g} rad/s"
-        if math.isfinite(p.frequency):
-            below, above = contact.admittance([p.frequency * f for f in (1 - 1e-6, 1 + 1e-6)]).rendered.real
-            known = "sign of Re Y just below and just above"
-            if not below > 0 > above:
-                known = "Re Y changes its sign within rounding there"
-        error = p.tolerance * p.frequency if math.isfinite(p.frequency) else 0.0
-        path = f"first_non_passive.{name}"
-        numbers[path] = Number(p.frequency, "rad/s", error, known, findings=p.findings)
-        spans = ", ".join(f"{low:.5g} … {high:.5g}" for low, high in p.intervals) or "none"
-        rows.append((titles.get(name, name), numbers[path], spans, "yes" if p.stable else "no"))
+        number, spans, alone = sign_of_admittance(contact)
+        numbers[f"first_non_passive.{name}"] = number
+        rows.append((titles.get(name, name), number, spans, alone))
     columns = ("variant", "first Re Y < 0 at", "all of Re Y < 0 [rad/s]", "stable alone")
     return Table("Sign of Re Y(jω)", columns, tuple(rows))
 

@@ -20,6 +20,7 @@ from .disks import disk_numbers, disk_range
 from .parts import MakesSections, ReportKind, ReportPart
 from .points import point_of
 from .pole_texts import list_poles
+from .section_contact import sign_of_admittance
 from .section_limits import LIMITS_TITLE
 from .section_poles import POLES_TITLE
 from .section_subject import SUBJECT_TITLE
@@ -57,6 +58,7 @@ __all__ = [
     "look_of",
     "point_of",
     "scatter",
+    "sign_of_admittance",
     "with_drawing",
     "without_memory",
 ]

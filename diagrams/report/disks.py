@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ...blocks.core import LoopwrightError, PeriodicLoopError
+from ...blocks.core import LoopwrightError
 from ..frequency import DiskMargin, Number, mimo_disk_margin, with_findings
 from ..report_writing import Section, Table
 from .case import Case
@@ -17,13 +17,8 @@ def several(case: Case, key: str, wire: str) -> LoopPart | None:
     own: dict[tuple[Variant, Cut], Mapping[str, Number]] = {}
     rows, notes = [], []
     for v in case.usable():
-        cut, title = Cut.PLAIN, v.title
         try:
-            try:
-                L = v.loop(wire)
-            except PeriodicLoopError:
-                cut, title = Cut.SLOW_OPEN, f"{v.title}, slow loops open"
-                L = v.loop(wire, cut=cut)
+            cut, title, L = v.fullest_loop(wire)
             disk = mimo_disk_margin(L)
         except LoopwrightError as error:
             notes.append(f"{v.title}: {error.message}")

@@ -76,7 +76,11 @@ def _contact(name: str, contact: Contact) -> Section:
     return Section(name, f"Contact {name!r}", (*text, *said), (*tables, *tried), plots, numbers)
 
 
-def _passivity(contact: Contact, numbers: dict[str, Number]) -> Table:
+def sign_of_admittance(contact: Contact) -> tuple[Number, str, str]:
+    """Return the first frequency at which Re Y is negative, all such spans, and whether the loop alone is stable.
+
+    The number is confirmed by the sign of Re Y on its two sides.
+    """
     p = contact.passivity()
     known = f"Re Y ≥ 0 on the whole scan up to {p.scanned[1]:.6g} rad/s"
     if math.isfinite(p.frequency):
@@ -85,9 +89,13 @@ def _passivity(contact: Contact, numbers: dict[str, Number]) -> Table:
         if not below > 0 > above:
             known = "Re Y changes its sign within rounding there"
     error = p.tolerance * p.frequency if math.isfinite(p.frequency) else 0.0
-    numbers["first_non_passive"] = Number(p.frequency, "rad/s", error, known, findings=p.findings)
     spans = ", ".join(f"{low:.5g} … {high:.5g}" for low, high in p.intervals) or "none"
-    rows = ((numbers["first_non_passive"], spans, "yes" if p.stable else "no"),)
+    return Number(p.frequency, "rad/s", error, known, findings=p.findings), spans, "yes" if p.stable else "no"
+
+
+def _passivity(contact: Contact, numbers: dict[str, Number]) -> Table:
+    rows = (sign_of_admittance(contact),)
+    numbers["first_non_passive"] = rows[0][0]
     return Table("Sign of Re Y(jω)", ("first Re Y < 0 at", "all of Re Y < 0 [rad/s]", "stable alone"), rows)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, PeriodicLoopError
+from ...blocks.core import LoopwrightError
 from .. import report_figures as figures
 from ..frequency import (
     Comparison,
@@ -74,13 +74,8 @@ def _wire(case: Case, key: str, wire: str) -> LoopPart | None:
     numbers: dict[str, Number] = {}
     beside: list[tuple[Any, ...]] = []
     for v in case.usable():
-        cut, title = Cut.PLAIN, v.title
         try:
-            try:
-                L = v.loop(wire)
-            except PeriodicLoopError:
-                cut, title = Cut.SLOW_OPEN, f"{v.title}, slow loops open"
-                L = v.loop(wire, cut=cut)
+            cut, title, L = v.fullest_loop(wire)
             if L.ninputs > 1:
                 return several(case, key, wire)
             m = margins(L)

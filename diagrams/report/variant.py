@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Finding, LoopwrightError
+from ...blocks.core import Finding, LoopwrightError, PeriodicLoopError
 from ..flat import WiredDiagram
 from ..linearization import Linearization, linearize
 from ..results import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, OperatingPoint
@@ -131,6 +131,16 @@ class Variant:
         if (wires, cut) not in self._loops:
             self._loops[wires, cut] = cut.loop(self.model, *wires)
         return self._loops[wires, cut]
+
+    def fullest_loop(self, wire: str) -> tuple[Cut, str, Any]:
+        """Return the cut that leaves the most closed at one rate, its title, and the loop transfer function.
+
+        Where the loops through slower subsystems make the loop periodic, they are open.
+        """
+        try:
+            return Cut.PLAIN, self.title, self.loop(wire)
+        except PeriodicLoopError:
+            return Cut.SLOW_OPEN, f"{self.title}, slow loops open", self.loop(wire, cut=Cut.SLOW_OPEN)
 
     def findings(self, *wires: str) -> tuple[Finding, ...]:
         """Return the findings that limit the numbers of the loop at wires."""
