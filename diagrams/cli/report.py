@@ -8,18 +8,23 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ...blocks.core import DefinitionError, FmuError, FmuFileError, LoopwrightError, OptionError, UnknownNameError, near
 from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..paper import EXPERIMENTS, Experiment
 from ..report_writing import Report, symbol
-from ..requirements import Reason, Requirements, Review, Verdict, read_requirements
+from ..requirements import STUDIES, Reason, Requirements, Review, TomlFile, Verdict, read_requirements
 from .options import parse_options, share
 from .text import say
 from .user_models import load_user_file
 
+if TYPE_CHECKING:
+    from ..studies import WorstCaseTask
+
+KEY = "worst_case"
+"""Table of a worst case."""
 ABOUT = ("title", "author", "project", "date")
 """Lines of the heading that the command line can give."""
 EXIT_STATUS = {Verdict.PASSED: 0, Verdict.FAILED: 3, Verdict.UNDECIDED: 4}
@@ -60,6 +65,12 @@ def add_report(commands: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="a loop that was measured at a wire: its margins stand beside the model's, requirements hold for them, "
         "too; repeat it for several",
     )
+    report.add_argument(
+        "--worst-case",
+        metavar="FILE.toml",
+        help="find a worst case over ranges of parameters, as the file's table [worst_case] says, which the file of "
+        "the requirements may have, too; see docs/worst_case.md",
+    )
     report.add_argument("--check", action="store_true", help="say by the exit status whether they are met")
     for name in ABOUT:
         report.add_argument(f"--{name}", metavar="TEXT", help=f"the {name} in the report's heading")
@@ -86,7 +97,9 @@ def report_command(arguments: argparse.Namespace) -> int:
 
     if arguments.check and arguments.requirements is None:
         raise OptionError("there is nothing to check. Give the file: --requirements loop.toml.", port="--check")
-    asked = None if arguments.requirements is None else read_requirements(arguments.requirements)
+    file = None if arguments.requirements is None else TomlFile.read(arguments.requirements, "--requirements")
+    asked = None if file is None else read_requirements(file)
+    searched = _read_worst_case(arguments.worst_case, file)
     measured = _read_measured(arguments.measured)
     subject = arguments.diagram or DEFAULT
     with contextlib.ExitStack() as open_file:
@@ -99,11 +112,13 @@ def report_command(arguments: argparse.Namespace) -> int:
             return 1 if isinstance(error, FmuError) and not isinstance(error, FmuFileError) else 2
         out = arguments.out or (f"{diagram.name}.html" if arguments.diagram else "fig3.html")
         check_files(out, pdf=arguments.pdf, json=arguments.json)
+        if searched is not None:
+            searched.check(diagram, asked)
         began = time.perf_counter()
         about = {name: text for name in ABOUT if (text := getattr(arguments, name)) is not None}
         try:
             with _progress(diagram.name) as tell:
-                report = _analyse(diagram, experiment, arguments, asked, about, tell, measured)
+                report = _analyse(diagram, experiment, arguments, asked, about, tell, measured, searched)
         except UnknownNameError as error:
             say(f"loopwright: error: {error}", sys.stderr)
             return 1 if asked is None and not measured else 2
@@ -126,6 +141,28 @@ def report_command(arguments: argparse.Namespace) -> int:
     if report.review is not None:
         say(_verdict(report.review))
     return EXIT_STATUS[report.review.verdict] if arguments.check and report.review is not None else 0
+
+
+def _read_worst_case(given: str | None, file: TomlFile | None) -> WorstCaseTask | None:
+    """Return the worst case that a file of its own asks for, or that of the requirements."""
+    from ..studies import WorstCaseTask
+
+    mine = file is not None and bool(file.table(KEY))
+    if given is None:
+        return WorstCaseTask.read(file) if file is not None and mine else None
+    own = TomlFile.read(given, "--worst-case")
+    if file is not None and own.path == file.path:
+        return WorstCaseTask.read(own)
+    if mine:
+        raise own.error("the file of the requirements has a worst case, too; expected one. Leave one out.", KEY)
+    for key in own.content:
+        if key not in STUDIES:
+            raise own.error(
+                "found it beside [worst_case], where requirements are not read. Name the file by --requirements, which "
+                "takes its table along.",
+                key,
+            )
+    return WorstCaseTask.read(own)
 
 
 def _read_measured(given: Sequence[str]) -> dict[str, Any]:
@@ -170,6 +207,7 @@ def _analyse(
     about: Mapping[str, str],
     tell: Callable[[str], None],
     measured: Mapping[str, Any],
+    searched: WorstCaseTask | None,
 ) -> Report:
     from ..report import analyse, with_drawing
 
@@ -183,6 +221,7 @@ def _analyse(
         hertz=arguments.hz,
         progress=tell,
         measured=measured,
+        worst_case=searched,
     )
     return with_drawing(made, diagram)
 

@@ -19,10 +19,9 @@ from .case import Basis, Case, InjectionPlan
 from .disks import disk_numbers, disk_range
 from .parts import MakesSections, ReportKind, ReportPart
 from .points import point_of
-from .pole_texts import list_poles
 from .section_contact import sign_of_admittance
 from .section_limits import LIMITS_TITLE
-from .section_poles import POLES_TITLE
+from .section_poles import POLES_TITLE, list_poles
 from .section_subject import SUBJECT_TITLE
 from .stability import scatter, without_memory
 from .variant import Implementation, Variant, in_s, look_of

@@ -13,8 +13,8 @@ from ..flat import WiredDiagram
 from ..linearization import find_signal
 from ..report_figures import AxisUnits
 from ..report_writing import DEFINITIONS, Report
-from ..requirements import Requirements, read_requirements
-from ..studies import WorstCase
+from ..requirements import Requirements, TomlFile, read_requirements
+from ..studies import WorstCase, WorstCaseTask
 from .case import Case, ReportedExperiment
 from .content_hash import content_hash
 from .parts import HasReportKind, MakesSections, ReportKind, ReportPart
@@ -26,10 +26,11 @@ from .section_limits import not_modelled
 from .section_loops import inner
 from .section_measured import measured_loops, read_measured
 from .section_poles import closed_loops, memory
-from .section_sensitivity import check_worst_case, sensitivity, worst_case_of, worst_case_outcomes
+from .section_sensitivity import sensitivity
 from .section_steps import steps
 from .section_subject import operating_points, remarks, subject, versions
 from .section_summary import summary
+from .section_worst_case import find_reported, read_task, worst_case_of
 
 SUBJECT = ReportPart("subject", subject)
 REMARKS = ReportPart("subject", remarks)
@@ -66,7 +67,7 @@ def analyse(
     hertz: bool = False,
     progress: Callable[[str], None] | None = None,
     measured: Mapping[str, Any] | None = None,
-    worst_case: WorstCase | None = None,
+    worst_case: WorstCase | WorstCaseTask | str | os.PathLike[str] | None = None,
     contacts: Mapping[str, Any] | None = None,
 ) -> Report:
     """Analyse a diagram, and return the content of its report.
@@ -108,9 +109,11 @@ def analyse(
         Contacts of an environment with the plant, by names that stand in dotted paths: ``{"tool":
         diagram.contact(…)}``. Each gets its admittance, the limits of coupled stability, a map of them, and a trial in
         the nonlinear run.
-    worst_case : WorstCase, optional
-        A worst case of this diagram, of `Diagram.worst_case`: it gets a section, with a run that confirms it,
-        and a line on the first page. Limits of its numbers fail where it is unstable.
+    worst_case : WorstCase or path, optional
+        A worst case of this diagram, of `Diagram.worst_case`, or a TOML file with a table ``[worst_case]``, which may
+        be that of ``requirements``, too: it gets a section, with a run that confirms it, and a line on the first page.
+        The limits that it was looked for with get verdicts of their own. Limits of its numbers fail where it is
+        unstable.
     progress : callable, optional
         Told the key of each section before it is made, and of the injection check each measurement, too.
 
@@ -142,25 +145,26 @@ def analyse(
         find_signal(diagram.flatten(None if diagram.has_clock else STEP), wire)
     tell = progress or (lambda key: None)
     contacts = check_contacts(diagram, contacts or {})
-    if worst_case is not None:
-        check_worst_case(diagram, worst_case)
-    asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(requirements)
+    file = None if isinstance(requirements, Requirements | None) else TomlFile.read(requirements, "requirements")
+    asked = requirements if isinstance(requirements, Requirements | None) else read_requirements(file or requirements)
+    task = read_task(diagram, worst_case, file, asked)
     case, sections = kind.sections(
         diagram, point, experiment, wires, only, tell, stairs, asked, AxisUnits(decibels, hertz), tuple(measured or ())
     )
     loops_measured = read_measured(case, measured) if measured else ()
     if loops_measured:
         sections = (*sections, measured_loops(case, loops_measured))
-    if worst_case is not None:
-        sections = (*sections, worst_case_of(worst_case))
+    searched = None if task is None else find_reported(diagram, task, asked, point, stairs, tell)
+    if searched is not None:
+        sections = (*sections, worst_case_of(searched))
     if contacts:
         tell("contact")
         sections = (*sections, contact_sections(contacts))
     made = Report("", sections).numbers()
-    outcomes = {} if worst_case is None else worst_case_outcomes(worst_case)
-    reviewed = None if asked is None else review(case, asked, made, loops_measured, outcomes)
+    reviewed = None if asked is None else review(case, asked, made, loops_measured, searched)
     if only is None or asked is not None:
-        sections = (summary(case, reviewed, made, worst_case), *sections)
+        found = None if searched is None else searched.found
+        sections = (summary(case, reviewed, made, found), *sections)
     name = diagram.name if experiment is None else f"Experiment {experiment.letter}: {diagram.name}"
     lines = {str(key): str(text) for key, text in (about or {}).items()}
     title = lines.pop("title", f"Design report: {name}")

@@ -28,6 +28,7 @@ from .points import STEP
 from .section_injection import REFUTED
 from .section_measured import MEASURED, MeasuredLoop
 from .section_steps import key_of_step
+from .section_worst_case import ReportedWorstCase
 from .stability import Stability
 from .variant import Cut, Variant
 
@@ -67,7 +68,7 @@ def review(
     asked: Requirements,
     numbers: Mapping[str, Number],
     measured: Sequence[MeasuredLoop] = (),
-    outcomes: Mapping[str, StudyCase] | None = None,
+    worst_case: ReportedWorstCase | None = None,
 ) -> Review:
     """Return the verdicts on requirements.
 
@@ -81,11 +82,13 @@ def review(
         All numbers of the report by their dotted paths.
     measured : sequence of MeasuredLoop
         Loops that were measured; limits of their margins hold for the measured ones, too.
-    outcomes : mapping of str to Case, optional
-        Cases of a worst case, by the path that their numbers stand below.
+    worst_case : ReportedWorstCase, optional
+        The worst case of the report.
     """
-    plain = (_plain(path, limit, numbers, outcomes or {}) for path, limit in asked.numbers.items())
-    return Review((*_results(case, asked, numbers), *plain, *_measured(case, asked, numbers, measured)))
+    outcomes = {} if worst_case is None else worst_case.outcomes()
+    searched = () if worst_case is None else worst_case.results()
+    plain = (_plain(path, limit, numbers, outcomes) for path, limit in asked.numbers.items())
+    return Review((*_results(case, asked, numbers), *plain, *_measured(case, asked, numbers, measured), *searched))
 
 
 def _results(case: Case, asked: Requirements, numbers: Mapping[str, Number]) -> Iterator[RequirementResult]:

@@ -25,7 +25,7 @@ from ..report_writing import Section, Table, Texts
 from .case import Case
 from .disks import several
 from .gang import gang_of_four
-from .pole_texts import list_poles
+from .section_poles import list_poles
 from .uncertainty import LoopPart, cut_key, left_out, widened
 from .variant import Cut, Variant, in_s
 from .wires import blocks_on_loops

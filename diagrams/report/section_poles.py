@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 
 from ..frequency import Number, with_findings
@@ -12,6 +14,10 @@ from .variant import in_s
 
 TEXTS = Texts(__package__, "poles")
 POLES_TITLE = "Closed-loop poles"
+SAME = 1e-6
+"""Relative distance up to which a pole is the conjugate of another one."""
+REAL = 1e-9
+"""Size of an imaginary part, relative to the pole, up to which it is rounding."""
 
 
 def closed_loops(case: Case) -> Section:
@@ -35,3 +41,36 @@ def memory(case: Case) -> Section | None:
     """Return the text on states that are only a warm start, None where there are none."""
     states = sorted({name for v in case.usable() for name in v.model.memory})
     return Section("poles", POLES_TITLE, TEXTS.paragraphs("memory", states=states)) if states else None
+
+
+def list_poles(poles: Iterable[complex], dt: float = 0.0) -> str:
+    """Return poles s in 1/s as text, the slowest first; those of a sampled model are s = log(z)/T.
+
+    A sampled pole with z < 0 lies at Im s = ±π/T. It alternates from tick to tick and has no partner, so it is written
+    with its z.
+
+    Examples
+    --------
+    >>> list_poles([-3 + 4j, -1, -3 - 4j])
+    '-1, -3 ± 4j'
+    >>> list_poles([np.log(-0.5 + 0j) / 0.1], 0.1)
+    '-6.93147 + jπ/T (z = -0.5)'
+    """
+    values = np.asarray(list(poles), dtype=complex)
+    values = values[np.isfinite(values) | np.isinf(values.real)]
+    left = list(values[np.lexsort((-values.imag, np.abs(values)))])
+    shown = []
+    while left:
+        v = complex(left.pop(0))
+        if not np.isfinite(v) or abs(v.imag) <= REAL * max(abs(v), 1e-300):
+            shown.append(f"{v.real:.6g}")
+        elif dt and abs(abs(v.imag) - np.pi / dt) < 1e-6 / dt:
+            shown.append(f"{v.real:.6g} + jπ/T (z = {-np.exp(v.real * dt):.6g})")
+        else:
+            near = [abs(other - v.conjugate()) for other in left]
+            if near and min(near) <= SAME * abs(v):
+                del left[int(np.argmin(near))]
+                shown.append(f"{v.real:.6g} ± {abs(v.imag):.6g}j")
+            else:
+                shown.append(f"{v.real:.6g} {'+' if v.imag > 0 else '−'} {abs(v.imag):.6g}j")
+    return ", ".join(shown) or "none"

@@ -17,6 +17,7 @@ from .review import weakest
 from .section_loops import ROWS
 from .section_measured import MEASURED
 from .section_steps import NAMES
+from .section_worst_case import KEY as WORST_CASE
 from .stability import unstable_first
 from .variant import Variant
 
@@ -90,7 +91,7 @@ def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
         number = result.number
         distance = Number(result.distance, number.unit, number.tolerance, number.confirmed_by, findings=number.findings)
     place = case.loop_wires().get(result.loop, result.loop) or (result.detail if result.quantity[:5] == "step." else "")
-    title = variant.title if variant else "measured" if result.variant == MEASURED else "–"
+    title = variant.title if variant else {MEASURED: "measured", WORST_CASE: "worst case"}.get(result.variant, "–")
     return (
         Judged(said, result.verdict), words_of(result.quantity), place or "whole diagram", title,
         _required(result.limit, unit), result.number if result.number is not None else "–", distance,

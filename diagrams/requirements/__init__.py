@@ -3,10 +3,11 @@
 from .limits import SENSES, Limit, Reason, Sense, Verdict, judge, judge_interval
 from .requirements import LoopLimits, Requirements, StepLimits
 from .results import RequirementResult, Review
-from .toml_file import read_requirements
+from .toml_file import STUDIES, TomlFile, read_requirements
 
 __all__ = [
     "SENSES",
+    "STUDIES",
     "Limit",
     "LoopLimits",
     "Reason",
@@ -15,6 +16,7 @@ __all__ = [
     "Review",
     "Sense",
     "StepLimits",
+    "TomlFile",
     "Verdict",
     "judge",
     "judge_interval",

@@ -1,26 +1,129 @@
-"""Requirements from a TOML file."""
+"""TOML files of a design review: requirements, and tables of studies beside them. Errors name the file and the line."""
 
 from __future__ import annotations
 
 import os
 import re
 import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Self
 
-from ...blocks.core import OptionError
+from ...blocks.core import LoopwrightError, OptionError, near
 from .requirements import Requirements
 
-_HEADER = re.compile(r"\s*\[\[?\s*(?P<key>[^\]#]+?)\s*\]")
+_HEADER = re.compile(r"""\s*\[\[?\s*(?P<key>(?:"[^"]*"|'[^']*'|[^\]#])+?)\s*\]""")
 _KEY = re.compile(r"""\s*(?P<key>(?:"[^"]*"|'[^']*'|[\w.\s-])+?)\s*=""")
 _PART = re.compile(r"""\s*(?:"([^"]*)"|'([^']*)'|([\w-]+))\s*\.?""")
 
+STUDIES = ("worst_case", "contact")
+"""Tables that belong to studies of the report, and not to its requirements."""
 
-def read_requirements(path: str | os.PathLike[str]) -> Requirements:
+
+@dataclass(frozen=True)
+class TomlFile:
+    """A TOML file that was read, with the lines of its entries.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    content : mapping
+        Its tables.
+    text : str
+        Its text.
+    """
+
+    path: Path
+    content: Mapping[str, Any]
+    text: str = field(repr=False)
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str], port: str) -> Self:
+        """Return a file's content.
+
+        Parameters
+        ----------
+        path : path
+            The file.
+        port : str
+            The option that named it, for errors.
+
+        Raises
+        ------
+        OptionError
+            A file that isn't there or isn't TOML.
+        """
+        file = Path(path).expanduser()
+        try:
+            text = file.read_text(encoding="utf-8")
+            return cls(file, tomllib.loads(text), text)
+        except OSError as error:
+            raise OptionError(
+                f"{str(path)!r} can't be read: {error.strerror}. Name another file.", port=port
+            ) from error
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise OptionError(f"{str(path)!r} is not TOML: {error}. Mend that line.", port=port) from error
+
+    def error(self, message: str, key: str = "") -> OptionError:
+        """Return an error about an entry, by its dotted path: it begins with the file, the line and the entry."""
+        line = self.find_line(key) if key else 0
+        place = f"{self.path}, line {line}" if line else str(self.path)
+        return OptionError(f"{place}: {key}: {message}" if key else f"{place}: {message}")
+
+    def error_at(self, error: LoopwrightError, key: str = "") -> OptionError:
+        """Return an error that was raised about an entry as one about this file."""
+        return self.error(error.message, ".".join(part for part in (key, error.port) if part))
+
+    def table(self, name: str) -> Mapping[str, Any]:
+        """Return a table, empty where the file has none.
+
+        Raises
+        ------
+        OptionError
+            If there is something else by its name.
+        """
+        found = self.content.get(name, {})
+        if not isinstance(found, Mapping):
+            raise self.error(f"found {found!r}; expected a table. Write [{name}], and its entries below.", name)
+        return found
+
+    def check_keys(self, table: str, known: tuple[str, ...]) -> None:
+        """Refuse entries of a table that it does not have.
+
+        Raises
+        ------
+        OptionError
+            An unknown name.
+        """
+        for key in self.table(table):
+            if key not in known:
+                raise self.error(f"[{table}] has no {key!r}. {near(key, known)}", f"{table}.{key}")
+
+    def find_line(self, path: str) -> int:
+        """Return the line, from 1, of the entry with a dotted path, or of the nearest one above it; 0 without any."""
+        found, best, table = 0, "", ""
+        for i, line in enumerate(self.text.splitlines(), 1):
+            if header := _HEADER.match(line):
+                here = table = _joined(header["key"])
+            elif key := _KEY.match(line):
+                here = ".".join(part for part in (table, _joined(key["key"])) if part)
+            else:
+                continue
+            if (path == here or path.startswith(f"{here}.")) and len(here) > len(best):
+                found, best = i, here
+            elif not found and here.startswith(f"{path}."):
+                found = i
+        return found
+
+
+def read_requirements(path: str | os.PathLike[str] | TomlFile) -> Requirements:
     """Return the requirements that a TOML file has; its names are those of `Requirements`.
 
     Parameters
     ----------
-    path : path
+    path : path or TomlFile
         File such as this one::
 
             phase_margin_deg = 45
@@ -33,51 +136,25 @@ def read_requirements(path: str | os.PathLike[str]) -> Requirements:
             [loops.u]
             ms = 1.6
 
+        Tables of studies beside them, such as ``[worst_case]``, are those of the report.
+
     Raises
     ------
     OptionError
         A file that isn't there or isn't TOML; an unknown name; a limit that is none.
     """
-    file = Path(path).expanduser()
-    try:
-        text = file.read_text(encoding="utf-8")
-        given = tomllib.loads(text)
-    except OSError as error:
-        raise OptionError(
-            f"{str(path)!r} can't be read: {error.strerror}. Name another file.", port="requirements"
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise OptionError(f"{str(path)!r} is not TOML: {error}. Mend that line.", port="requirements") from error
+    file = path if isinstance(path, TomlFile) else TomlFile.read(path, "requirements")
+    given = {key: value for key, value in file.content.items() if key not in STUDIES}
     try:
         found = Requirements(**given)
     except OptionError as error:
-        line = _find_line(text, error.port or "")
-        place = f"{path}, line {line}" if line else str(path)
+        raise file.error_at(error) from None
+    if found.is_empty and not (found.loops or found.numbers or found.steps) and not given.get("stable"):
         raise OptionError(
-            f"{place}: {error.port}: {error.message}" if error.port else f"{place}: {error.message}"
-        ) from None
-    if found.is_empty and not (found.loops or found.numbers or found.steps):
-        raise OptionError(
-            f"{str(path)!r} requires nothing; expected a limit. Write one, such as phase_margin_deg = 45.",
+            f"{str(file.path)!r} requires nothing; expected a limit. Write one, such as phase_margin_deg = 45, or "
+            "stable = true.",
             port="requirements",
         )
-    return found
-
-
-def _find_line(text: str, path: str) -> int:
-    """Return the line, from 1, of the entry with a dotted path, or of the nearest one above it; 0 without any."""
-    found, best, table = 0, "", ""
-    for i, line in enumerate(text.splitlines(), 1):
-        if header := _HEADER.match(line):
-            here = table = _joined(header["key"])
-        elif key := _KEY.match(line):
-            here = ".".join(part for part in (table, _joined(key["key"])) if part)
-        else:
-            continue
-        if (path == here or path.startswith(f"{here}.")) and len(here) > len(best):
-            found, best = i, here
-        elif not found and here.startswith(f"{path}."):
-            found = i
     return found
 
 

@@ -4,6 +4,7 @@ from .cases import Case, CaseOrigin, CaseState, Goal
 from .confirmation import ConfirmationKind, RunConfirmation, confirm_parameter, confirm_sensitivity
 from .sensitivity import Sensitivities, Sensitivity, find_sensitivities, sensitivities_of
 from .worst_case import WorstCase, find_worst_case
+from .worst_case_task import WorstCaseTask
 
 __all__ = [
     "Case",
@@ -15,6 +16,7 @@ __all__ = [
     "Sensitivities",
     "Sensitivity",
     "WorstCase",
+    "WorstCaseTask",
     "confirm_parameter",
     "confirm_sensitivity",
     "find_sensitivities",

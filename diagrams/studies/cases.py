@@ -151,7 +151,9 @@ def make_goal(
             block=diagram,
         )
     if quantity is not None and quantity not in SENSES:
-        raise OptionError(f"a loop has no number {quantity!r}. {near(quantity, SENSES)}", block=diagram)
+        raise OptionError(
+            f"a loop has no number {quantity!r}. {near(quantity, SENSES)}", block=diagram, port="quantity"
+        )
     wires = [loops] if isinstance(loops, str) else list(loops or ())
     if requirements is None:
         if not wires:

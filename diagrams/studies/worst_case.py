@@ -169,11 +169,14 @@ def find_worst_case(
         quantity = "disk_margin"
     if points is not None and at is not None:
         raise OptionError("found at and points; expected one of them. Give points=[…] alone.", block=diagram.name)
+    for name, number in (("starts", starts), ("steps", steps), ("delay", delay)):
+        if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 0:
+            raise OptionError(f"found {name}={number!r}; expected an integer from 0 on.", block=diagram.name, port=name)
     goal = make_goal(loop, quantity, requirements, diagram.name)
     if samples == "latin" and count is None:
         count = 100
     drawn = read_samples(diagram, parameters, samples, count=count, seed=seed)
-    _check_parameters(diagram, drawn.names)
+    check_parameters(diagram, drawn.names)
     boxes = _read_boxes(diagram, parameters, drawn)
     places = tuple(points) if points is not None else (at,)
     study = Study(diagram, goal, boxes, places, delay, options, progress or (lambda text: None))
@@ -192,7 +195,7 @@ def find_worst_case(
     return WorstCase(worst, tuple(nominal), cases, boxes, goal, diagram, places, {**options, "delay": delay})
 
 
-def _check_parameters(diagram: WiredDiagram, names: Iterable[str]) -> None:
+def check_parameters(diagram: WiredDiagram, names: Iterable[str]) -> None:
     """Refuse parameters that are structure of the linear model: sample times, and those that are true or false."""
     for name in names:
         head, _, last = name.rpartition(".")

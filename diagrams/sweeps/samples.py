@@ -230,7 +230,7 @@ def latin(parameters: Mapping[str, Any], count: int, *, seed: int = 0) -> Sample
     _check_parameters(parameters)
     boxes = {name: Box.of(value, name) for name, value in parameters.items()}
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-        raise OptionError(f"found count={count!r}; expected a positive integer, the number of samples.")
+        raise OptionError(f"found count={count!r}; expected a positive integer, the number of samples.", port="count")
     generator = np.random.default_rng(np.random.SeedSequence(check_seed(seed)))
     fractions = qmc.LatinHypercube(sum(box.size for box in boxes.values()), seed=generator).random(int(count))
     ends = np.cumsum([box.size for box in boxes.values()])[:-1]
@@ -311,7 +311,9 @@ def read_samples(
     kind = samples if isinstance(samples, str) else None
     if kind is not None and kind not in KINDS:
         raise OptionError(
-            f"found samples={kind!r}. {near(kind, KINDS)} Or give a table: a list of mappings.", block=diagram.name
+            f"found samples={kind!r}. {near(kind, KINDS)} Or give a table: a list of mappings.",
+            block=diagram.name,
+            port="samples",
         )
     if kind != "latin" and count is not None:
         raise OptionError(
@@ -347,7 +349,7 @@ def check_seed(seed: object) -> int:
         If it is no integer from 0 on.
     """
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise OptionError(f"found seed={seed!r}; expected an integer from 0 on.")
+        raise OptionError(f"found seed={seed!r}; expected an integer from 0 on.", port="seed")
     return int(seed)
 
 

@@ -169,6 +169,15 @@ def test_a_toml_file_says_the_same_as_code(tmp_path):
     assert found.further_variants == said.further_variants
 
 
+def test_a_file_may_ask_for_stability_alone(tmp_path):
+    file = tmp_path / "limits.toml"
+    file.write_text("stable = true", encoding="utf-8")
+    assert read_requirements(file).stable
+    file.write_text("stable = false", encoding="utf-8")
+    with pytest.raises(OptionError, match="requires nothing"):
+        read_requirements(file)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -1,0 +1,209 @@
+"""Worst case over ranges of parameters: its section, its run, and verdicts on the limits of the search."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import LoopwrightError, OptionError
+from ..flat import WiredDiagram
+from ..frequency import Number
+from ..report_writing import Plot, Section, Table, Texts
+from ..requirements import Limit, Reason, RequirementResult, Requirements, TomlFile, Verdict, judge
+from ..studies import Case as StudyCase
+from ..studies import CaseOrigin, CaseState, RunConfirmation, WorstCase, WorstCaseTask
+from .content_hash import content_hash
+
+TEXTS = Texts(__package__, "worst_case")
+KEY = "worst_case"
+"""Key of the section, and the variant that its verdicts belong to."""
+
+
+def check_worst_case(diagram: WiredDiagram, found: Any) -> None:
+    """Check that a worst case is one of this diagram.
+
+    Raises
+    ------
+    OptionError
+        If there is something else, or a worst case of another diagram.
+    """
+    if not isinstance(found, WorstCase):
+        raise OptionError(
+            f"found {found!r}; expected a worst case. Give diagram.worst_case(…), or a TOML file.", port="worst_case"
+        )
+    if content_hash(found.base) != content_hash(diagram):
+        raise OptionError(
+            f"found a worst case of another diagram; expected one of {diagram.name!r} with its present parameters. "
+            "Make it by diagram.worst_case(…).",
+            port="worst_case",
+        )
+
+
+def read_task(
+    diagram: WiredDiagram,
+    given: WorstCase | WorstCaseTask | str | os.PathLike[str] | None,
+    file: TomlFile | None,
+    requirements: Requirements | None,
+) -> WorstCase | WorstCaseTask | None:
+    """Return the worst case of a report, or the task to find it, checked; None where none is asked for.
+
+    Parameters
+    ----------
+    diagram : Diagram
+        The diagram.
+    given : WorstCase, WorstCaseTask or path, optional
+        The option of the report.
+    file : TomlFile, optional
+        The file of its requirements, which may have the table.
+    requirements : Requirements, optional
+        The requirements.
+
+    Raises
+    ------
+    OptionError
+        A worst case of another diagram; a file that asks for something that isn't there; two worst cases.
+    """
+    if file is not None and file.table(KEY):
+        if given is not None:
+            raise file.error(
+                "found a worst case here, and another one in worst_case; expected one. Leave one out.", KEY
+            )
+        given = WorstCaseTask.read(file)
+    elif isinstance(given, str | os.PathLike):
+        given = WorstCaseTask.read(given)
+    if isinstance(given, WorstCaseTask):
+        given.check(diagram, requirements)
+    elif given is not None:
+        check_worst_case(diagram, given)
+    return given
+
+
+def find_reported(
+    diagram: WiredDiagram,
+    given: WorstCase | WorstCaseTask,
+    requirements: Requirements | None,
+    at: Any,
+    stairs: str | None,
+    tell: Callable[[str], None],
+) -> ReportedWorstCase:
+    """Return the worst case of a report: one that was found, or one that a file asks for, with its run."""
+    if isinstance(given, WorstCaseTask):
+        options = {} if stairs is None else {"stairs": stairs}
+        given = given.find(diagram, requirements, at=at, progress=lambda line: tell(f"{KEY}: {line}"), **options)
+    try:
+        return ReportedWorstCase(given, given.confirm())
+    except LoopwrightError as error:
+        return ReportedWorstCase(given, problem=error.message)
+
+
+@dataclass(frozen=True)
+class ReportedWorstCase:
+    """Worst case of a report.
+
+    Attributes
+    ----------
+    found : WorstCase
+        The worst case.
+    run : RunConfirmation, optional
+        Its run; None where it has none.
+    problem : str
+        Why it has none.
+    """
+
+    found: WorstCase
+    run: RunConfirmation | None = None
+    problem: str = ""
+
+    def outcomes(self) -> dict[str, StudyCase]:
+        """Return the diagram as it is and the worst case, by the paths that their numbers stand below."""
+        nominal = min(self.found.nominal, key=lambda case: case.goodness)
+        return {f"{KEY}.as_it_is": nominal, f"{KEY}.worst": self.found.worst}
+
+    def results(self) -> Iterator[RequirementResult]:
+        """Yield the verdicts on the limits that the worst case was looked for with, one for each loop and number."""
+        for loop, limits in self.found.goal.loops.items():
+            for quantity, limit in limits.items():
+                if limit is not None:
+                    yield self._result(loop, quantity, limit)
+
+    def _result(self, loop: tuple[str, ...], quantity: str, limit: Limit) -> RequirementResult:
+        found = self.found
+        result = RequirementResult(quantity, ", ".join(loop), KEY, limit, Verdict.UNDECIDED, Reason.NO_NUMBER)
+        if found.unstable:
+            return replace(result, verdict=Verdict.FAILED, reason=Reason.UNSTABLE)
+        mine = [case for case in found.cases if quantity in case.numbers.get(loop, {})]
+        numbers = [(case, case.numbers[loop][quantity]) for case in mine]
+        known = [(case, n) for case, n in numbers if not math.isnan(n.value)]
+        if not known:
+            return result
+        case, number = min(known, key=lambda pair: limit.distance(pair[1].value))
+        verdict, reason, distance = judge(number, limit)
+        path = f"{KEY}.worst.{quantity}" if case is found.worst and quantity == case.quantity else ""
+        result = replace(result, verdict=verdict, reason=reason, distance=distance, number=number, path=path)
+        if found.failures and verdict is not Verdict.FAILED:
+            told = found.failures[0].reason.rstrip(".")
+            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NOT_ANALYSED, detail=told)
+        if verdict is Verdict.PASSED and any(one.state is CaseState.MOVING for one in found.cases):
+            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.MOVING)
+        if case is found.worst and self.run is not None and not self.run.agrees:
+            return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.REFUTED)
+        return result
+
+
+def _text(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _ranges(found: WorstCase) -> Table:
+    """Return the table of the ranges that were searched, or of the samples that were given in their place."""
+    rows: list[tuple[str, str, str, str]] = []
+    for name in dict.fromkeys(name for case in found.cases for name in case.parameters):
+        box = found.boxes.get(name)
+        if box is not None:
+            rows.append((name, _text(box.low), _text(box.high), f"range, {box.scale}"))
+            continue
+        values = [case.parameters[name] for case in found.cases if name in case.parameters]
+        plain = all(isinstance(value, float | int) and not isinstance(value, bool) for value in values)
+        low, high = (_text(min(values)), _text(max(values))) if plain else ("–", "–")
+        rows.append((name, low, high, "given samples"))
+    return Table("Ranges of the parameters", ("parameter", "from", "to", "values"), tuple(rows))
+
+
+def worst_case_of(reported: ReportedWorstCase) -> Section:
+    """Return the section on a worst case: its parameters, its number beside the nominal one, its run, and a scatter."""
+    found, run = reported.found, reported.run
+    nominal, worst = reported.outcomes().values()
+    origins = {case.origin for case in found.cases}
+    facts = {"corners": CaseOrigin.CORNER in origins, "searched": CaseOrigin.SEARCH in origins}
+    counts = {"cases": len(found.cases), "unstable": len(found.unstable), "failed": len(found.failures)}
+    text = [TEXTS.line("worst", **counts, **facts)]
+    confirmed = run.trial if run is not None and run.agrees else ""
+    if run is None:
+        text.append(TEXTS.line("left_out", wire=", ".join(worst.loop) or "worst case", message=reported.problem))
+    else:
+        text.append(f"{run}.")
+    numbers: dict[str, Number] = {}
+    for name, case in (("as_it_is", nominal), ("worst", worst)):
+        if case.state is CaseState.UNSTABLE:
+            numbers[f"{name}.worst_growth"] = Number(case.growth, "1/s", 1e-6 * abs(case.growth), confirmed)
+        elif case.quantity:
+            number = case.numbers[case.loop][case.quantity]
+            how = f"{number.confirmed_by}; {confirmed}" if confirmed and case is worst else number.confirmed_by
+            numbers[f"{name}.{case.quantity}"] = replace(number, confirmed_by=how)
+    rows = [
+        (path.partition(".")[0].replace("_", " "), path.partition(".")[2], number) for path, number in numbers.items()
+    ]
+    tables = [Table("Worst case, beside the diagram as it is", ("case", "number", "value"), tuple(rows), digits=4)]
+    given = tuple((name, _text(value)) for name, value in worst.parameters.items())
+    if given:
+        tables.append(Table("Parameters of the worst case", ("parameter", "value"), given))
+    tables.append(_ranges(found))
+    plots = []
+    if any(np.ndim(value) == 0 for value in worst.parameters.values()):
+        plots.append(Plot("worst_case", TEXTS.line("scatter"), found.plot()))
+    return Section("worst_case", "Worst case", tuple(text), tuple(tables), tuple(plots), numbers)

@@ -1,0 +1,221 @@
+"""Worst cases that a TOML file asks for: ranges, a loop, and a number or requirements."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+from ...blocks.core import LoopwrightError, OptionError
+from ..flat import WiredDiagram
+from ..linearization import find_signal
+from ..requirements import Requirements, TomlFile
+from ..sweeps import Box, find_parameter, read_samples
+from .cases import Goal, make_goal
+from .worst_case import WorstCase, check_parameters, find_worst_case
+
+TABLE = "worst_case"
+"""Name of the table."""
+KEYS = ("ranges", "loop", "quantity", "requirements", "samples", "count", "seed", "starts", "steps", "delay")
+"""Entries of the table."""
+STEP = 1e-3
+"""Communication step in s with which signals of a diagram without a clock are looked up."""
+
+
+@dataclass(frozen=True)
+class WorstCaseTask:
+    """Search of a worst case that a TOML file asks for.
+
+    Attributes
+    ----------
+    file : TomlFile
+        The file.
+    ranges : mapping
+        Ranges, or values for a grid, by the paths of parameters.
+    loops : tuple of str
+        Wires of the loops.
+    requirements : Requirements, optional
+        Limits of the file's table.
+    options : mapping
+        All else that `Diagram.worst_case` takes.
+    """
+
+    file: TomlFile
+    ranges: Mapping[str, Any]
+    loops: tuple[str, ...]
+    requirements: Requirements | None
+    options: Mapping[str, Any]
+
+    @classmethod
+    def read(cls, source: str | os.PathLike[str] | TomlFile) -> Self:
+        """Return the task of a file with a table ``[worst_case]``.
+
+        Parameters
+        ----------
+        source : path or TomlFile
+            File such as this one::
+
+                [worst_case]
+                loop = "u"
+                quantity = "phase_margin_deg"
+                count = 100
+                seed = 1
+
+                [worst_case.ranges]
+                "plant.mass" = [0.9, 1.5]
+                "pid.kp" = {low = 1, high = 100, scale = "log"}
+
+        Raises
+        ------
+        OptionError
+            A file that isn't there, isn't TOML or has no such table; an unknown entry, or a value that is none.
+        """
+        file = source if isinstance(source, TomlFile) else TomlFile.read(source, TABLE)
+        table = file.table(TABLE)
+        if not table:
+            raise file.error(
+                'found no table [worst_case]; expected one. Write [worst_case], with loop = "u", and '
+                "[worst_case.ranges] below."
+            )
+        file.check_keys(TABLE, KEYS)
+        ranges, samples = dict(_flatten(file, table.get("ranges", {}))), table.get("samples", "latin")
+        if isinstance(samples, int | float):
+            raise file.error(
+                f"found {samples!r}; expected 'latin', 'grid', or a list of samples. Write count = {samples}.",
+                f"{TABLE}.samples",
+            )
+        if not ranges and isinstance(samples, str):
+            raise file.error(
+                "found no range; expected one at least. Write [worst_case.ranges], and 'plant.mass' = [0.9, 1.5] "
+                "below it.",
+                TABLE,
+            )
+        loop = table.get("loop", [])
+        loops = (loop,) if isinstance(loop, str) else tuple(loop) if isinstance(loop, list) else (None,)
+        if not all(isinstance(wire, str) for wire in loops):
+            raise file.error(f'found {loop!r}; expected the name of a wire. Write loop = "u".', f"{TABLE}.loop")
+        asked = file.table(TABLE).get("requirements")
+        limits = None if asked is None else _requirements(file, asked)
+        options = {key: value for key, value in table.items() if key not in ("ranges", "loop", "requirements")}
+        return cls(file, ranges, loops, limits, options)
+
+    def check(self, diagram: WiredDiagram, requirements: Requirements | None = None) -> None:
+        """Check the task against a diagram, before anything is computed.
+
+        Raises
+        ------
+        OptionError
+            A parameter, a wire or a number that isn't there; a range that is none. It names the file and the line.
+        """
+        flat = diagram.flatten(None if diagram.has_clock else STEP)
+        for wire in self.loops:
+            with _Placed(self.file, f"{TABLE}.loop"):
+                find_signal(flat, wire)
+        samples = self.options.get("samples", "latin")
+        for name, values in self.ranges.items():
+            with _Placed(self.file, f"{TABLE}.ranges.{name}"):
+                check_parameters(diagram, [find_parameter(diagram, name)])
+                if samples == "latin" and not (
+                    isinstance(values, Box) or (isinstance(values, list) and len(values) == 2)
+                ):
+                    raise OptionError(
+                        f"found {values!r}; expected a range. Write [low, high], or {{low = 1, high = 9, "
+                        'scale = "log"}; or samples = "grid".'
+                    )
+                if samples == "latin":
+                    Box.of(values)
+        with _Placed(self.file, TABLE):
+            self._goal(diagram, requirements)
+            count = self.options.get("count", 100 if samples == "latin" else None)
+            read_samples(diagram, self.ranges or None, samples, count=count, seed=self.options.get("seed", 0))
+
+    def find(
+        self,
+        diagram: WiredDiagram,
+        requirements: Requirements | None = None,
+        *,
+        progress: Callable[[str], None] | None = None,
+        **options: Any,
+    ) -> WorstCase:
+        """Return the worst case.
+
+        Parameters
+        ----------
+        diagram : Diagram
+            The diagram.
+        requirements : Requirements, optional
+            Those of the report. They are taken where the file names no number and no limits of its own, and they limit
+            a number of the loop.
+        progress : callable, optional
+            Told a line for every case.
+        **options
+            Of `Diagram.worst_case`, such as ``at``.
+        """
+        self.check(diagram, requirements)
+        given = {key: value for key, value in self.options.items() if key != "quantity"}
+        quantity, limits = self._asked(diagram, requirements)
+        with _Placed(self.file, TABLE, KEYS):
+            return find_worst_case(
+                diagram, self.ranges or None, self.loops, quantity=quantity, requirements=limits, progress=progress,
+                **given, **options,
+            )  # fmt: skip
+
+    def _asked(
+        self, diagram: WiredDiagram, requirements: Requirements | None
+    ) -> tuple[str | None, Requirements | None]:
+        quantity, limits = self.options.get("quantity"), self.requirements
+        if quantity is None and limits is None and requirements is not None:
+            try:
+                make_goal(self.loops, None, requirements, diagram.name)
+            except OptionError:  # it limits nothing that a worst case is looked for
+                return "disk_margin", None
+            return None, requirements
+        return ("disk_margin" if quantity is None and limits is None else quantity), limits
+
+    def _goal(self, diagram: WiredDiagram, requirements: Requirements | None) -> Goal:
+        quantity, limits = self._asked(diagram, requirements)
+        return make_goal(self.loops, quantity, limits, diagram.name)
+
+
+class _Placed:
+    """Names the file and the line in errors about an entry: all errors, or those about some options."""
+
+    def __init__(self, file: TomlFile, key: str, ports: tuple[str, ...] | None = None):
+        self.file, self.key, self.ports = file, key, ports
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: object, trace: object) -> None:
+        if isinstance(error, LoopwrightError) and (self.ports is None or error.port in self.ports):
+            known = error.port if error.port in KEYS else ""
+            key = ".".join(part for part in (self.key, known) if part)
+            raise self.file.error(error.message, key) from None
+
+
+def _flatten(file: TomlFile, given: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield ranges by the paths of their parameters: dotted keys of TOML are tables in tables."""
+    if not isinstance(given, Mapping):
+        raise file.error(f"found {given!r}; expected ranges by path. Write [worst_case.ranges].", f"{TABLE}.ranges")
+    for key, value in given.items():
+        here = f"{path}.{key}" if path else str(key)
+        if not isinstance(value, Mapping):
+            yield here, value
+        elif {"low", "high"} <= value.keys() <= {"low", "high", "scale"}:
+            try:
+                yield here, Box(**value)
+            except LoopwrightError as error:
+                raise file.error(error.message, f"{TABLE}.ranges.{here}") from None
+        else:
+            yield from _flatten(file, value, here)
+
+
+def _requirements(file: TomlFile, asked: Any) -> Requirements:
+    key = f"{TABLE}.requirements"
+    if not isinstance(asked, Mapping):
+        raise file.error(f"found {asked!r}; expected limits by name. Write [{key}], and ms = 1.6 below it.", key)
+    try:
+        return Requirements(**asked)
+    except OptionError as error:
+        raise file.error_at(error, key) from None

@@ -1,0 +1,153 @@
+"""Worst cases that a TOML file asks for: in the report, and on the command line."""
+
+import math
+
+import pytest
+
+from loopwright.blocks import OptionError
+from loopwright.diagrams.cli.command_line import main
+from loopwright.diagrams.report import analyse
+from loopwright.diagrams.requirements import Reason, Verdict, read_requirements
+from loopwright.diagrams.studies import WorstCaseTask
+from loopwright.diagrams.sweeps import Box
+from support.tuned_loops import make_pi_loop, pi_phase_margin
+
+TABLE = """
+[worst_case]
+loop = "u"
+quantity = "phase_margin_deg"
+samples = "grid"
+starts = 0
+
+[worst_case.ranges]
+"p.gain" = [0.5, 1.0, 2.0]
+"""
+LIMITS = """
+phase_margin_deg = 100
+
+[worst_case]
+loop = "u"
+samples = "grid"
+starts = 0
+
+[worst_case.ranges]
+p.gain = [0.5, 1.0, 2.0]
+"""
+LOOP = """
+from support.tuned_loops import make_pi_loop
+
+loop = make_pi_loop()
+"""
+
+
+def write(folder, text, name="limits.toml"):
+    file = folder / name
+    file.write_text(text.strip(), encoding="utf-8")
+    return file
+
+
+def test_a_file_asks_as_code_does(tmp_path):
+    task = WorstCaseTask.read(write(tmp_path, TABLE))
+    found = task.find(make_pi_loop())
+    assert found.worst.value == pytest.approx(min(pi_phase_margin(k, 0.5, 2.0) for k in (0.5, 1.0, 2.0)), rel=1e-9)
+    assert found.parameters == {"p.gain": 0.5}
+
+
+def test_ranges_are_pairs_or_tables_and_keys_may_be_dotted(tmp_path):
+    text = '[worst_case]\nloop = ["u"]\n[worst_case.ranges]\np.gain = [0.5, 2]\n"ki.gain" = {low = 1, high = 9, scale = "log"}'
+    task = WorstCaseTask.read(write(tmp_path, text))
+    assert task.ranges == {"p.gain": [0.5, 2], "ki.gain": Box(1, 9, "log")}
+    task.check(make_pi_loop())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"p.gain"', '"p.gian"', r"limits.toml, line 8: worst_case.ranges.p.gian: .*gian"),
+        ('"u"', '"w"', r"limits.toml, line 2: worst_case.loop: there is no signal 'w'"),
+        ('"phase_margin_deg"', '"phase_margin"', r"line 3: worst_case.quantity: a loop has no number 'phase_margin'"),
+        ('samples = "grid"', "samples = 20", r"line 4: worst_case.samples: found 20; .* Write count = 20"),
+        ('samples = "grid"', 'samples = "gird"', r"line 4: worst_case.samples: found samples='gird'"),
+        ('samples = "grid"', "count = 20", r"line 8: worst_case.ranges.p.gain: found \[0.5, 1.0, 2.0\]; .* Write \[low, high\]"),
+        ("starts = 0", "start = 0", r"line 5: worst_case.start: \[worst_case\] has no 'start'. Did you mean 'starts'"),
+        ("starts = 0", "starts = -1", r"line 5: worst_case.starts: found starts=-1; expected an integer from 0 on"),
+        ("starts = 0", "seed = 1.5", r"line 5: worst_case.seed: found seed=1.5"),
+        ("starts = 0", "requirements = {mss = 1.6}", r"line 5: worst_case.requirements.mss: there is no requirement 'mss'"),
+        ("starts = 0", "requirements = {ms = 1.6}", r"line 1: worst_case: found quantity='phase_margin_deg' and requirem"),
+        ("[0.5, 1.0, 2.0]", "{low = 2.0, high = 1.0}", r"line 8: worst_case.ranges.p.gain: found a range from 2.0 to 1.0"),
+    ],
+)  # fmt: skip
+def test_errors_name_the_line_and_the_entry(old, new, message, tmp_path):
+    file = write(tmp_path, TABLE.replace(old, new))
+    with pytest.raises(OptionError, match=message):
+        WorstCaseTask.read(file).find(make_pi_loop())
+
+
+def test_requirements_of_the_file_are_made_worst_and_judged(tmp_path):
+    """110° is met by the diagram as it is, and not with half the proportional gain."""
+    file = write(tmp_path, LIMITS)
+    assert dict(read_requirements(file).limits) == {"phase_margin_deg": (100.0, math.inf)}
+    margins = {k: pi_phase_margin(k, 0.5, 2.0) for k in (0.5, 1.0)}
+    assert margins[0.5] < 110 < margins[1.0]
+    file = write(tmp_path, LIMITS.replace("100", "110"))
+    report = analyse(make_pi_loop(), requirements=file, only=("inner",))
+    mine = {(r.variant, r.quantity): r for r in report.review.results}
+    searched = mine["worst_case", "phase_margin_deg"]
+    assert searched.verdict is Verdict.FAILED
+    assert searched.distance == pytest.approx(margins[0.5] - 110, rel=1e-6)
+    assert mine["continuous", "phase_margin_deg"].verdict is Verdict.PASSED
+    assert report.review.verdict is Verdict.FAILED
+    assert report.numbers()["worst_case.worst.phase_margin_deg"].value == pytest.approx(margins[0.5], rel=1e-9)
+
+
+def test_limits_that_an_unstable_case_breaks_fail(tmp_path):
+    file = write(tmp_path, LIMITS.replace("[0.5, 1.0, 2.0]", "[-2.0, 1.0]"))
+    report = analyse(make_pi_loop(), requirements=file, only=("inner",))
+    (searched,) = [r for r in report.review.results if r.variant == "worst_case"]
+    assert (searched.verdict, searched.reason) == (Verdict.FAILED, Reason.UNSTABLE)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "loop.py").write_text(LOOP, encoding="utf-8")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("files", "arguments", "message"),
+    [
+        ({"w.toml": TABLE.replace('"u"', '"v"')}, ["--worst-case", "w.toml"], "w.toml, line 2: worst_case.loop: there"),
+        ({"w.toml": "ms = 2"}, ["--worst-case", "w.toml"], "w.toml, line 1: ms: found it beside [worst_case]"),
+        ({"w.toml": ""}, ["--worst-case", "w.toml"], "w.toml: found no table [worst_case]"),
+        ({}, ["--worst-case", "w.toml"], "--worst-case: 'w.toml' can't be read"),
+        (
+            {"w.toml": TABLE.strip(), "l.toml": LIMITS.strip()},
+            ["--worst-case", "w.toml", "--requirements", "l.toml"],
+            "w.toml, line 1: worst_case: the file of the requirements has a worst case, too",
+        ),
+        (
+            {"l.toml": LIMITS.replace("p.gain", "q.gain").strip()},
+            ["--requirements", "l.toml"],
+            "l.toml, line 9: worst_case.ranges.q.gain: ",
+        ),
+    ],
+)
+def test_wrong_usage_is_found_before_anything_is_analysed(files, arguments, message, folder, capsys):
+    for name, text in files.items():
+        write(folder, text, name)
+    assert main(["report", "loop.py:loop", *arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert not (folder / "loop.html").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("limit", "status"), [(100, 0), (110, 3)])
+def test_the_command_line_finds_and_checks_a_worst_case(limit, status, folder, capsys):
+    write(folder, LIMITS.replace("100", str(limit)), "l.toml")
+    assert (
+        main(["report", "loop.py:loop", "--requirements", "l.toml", "--check", "--json", "--out", "r.html"]) == status
+    )
+    told = capsys.readouterr().out
+    assert ("failed: worst_case.worst.phase_margin_deg" in told) == (status == 3)
+    assert "worst case" in (folder / "r.html").read_text(encoding="utf-8")
