@@ -3,6 +3,7 @@
 from . import arithmetic, source
 from .arithmetic import Gain, Product, Sum, check_shapes, shape_of
 from .block import SOLVED, Block
+from .collection import without_collection
 from .errors import (
     AlgebraicLoopError,
     CompilerError,
@@ -40,7 +41,7 @@ from .instants import FINEST, is_before, left_of, move_earlier, next_edge, perio
 from .layout import Layout, elements, lay_out
 from .one_thread import on_one_thread, one_thread
 from .parameters import ParameterSpec
-from .ports import Event, Input, Output, Port, PortUnit, Shape, State
+from .ports import Event, Input, Output, Port, PortUnit, Shape, State, number_inputs
 from .signals import Call, Signal, UnknownAttributeError, Wireable, as_signal, check_name, recorder
 from .source import Constant, Source
 from .units import (
@@ -126,6 +127,7 @@ __all__ = [
     "move_earlier",
     "near",
     "next_edge",
+    "number_inputs",
     "on_one_thread",
     "one_thread",
     "parameter",
@@ -141,5 +143,6 @@ __all__ = [
     "shape_of",
     "shorten",
     "source",
+    "without_collection",
     "write_text",
 ]

@@ -9,7 +9,7 @@ import numpy as np
 
 from .block import Block
 from .errors import ParameterError, ShapeError
-from .ports import Input, Output, Shape
+from .ports import Input, Output, Shape, number_inputs
 from .signals import register_operator_block
 from .values import Array, parameter
 
@@ -66,7 +66,7 @@ class Sum(Block):
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
         """One input per sign."""
-        return {f"u{i}": Input(shape=None, name=f"u{i}") for i in range(1, len(self.signs) + 1)}
+        return number_inputs(len(self.signs))
 
     def output(self, t: Array, x: Any, u: Any) -> Array:
         """Return the sum."""

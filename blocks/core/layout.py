@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
@@ -61,7 +62,7 @@ class Layout:
         offset : int, default: 0
             Number of the first entry.
         """
-        sizes = [int(np.prod(shape, dtype=int)) for shape in shapes.values()]
+        sizes = [int(math.prod(shape)) for shape in shapes.values()]
         return Layout(dict(zip(shapes, lay_out(sizes, offset), strict=True)), dict(shapes))
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import Any, overload
 
 import numpy as np
@@ -154,6 +155,16 @@ class Input(Port):
         raise AttributeError(
             f"{self.name!r} is an input of {instance!r} and can't be read; wire it by calling the block."
         )
+
+
+@lru_cache(maxsize=64)
+def _numbered(count: int) -> Mapping[str, Input]:
+    return {f"u{i}": Input(shape=None, name=f"u{i}") for i in range(1, count + 1)}
+
+
+def number_inputs(count: int) -> dict[str, Input]:
+    """Return the inputs ``u1``, ``u2``, … of any shape; blocks with as many share them."""
+    return dict(_numbered(count))
 
 
 class Output(Port):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core import Array, Block, Input, ShapeError, check_shapes, parameter, shape_of
+from ..core import Array, Block, Input, ShapeError, check_shapes, number_inputs, parameter, shape_of
 
 
 def check_fits(value: Array, port: str, main: Array, main_port: str) -> None:
@@ -57,7 +57,7 @@ class NumberedInputs(Block):
     @property
     def inputs(self) -> Mapping[str, Input]:  # type: ignore[override]
         """The numbered inputs."""
-        return {f"u{i}": Input(shape=None, name=f"u{i}") for i in range(1, self.count + 1)}
+        return number_inputs(self.count)
 
     def fold(self, u: Any, combine: Any) -> Array:
         """Combine the inputs from the first to the last."""

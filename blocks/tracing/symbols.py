@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import namedtuple
 from collections.abc import Mapping
 from functools import lru_cache
@@ -20,7 +21,7 @@ LARGE = 64 * 64
 
 def size(shape: Shape) -> int:
     """Return the number of entries of a shape."""
-    return int(np.prod(shape, dtype=int))
+    return int(math.prod(shape))
 
 
 @lru_cache(maxsize=4096)

@@ -8,6 +8,7 @@ from heapq import heapify, heappop, heappush
 
 import numpy as np
 
+from ...blocks.core import without_collection
 from ..flat import COPY, Ids, Operation, Program, TickProgram
 from .kernels import Kernel
 
@@ -69,6 +70,7 @@ class Tables:
     python: Sequence[PythonCall]
 
 
+@without_collection
 def make_tables(tick: TickProgram, kernels: Mapping[int | str, Kernel]) -> Tables:
     """Return the tables of a tick.
 

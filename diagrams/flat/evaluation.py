@@ -186,7 +186,7 @@ class Instant:
             if self._acts(subsystem):
                 self.is_open(subsystem)  # one without blocks of its own remembers, too
         for path in layout.starts.slices:  # blocks of another rate than the subsystem that resets them
-            if not acts[path] and any(self._resets(subsystem) for subsystem in table.gates(table.subsystem_of[path])):
+            if not acts[path] and any(self._resets(subsystem) for subsystem in layout.around[table.subsystem_of[path]]):
                 self.new[path] = self._state(path)
 
     def _acts(self, subsystem: str) -> bool:
@@ -291,7 +291,7 @@ class Instant:
     def gate_of(self, path: str) -> Any:
         """Whether all subsystems around a block are open at this instant: True, or a number or symbol."""
         gate: Any = True
-        for subsystem in self.layout.table.gates(self.layout.table.subsystem_of[path]):
+        for subsystem in self.layout.around[self.layout.table.subsystem_of[path]]:
             gate = logic_and(gate, self.is_open(subsystem))
         return gate
 
@@ -305,7 +305,7 @@ class Instant:
             return True
         if subsystem in self._open:
             return self._open[subsystem]
-        table, settings = self.layout.table, self.layout.table.subsystems[subsystem]
+        _table, settings = self.layout.table, self.layout.table.subsystems[subsystem]
         last = rows(self.x, self.layout.gates.slices[subsystem])
         if (subsystem, "enable") in self._events or not self._acts(subsystem):
             gate = is_true(last)  # blocks of another rate in it go by its last tick
@@ -314,7 +314,7 @@ class Instant:
             gate = False if self.fired is None else is_true(self.fired[i : i + 1])
         else:
             outer: Any = True
-            for around in table.gates(subsystem.rpartition(".")[0]):
+            for around in self.layout.around[subsystem.rpartition(".")[0]]:
                 outer = logic_and(outer, self.is_open(around))
             now = is_true(self.control(subsystem))
             if settings.control == "enabled":
@@ -335,7 +335,7 @@ class Instant:
         if path not in layout.starts.slices or self.opened:
             return state
         outer: Any = True
-        for subsystem in layout.table.gates(layout.table.subsystem_of[path]):
+        for subsystem in layout.around[layout.table.subsystem_of[path]]:
             outer = logic_and(outer, self.is_open(subsystem))
             if self._resets(subsystem):
                 entering = logic_and(outer, logic_not(is_true(rows(self.x, layout.gates.slices[subsystem]))))

@@ -8,52 +8,51 @@ from fractions import Fraction
 
 import numpy as np
 
-from ...blocks.core import Block, Layout, SampleTimeError, Shape
-from ..wiring import Checked, Structure, evaluation_order, join, stepped_blocks
+from ...blocks.core import Block, Layout, SampleTimeError, Shape, without_collection
+from ..wiring import Checked, Order, Structure, join, stepped_blocks
 from .clocks import TickPattern
 from .flat_diagram import FlatDiagram
 from .layout import FlatEvent, StateLayout, sample_time_of
 from .plant_ticks import own_step
 
 
+@without_collection
 def flatten(
     table: Structure,
     checked: Checked,
+    orders: tuple[Order, Order],
     step: Fraction | None = None,
     *,
     asked: bool | None = None,
     name: str = "",
-    solve: bool = False,
 ) -> FlatDiagram:
     """Flatten a checked diagram.
 
     Parameters
     ----------
+    orders : pair of Order
+        Orders of evaluation at an instant, and of initialization.
     step : Fraction, optional
         Seconds between two ticks; required where there is no other clock.
     asked : bool, optional
         Whether ``step`` was asked for, and is not that of the clocks; by default it was if it is given.
     name : str
         The diagram's name, for errors.
-    solve : bool
-        Whether algebraic loops are to be solved.
 
     Raises
     ------
-    AlgebraicLoopError
-        Ports that depend on each other within a tick, or at the start.
     SampleTimeError
         No sample time anywhere, a step that does not divide one.
     """
     base, clocks = _clocks(table, step, name)
     traced, blocks = checked.traced, table.blocks
     paths = sorted(traced)
-    order = evaluation_order(table, traced, solve=solve)
-    start_order = evaluation_order(table, traced, start=True, solve=solve)
+    order, start_order = orders
     events = tuple(_events(table, checked))
     between = bool(events) or any(traced[path].advance == "derivative" for path in paths)
     between = between or any(block.transport and path not in traced for path, block in blocks.items())
-    gated = {path: table.gates(table.subsystem_of[path]) for path in paths}
+    around = {subsystem: table.gates(subsystem) for subsystem in table.subsystems}
+    gated = {path: around[table.subsystem_of[path]] for path in paths}
 
     states = StateLayout.of_blocks({path: traced[path].states for path in paths})
     position = states.total

@@ -16,6 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from ...blocks.core import without_collection
 from .block_functions import BlockFunctions
 from .clocks import NONE, TickPattern
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, rows
@@ -57,6 +58,7 @@ def trace_tick(
     return trace_schedule("tick", symbols, results, by_block=by_block)
 
 
+@without_collection
 def trace_tick_program(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[TickPattern]) -> TickProgram:
     """Return a tick at which the given clocks act as a program: the calls of block functions that it consists of."""
     program = Program((layout.width, layout.plant_outputs.total, layout.parameters.total))

@@ -148,6 +148,11 @@ class FlatLayout:
         return [self.labels[i] for i in self.continuous]
 
     @cached_property
+    def around(self) -> dict[str, tuple[str, ...]]:
+        """Paths of the enabled and triggered subsystems around the blocks of each subsystem, from outside in."""
+        return {subsystem: self.table.gates(subsystem) for subsystem in self.table.subsystems}
+
+    @cached_property
     def distinct(self) -> tuple[TickPattern, ...]:
         """The different clocks."""
         return in_order(set(self.clocks.values()))

@@ -9,11 +9,13 @@ from typing import Any
 
 import casadi as ca
 
+from ...blocks.core import without_collection
 from .evaluation import JUMP, Apart, Instant
 from .stages import OpaqueStage, Schedule, TracedStage
 from .vectors import join_columns
 
 
+@without_collection
 def trace_schedule(
     name: str,
     arguments: Mapping[str, Any],

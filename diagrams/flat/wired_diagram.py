@@ -86,6 +86,5 @@ class WiredDiagram(CheckedDiagram):
             origin, blocks = self._origin
             self._flat[key] = renumber(origin.flattened(step, asked=asked), blocks)
         if key not in self._flat:
-            solve = self.loops == "solve"
-            self._flat[key] = flatten(self.scheduled, self.checked, step, asked=asked, name=self.name, solve=solve)
+            self._flat[key] = flatten(self.scheduled, self.checked, self.orders, step, asked=asked, name=self.name)
         return self._flat[key]

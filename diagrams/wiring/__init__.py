@@ -4,7 +4,7 @@ from .check import Checked
 from .checked_diagram import CheckedDiagram
 from .cycles import find_cyclic_parts
 from .entry_order import OrderStep
-from .order import Order, evaluation_order
+from .order import Order, find_orders
 from .structure import Collector, Structure, SubsystemSettings, Wire, join, stepped_blocks
 from .subsystems import Subsystem, exact_time, subsystem
 from .variants import change_parameter, split_path
@@ -20,9 +20,9 @@ __all__ = [
     "SubsystemSettings",
     "Wire",
     "change_parameter",
-    "evaluation_order",
     "exact_time",
     "find_cyclic_parts",
+    "find_orders",
     "join",
     "split_path",
     "stepped_blocks",

@@ -7,11 +7,11 @@ from dataclasses import replace as replace_fields
 from fractions import Fraction
 from typing import Self
 
-from ...blocks.core import Block, OptionError, WiringError, check_name
+from ...blocks.core import Block, OptionError, WiringError, check_name, without_collection
 from ...blocks.tracing import check_method
 from .check import Checked, check
 from .delay_blocks import add_delay_blocks
-from .order import evaluation_order
+from .order import Order, find_orders
 from .structure import Collector, Structure, SubsystemSettings, Wire, stepped_blocks
 from .subsystems import exact_time
 from .units import add_unit_conversions
@@ -40,6 +40,7 @@ class CheckedDiagram:
         A block whose equations can't be traced.
     """
 
+    @without_collection
     def __init__(self, name: str, *roots: object, loops: str = "error"):
         if not isinstance(name, str):
             raise WiringError(
@@ -61,13 +62,15 @@ class CheckedDiagram:
     """The structure that the scheduler sees: computational delays and conversions of units have become blocks."""
     checked: Checked
     """Traces of the scheduled blocks, and shapes and units of their ports."""
+    orders: tuple[Order, Order]
+    """Orders of evaluation of the scheduled blocks: at an instant, and of initialization."""
 
+    @without_collection
     def _set(self, name: str, table: Structure, loops: str) -> None:
         runs = add_unit_conversions(add_delay_blocks(table))
         checked = check(runs)
-        for start in (False, True):
-            evaluation_order(runs, checked.traced, start=start, solve=loops == "solve")
-        self.__dict__.update(name=name, loops=loops, structure=table, scheduled=runs, checked=checked)
+        orders = find_orders(runs, checked.traced, solve=loops == "solve")
+        self.__dict__.update(name=name, loops=loops, structure=table, scheduled=runs, checked=checked, orders=orders)
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"a diagram is a value: {name!r} can't be set. Use replace(…), or build another one.")

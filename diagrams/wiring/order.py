@@ -30,13 +30,20 @@ def dependencies(table: Structure, traced: Mapping[str, Traced], *, start: bool 
     waits for all of them first.
     """
     waits: dict[Port, set[Port]] = {}
+    gated = {
+        s: [(w.block, w.port) for g in table.gates(s) if (w := table.controls[g]).block in traced]
+        for s in table.subsystems
+    }
     for path, trace in traced.items():
         all_inputs = start and table.blocks[path].starts_from_inputs
-        controls = [table.controls[gate] for gate in table.gates(table.subsystem_of[path])]
+        controls, sources = gated[table.subsystem_of[path]], dict[str, Port]()
+        for port in trace.inputs:
+            wire = table.wires.get((path, port))
+            if wire is not None and wire.block in traced:
+                sources[port] = (wire.block, wire.port)
         for name in (*trace.outputs, NEXT, GUARDS):
             inputs = trace.inputs if all_inputs else trace.depends[name]
-            wires = (table.wires.get((path, port)) for port in trace.inputs if port in inputs)
-            waits[path, name] = {(w.block, w.port) for w in [*wires, *controls] if w is not None and w.block in traced}
+            waits[path, name] = {*(source for port, source in sources.items() if port in inputs), *controls}
     return waits
 
 
@@ -92,6 +99,14 @@ def evaluation_order(
         torn.add(port)
         loops.append("\n".join(_write_loop(table, traced, loop)))
     return Order([*steps, *entries.sort(torn)[0]], tuple(sorted(torn)), tuple(loops))
+
+
+def find_orders(table: Structure, traced: Mapping[str, Traced], *, solve: bool = False) -> tuple[Order, Order]:
+    """Return the orders of evaluation at an instant, and of initialization; see `evaluation_order`."""
+    order = evaluation_order(table, traced, solve=solve)
+    if not any(table.blocks[path].starts_from_inputs for path in traced):
+        return order, order
+    return order, evaluation_order(table, traced, start=True, solve=solve)
 
 
 def _tear(traced: Mapping[str, Traced], within: Mapping[Port, set[Port]]) -> Iterator[tuple[list[Port], Port]]:
