@@ -27,9 +27,9 @@ from ..flat import (
     rates,
     trace_schedule,
 )
-from ..results import OperatingPoint, index_of, resolve, split_entry
+from ..results import OperatingPoint, resolve
 from ..simulation import Workspace
-from ..wiring import Wire, join
+from ..wiring import Wire, index_of, join, split_entry
 from .mean_stairs import NO_STAIRS, Stairs
 from .plant_models import PlantModel, model_equations, model_step
 

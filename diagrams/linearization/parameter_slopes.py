@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, ParameterError, elements
+from ...blocks.core import LoopwrightError, ParameterError
 from ..flat import NONE, FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
@@ -26,7 +26,7 @@ from .linear_model import Linearization
 from .loops_over_a_period import advance_point, find_slower_clocks, model_loop, ticks_to_renewal
 from .over_a_period import Chain, model_period, period_of
 from .plant_models import join_matrices, plant_layout
-from .trim_request import Free, difference, free_parameters, locate, read_value, spread_nodes
+from .trim_request import Free, difference, free_parameters, locate, read_value, split_array, spread_nodes
 
 if TYPE_CHECKING:
     from control import StateSpace
@@ -89,7 +89,8 @@ def differentiate_loop(
     wires : iterable of str
         Wires that the loop is cut at, as of `Linearization.loop`.
     parameters : iterable of str
-        Paths, as `Diagram.trim` frees them: of numbers in traced equations, or start values of FMUs.
+        Paths, as `Diagram.trim` frees them: of numbers in traced equations, or start values of FMUs; or of one entry of
+        an array, ``"motor.denominator[1]"``.
     find : callable, optional
         How the operating point is found: a changed diagram's point is found anew, and the derivatives count its change.
         Without it, an equilibrium follows the parameter, and any other point keeps its states.
@@ -107,10 +108,11 @@ def differentiate_loop(
     cut = _Cut(model, tuple(wires), slow)
     found = []
     for name in dict.fromkeys(parameters):
+        whole, entry = split_array(model.diagram, name)
         try:
-            (free,), diagram = free_parameters(model.diagram, {name: None})
+            (free,), diagram = free_parameters(model.diagram, {whole: None})
             kind = _StartValues if free.where is None else _Traced
-            found += kind(cut, free, diagram, find).slopes()
+            found += kind(cut, free, diagram, find).slopes(free.find_entries(entry))
         except LoopwrightError as error:
             if left_out is None:
                 raise
@@ -313,11 +315,11 @@ class _StartValues:
     def __init__(self, cut: _Cut, free: Free, diagram: WiredDiagram, find: PointFinder | None):
         self.cut, self.free, self.find = cut, free, find
 
-    def slopes(self) -> list[LoopSlope]:
+    def slopes(self, entries: Sequence[tuple[int, str]]) -> list[LoopSlope]:
         free, model = self.free, self.cut.model
         found, value = [], free.start
         middle = self._loop(model.diagram, model.point)[0]
-        for i, name in enumerate(elements(free.name, free.shape)):
+        for i, name in entries:
             changed = _Changed.of(free, value, i, model.diagram)
             made = [self._loop(d, model.point if self.find is None else self.find(d)) for d in changed.diagrams]
             if any([np.shape(M) for M in four] != [np.shape(M) for M in middle] for four, _ in made):
@@ -361,11 +363,11 @@ class _Traced:
             self.flat = replace(flat, p=p)
             model.point.check_fits(self.flat, model.diagram.name)
 
-    def slopes(self) -> list[LoopSlope]:
+    def slopes(self, entries: Sequence[tuple[int, str]]) -> list[LoopSlope]:
         free, cut = self.free, self.cut
         found = []
         packed, error = free.slope_with_error(self.value)
-        for i, name in enumerate(elements(free.name, self.shape)):
+        for i, name in entries:
             direction = np.zeros(self.flat.p.size)
             direction[free.where] = packed[:, i]
             local, closed = cut.derivatives(self.flat, self.diagram)

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ...blocks.core import Block, OptionError, ParameterError, UnknownNameError, Value, near
+from ...blocks.core import Block, OptionError, ParameterError, UnknownNameError, Value, elements, near
 from ...blocks.tracing import traced_parameters
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint, PointOrigin
-from ..wiring import change_parameter, split_path
+from ..wiring import change_parameter, index_of, split_entry, split_path
 from .derivatives import find_signal
 from .plant_models import plant_layout
 
@@ -71,6 +71,13 @@ class Free:
     shape: tuple[int, ...]
     where: slice | None = None
     pack: Callable[[Block], np.ndarray] | None = field(default=None, repr=False)
+
+    def find_entries(self, entry: tuple[int, ...]) -> list[tuple[int, str]]:
+        """Return the places and names of all entries, or of one that is named by its numbers, counted from 1."""
+        names = list(enumerate(elements(self.name, self.shape)))
+        if not entry:
+            return names
+        return [names[int(np.ravel_multi_index(index_of(entry, self.shape, self.name), self.shape))]]
 
     def shape_value(self, value: np.ndarray) -> np.ndarray | float:
         """Return the parameter's value from its entries."""
@@ -287,6 +294,14 @@ def free_parameters(diagram: WiredDiagram, asked: Mapping[str, Any]) -> tuple[li
         if free.path in flat.checked.traced:
             locate(free, diagram, flat)
     return found, diagram
+
+
+def split_array(diagram: WiredDiagram, name: str) -> tuple[str, tuple[int, ...]]:
+    """Return the path of a parameter, and the entry of an array that is named behind it: ``"motor.denominator[1]"``."""
+    path, keys = split_path(diagram.structure, name, diagram.name)
+    block = diagram.structure.blocks[path]
+    known = cast("Fmu", block).description.variables if block.stepped and keys[0] == "start" else ()
+    return (name, ()) if ".".join(keys[1:]) in known else split_entry(name, ())
 
 
 def locate(free: Free, diagram: WiredDiagram, flat: FlatDiagram) -> None:

@@ -21,7 +21,7 @@ from .recorder import Recorder
 from .recording import Recording
 from .run import Run
 from .saved_state import RunState, check_fits, layout_of, not_open_error
-from .signal_names import entries, index_of, resolve, split_entry
+from .signal_names import entries, resolve
 from .snapshot import Snapshot
 from .stored import Occurrence, Stopped
 from .texts import TextSignal
@@ -48,7 +48,6 @@ __all__ = [
     "TextSignal",
     "check_fits",
     "entries",
-    "index_of",
     "layout_of",
     "limit_time",
     "machine_memory",
@@ -57,6 +56,5 @@ __all__ = [
     "not_open_error",
     "resolve",
     "save",
-    "split_entry",
     "style",
 ]

@@ -11,8 +11,8 @@ from typing import IO, TYPE_CHECKING, Any
 import numpy as np
 
 from ...blocks.core import Layout, OptionError, PortUnit, UnknownNameError
-from ..wiring import CheckedDiagram, Wire
-from .signal_names import entries, resolve, split_entry
+from ..wiring import CheckedDiagram, Wire, split_entry
+from .signal_names import entries, resolve
 from .snapshot import Snapshot
 from .stored import Occurrence, PathLike, Stopped, header, prepare, read, write
 from .texts import TextSignal

@@ -6,16 +6,12 @@ matrix a single number counts row by row, as the columns of exported tables do.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Mapping
 
 import numpy as np
 
 from ...blocks.core import Layout, UnknownNameError, near
-from ..wiring import Wire
-
-Entry = tuple[int, ...]
-"""Numbers in brackets behind a name, counted from 1; none for the whole signal."""
+from ..wiring import Wire, index_of, split_entry
 
 
 def resolve(name: str, wires: Mapping[str, Wire], ports: Collection[str]) -> str:
@@ -49,33 +45,6 @@ def resolve(name: str, wires: Mapping[str, Wire], ports: Collection[str]) -> str
         return resolve(whole, wires, ports) + name[len(whole) :]
     short = {n.rpartition(".")[2] for n in (*wires, *ports)}
     raise UnknownNameError(f"no signal {name!r} was recorded. {near(name, short | set(wires) | set(ports))}")
-
-
-def split_entry(name: str, known: Collection[str]) -> tuple[str, Entry]:
-    """Return the name of a signal and the entry behind it; the name of a port may end in brackets, too."""
-    found = re.fullmatch(r"(.+)\[(\d+(?:,\d+)*)\]", name)
-    if found is None or name in known:
-        return name, ()
-    return found[1], tuple(int(i) for i in found[2].split(","))
-
-
-def index_of(entry: Entry, shape: tuple[int, ...], name: str) -> tuple[int, ...]:
-    """Return the index of an entry in an array of a shape, counted from 0.
-
-    Raises
-    ------
-    UnknownNameError
-        If the array has no such entry.
-    """
-    if len(entry) == len(shape) and all(1 <= i <= n for i, n in zip(entry, shape, strict=True)):
-        return tuple(i - 1 for i in entry)
-    if len(entry) == 1 and 1 <= entry[0] <= int(np.prod(shape)) and shape:
-        return tuple(int(i) for i in np.unravel_index(entry[0] - 1, shape))
-    raise UnknownNameError(
-        f"{name!r} has no entry {list(entry)}; expected one within its shape {shape}, counted from 1."
-        if shape
-        else f"{name!r} has no entry {list(entry)}, as it is a scalar. Leave the brackets out."
-    )
 
 
 def entries(full: str, layout: Layout, wires: Mapping[str, Wire]) -> np.ndarray:

@@ -8,8 +8,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..wiring import Wire
-from .signal_names import index_of, resolve, split_entry
+from ..wiring import Wire, index_of, split_entry
+from .signal_names import resolve
 
 
 class RecordedRun(Protocol):

@@ -9,7 +9,7 @@ import numpy as np
 from ...blocks.core import Block, OptionError, Value
 from ...blocks.tracing import traced_parameters
 from ..flat import WiredDiagram
-from ..wiring import split_path
+from ..wiring import index_of, split_entry, split_path
 
 
 def list_parameters(diagram: WiredDiagram) -> tuple[list[str], dict[str, str]]:
@@ -91,13 +91,14 @@ def changed_entry(diagram: WiredDiagram, parameter: str, value: float) -> dict[s
 
 
 def read_parameter(diagram: WiredDiagram, name: str) -> Any:
-    """Return the value of a parameter, or of an FMU's start value, by its full path."""
+    """Return the value of a parameter, or of an FMU's start value, by its full path; or of an entry of an array."""
     path, keys = split_path(diagram.structure, name, diagram.name)
     owner: Any = diagram.structure.blocks[path]
     if owner.stepped and keys[0] == "start":
         key = ".".join(keys[1:])
         known = owner.start.get(key)
-        return owner.description.variables[key].start if known is None else known
-    for key in keys:
+        return owner.description.find(key).start if known is None else known
+    last, entry = split_entry(keys[-1], ())
+    for key in (*keys[:-1], last):
         owner = owner.__dict__[key] if isinstance(owner, Value) else owner[key]
-    return owner
+    return np.asarray(owner)[index_of(entry, np.shape(owner), last)].item() if entry else owner

@@ -211,12 +211,9 @@ class Study:
         find = point if callable(point) else None
         names = [name for name in self.boxes if name in self.smooth]
         made = differentiate_loop(model, case.loop, names, find=find, left_out={})
-        by_name: dict[str, list[LoopSlope]] = {}
-        for one in made:
-            by_name.setdefault(one.parameter.partition("[")[0], []).append(one)
         slopes: list[LoopSlope | None] = []
         for name, box in self.boxes.items():
-            mine = by_name.get(name, [])
+            mine = [one for one in made if one.parameter == name or one.parameter.startswith(f"{name}[")]
             slopes += mine if len(mine) == box.size else [None] * box.size
         known = [s for s in slopes if s is not None]
         exact = iter(margin_slopes(L, [s.slopes for s in known], delay=self.delay)[case.quantity].slopes)

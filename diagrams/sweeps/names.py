@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ...blocks.core import Block, OptionError, UnknownNameError, Value, near
-from ..wiring import CheckedDiagram, split_path
+import numpy as np
+
+from ...blocks.core import Block, OptionError, UnknownNameError, Value, elements, near
+from ..wiring import CheckedDiagram, index_of, split_entry, split_path
 
 _OF_A_SUBSYSTEM = ("sample_time", "method", "offset", "delay")
 
@@ -14,7 +16,8 @@ _OF_A_SUBSYSTEM = ("sample_time", "method", "offset", "delay")
 def find_parameter(diagram: CheckedDiagram, name: object) -> str:
     """Return the full path of a parameter, a start value, a subsystem's setting or a block, for `Diagram.replace`.
 
-    A start value of an FMU is found without ``start`` as well: ``"plant.mass"`` is ``"plant.start.mass"``.
+    A start value of an FMU is found without ``start`` as well: ``"plant.mass"`` is ``"plant.start.mass"``. An entry of
+    an array is one, too, counted from 1: ``"motor.denominator[1]"``.
 
     Parameters
     ----------
@@ -52,6 +55,9 @@ def _inside(block: Block, path: str, keys: list[str]) -> list[str]:
     """Return the names that lead to a parameter in a block."""
     specs = type(block).parameter_specs
     whole = ".".join(keys)
+    array, entry = split_entry(keys[-1], _start_values(block))
+    if entry and whole not in _start_values(block) and ".".join(keys[1:]) not in _start_values(block):
+        return _entry_inside(block, path, [*keys[:-1], array], entry)
     if keys[0] not in specs:
         starts = _start_values(block)
         if whole in starts:
@@ -80,9 +86,31 @@ def _inside(block: Block, path: str, keys: list[str]) -> list[str]:
     return keys
 
 
+def _entry_inside(block: Block, path: str, keys: list[str], entry: tuple[int, ...]) -> list[str]:
+    """Return the names that lead to an entry of an array in a block."""
+    keys = _inside(block, path, keys)
+    inner: Any = block
+    for key in keys[:-1]:
+        inner = inner.__dict__[key] if isinstance(inner, Value) else inner[key]
+    if not isinstance(inner, Value):
+        raise UnknownNameError(
+            f"found an entry of {keys[-1]!r}; expected a whole start value, as the FMU has no variable of the entry's "
+            "own. Name it alone.",
+            block=path,
+        )
+    array = np.asarray(inner.__dict__[keys[-1]])
+    if array.dtype.kind not in "iuf":
+        raise UnknownNameError(f"{keys[-1]!r} has no entries that are numbers. Name it alone.", block=path)
+    try:
+        place = index_of(entry, array.shape, keys[-1])
+    except UnknownNameError as error:
+        raise error.at(block=path) from None
+    return [*keys[:-1], elements(keys[-1], array.shape)[int(np.ravel_multi_index(place, array.shape))]]
+
+
 def _start_values(block: Block) -> list[str]:
     """Return the names of the start values that a block of an FMU takes."""
     if "start" not in type(block).parameter_specs or not hasattr(block, "description"):
         return []
     about: Any = block
-    return list(about.description.variables)
+    return [*about.description.variables, *about.description.elements]

@@ -177,6 +177,9 @@ class Samples(Sequence[Sample]):
                     port=path,
                 )
             full[path] = name
+        for path in full:
+            if (whole := path.rpartition("[")[0]) in full:
+                raise OptionError(f"found {whole!r} and an entry of it, {path!r}; expected one of them. Leave one out.")
         paths = {name: path for path, name in full.items()}
         axes = None if self.axes is None else {paths[name]: values for name, values in self.axes.items()}
         boxes = {paths[name]: box for name, box in self.boxes.items()}

@@ -12,7 +12,7 @@ from ...blocks.tracing import structure
 from ...fmus import Fmu
 from ...fmus.archive import FmuDescription
 from ..simulation import SimulatedDiagram
-from ..wiring import change_parameter, split_path
+from ..wiring import change_parameter, split_entry, split_path
 
 D = TypeVar("D", bound=SimulatedDiagram)
 _KEPT = 8
@@ -145,7 +145,8 @@ class Variation(Generic[D]):
             name = ".".join(keys[1:])
             plain = keys[0] == "start" and name in about.variables and not about.structural
             return (path, ["start", name]) if plain and not _has_elements(block, name) else None
-        return (path, keys) if path in diagram.checked.traced and keys[0] in type(block).parameter_specs else None
+        known = split_entry(keys[0], type(block).parameter_specs)[0] in type(block).parameter_specs
+        return (path, keys) if path in diagram.checked.traced and known else None
 
     def _structure(self, path: str, block: Block) -> Any:
         if path not in self._structures:

@@ -3,6 +3,7 @@
 from .check import Checked
 from .checked_diagram import CheckedDiagram
 from .cycles import find_cyclic_parts
+from .entry_names import index_of, split_entry
 from .entry_order import OrderStep
 from .order import Order, find_orders
 from .structure import Collector, Structure, SubsystemSettings, Wire, join, stepped_blocks
@@ -23,7 +24,9 @@ __all__ = [
     "exact_time",
     "find_cyclic_parts",
     "find_orders",
+    "index_of",
     "join",
+    "split_entry",
     "split_path",
     "stepped_blocks",
     "subsystem",

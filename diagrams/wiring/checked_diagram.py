@@ -123,7 +123,8 @@ class CheckedDiagram:
         ----------
         changes : mapping, optional
             By dotted path, or its unique end: a block (``"plant"``), a parameter
-            (``"controller.admittance_par.stiffness"``), a subsystem's ``sample_time``, ``method``, ``offset`` or
+            (``"controller.admittance_par.stiffness"``), an entry of an array, counted from 1
+            (``"motor.denominator[1]"``), a subsystem's ``sample_time``, ``method``, ``offset`` or
             ``delay`` (``"controller.sample_time"``; None: that of its surroundings), a plant's start value
             (``"plant.start.position"``).
         **more

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from dataclasses import replace as replace_fields
 from typing import Any, TypeVar
 
-from ...blocks.core import Block, UnknownNameError, Value, WiringError, near
+from ...blocks.core import Block, LoopwrightError, UnknownNameError, Value, WiringError, near
 from ...blocks.tracing import check_method
+from .entry_names import split_entry, with_entry
 from .structure import Structure, SubsystemSettings
 from .subsystems import check_delay, exact_offset, exact_time
 
@@ -49,7 +50,10 @@ def _change(table: Structure, path: str, value: object, diagram: str) -> None:
         )
     else:
         full, keys = split_path(table, path, diagram)
-        table.blocks[full] = change_parameter(table.blocks[full], keys, value)
+        try:
+            table.blocks[full] = change_parameter(table.blocks[full], keys, value)
+        except LoopwrightError as error:
+            raise error.at(block=full) from None
 
 
 def _used_ports(table: Structure, path: str) -> tuple[set[str], set[str]]:
@@ -79,7 +83,8 @@ def split_path(table: Structure, path: str, diagram: str) -> tuple[str, list[str
             return find_path(".".join(parts[:cut]), table.blocks, "block", diagram), parts[cut:]
         except UnknownNameError:
             continue
-    owners = [p for p, block in sorted(table.blocks.items()) if path in type(block).parameter_specs]
+    last = split_entry(path, ())[0]
+    owners = [p for p, block in sorted(table.blocks.items()) if last in type(block).parameter_specs]
     if len(owners) == 1:
         return owners[0], [path]
     if owners:
@@ -123,9 +128,15 @@ def find_path(path: str, known: Mapping[str, object], kind: str, diagram: str) -
 
 
 def change_parameter(block: V, keys: list[str], value: object) -> V:
-    """Return ``block`` with the parameter at a path of attribute names or mapping keys changed."""
+    """Return ``block`` with the parameter at a path of attribute names or mapping keys changed.
+
+    The last name may be an entry of an array: ``"denominator[1]"``.
+    """
     name = keys[0]
     if len(keys) == 1:
+        whole, entry = split_entry(name, type(block).parameter_specs)
+        if entry and whole in type(block).parameter_specs:
+            name, value = whole, with_entry(block.__dict__[whole], entry, value, whole)
         return block.replace(**{name: value})
     inner = block.__dict__.get(name)
     if isinstance(inner, Value):

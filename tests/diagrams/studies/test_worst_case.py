@@ -5,7 +5,18 @@ import math
 import numpy as np
 import pytest
 
-from loopwright.blocks import Block, Constant, Gain, Input, Integrator, OptionError, Output, UnknownNameError, parameter
+from loopwright.blocks import (
+    Block,
+    Constant,
+    Gain,
+    Input,
+    Integrator,
+    OptionError,
+    Output,
+    TransferFunction,
+    UnknownNameError,
+    parameter,
+)
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.linearization import loop_of_variant
 from loopwright.diagrams.requirements import Requirements
@@ -47,6 +58,34 @@ def test_friction_that_is_compensated_twofold_is_unstable_in_linear_model_and_ru
     confirmed = found.confirm()
     assert confirmed.kind is ConfirmationKind.GROWTH
     assert confirmed.agrees, confirmed
+
+
+def make_lag_loop(a0=0.1, a1=1.0, b=2.0, k=3.0):
+    motor = TransferFunction(numerator=[b], denominator=[a0, a1], name="motor")
+    return Diagram("lag", motor(Gain(gain=k, name="k")(Constant(value=0.0, name="r") - motor.y).named("u")))
+
+
+def lag_delay_margin(a0, a1, b=2.0, k=3.0):
+    """The delay margin of L = k b/(a0 s + a1)."""
+    w = math.sqrt((k * b) ** 2 - a1**2) / a0
+    return (math.pi - math.atan2(a0 * w, a1)) / w
+
+
+def test_entries_of_an_array_are_ranges_by_the_names_that_sensitivity_gives():
+    diagram = make_lag_loop()
+    slopes = diagram.sensitivity("u", ["motor.denominator[1]", "motor.numerator"])
+    assert [row.parameter for row in slopes.of("delay_margin_s")] == ["motor.numerator[1]", "motor.denominator[1]"]
+    h = 1e-5
+    by_hand = (lag_delay_margin(0.1 + h, 1.0) - lag_delay_margin(0.1 - h, 1.0)) / (2 * h)
+    assert slopes["motor.denominator[1]", "delay_margin_s"].slope.value == pytest.approx(by_hand, rel=1e-6)
+    ranges = {"motor.denominator[1]": (0.05, 0.2), "motor.denominator[2]": (0.5, 2.0)}
+    found = diagram.worst_case(ranges, "u", quantity="delay_margin_s", count=2, starts=1, steps=2)
+    assert found.parameters["motor.denominator[1]"] == 0.05
+    assert found.worst.value == pytest.approx(
+        lag_delay_margin(0.05, found.parameters["motor.denominator[2]"]), rel=1e-9
+    )
+    assert found.worst.value <= lag_delay_margin(0.05, 0.5)
+    assert found.diagram.blocks["motor"].denominator[0] == 0.05
 
 
 def draw(count, seed=5):

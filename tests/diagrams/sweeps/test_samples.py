@@ -113,7 +113,7 @@ def test_a_start_value_of_an_fmu_is_found_without_the_word_start():
         ({"sign.gain": ()}, {}, r"sign.gain: found no value; expected one at least"),
         ({"sign.gain": 2.0}, {}, r"sign.gain: found 2.0; expected a list of its values"),
         ({"sign.gain": (1.0, float("nan"))}, {}, r"sign.gain: found the value nan; expected finite"),
-        ({"sign.gain": (1.0, 2.0)}, {"samples": "lattin"}, r"loop: found samples='lattin'. .*'latin'"),
+        ({"sign.gain": (1.0, 2.0)}, {"samples": "lattin"}, r"loop.samples: found samples='lattin'. .*'latin'"),
         ({"sign.gain": (1.0, 2.0)}, {"samples": "latin"}, r"needs count="),
         ({"sign.gain": (1.0, 2.0)}, {"samples": "latin", "count": 0}, r"found count=0; expected a positive integer"),
         ({"sign.gain": (2.0, 1.0)}, {"samples": "latin", "count": 3}, r"sign.gain: found a range from 2.0 to 1.0"),
