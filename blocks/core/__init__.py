@@ -51,9 +51,11 @@ from .units import (
     convert_unit,
     describe_mismatch,
     parse_unit,
+    print_unit,
     rate_of,
     same_dimension,
     same_unit,
+    with_unit,
 )
 from .values import Array, Value, identity, parameter, shorten
 
@@ -133,6 +135,7 @@ __all__ = [
     "parameter",
     "parse_unit",
     "period_of",
+    "print_unit",
     "rate_of",
     "read_time",
     "recorder",
@@ -143,6 +146,7 @@ __all__ = [
     "shape_of",
     "shorten",
     "source",
+    "with_unit",
     "without_collection",
     "write_text",
 ]

@@ -258,6 +258,36 @@ def describe_mismatch(a: Unit | str, b: Unit | str) -> str:
     return f"{a.text} and {b.text} differ by a factor of {gain}: put Gain(gain={gain}) between"
 
 
+_POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_PRINTED = {"1": "", "deg": "°"}
+
+
+def print_unit(text: str) -> str:
+    """Return a unit as it is printed, empty for a pure number.
+
+    Examples
+    --------
+    >>> print_unit("N.s/m"), print_unit("m/s2"), print_unit("deg"), print_unit("1")
+    ('N·s/m', 'm/s²', '°', '')
+    """
+    if text in _PRINTED:
+        return _PRINTED[text]
+    raised = re.sub(r"(?<=[A-Za-z])(-?\d+)", lambda m: m[1].translate(_POWERS), text)
+    return re.sub(r"(?<=[^\s\d])[.*](?=[^\s\d])", "·", raised)
+
+
+def with_unit(name: str, unit: str) -> str:
+    """Return the name of a quantity with its unit, as heads of tables and axes of figures have it.
+
+    Examples
+    --------
+    >>> with_unit("t", "s"), with_unit("|S|", "1")
+    ('t [s]', '|S|')
+    """
+    shown = print_unit(unit)
+    return f"{name} [{shown}]" if shown else name
+
+
 def rate_of(text: str) -> str:
     """Return the unit of the time derivative: ``m/s`` for ``m``, ``m/s2`` for ``m/s``."""
     if parse_unit(text).offset:

@@ -10,11 +10,20 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...blocks.core import DefinitionError, FmuError, FmuFileError, LoopwrightError, OptionError, UnknownNameError, near
+from ...blocks.core import (
+    DefinitionError,
+    FmuError,
+    FmuFileError,
+    LoopwrightError,
+    OptionError,
+    UnknownNameError,
+    near,
+    print_unit,
+)
 from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..paper import EXPERIMENTS, Experiment
-from ..report_writing import Report, symbol
+from ..report_writing import Report
 from ..requirements import STUDIES, Reason, Requirements, Review, TomlFile, Verdict, read_requirements
 from .options import parse_options, share
 from .text import say
@@ -191,7 +200,7 @@ def _verdict(reviewed: Review) -> str:
     for result in (*reviewed.of(Verdict.FAILED), *reviewed.of(Verdict.UNDECIDED)):
         place = result.path or ".".join(part for part in (result.loop, result.variant, result.quantity) if part)
         found = "" if result.number is None else f" found {result.number},"
-        unit = "" if result.number is None else symbol(result.number.unit)
+        unit = "" if result.number is None else print_unit(result.number.unit)
         required = f"{result.limit}{'' if unit in ('', '°') else ' '}{unit}"
         detail = f": {result.detail}" if result.detail else ""
         reason = "" if result.reason is Reason.COMPARED else f" ({result.reason}{detail})"

@@ -10,7 +10,7 @@ from .loop_margins import margins
 from .margin_slopes import MarginSlope, margin_slopes
 from .margins_found import GainCrossover, Margins, PhaseCrossover
 from .measured_margins import Interval, MeasuredMargins, measured_margins, read_frequency_data
-from .number import MARK, Number
+from .number import MARK, Confirmation, Number, method_of
 from .nyquist import NyquistCount, nyquist_count
 from .periodic_margins import PeriodicMargins, periodic_margins
 from .pole_placement import SampledDesign, place, sampled_gains, sampled_poles
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MARK",
     "Comparison",
+    "Confirmation",
     "DiskMargin",
     "GainCrossover",
     "GangOfFour",
@@ -52,6 +53,7 @@ __all__ = [
     "margin_slopes",
     "margins",
     "measured_margins",
+    "method_of",
     "mimo_disk_margin",
     "mu_bound",
     "nyquist_count",

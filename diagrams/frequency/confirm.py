@@ -13,6 +13,7 @@ import numpy as np
 from ...blocks.core import ConfirmationError
 from .crossings import Crossing
 from .features import Features
+from .number import Confirmation
 from .nyquist import winding_number
 from .realization import Realization
 
@@ -54,7 +55,7 @@ def pick_test_values(value: float, others: Sequence[float], nominal: float) -> t
 
 def confirm_limit(
     name: str, value: float, others: Sequence[float], nominal: float, stable: Callable[[float], bool], how: str
-) -> str:
+) -> Confirmation:
     """Confirm that stability ends at a limit, seen from the nominal value; return the computation.
 
     Raises
@@ -72,10 +73,13 @@ def confirm_limit(
             "realization may be ill-conditioned.",
             block=name,
         )
-    return f"{how}: stable at {inside:.9g}, unstable at {outside:.9g}"
+    return Confirmation(
+        f"{how}: stable at {inside:.9g}, unstable at {outside:.9g}",
+        f"{how}: stable just before this value, unstable just beyond it",
+    )
 
 
-def confirm_no_limit(name: str, values: Sequence[float], stable: Callable[[float], bool], how: str) -> str:
+def confirm_no_limit(name: str, values: Sequence[float], stable: Callable[[float], bool], how: str) -> Confirmation:
     """Confirm that the loop is stable at all the values; return the computation."""
     bad = [v for v in values if not stable(v)]
     if bad:
@@ -83,9 +87,12 @@ def confirm_no_limit(name: str, values: Sequence[float], stable: Callable[[float
             f"found no limit, but {how} say unstable at {bad[0]:.6g}; expected stable. Look at closed_loop_poles.",
             block=name,
         )
+    method = f"{how}: stable at all values that were tried"
     if len(values) > FEW:
-        return f"{how}: stable at {len(values)} values from {values[0]:.6g} to {values[-1]:.6g}"
-    return f"{how}: stable at " + ", ".join(f"{v:.6g}" for v in values)
+        text = f"{how}: stable at {len(values)} values from {values[0]:.6g} to {values[-1]:.6g}"
+    else:
+        text = f"{how}: stable at " + ", ".join(f"{v:.6g}" for v in values)
+    return Confirmation(text, method)
 
 
 def confirm_crossing(r: Realization, c: Crossing, factor: complex, name: str) -> str:

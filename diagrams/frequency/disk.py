@@ -13,7 +13,7 @@ from .carried import carries_findings
 from .confirm import confirm_limit, confirm_peak, refuse_singular
 from .features import Features, scan
 from .loop_margins import EIGENVALUES
-from .number import Number
+from .number import Confirmation, Number
 from .realization import Realization
 from .state_space import make_state_space, read_matrices
 
@@ -247,9 +247,9 @@ def _compute_disk_margin(r: Realization, skew: float) -> DiskMargin:
         )
     how = _confirm_destabilizing(r, delta, skew)
     if n == 1:
-        how += "; " + confirm_peak(r, (1 + skew) / 2, -(1 - skew) / 2, bound, "disk_margin")
+        how = how.and_by(confirm_peak(r, (1 + skew) / 2, -(1 - skew) / 2, bound, "disk_margin"))
     else:
-        how += f"; smallest perturbation found: {1 / lower:.9g}"
+        how = how.and_by(f"smallest perturbation found: {1 / lower:.9g}", "the smallest perturbation that was found")
     low, high, phase = disk_gains(alpha, skew)
     ends = omega in (0.0, np.inf) or omega == r.nyquist
     return DiskMargin(
@@ -280,7 +280,7 @@ def disk_gains(alpha: float, skew: float = 0.0) -> tuple[float, float, float]:
     return max(low, 0.0), high, 180.0 if abs(cosine) > 1 else float(np.degrees(np.arccos(cosine)))
 
 
-def _confirm_destabilizing(r: Realization, delta: np.ndarray, skew: float) -> str:
+def _confirm_destabilizing(r: Realization, delta: np.ndarray, skew: float) -> Confirmation:
     """Confirm that the loop loses its stability when the perturbation grows to δ; return the computation."""
 
     def stable(size: float) -> bool:
@@ -289,7 +289,7 @@ def _confirm_destabilizing(r: Realization, delta: np.ndarray, skew: float) -> st
     try:
         return confirm_limit("disk_margin", 1.0, [], 0.0, stable, EIGENVALUES + " with δ scaled")
     except np.linalg.LinAlgError:
-        return "I + L F is singular at infinite frequency with δ"
+        return Confirmation("I + L F is singular at infinite frequency with δ")
 
 
 def sensitivity_at(r: Realization, omega: float) -> np.ndarray:

@@ -22,7 +22,7 @@ from .confirm import (
 from .crossings import Crossing, Peak, Scan
 from .features import find_hidden_unstable
 from .margins_found import GainCrossover, Margins, PhaseCrossover
-from .number import Number
+from .number import Confirmation, Number
 from .nyquist import count_encirclements
 from .realization import Realization
 
@@ -165,8 +165,7 @@ class _MarginFinder:
             return {name: Number(np.inf, "deg", 0.0, how)}
         margin, c = min(((abs(_missing_phase(c)), c) for c in self.gain), key=lambda pair: pair[0])
         if margin > 180 - 1e-6:  # L = 1: both directions have the same limit
-            how = confirm_crossing(self.r, c, -1 / c.L, name)
-            return {name: Number(180.0, "deg", 1e-6, how)}
+            return {name: Number(180.0, "deg", 1e-6, confirm_crossing(self.r, c, -1 / c.L, name))}
         others = [abs(_missing_phase(o)) for o in self.gain if o is not c]
         others += [360 - o for o in (margin, *others)]  # the same limits, reached by rotating to the other side
         how = confirm_limit(name, margin, others, 0.0, stable, EIGENVALUES + " with L rotated")
@@ -223,7 +222,10 @@ class _MarginFinder:
                 )
         with_z = EIGENVALUES if above <= 100 else "encirclements"
         on_it = f", on the limit at n = {round(n)}" if whole else ""
-        return f"{with_z} with z⁻ⁿ: stable at n = {below}{on_it}, as many unstable at n = {above} as crossovers say"
+        return Confirmation(
+            f"{with_z} with z⁻ⁿ: stable at n = {below}{on_it}, as many unstable at n = {above} as crossovers say",
+            f"{with_z} with z⁻ⁿ: stable with fewer samples, as many unstable with more as crossovers say",
+        )
 
     def _confirm_no_samples(self) -> str:
         """Confirm that no number of samples ends stability; return the computation."""
@@ -238,7 +240,10 @@ class _MarginFinder:
         n = 0
         while n < 100 and count_unstable(self.r, self.scan.features, n + 1) == 0:
             n += 1
-        return float(n), f"{EIGENVALUES} with z⁻ⁿ: stable at n = {n}, unstable at n = {n + 1} (|L| ≥ 1 at π/T)"
+        return float(n), Confirmation(
+            f"{EIGENVALUES} with z⁻ⁿ: stable at n = {n}, unstable at n = {n + 1} (|L| ≥ 1 at π/T)",
+            f"{EIGENVALUES} with z⁻ⁿ: stable with these samples, unstable with one more (|L| ≥ 1 at π/T)",
+        )
 
     def _find_peaks(self) -> dict[str, Number]:
         upper, lower = (1 + self.skew) / 2, -(1 - self.skew) / 2

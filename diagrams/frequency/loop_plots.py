@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...blocks.core import OptionError
-from ..results import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, new_figure, style
+from ...blocks.core import OptionError, with_unit
+from ..results import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, VERMILION, legend_above, new_figure, style
 from .realization import Realization
 
 if TYPE_CHECKING:
@@ -126,9 +126,8 @@ def _phase(values: np.ndarray) -> np.ndarray:
     return np.asarray(phase - 360.0 * np.ceil((phase[0] - 90.0) / 360.0))
 
 
-def _legend(figure: Figure, axes: Axes, count: int) -> None:
-    if count > 1:
-        axes.legend(fontsize=7)
+def _legend(figure: Figure, axes: Axes) -> None:
+    legend_above(figure, axes)
     figure.align_ylabels()
 
 
@@ -152,10 +151,10 @@ def bode(loops: Sequence[Any], omega: ArrayLike | None, labels: Sequence[str] | 
         low, high = phase.get_ylim()
         step = 45.0 if high - low < 400.0 else 90.0 if high - low < 900.0 else 360.0
         phase.set_yticks(np.arange(np.ceil(low / step) * step, high + 1e-9, step))
-        gain.set_ylabel("gain in dB" if db else "gain")
-        phase.set_ylabel("phase in °")
-        phase.set_xlabel("frequency in Hz" if hz else "frequency in rad/s")
-        _legend(figure, gain, len(loops))
+        gain.set_ylabel(with_unit("|L|", "dB" if db else "1"))
+        phase.set_ylabel(with_unit("phase of L", "deg"))
+        phase.set_xlabel(with_unit("frequency", "Hz") if hz else with_unit("ω", "rad/s"))
+        _legend(figure, gain)
     return figure
 
 
@@ -191,7 +190,7 @@ def nyquist(loops: Sequence[Any], omega: ArrayLike | None, labels: Sequence[str]
         axes.axhline(0.0, color=GREY, linewidth=0.6, zorder=0)
         axes.axvline(0.0, color=GREY, linewidth=0.6, zorder=0)
         axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="Re L", ylabel="Im L")
-        _legend(figure, axes, len(loops))
+        _legend(figure, axes)
     return figure
 
 
@@ -216,8 +215,10 @@ def nichols(loops: Sequence[Any], omega: ArrayLike | None, labels: Sequence[str]
         lines = axes.contour(phase, gain, closed, levels=[-12, -6, -3, 0, 3, 6, 12], colors=GREY, linewidths=0.6)
         axes.clabel(lines, fmt="%g dB", fontsize=6)
         axes.plot([-180.0], [0.0], marker="+", color=DARK, markersize=9, linestyle="none")
-        axes.set(xlim=(left, right), ylim=(low, high), xlabel="phase in °", ylabel="gain in dB")
-        _legend(figure, axes, len(loops))
+        axes.set(
+            xlim=(left, right), ylim=(low, high), xlabel=with_unit("phase of L", "deg"), ylabel=with_unit("|L|", "dB")
+        )
+        _legend(figure, axes)
     return figure
 
 
@@ -238,8 +239,8 @@ def step(closed: Sequence[Any], names: Sequence[str], times: ArrayLike | None, h
             look = _look(i, system)
             axes.plot(found.t, np.ravel(found.y), label=names[i], drawstyle="steps-post" if dt else "default", **look)
         axes.axhline(1.0, color=GREY, linewidth=0.8, zorder=0)
-        axes.set(xlim=(0.0, end), xlabel="time in s", ylabel="response to a unit step")
-        _legend(figure, axes, len(closed))
+        axes.set(xlim=(0.0, end), xlabel=with_unit("t", "s"), ylabel="response to a unit step")
+        _legend(figure, axes)
     return figure
 
 
@@ -259,6 +260,6 @@ def four(systems: Sequence[Mapping[str, Any]], names: Sequence[str], omega: Arra
             if key in ("S", "T"):
                 axes.axhline(1.0, color=GREY, linewidth=0.8, zorder=0)
         for axes in panels[1]:
-            axes.set_xlabel("frequency in rad/s")
-        _legend(figure, panels[0, 0], len(systems))
+            axes.set_xlabel(with_unit("ω", "rad/s"))
+        _legend(figure, panels[0, 0])
     return figure

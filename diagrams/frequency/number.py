@@ -11,6 +11,49 @@ MARK = "†"
 """Mark of a number with findings."""
 
 
+class Confirmation(str):
+    """Text on how a number was confirmed, with the values of the single case.
+
+    Parameters
+    ----------
+    text : str
+        The text.
+    method : str, optional
+        The same without values that differ from number to number, for a table of many; without it that of the text.
+
+    Examples
+    --------
+    >>> Confirmation("eigenvalues: stable at 0.99, unstable at 1.01", "eigenvalues on both sides").method
+    'eigenvalues on both sides'
+    """
+
+    method: str
+
+    def __new__(cls, text: str, method: str | None = None) -> Confirmation:
+        """Make a text with its method."""
+        made = super().__new__(cls, text)
+        made.method = method_of(text) if method is None else method
+        return made
+
+    def and_by(self, text: str, method: str | None = None) -> Confirmation:
+        """Return this confirmation with a further one behind it.
+
+        Parameters
+        ----------
+        text : str
+            The further one; it brings its own method, if it is a `Confirmation`.
+        method : str, optional
+            Its method; empty if only single cases have it.
+        """
+        own = method_of(text) if method is None else method
+        return Confirmation(f"{self}; {text}", "; ".join(part for part in (self.method, own) if part))
+
+
+def method_of(text: str) -> str:
+    """Return the method of a confirmation, which is all of a plain text."""
+    return text.method if isinstance(text, Confirmation) else str(text)
+
+
 @dataclass(frozen=True)
 class Number:
     """A number with unit, tolerance, and the computation that confirmed it.
@@ -24,7 +67,8 @@ class Number:
     tolerance : float
         Absolute bound of the numerical error of the value, in its unit.
     confirmed_by : str
-        The independent computation that agreed.
+        The independent computation that agreed. A `Confirmation` gives its method, too, without the single case's
+        values.
     given : bool
         Whether it is a given, such as a parameter, with nothing to confirm.
     findings : tuple of Finding

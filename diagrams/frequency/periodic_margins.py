@@ -19,7 +19,7 @@ from .carried import carries_findings
 from .confirm import confirm_limit, confirm_no_limit, refuse_singular
 from .disk import disk_gains, sensitivity_at
 from .features import SIDES
-from .number import MARK, Number
+from .number import MARK, Confirmation, Number
 from .realization import Realization
 
 if TYPE_CHECKING:
@@ -272,7 +272,10 @@ class PeriodicMarginFinder:
         while n < RENEWALS and delayed.is_stable():
             n, delayed = n + 1, _delay_by_a_renewal(delayed)
         if n < RENEWALS:
-            how = f"{EIGENVALUES}, delayed by whole renewals: stable at {n}, unstable at {n + 1}"
+            how: str = Confirmation(
+                f"{EIGENVALUES}, delayed by whole renewals: stable at {n}, unstable at {n + 1}",
+                f"{EIGENVALUES}, delayed by whole renewals: stable with these, unstable with one more",
+            )
             samples, seconds = float(n), n * T
         elif self._is_small():
             how = "the largest singular value of the lifted loop is below 1 at all frequencies: no delay matters"
@@ -316,17 +319,17 @@ class PeriodicMarginFinder:
         alpha = smallest(theta)
         how = self._confirm_disk(alpha, factor, theta)
         low, high, phase = disk_gains(alpha, 0.0)
-        how += f"; gains {low:.6g} … {high:.6g} and phases up to ± {phase:.6g}° may vary together"
+        how = how.and_by(f"gains {low:.6g} … {high:.6g} and phases up to ± {phase:.6g}° may vary together", "")
         return {
             "disk_margin": Number(alpha, "1", 1e-8 * alpha, how),
             "disk_frequency": Number(theta / self.r.dt, "rad/s", 1e-3 * theta / self.r.dt, how),
         }, factor
 
-    def _confirm_disk(self, alpha: float, factor: complex, theta: float) -> str:
+    def _confirm_disk(self, alpha: float, factor: complex, theta: float) -> Confirmation:
         """Confirm a disk margin by eigenvalues around the rim and at the factor; return the computation."""
         delta = 2 * (factor - 1) / (factor + 1)
         if np.isclose(alpha, 2.0, rtol=1e-12) or abs(2 - delta) < 1e-9:
-            return "the loop's factors: one of them is 0 or infinite"
+            return Confirmation("the loop's factors: one of them is 0 or infinite")
 
         def at(d: complex) -> complex:
             return (1 + d / 2) / (1 - d / 2)
@@ -344,7 +347,7 @@ class PeriodicMarginFinder:
                 f"{apart:.3g} from e^(jθ); expected none, unstable, and a pole there. Look at closed_loop_poles.",
                 block="disk_margin",
             )
-        return (
+        return Confirmation(
             f"{EIGENVALUES}: stable at {len(inner)} factors of {1 - INSIDE:g} α, unstable at {1 + INSIDE:g} α, "
             "a pole on the limit at the factor itself"
         )

@@ -122,8 +122,8 @@ def _limits(loops: ReducedLoops, side: str, numbers: dict[str, Number], titles: 
                 place = f"{name}.be_{b:g}"
                 numbers |= {f"{kind.key_of(of)}.{place}": n for of, n in shown.items() if n is not None}
                 title = titles.get(name + kind.suffix, name + kind.suffix)
-                rows.append((title, f"{b:g} N·s/m", *shown.values(), again(found)))
-        columns = ("variant", "b_e", "largest k_e", "rule of thumb", "oscillates at", "stable again")
+                rows.append((title, b, *shown.values(), again(found)))
+        columns = ("variant", "b_e [N·s/m]", "largest k_e", "rule of thumb", "oscillates at", "stable again")
         yield Table(f"Largest stiffness of the environment, {kind.title}", columns, tuple(rows))
 
 

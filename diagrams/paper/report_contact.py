@@ -96,8 +96,8 @@ def _limits(variants: Mapping[Implementation, Contact], numbers: dict[str, Numbe
             found = contact.stability_limit("stiffness", damping=b)
             place = f"{name}.be_{b:g}"
             shown = _enter(found, "ke_limit", place, "ke_frequency", numbers)
-            rows.append((titles.get(name, name), f"{b:g} N·s/m", *shown))
-    columns = ("variant", "b_e", "largest k_e", "oscillates at", "moves", "stable again")
+            rows.append((titles.get(name, name), b, *shown))
+    columns = ("variant", "b_e [N·s/m]", "largest k_e", "oscillates at", "moves", "stable again")
     return Table("Largest stiffness of the environment", columns, tuple(rows))
 
 

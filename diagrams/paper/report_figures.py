@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from ...blocks.core import with_unit
 from ..report import look_of
-from ..report_figures import set_powers
+from ..report_figures import level_text, set_powers
 from ..report_writing import Plot, Texts
-from ..results import DARK, VERMILION, new_figure, style
+from ..results import DARK, VERMILION, legend_above, new_figure, style
 
 TEXTS = Texts(__package__, "admittance")
 TARGET, RULE = "target", "rule_of_thumb"
@@ -42,7 +43,7 @@ def draw_admittances(
         Whether it is the direction along the path.
     """
     with style():
-        figure = new_figure(3.9)
+        figure = new_figure(3.2)
         top, bottom = figure.subplots(2, 1, sharex=True)
         for i, (name, (title, Y)) in enumerate(curves.items()):
             look = DOTTED if name == TARGET else looks.get(name) or look_of(name, i)
@@ -54,12 +55,12 @@ def draw_admittances(
         bottom.axhspan(-180, -90, color=VERMILION, alpha=0.07, linewidth=0)
         bottom.set_ylim(-180, 180)
         bottom.set_yticks([-180, -90, 0, 90, 180])
-        top.set_ylabel("|Y| [m/(N s)]")
-        bottom.set_ylabel("phase of Y [°]")
-        bottom.set_xlabel("ω [rad/s]")
+        top.set_ylabel(with_unit("|Y|", "m/(N.s)"))
+        bottom.set_ylabel(with_unit("phase of Y", "deg"))
+        bottom.set_xlabel(with_unit("ω", "rad/s"))
         set_powers(bottom.xaxis, bottom.get_xlim(), 9)
         set_powers(top.yaxis, top.get_ylim(), 6)
-        top.legend(loc="best")
+        legend_above(figure, top)
     return Plot(key, TEXTS.line("rendered", along=along), figure)
 
 
@@ -80,7 +81,7 @@ def draw_stability(
     key : str
         Key of the figure.
     k, b : ndarray
-        Stiffness in N/m and damping in N s/m of the environment.
+        Stiffness in N/m and damping in N·s/m of the environment.
     growth : ndarray
         Growth rates in 1/s, for each damping and stiffness.
     lines : mapping of str to (str, ndarray)
@@ -91,7 +92,7 @@ def draw_stability(
         Whether it is the direction along the path.
     """
     with style():
-        figure = new_figure(3.4)
+        figure = new_figure(2.9)
         ax = figure.subplots()
         levels = [-100, -10, -1, -0.1, 0, 0.1, 1, 10, 100, 1000]
         from matplotlib.colors import SymLogNorm
@@ -114,8 +115,8 @@ def draw_stability(
         ax.set_ylim(b[0], b[-1])
         set_powers(ax.xaxis, ax.get_xlim(), 9)
         set_powers(ax.yaxis, ax.get_ylim(), 6)
-        ax.set_xlabel("stiffness kₑ of the environment [N/m]")
-        ax.set_ylabel("damping bₑ [N s/m]")
-        figure.colorbar(filled, ax=ax, label="growth rate σ [1/s]", ticks=levels, format="%g")
-        ax.legend(loc="upper left")
+        ax.set_xlabel(with_unit("stiffness kₑ of the environment", "N/m"))
+        ax.set_ylabel(with_unit("damping bₑ", "N.s/m"))
+        figure.colorbar(filled, ax=ax, label=with_unit("growth rate σ", "1/s"), ticks=levels, format=level_text)
+        legend_above(figure, ax)
     return Plot(key, TEXTS.line("map", along=along), figure)

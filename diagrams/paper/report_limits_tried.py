@@ -8,7 +8,7 @@ from typing import Any
 
 from ...blocks.core import ConfirmationError, LoopwrightError
 from ..admittance import AdmittanceLoop, growth_rate
-from ..frequency import Number
+from ..frequency import Confirmation, Number
 from ..report import Implementation
 from ..report_writing import Section, Table, Texts
 from .moored_gantry import deviation, measured_growth, moored_diagram
@@ -92,5 +92,8 @@ def _tried(loop: AdmittanceLoop, limit: Number, damping: float, path: str) -> It
                 f"{limit.value:.6g} N/m, predicted {predicted:.5g} 1/s; expected them within {WITHIN:g} 1/s.",
                 block=path,
             )
-        how = f"σ = {predicted:.6g} 1/s predicted by the eigenvalues of the reduced loop"
+        how = Confirmation(
+            f"σ = {predicted:.6g} 1/s predicted by the eigenvalues of the reduced loop",
+            "the prediction by the eigenvalues of the reduced loop",
+        )
         yield where, Number(measured, "1/s", WITHIN, how), predicted

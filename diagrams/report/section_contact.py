@@ -104,8 +104,8 @@ def _stiffness(contact: Contact, soft: ContactLimit, numbers: dict[str, Number])
     for b in DAMPINGS:
         found = soft if b == 0.0 else contact.stability_limit("stiffness", damping=b)
         again = f"{found.second_look:.6g} N/m" if math.isfinite(found.second_look) else ""
-        rows.append((f"{b:g} N·s/m", *_enter(found, "ke_limit", f"be_{b:g}", numbers), again))
-    columns = ("b_e", "largest k_e", "oscillates at", "moves", "stable again", "from Re Y = 0")
+        rows.append((f"{b:g}", *_enter(found, "ke_limit", f"be_{b:g}", numbers), again))
+    columns = ("b_e [N·s/m]", "largest k_e", "oscillates at", "moves", "stable again", "from Re Y = 0")
     return Table("Largest stiffness of the environment", columns, tuple(rows))
 
 

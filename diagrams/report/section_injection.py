@@ -8,7 +8,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError, PeriodicLoopError
 from .. import report_figures as figures
-from ..frequency import Number
+from ..frequency import Confirmation, Number
 from ..linearization import Linearization
 from ..measure import FrequencyResponse, frequency_response
 from ..report_writing import Section, Table, Texts
@@ -67,7 +67,10 @@ def injected(case: Case) -> Section | None:
                 text.append(TEXTS.line("refuted", variant=v.title, wire=wire, deviation=worst))
             where = f"{key}.{v.key}"
             low, high = float(found.omega[0]), float(found.omega[-1])
-            how = f"{len(found.omega)} sines from {low:.4g} to {high:.4g} rad/s, amplitude {found.amplitude:g}"
+            how = Confirmation(
+                f"{len(found.omega)} sines from {low:.4g} to {high:.4g} rad/s, amplitude {found.amplitude:g}",
+                "sines at these frequencies in the running co-simulation",
+            )
             numbers[f"{where}.deviation"] = Number(worst, "1", max(own, 1e-12), how)
             numbers[f"{where}.uncertainty"] = Number(
                 own, "1", own, "the last windows, a second amplitude, and the movement of the operating point"

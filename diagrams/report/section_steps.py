@@ -13,7 +13,7 @@ from ...blocks import Saturation
 from ...blocks.core import LoopwrightError, PeriodicLoopError
 from .. import report_figures as figures
 from ..flat import WiredDiagram
-from ..frequency import Number, Realization
+from ..frequency import Confirmation, Number, Realization
 from ..linearization import find_signal
 from ..measure import StepResponse, measure_step, step_response
 from ..report_writing import Plot, Section, Table, Texts
@@ -31,6 +31,10 @@ BEYOND = 3.0
 """Length of a run at least, in times of the limits of its settling and its rise."""
 SAMPLES = (100, 20000)
 """Fewest and most samples of a run."""
+ROUNDING = 1e-12
+"""Size of rounding errors, relative to the largest signal."""
+AGREEMENT = 0.01
+"""Difference of co-simulation and linear model, relative to the largest change, up to which they agree."""
 SIZE = 100.0
 """Size of a step, in amplitudes of the injection check, where none is given."""
 SLOWEST = 1e-6
@@ -99,8 +103,10 @@ def steps(case: Case) -> Section | None:
             saturated = _limits_reached(v.diagram, got)
             for name, before, change in _effort(got, test):
                 key = f"effort.{name.replace('.', '_')}"
-                numbers[f"{where}.{key}"] = Number(change, _unit(v.diagram, name), 1e-9 * change, _how(got))
-                effort.append((_said(test), v.title, name, before, numbers[f"{where}.{key}"]))
+                unit = _unit(v.diagram, name)
+                numbers[f"{where}.{key}"] = Number(change, unit, 1e-9 * abs(change), _how(got))
+                at_first = Number(before, unit, 1e-9 * abs(before), "the run before the step", given=True)
+                effort.append((_said(test), v.title, name, at_first, numbers[f"{where}.{key}"]))
             text += [TEXTS.line("saturated", variant=v.title, wire=test.wire, blocks=saturated)] if saturated else []
             if got.prediction is None:
                 text.append(TEXTS.line("unpredicted", variant=v.title, wire=test.wire))
@@ -218,7 +224,7 @@ def _unit(diagram: WiredDiagram, name: str) -> str:
 
 def _rounded(value: float, size: float) -> float:
     """Return a value, 0 where it is rounding beside values of a size."""
-    return 0.0 if abs(value) <= 1e-12 * max(size, 1e-300) else value
+    return 0.0 if abs(value) <= ROUNDING * max(size, 1e-300) else value
 
 
 def _numbers(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]:
@@ -248,21 +254,35 @@ def _numbers(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]
 
 
 def _deviation(got: StepResponse) -> float:
-    """Return the largest difference of co-simulation and linear model, relative to the largest change."""
+    """Return the largest difference of co-simulation and linear model, relative to the largest change of its signal.
+
+    Entries of one signal share their largest change: one that hardly moves beside the others has no scale of its own.
+    A signal that moves by rounding only does not count.
+    """
     assert got.prediction is not None  # callers look
     both = np.column_stack([got.v, got.y])
-    size = np.max(np.abs(both), axis=0)
-    off = np.max(np.abs(both - got.prediction), axis=0)
-    return float(np.max(off[size > 0] / size[size > 0], initial=0.0))
+    signals = ["", *(name.partition("[")[0] for name in got.outputs)]
+    sizes, off = np.max(np.abs(both), axis=0), np.max(np.abs(both - got.prediction), axis=0)
+    before = np.abs([got.wire_before, *got.before])
+    least = ROUNDING * max(np.max(before, initial=0.0), np.max(sizes, initial=0.0))
+    found = 0.0
+    for signal in set(signals):
+        own = [i for i, name in enumerate(signals) if name == signal]
+        size = float(np.max(sizes[own]))
+        found = max(found, float(np.max(off[own])) / size) if size > least else found
+    return found
 
 
-def _how(got: StepResponse) -> str:
-    if got.prediction is None:
-        return f"the nonlinear co-simulation, {len(got.t)} samples, with and without the step"
-    return (
-        f"the nonlinear co-simulation, {len(got.t)} samples, with and without the step; the linear model differs by "
-        f"{_deviation(got):.2g} of the largest change"
+def _how(got: StepResponse) -> Confirmation:
+    run = Confirmation(
+        f"the nonlinear co-simulation, {len(got.t)} samples, with and without the step",
+        "the nonlinear co-simulation, with and without the step",
     )
+    if got.prediction is None:
+        return run
+    deviation = _deviation(got)
+    agrees = f"the linear model {'agrees' if deviation <= AGREEMENT else 'does not agree'} to {100 * AGREEMENT:g} %"
+    return run.and_by(f"the linear model differs by {deviation:.2g} of the largest change", agrees)
 
 
 def _plot(case: Case, test: StepTest, curves: Mapping[str, StepResponse]) -> Plot:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Block
+from ...blocks.core import Block, print_unit
 from ...fmus.running import Fmu
 from ..frequency import Number
-from ..report_writing import Section, Table, Texts, plain, symbol
+from ..report_writing import Section, Table, Texts, plain
 from ..results import PointOrigin
 from ..wiring import Wire
 from .case import Case
@@ -65,7 +65,7 @@ def subject(case: Case) -> Section:
     for path, block in sorted(diagram.blocks.items()):
         rows = list(_fmu_parameters(block) if isinstance(block, Fmu) else _parameters(block))
         for name, shown, unit, value in rows:
-            parameters.append((path, type(block).__name__, name, shown, symbol(unit)))
+            parameters.append((path, type(block).__name__, name, shown, print_unit(unit)))
             if isinstance(value, float) and np.isfinite(value):
                 numbers[f"{path}.{name}"] = Number(value, unit or "1", 0.0, "given", given=True)
         if isinstance(block, Fmu):

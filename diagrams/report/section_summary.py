@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from ...blocks.core import LoopwrightError
+from ...blocks.core import LoopwrightError, print_unit
 from ..frequency import Number
 from ..linearization import Linearization
-from ..report_writing import Judged, Section, Table, Texts, symbol
+from ..report_writing import Judged, Section, Table, Texts
 from ..requirements import Limit, RequirementResult, Review, Verdict
 from ..studies import WorstCase
 from .case import Case
@@ -99,7 +99,7 @@ def _row(case: Case, result: RequirementResult) -> tuple[Any, ...]:
 
 
 def _required(limit: Limit, unit: str) -> str:
-    shown = symbol(unit) if unit else ""
+    shown = print_unit(unit) if unit else ""
     return f"{limit}{'' if shown in ('', '°') else ' '}{shown}"
 
 
@@ -143,7 +143,7 @@ def _worst_case(found: WorstCase) -> str:
     """Return the line on a worst case: its number, its growth, or the reason why it could not be analysed."""
     worst = found.worst
     number = worst.numbers.get(worst.loop, {}).get(worst.quantity)
-    shown = "" if number is None else symbol(number.unit)
+    shown = "" if number is None else print_unit(number.unit)
     return TEXTS.line(
         "worst_case",
         state=worst.state.name,

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...blocks.core import LoopwrightError
 from ...fmus.running import DerivativeMethod
-from ..frequency import Number, margins
+from ..frequency import Confirmation, Number, margins
 from ..linearization import StepsOnly, linearize
 from ..report_writing import Section, Table, Texts
 from .case import Case
@@ -98,7 +98,10 @@ def widened(wire: str, part: LoopPart) -> Section:
         for name, n in own.items():
             more = _floor(n, error * slopes)
             if more > n.tolerance:
-                why = f"{n.confirmed_by}; tolerance: its FMUs' linear models are right to {error:.1e} of L"
+                why = Confirmation(n.confirmed_by).and_by(
+                    f"tolerance: its FMUs' linear models are right to {error:.1e} of L",
+                    "tolerance: from the error of its FMUs' linear models",
+                )
                 new = replace(n, tolerance=more, confirmed_by=why)
                 changed[id(n)] = numbers[f"{cut_key(v, cut)}.{name}"] = new
     tables = tuple(_renewed(table, changed) for table in part.section.tables)

@@ -1,7 +1,7 @@
 """Figures of a design report, drawn without pyplot."""
 
 from .axes import AxisUnits, set_powers
-from .contact_figures import contact_admittance, contact_map
+from .contact_figures import contact_admittance, contact_map, level_text
 from .drawings import with_drawing
 from .loop_figures import bode, gang, nyquist, response, sensitivities
 from .measured_figures import Measured, injected, measured
@@ -16,6 +16,7 @@ __all__ = [
     "contact_map",
     "gang",
     "injected",
+    "level_text",
     "measured",
     "nyquist",
     "response",

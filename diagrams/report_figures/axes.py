@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ...blocks.core import with_unit
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
@@ -37,11 +39,11 @@ class AxisUnits(NamedTuple):
     @property
     def frequency_label(self) -> str:
         """Label of the frequency axis."""
-        return "frequency [Hz]" if self.hertz else "ω [rad/s]"
+        return with_unit("frequency", "Hz") if self.hertz else with_unit("ω", "rad/s")
 
     def magnitude_label(self, name: str) -> str:
         """Return the label of a magnitude's axis."""
-        return f"{name} [dB]" if self.decibels else name
+        return with_unit(name, "dB" if self.decibels else "1")
 
 
 def set_magnitudes(ax: Axes, axes: AxisUnits) -> None:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...blocks.core import with_unit
 from ..report_writing import Plot, Texts
-from ..results import DARK, GREY, new_figure, style
+from ..results import DARK, GREY, legend_above, new_figure, style
 from .axes import AxisUnits, set_frequencies, set_magnitudes
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def bode(
     """Draw L over frequency, with the margins marked."""
     low, high = _span(loops, found)
     with style():
-        figure = new_figure(3.7)
+        figure = new_figure(3.0)
         top, bottom = figure.subplots(2, 1, sharex=True)
         for name, L in loops.items():
             look = looks[name]
@@ -87,9 +88,9 @@ def bode(
         _degrees(bottom)
         set_frequencies(bottom, 9)
         top.set_ylabel(axes.magnitude_label("|L|"))
-        bottom.set_ylabel("phase of L [°]")
+        bottom.set_ylabel(with_unit("phase of L", "deg"))
         bottom.set_xlabel(axes.frequency_label)
-        top.legend(loc="best")
+        legend_above(figure, top)
     caption = TEXTS.line("bode", wire=wire)
     return Plot(key, caption, figure)
 
@@ -117,7 +118,7 @@ def nyquist(
     crossings = [-1 / p.gain_margin.value for m in found.values() for p in m.phase_crossovers if p.gain_margin.value]
     farthest = min([-1.0, *(x for x in crossings if np.isfinite(x))])
     with style():
-        figure = new_figure(3.3)
+        figure = new_figure(2.9)
         panels = figure.subplots(1, 2 if farthest < NEAR[0] else 1, squeeze=False)[0]
         for ax in panels:
             _draw_nyquist(ax, loops, found, titles, looks, low, high)
@@ -130,13 +131,11 @@ def nyquist(
             panels[0].set_ylim(-0.675 * span, 0.675 * span)
             panels[0].set_title("all crossings")
             near.set_title("near −1")
-        panels[0].legend(loc="lower left" if len(panels) > 1 else "upper left", **_BESIDE[len(panels)])
+        legend_above(figure, panels[0])
     caption = TEXTS.line("nyquist", wire=wire)
     return Plot(key, caption, figure)
 
 
-_BESIDE: Mapping[int, dict[str, Any]] = {1: {"bbox_to_anchor": (1.03, 1.0)}, 2: {"fontsize": "small"}}
-"""Place of a Nyquist diagram's legend: of a single panel to the right of it, where it hides no curve."""
 NEAR = (-2.6, 1.4)
 """Real parts that are drawn near −1."""
 
@@ -200,7 +199,7 @@ def sensitivities(
     """Draw |S| and |T|."""
     low, high = _span(loops, found)
     with style():
-        figure = new_figure(2.5)
+        figure = new_figure(2.1)
         left, right = figure.subplots(1, 2, sharey=True)
         for name, L in loops.items():
             w, value = _response(L, low, high)
@@ -218,7 +217,7 @@ def sensitivities(
             ax.set_xlabel(axes.frequency_label)
             set_frequencies(ax)
             ax.set_ylim(bottom=axes.magnitude(1e-3))
-        left.legend(loc="best")
+        legend_above(figure, left)
     return Plot(key, TEXTS.line("sensitivities", wire=wire), figure)
 
 
@@ -232,7 +231,7 @@ def gang(
 ) -> Plot:
     """Draw the responses from a disturbance at a wire to the next one on the loop, and from there back."""
     with style():
-        figure = new_figure(2.5)
+        figure = new_figure(2.1)
         left, right = figure.subplots(1, 2)
         for name, (title, w, there, back) in curves.items():
             look = looks[name]
@@ -243,7 +242,7 @@ def gang(
             set_frequencies(ax)
             ax.set_title(axes.magnitude_label(name), fontsize="small")
             ax.set_xlabel(axes.frequency_label)
-        left.legend(loc="best")
+        legend_above(figure, left)
     return Plot(key, TEXTS.line("gang", wire=wire, other=other), figure)
 
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ...blocks.core import with_unit
 from ..report_writing import Plot, Texts
-from ..results import BLUE, VERMILION, new_figure, style
+from ..results import BLUE, VERMILION, legend_above, new_figure, style
 from .axes import AxisUnits, set_frequencies, set_magnitudes
 
 if TYPE_CHECKING:
@@ -34,21 +35,23 @@ def injected(
 ) -> Plot:
     """Draw points that were measured in the running co-simulation over linear models, each in its variant's color."""
     with style():
-        figure = new_figure(2.9)
+        figure = new_figure(2.3)
         left, right = figure.subplots(1, 2)
         for name, curve in curves.items():
             _draw_measured(left, right, curve, axes, looks[name], looks[name]["color"])
         _label_measured(left, right, axes)
+        legend_above(figure, left)
     return Plot(key, TEXTS.line("injected", wire=wire), figure)
 
 
 def measured(key: str, wire: str, curve: Measured, axes: AxisUnits) -> Plot:
     """Draw points that were measured elsewhere, with their uncertainty, over the linear model in another color."""
     with style():
-        figure = new_figure(2.9)
+        figure = new_figure(2.3)
         left, right = figure.subplots(1, 2)
         _draw_measured(left, right, curve, axes, {"color": BLUE}, VERMILION, measured="measured")
         _label_measured(left, right, axes)
+        legend_above(figure, left)
     return Plot(key, TEXTS.line("measured", wire=wire, bars=curve.uncertainty is not None), figure)
 
 
@@ -80,8 +83,7 @@ def _draw_measured(
 def _label_measured(left: Axes, right: Axes, axes: AxisUnits) -> None:
     set_magnitudes(left, axes)
     left.set_ylabel(axes.magnitude_label("|L|"))
-    right.set_ylabel("phase of L [°]")
+    right.set_ylabel(with_unit("phase of L", "deg"))
     for ax in (left, right):
         ax.set_xlabel(axes.frequency_label)
         set_frequencies(ax)
-    left.legend(loc="best")

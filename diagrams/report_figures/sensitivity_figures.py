@@ -17,7 +17,7 @@ def sensitivity_bars(key: str, wire: str, title: str, changes: Mapping[str, floa
     names = [name if len(name) <= LONGEST else f"…{name[1 - LONGEST :]}" for name in changes]
     values = [*changes.values()]
     with style():
-        figure = new_figure(0.9 + 0.28 * max(len(values), 1))
+        figure = new_figure(0.75 + 0.22 * max(len(values), 1))
         ax = figure.add_subplot()
         ax.barh(names[::-1], values[::-1], color=[BLUE if v >= 0 else VERMILION for v in values[::-1]], height=0.6)
         ax.axvline(0.0, color=DARK, linewidth=0.6)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..results import DARK, GREY, new_figure, style
+from ...blocks.core import with_unit
+from ..results import DARK, GREY, legend_above, new_figure, style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -24,7 +25,7 @@ def step_responses(
 ) -> Figure:
     """Draw responses to a step: the answer, and of a loop's own wire what is left of a disturbance."""
     with style():
-        figure = new_figure(2.9)
+        figure = new_figure(2.3)
         axes = figure.subplots(1, 1 if to_output else 2, squeeze=False)[0]
         for name, got in curves.items():
             look, title = looks[name], titles[name]
@@ -42,9 +43,9 @@ def step_responses(
                     ax.plot(t[few], dots, "o", color=look["color"], markersize=2.5)
         for ax, name in zip(axes, ("answer, per unit of the step", "rest of a disturbance"), strict=False):
             ax.set_title(name)
-            ax.set_xlabel("time since the step [s]")
+            ax.set_xlabel(with_unit("time since the step", "s"))
             ax.axhline(0.0, color=DARK, linewidth=0.6)
         if not to_output:
             axes[0].axhline(1.0, color=GREY, linewidth=0.6, linestyle=":")
-        axes[0].legend(loc="best")
+        legend_above(figure, axes[0])
     return figure

@@ -5,7 +5,7 @@ from .files import check_files, write_report
 from .model import Judged, Plot, Section, Table
 from .report import Report
 from .templating import Texts
-from .values import plain, symbol
+from .values import plain
 
 __all__ = [
     "DEFINITIONS",
@@ -18,6 +18,5 @@ __all__ = [
     "check_files",
     "plain",
     "read_definitions",
-    "symbol",
     "write_report",
 ]

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
+from ...blocks.core import print_unit
 from ..frequency import Number
 from .definitions import LOOP_TERMS, definition
 from .figures import Picture, embedded
 from .model import Document, Plot, Section, Table
 from .tables import Numbered, TableView, anchor
-from .values import cell, mark, reason, symbol, tolerance_text, value_text
+from .values import cell, mark, reason, tolerance_text, value_text
 
 ELSEWHERE = frozenset({"definitions", "versions", "variants", "fmus"})
 """Entries of ``meta`` that stand in sections."""
@@ -125,7 +126,7 @@ class Page:
                 path,
                 anchor("n", path),
                 value_text(number, 10) + mark(number),
-                symbol(number.unit),
+                print_unit(number.unit),
                 tolerance_text(number),
                 reasons.index(reason(number)) + 1,
                 known[path],

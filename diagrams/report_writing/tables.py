@@ -8,15 +8,16 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ..frequency import MARK, Number
+from ...blocks.core import print_unit
+from ..frequency import MARK, Number, method_of
 from .model import Judged, Table
-from .values import cell, is_numeric, mark, quantity, reason, symbol, tolerance_text, value_text
+from .values import cell, is_numeric, mark, quantity, reason, tolerance_text, value_text
 
 LONG, LONG_DETAILS = 30, 8
 """Rows above which a table, or one in the appendix, may go over to the next page."""
 WIDE = 6
 """Columns above which a table is set small."""
-NO_VALUE = "no value"
+NO_VALUE, NOT_CONFIRMED = "no value", "not confirmed"
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class CellView:
 
 
 @dataclass(frozen=True)
-class Confirmation:
+class NoteView:
     """A line below a table: how numbers were confirmed, and their letter where there are several."""
 
     letter: str
@@ -62,7 +63,7 @@ class TableView:
     headings: tuple[Heading, ...]
     rows: tuple[tuple[CellView, ...], ...]
     note: str
-    confirmations: tuple[Confirmation, ...]
+    confirmations: tuple[NoteView, ...]
     is_long: bool
     """Whether it may go over to the next page."""
 
@@ -99,7 +100,7 @@ class Numbered:
         heads = zip(table.columns, units, right, strict=True)
         headings = [Heading(str(text), _heading_unit(text, unit), flush) for text, unit, flush in heads]
         reasons = _grouped(v for row in table.rows for v in row if isinstance(v, Number))
-        letters = {kind: _letter(i) for i, kind in enumerate(reasons)} if len(reasons) > 1 else {}
+        letters = {method: _letter(i) for i, method in enumerate(reasons)} if len(reasons) > 1 else {}
         rows = []
         for above, row in zip([(), *table.rows], table.rows, strict=False):
             cells = []
@@ -115,8 +116,8 @@ class Numbered:
                 unit = units[i] is None
                 cells.append(self._cell(value, kind, letters, table.digits, first=i == 0, with_unit=unit))
             rows.append(tuple(cells))
-        said = tuple(Confirmation(letters.get(kind, ""), _said(*why)) for kind, why in reasons.items() if why[1])
-        said += tuple(Confirmation(MARK, text) for text in _left_out(table))
+        said = tuple(NoteView(letters.get(method, ""), _said(*why)) for method, why in reasons.items())
+        said += tuple(NoteView(MARK, text) for text in _left_out(table))
         is_long = len(rows) > (LONG_DETAILS if table.details else LONG)
         return TableView(self.count, table.title, tuple(headings), tuple(rows), table.note, said, is_long)
 
@@ -127,9 +128,9 @@ class Numbered:
             return CellView(cell(value), kind, first)
         path = self.paths.get(id(value)) or self.equal.get(value)
         text = quantity(value, digits) if with_unit else value_text(value, digits) + mark(value)
-        why = reason(value) if value.given else f"confirmed by {reason(value)}"
+        why = reason(value) if value.given or not value.confirmed_by else f"confirmed by {reason(value)}"
         about = f"{path + ': ' if path else ''}{tolerance_text(value)}; {why}"
-        letter = letters.get(_kind(_reason(value)), "")
+        letter = letters.get(_method(value), "")
         return CellView(text, kind, False, True, anchor("n", path) if path else "", about, letter)
 
 
@@ -149,31 +150,32 @@ def anchor(kind: str, key: str) -> str:
     return f"{kind}-" + re.sub(r"[^A-Za-z0-9._-]", lambda m: f"_{ord(m[0]):x}_", key)
 
 
-def _kind(reason: str) -> str:
-    """Return how a number was confirmed without the numbers in it."""
-    number = r"[-−]?\d[\d.]*(?:e[-+]?\d+)?(?![\d/])"
-    return re.sub(rf"{number}(?:, {number})*", "…", reason)
+def _method(number: Number) -> str:
+    """Return how a number was confirmed, or why there is none, without what only its single case has."""
+    return _whole(number, method_of(number.confirmed_by))
 
 
 def _grouped(numbers: Iterable[Number]) -> dict[str, tuple[Number, str]]:
-    """Return each kind of confirmation once: as it is where that is the same for all, else without its numbers."""
+    """Return each method of confirmation once: in full where all its numbers have one text, else the method."""
     found: dict[str, tuple[Number, str]] = {}
     for number in numbers:
-        reason = _reason(number)
-        kind = _kind(reason)
-        found[kind] = (number, kind if found.get(kind, (number, reason))[1] != reason else reason)
+        method, text = _method(number), _whole(number, number.confirmed_by)
+        found[method] = (number, text if found.get(method, (number, text))[1] == text else method)
     return found
 
 
-def _reason(number: Number) -> str:
-    """Return how a number was confirmed, or why there is none."""
-    return f"{NO_VALUE}: {number.confirmed_by}" if math.isnan(number.value) else number.confirmed_by
+def _whole(number: Number, why: str) -> str:
+    """Return how a number was confirmed; why there is none; or that it is given, or not confirmed."""
+    if math.isnan(number.value):
+        return f"{NO_VALUE}: {why}" if why else NO_VALUE
+    return str(why) or ("given" if number.given else NOT_CONFIRMED)
 
 
 def _said(number: Number, why: str) -> str:
     """Return a sentence on how a number was confirmed."""
-    text = why[0].upper() + why[1:] if number.given or math.isnan(number.value) else f"Confirmed by {why}"
-    return text if text.endswith(("…", ".")) else f"{text}."
+    plainly = number.given or math.isnan(number.value) or why == NOT_CONFIRMED
+    text = why[0].upper() + why[1:] if plainly else f"Confirmed by {why}"
+    return text if text.endswith(".") else f"{text}."
 
 
 def _left_out(table: Table) -> dict[str, None]:
@@ -195,7 +197,7 @@ def _heading_unit(heading: str, unit: str | None) -> str:
     if unit is None or unit == "1":
         return ""
     words = re.split(r"[\s(),\[\]]+", str(heading))
-    return "" if {unit, symbol(unit), f"/{unit}"} & set(words) else symbol(unit)
+    return "" if {unit, print_unit(unit), f"/{unit}"} & set(words) else print_unit(unit)
 
 
 def _letter(i: int) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ...blocks.core import print_unit
 from ..frequency import MARK, Number
 
 NOTHING = 1e-9
@@ -16,15 +17,6 @@ NOTHING = 1e-9
 ROUNDING = 1e-15
 """Size below which any number is written as 0."""
 _POWERS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_UNITS = {"1": "", "deg": "°"}
-
-
-def symbol(unit: str) -> str:
-    """Return a unit as it is printed: N·s/m, m/s²."""
-    if unit in _UNITS:
-        return _UNITS[unit]
-    raised = re.sub(r"(?<=[A-Za-z])(-?\d+)", lambda m: m[1].translate(_POWERS), unit)
-    return re.sub(r"(?<=[^\s\d])[.*](?=[^\s\d])", "·", raised)
 
 
 def plain(value: float, digits: int = 6) -> str:
@@ -40,6 +32,11 @@ def plain(value: float, digits: int = 6) -> str:
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
     mantissa, _, exponent = f"{value:.{digits}g}".partition("e")
+    return with_power(mantissa, exponent)
+
+
+def with_power(mantissa: str, exponent: str) -> str:
+    """Return a number in print by the parts of its program's notation: its mantissa, and its exponent or nothing."""
     power = f"×10{str(int(exponent)).translate(_POWERS)}" if exponent else ""
     return mantissa.replace("-", "−") + power
 
@@ -57,7 +54,7 @@ def value_text(number: Number, most: int = 6) -> str:
 
 def quantity(number: Number, most: int = 6) -> str:
     """Return a number with its unit, with so many significant digits at most."""
-    text, unit = value_text(number, most), symbol(number.unit)
+    text, unit = value_text(number, most), print_unit(number.unit)
     if not unit or text == "–":
         return text + mark(number)
     return text + ("" if unit == "°" else "\u202f") + unit + mark(number)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks.core import OptionError, replace_file
+from ...blocks.core import OptionError, print_unit, replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -122,6 +122,19 @@ def new_figure(height: float) -> Figure:
     return figure
 
 
+LETTERS = 118
+"""Letters of a legend that fit above a figure, side by side."""
+
+
+def legend_above(figure: Figure, axes: Axes) -> None:
+    """Put the legend of axes above a figure, where it hides no curve; a single curve needs none."""
+    handles, labels = axes.get_legend_handles_labels()
+    if len(labels) < 2:
+        return
+    columns = max(1, min(len(labels), LETTERS // (max(map(len, labels)) + 6)))
+    figure.legend(handles, labels, loc="outside upper left", ncols=columns)
+
+
 def save(figure: Figure, stem: Path) -> tuple[Path, Path]:
     """Write a figure as PNG (150 dpi) and SVG, the same bytes for the same figure, and return the files."""
     files = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
@@ -221,12 +234,7 @@ def _units(run: RecordedSignals, name: str) -> list[str]:
     """Return the unit of every entry, as readers see it."""
     unit = run.unit(name)
     units = unit if isinstance(unit, tuple) else [unit or ""] * _size(run, name)
-    return [_unit_text(u) for u in units]
-
-
-def _unit_text(unit: str) -> str:
-    """Write an FMI unit with superscripts: m/s2 as m/s²."""
-    return "" if unit == "1" else unit.translate(str.maketrans("23", "²³")).replace(".", " ")
+    return [print_unit(u) for u in units]
 
 
 def marker_of(run: RecordedSignals) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from ...blocks.core import ConfirmationError, LoopwrightError, OptionError, SimulationError
 from ..admittance import hold_sources
 from ..flat import WiredDiagram
-from ..frequency import Margins, Number, Realization, disk_margin, margins, mimo_disk_margin, mu_bound
+from ..frequency import Confirmation, Margins, Number, Realization, disk_margin, margins, mimo_disk_margin, mu_bound
 from ..linearization import Linearization, find_signal, linearize, loop_of_variant, trim
 from ..measure import frequency_response, step_response
 from .numbers import numbers_of
@@ -288,6 +288,9 @@ def confirm_parameter(
                 "margin may have a kink there.",
                 block=model.diagram.name,
             )
-        how = f"{row.slope.confirmed_by}; differences of the margin of the changed diagram give {other:.6g}"
+        how = Confirmation(row.slope.confirmed_by).and_by(
+            f"differences of the margin of the changed diagram give {other:.6g}",
+            "differences of the margin of the changed diagram",
+        )
         made.append(replace(row, slope=replace(row.slope, confirmed_by=how)))
     return made

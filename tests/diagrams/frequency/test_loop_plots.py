@@ -119,12 +119,17 @@ def test_several_loops_and_measured_data_stand_in_one_figure(loop):
     data = control.frd(C * P, np.array([1.0, 10.0]), name="measured")
     plain = control.tf([KP], [TAU, 1.0, 0.0], name="plain")
     axes = loop.bode(plain, data, loop).axes[0]
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["L(u) (1)", "plain", "measured", "L(u) (2)"]
+    assert [text.get_text() for text in axes.figure.legends[0].get_texts()] == [
+        "L(u) (1)",
+        "plain",
+        "measured",
+        "L(u) (2)",
+    ]
     w, size = curve(axes, 2)
     assert list(w) == [1.0, 10.0]
     assert np.allclose(10 ** (size / 20), np.abs(C * P))
     assert axes.lines[2].get_marker() == "o"
-    own = loop.bode(plain, labels=["a", "b"]).axes[0].get_legend().get_texts()
+    own = loop.bode(plain, labels=["a", "b"]).legends[0].get_texts()
     assert [text.get_text() for text in own] == ["a", "b"]
 
 

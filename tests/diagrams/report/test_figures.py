@@ -106,7 +106,7 @@ def test_measured_points_and_the_model_have_two_colors_and_bars_of_their_uncerta
     left, right = measured("m", "u", data, AxisUnits()).figure.axes
     model, points = left.get_lines()
     assert model.get_color() != points.get_color()
-    assert {text.get_text() for text in left.get_legend().get_texts()} == {"model", "measured"}
+    assert {text.get_text() for text in left.figure.legends[0].get_texts()} == {"model", "measured"}
     (bars,) = right.collections
     ends = np.array([segment[:, 1] for segment in bars.get_segments()])
     np.testing.assert_allclose(ends - -90.0, np.degrees(np.arcsin(0.2)) * np.array([[-1, 1]] * 20), atol=1e-9)

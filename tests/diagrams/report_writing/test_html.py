@@ -2,9 +2,11 @@
 
 import json
 import math
+import pickle
 import re
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import html5lib
 import pypdfium2
@@ -12,8 +14,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from loopwright.blocks import DefinitionError, Gain, OptionError, Sine
+from loopwright.blocks.core import print_unit, with_unit
 from loopwright.diagrams import Diagram, experiments
-from loopwright.diagrams.frequency.number import Number
+from loopwright.diagrams.frequency.number import Confirmation, Number, method_of
 from loopwright.diagrams.report_figures.drawings import with_drawing
 from loopwright.diagrams.report_writing.definitions import definition
 from loopwright.diagrams.report_writing.files import check_files, write_report
@@ -26,7 +29,6 @@ from loopwright.diagrams.report_writing.values import (
     is_numeric,
     plain,
     quantity,
-    symbol,
     tolerance_text,
     value_text,
 )
@@ -118,16 +120,42 @@ def test_confirmations_stand_below_the_table_by_letters():
     assert "A note with <code>code</code>." in html
 
 
-def test_kinds_of_confirmation_stand_once_and_why_there_is_no_value():
-    numbers = [Number(1.0, "1", 0.0, f"eigenvalues: stable at {x}, unstable at {2 * x}") for x in (0.5, 1.5)]
-    numbers += [Number(math.nan, "1", math.nan, "the loop is not sampled"), Number(2.0, "1", 0.0, "given", given=True)]
+def test_methods_of_confirmation_stand_once_and_why_there_is_no_value():
+    ways = [Confirmation(f"eigenvalues: stable at {x}", "eigenvalues on both sides") for x in (0.5, 1.5)]
+    numbers = [Number(1.0, "1", 0.0, way) for way in ways]
+    numbers += [Number(1.0, "1", 0.0, Confirmation(f"a run of {5} s", "a run"))]
+    numbers += [Number(math.nan, "1", math.nan, "the loop is not sampled"), Number(2.0, "1", 0.0, "", given=True)]
+    numbers += [Number(3.0, "1", 0.0, "")]
     html = to_html(Report("R", (Section("s", "S", tables=(Table("T", ("x",), tuple((n,) for n in numbers)),)),)))
     notes = re.search(r'<p class="note">(.*?)</p>', html)[1].split("<br>")
     assert [re.sub("<.*?>", "", note) for note in notes] == [
-        "a Confirmed by eigenvalues: stable at …, unstable at …",
-        "b No value: the loop is not sampled.",
-        "c Given.",
+        "a Confirmed by eigenvalues on both sides.",
+        "b Confirmed by a run of 5 s.",
+        "c No value: the loop is not sampled.",
+        "d Given.",
+        "e Not confirmed.",
     ]
+    assert re.findall(r"<sup>(.)</sup>", html.partition("</table>")[0]) == ["a", "a", "b", "c", "d", "e"]
+
+
+def test_confirmations_keep_their_methods_when_they_are_joined_and_pickled():
+    one = Confirmation("eigenvalues at 0.5", "eigenvalues").and_by("a run of 3 s", "a run").and_by("gains 1 to 2", "")
+    for each in (one, pickle.loads(pickle.dumps(one)), Confirmation(one)):
+        assert each == "eigenvalues at 0.5; a run of 3 s; gains 1 to 2"
+        assert each.method == "eigenvalues; a run"
+    assert method_of("plain") == "plain"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("up to 1e8 N/m, below 1e-09, by -2.5e-3", "up to 1×10⁸ N/m, below 1×10⁻⁹, by −2.5×10⁻³"),
+        ("found -1.88 (-3); SHA-256, 2026-11-22, x-1, 4e50b9", "found −1.88 (−3); SHA-256, 2026-11-22, x-1, 4e50b9"),
+        ("`1e-3 -2` stays", "<code>1e-3 -2</code> stays"),
+    ],
+)
+def test_numbers_in_texts_stand_as_in_print(text, shown):
+    assert str(marked(text)) == shown
 
 
 def test_digests_and_paths_may_break_and_are_whole():
@@ -145,9 +173,9 @@ def test_a_unit_that_a_whole_column_shares_stands_in_its_heading():
     tree = parsed(to_html(report()))
     assert [text_of(th) for th in next(tree.iter("thead")).iter("th")] == [
         "loop",
-        "phase margin (°)",
+        "phase margin [°]",
         "gain margin",
-        "delay (s)",
+        "delay [s]",
         "Ms",
     ]
 
@@ -216,7 +244,7 @@ def test_a_value_has_the_digits_that_its_tolerance_bears(value, tolerance, text)
 
 
 def test_units_and_tolerances_in_print():
-    assert [symbol(u) for u in ("1", "deg", "N.s/m", "m/s2", "rad/s", "kg*m2")] == [
+    assert [print_unit(u) for u in ("1", "deg", "N.s/m", "m/s2", "rad/s", "kg*m2")] == [
         "",
         "°",
         "N·s/m",
@@ -396,3 +424,17 @@ def test_a_pdf_is_on_the_paper_that_is_asked_for(tmp_path):
 )
 def test_symbols_have_their_index_below_the_line_and_names_stay(text, shown):
     assert str(marked(text)) == shown
+
+
+UNIT_IN_PARENTHESES = re.compile(r"""["'][^"'\n]*\((?:s|1/s|rad/s|Hz|dB|°|deg|m|N|N/m|kg|%|1/s²)\)["']""")
+UNIT_IN_WORDS = re.compile(r"""(?:label|set_[xy]label)\S*["'][^"'\n]* in (?:s|rad/s|Hz|dB|°|m|N)["']""")
+
+
+def test_units_stand_behind_quantities_in_one_way_in_tables_figures_and_on_the_command_line():
+    code = Path(__file__).parents[3] / "diagrams"
+    for file in (*code.rglob("*.py"), *code.rglob("*.j2")):
+        text = file.read_text(encoding="utf-8")
+        for kind in (UNIT_IN_PARENTHESES, UNIT_IN_WORDS):
+            assert not kind.search(text), (file, kind.search(text))
+        assert "N s/m]" not in text, file
+    assert with_unit("damping", "N.s/m") == "damping [N·s/m]"
