@@ -8,9 +8,10 @@ Nothing in it changes but these caches: a run has its own vectors, of parameters
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any, Self, TypeVar, overload
+from typing import Any, Self, TypeVar, cast, overload
 
 import numpy as np
 
@@ -28,6 +29,8 @@ T = TypeVar("T")
 
 LARGEST = 2_000
 """Operations of a tick up to which it is simplified as a whole: a C compiler's time grows faster than they do."""
+MOST_KEPT = 24
+"""Functions of others that are kept with a diagram's own."""
 EXACT_LOOP = 4
 """Values of algebraic loops up to which interpreted and compiled runs solve them alike, to the last bit."""
 
@@ -178,6 +181,24 @@ class FlatDiagram(FlatLayout):
 
     @_shared
     def _loops(self) -> dict[frozenset[TickPattern], Derivative | None]:
+        return {}
+
+    def keep(self, key: Any, make: Callable[[], T]) -> T:
+        """Return what others have made of these functions, by a key of theirs: it is made once, also for other numbers.
+
+        The last ones are kept. What is made must depend on the functions and the key alone, never on numbers.
+        """
+        kept = self._kept
+        if key not in kept:
+            made = make()
+            while len(kept) >= MOST_KEPT:
+                kept.pop(next(iter(kept)))
+            kept[key] = made
+        kept[key] = kept.pop(key)  # the last one asked for
+        return cast("T", kept[key])
+
+    @_shared
+    def _kept(self) -> dict[Any, Any]:
         return {}
 
     def pack(self, path: str, block: Block) -> np.ndarray:

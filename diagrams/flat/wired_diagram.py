@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Mapping
 from fractions import Fraction
 from typing import Protocol, Self
@@ -11,6 +12,10 @@ from ..wiring import CheckedDiagram, Structure, exact_time, stepped_blocks
 from .flat_diagram import FlatDiagram
 from .flatten import flatten, renumber
 from .plant_ticks import own_step
+from .same_functions import find_other_numbers
+
+VARIANTS = 8
+"""Variants with functions of their own that a diagram remembers, as long as they are in use."""
 
 
 class HasBase(Protocol):
@@ -30,10 +35,29 @@ class WiredDiagram(CheckedDiagram):
 
     _flat: dict[tuple[Fraction | None, bool], FlatDiagram]
     _origin: tuple[WiredDiagram, dict[str, Block]] | None
+    _variants: list[weakref.ref[WiredDiagram]]
 
     def _set(self, name: str, table: Structure, loops: str) -> None:
         super()._set(name, table, loops)
-        self.__dict__.update(_flat={}, _origin=None)
+        self.__dict__.update(_flat={}, _origin=None, _variants=[])
+
+    def with_structure(self, structure: Structure, loops: str | None = None) -> Self:
+        """Return the diagram of another structure.
+
+        It shares the functions of this diagram, or of one that was made of it lately, where it differs from that in
+        numbers alone.
+        """
+        found = super().with_structure(structure, loops)
+        own = self if self._origin is None else self._origin[0]
+        for origin in (own, *(other for ref in reversed(own._variants) if (other := ref()) is not None)):
+            blocks = find_other_numbers(origin, found)
+            if blocks is not None:
+                found.__dict__["_origin"] = (origin, blocks)
+                break
+        else:
+            own._variants.append(weakref.ref(found))
+            del own._variants[:-VARIANTS]
+        return found
 
     def renumbered(self, blocks: Mapping[str, Block]) -> Self:
         """Return a variant with other numbers, which shares the functions of this diagram; nothing is checked again.
@@ -48,7 +72,9 @@ class WiredDiagram(CheckedDiagram):
         structure, scheduled = self.structure.copy(), self.scheduled.copy()
         structure.blocks.update(blocks)
         scheduled.blocks.update(blocks)
-        found.__dict__.update(structure=structure, scheduled=scheduled, _flat={}, _origin=(self, dict(blocks)))
+        found.__dict__.update(
+            structure=structure, scheduled=scheduled, _flat={}, _origin=(self, dict(blocks)), _variants=[]
+        )
         return found
 
     def flatten(self, step: float | Fraction | None = None) -> FlatDiagram:

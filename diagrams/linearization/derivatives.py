@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -33,6 +33,7 @@ from ..wiring import Wire, index_of, join, split_entry
 from .mean_stairs import NO_STAIRS, Stairs
 from .plant_models import PlantModel, model_equations, model_step
 
+T = TypeVar("T")
 SLOPE = 2.0**-140
 """Factor of the slopes that imaginary parts carry: so small that its square vanishes beside any value."""
 _RESULTS, _ARGUMENTS = ("x", "z", "y", "dx", "v", "r"), ("x", "w", "d", "e")
@@ -135,12 +136,23 @@ class LocalDerivatives:
         self.evaluators = evaluators
         self._schedules: dict[frozenset[TickPattern], Schedule] = {}
         self._derivatives: dict[frozenset[TickPattern], Derivative] = {}
+        taps = [tuple((tap.port, tap.entries) for tap in group) for group in (inputs, outputs, openings)]
+        self._taps: tuple[Any, ...] = tuple(taps)
         self._workspace = Workspace(flat, evaluators) if flat.loops.slices else None
 
     @cached_property
     def varies(self) -> bool:
         """Whether the flow between ticks depends on time, or on algebraic loops."""
         return bool(self.flat.flow.depends("dx", "t").any()) or self._workspace is not None
+
+    def _kept(self, name: str, acting: frozenset[TickPattern], make: Callable[[], T]) -> T:
+        """Return a function of these taps, made once for all diagrams with the same functions.
+
+        Stairs that are replaced depend on the operating point: functions with them are not kept.
+        """
+        if self.stairs.stairs:
+            return make()
+        return self.flat.keep((name, acting, self._taps), make)
 
     def _make_taps(self, d: ca.MX, c: ca.MX) -> dict[tuple[str, str], Any]:
         """Return a function for each port with an injection or a cut, from its signal to that of the consumers."""
@@ -179,19 +191,24 @@ class LocalDerivatives:
 
     def _trace_closed(self, acting: frozenset[TickPattern]) -> Schedule:
         """Return ``(t, x, w, p) -> c``, the values of the cut ports in the closed diagram."""
-        if acting not in self._schedules:
+
+        def make() -> Schedule:
             flat, symbols = self.flat, self.flat.symbols()
 
             def results(apart: Apart) -> Mapping[str, Any]:
                 instant = evaluate(flat, flat.blocks, acting, **symbols, apart=apart)
                 return {"c": ca.vertcat(*(ca.densify(ca.MX(instant.values[port])) for port in self.cut))}
 
-            self._schedules[acting] = trace_schedule("closed", symbols, results)
+            return trace_schedule("closed", symbols, results)
+
+        if acting not in self._schedules:
+            self._schedules[acting] = self._kept("closed", acting, make)
         return self._schedules[acting]
 
     def _trace_derivative(self, acting: frozenset[TickPattern]) -> Derivative:
         """Return values and derivatives by (x, w, d) at an instant; ``NONE`` is one between ticks."""
-        if acting not in self._derivatives:
+
+        def make() -> Derivative:
             flat, symbols = self.flat, self.flat.symbols()
             d, e = ca.MX.sym("d", self.n_inputs), ca.MX.sym("e", self.stairs.e.total)
             c = ca.MX.sym("c", sum(size(flat.checked.shapes[port]) for port in self.cut))
@@ -205,7 +222,10 @@ class LocalDerivatives:
                 return {**found, "dx": rates(instant), "v": self.stairs.read(instant), "r": loop_mismatch(instant)}
 
             schedule = trace_schedule("parts", {**symbols, "d": d, "e": e, "c": c}, results)
-            self._derivatives[acting] = Derivative(schedule, [(name, None) for name in _ARGUMENTS])
+            return Derivative(schedule, [(name, None) for name in _ARGUMENTS])
+
+        if acting not in self._derivatives:
+            self._derivatives[acting] = self._kept("parts", acting, make)
         return self._derivatives[acting]
 
     def model_step(self, at: OperatingPoint, path: str, z: np.ndarray, h: float, way: str | None) -> PlantModel:

@@ -64,7 +64,8 @@ class DerivativesAlong(LocalDerivatives):
 
         c are the values of the cut ports, r is the mismatch of the algebraic loops.
         """
-        if acting not in self._closed_slopes:
+
+        def make() -> Derivative:
             flat, symbols = self.flat, self.flat.symbols()
 
             def results(apart: Apart) -> Mapping[str, Any]:
@@ -73,7 +74,10 @@ class DerivativesAlong(LocalDerivatives):
                 return {"c": ca.vertcat(*columns) if columns else ca.MX(0, 1), "r": loop_mismatch(instant)}
 
             schedule: Schedule = trace_schedule("closed", symbols, results)
-            self._closed_slopes[acting] = Derivative(schedule, [("x", None)])
+            return Derivative(schedule, [("x", None)])
+
+        if acting not in self._closed_slopes:
+            self._closed_slopes[acting] = self._kept("closed slopes", acting, make)
         return self._closed_slopes[acting]
 
     def differentiate(self, acting: frozenset[TickPattern], t: float, x: np.ndarray, w: np.ndarray) -> Numbers:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from ...blocks.core import Block, FmuError, Layout, LoopwrightError, OptionError
-from ...fmus.running import Derivation, FmuLinearization
+from ...fmus.running import Derivation, FmuLinearization, linearize_fmu
 from ..flat import FlatDiagram, StateLayout
 from ..results import OperatingPoint
 from ..wiring import join, stepped_blocks
@@ -134,11 +134,11 @@ def plant_changes(flat: FlatDiagram, at: OperatingPoint) -> dict[str, np.ndarray
             continue
         now = {**at.plants[path], "inputs": _inputs(flat, at, path, at.z)}
         try:
-            m = block.linear_model(**now)
+            m = linearize_fmu(block, **now)
             change = m.f
         except LoopwrightError:
             try:
-                m = block.step_difference(float(flat.base), **now)
+                m = linearize_fmu(block, h=float(flat.base), **now)
             except LoopwrightError:
                 continue
             change = m.f - m.x0
@@ -226,9 +226,8 @@ def model_step(
         return _identify_model(flat, at, path, z, h)
     else:
         try:
-            step = block.step_difference(
-                h, t=at.plants[path]["t"], state=at.plants[path]["state"], inputs=_inputs(flat, at, path, z)
-            )
+            now = {**at.plants[path], "inputs": _inputs(flat, at, path, z)}
+            step = linearize_fmu(block, h=h, **now)
         except FmuError as error:
             if way == "step":
                 raise
@@ -325,7 +324,7 @@ def _outputs_before(
 def linearize_equations(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> FmuLinearization:
     """Return the linear model of an FMU's equations under the inputs z."""
     point = at.plants[path]
-    return fmu_at(flat, path).linear_model(t=point["t"], state=point["state"], inputs=_inputs(flat, at, path, z))
+    return linearize_fmu(fmu_at(flat, path), t=point["t"], state=point["state"], inputs=_inputs(flat, at, path, z))
 
 
 def _inputs(flat: FlatDiagram, at: OperatingPoint, path: str, z: np.ndarray) -> dict[str, Any]:

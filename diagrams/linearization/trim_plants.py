@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 
 from ...blocks.core import FmuError, SimulationError, elements
-from ...fmus.running import FmuLinearization
+from ...fmus.running import FmuLinearization, linearize_fmu
 from ..flat import FlatDiagram, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
@@ -84,9 +84,8 @@ class Plants:
         return False
 
     def _linearize(self, block: Fmu, point: Mapping[str, Any], *, step: bool) -> FmuLinearization:
-        if step:
-            return block.step_difference(self.h, t=point["t"], state=point["state"], inputs=point["inputs"])
-        return block.linear_model(t=point["t"], state=point["state"], inputs=point["inputs"])
+        here = {name: point[name] for name in ("t", "state", "inputs")}
+        return linearize_fmu(block, h=self.h if step else None, **here)
 
     def point(self, path: str, block: Fmu, xp: np.ndarray, z: np.ndarray) -> dict[str, Any]:
         """Return time, states and inputs of an FMU, the arguments of its linear models."""

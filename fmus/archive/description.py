@@ -199,16 +199,20 @@ def read_description(
         If the file is missing, is no FMU, has neither co-simulation nor model exchange of FMI 1.0 to 3.0, or no binary
         for this platform; if its archive is unsafe, damaged or beyond the limits. Its ``fault`` is an `FmuFault`.
     """
-    path = Path(file).expanduser()
+    path = os.path.expanduser(os.fspath(file))  # blocks ask often: pathlib would take most of the time
     try:
         status = os.stat(path)
     except (FileNotFoundError, NotADirectoryError):
         status = None
     if status is None or not stat.S_ISREG(status.st_mode):
-        found = f"{str(path)!r} is a folder" if path.is_dir() else f"there is no file {str(path)!r}"
+        shown = str(Path(path))
+        found = f"{shown!r} is a folder" if os.path.isdir(path) else f"there is no file {shown!r}"
         raise FmuFileError(f"{found}; expected an FMU. Check the path.", fault=FmuFault.NO_FILE)
     identity = (status.st_dev, status.st_ino, status.st_mtime_ns, status.st_size)
-    return _read(os.path.abspath(path), identity, limits or ArchiveLimits(), tuple(sorted((sizes or {}).items())))
+    return _read(os.path.abspath(path), identity, limits or _USUAL, tuple(sorted(sizes.items())) if sizes else ())
+
+
+_USUAL = ArchiveLimits()
 
 
 @lru_cache(maxsize=256)

@@ -1,6 +1,6 @@
 """FMI calls into a library that is loaded in this process."""
 
-from .bound_calls import BoundCalls, Call, exported_name
+from .bound_calls import BoundCalls, Call, bind_functions, exported_name, list_prototypes
 from .evaluated_exchange import is_smooth
 from .exchange_instance import ExchangeInstance
 from .fmi_calls import ERROR, WARNING, FmiCalls, Log
@@ -30,7 +30,9 @@ __all__ = [
     "NativeStep",
     "StepOptions",
     "StepTime",
+    "bind_functions",
     "check_offered",
     "exported_name",
     "is_smooth",
+    "list_prototypes",
 ]

@@ -11,7 +11,18 @@ from typing import Any
 import numpy as np
 
 from ...blocks.core import FmuError
-from ..calls import CALLS, ERROR, WARNING, BoundCalls, Call, FmiCalls, Log, exported_name
+from ..calls import (
+    CALLS,
+    ERROR,
+    WARNING,
+    BoundCalls,
+    Call,
+    FmiCalls,
+    Log,
+    bind_functions,
+    exported_name,
+    list_prototypes,
+)
 from .endings import describe_memory
 from .library import RemoteLibrary, describe_call, seconds_for
 from .limits import Isolation
@@ -82,7 +93,7 @@ class RemoteCalls(FmiCalls):
             fmu.guid, fmu.modelIdentifier = given["guid"], given["modelIdentifier"]
             fmu.unzipDirectory, fmu.instanceName = given["unzipDirectory"], given["instanceName"]
             fmu.fmiCallLogger, fmu.requireFunctions, fmu._functions = None, True, {}
-            names = [name for name in dir(fmu) if name.startswith(prefix)]
+            names = [name for name, *_ in list_prototypes(kind, prefix)]
             shown = [exported_name(name, prefix, given["modelIdentifier"]) for name in names]
             fmu.dll = RemoteLibrary(process, path, shown, limits)
             fmu.missing_functions = set()
@@ -90,7 +101,7 @@ class RemoteCalls(FmiCalls):
                 if name not in needed and not hasattr(fmu.dll, export):
                     fmu.missing_functions.add(name)
                     setattr(fmu.dll, export, ctypes.CFUNCTYPE(ctypes.c_int)(lambda: ERROR))
-            fmu._loadFunctions()
+            bind_functions(fmu, kind, prefix)
             fmu.component = fmu.callbacks = None
 
         def unload(fmu: Any) -> None:

@@ -3,6 +3,7 @@
 from .derivation import Derivation, DerivativeMethod
 from .exchange import find_exchange_slopes
 from .fmu import Fmu
+from .known_models import linearize_fmu
 from .linearization import FmuLinearization
 from .restored_point import RestoredPoint
 
@@ -13,4 +14,5 @@ __all__ = [
     "FmuLinearization",
     "RestoredPoint",
     "find_exchange_slopes",
+    "linearize_fmu",
 ]

@@ -1,10 +1,13 @@
 """Diagrams with other numbers share the functions of their origin, and run as diagrams that were made anew."""
 
+import math
+
 import pytest
 
 from loopwright.blocks import Gain, Integrator, Pulse, Relay, Sine, Step, TransferFunction
 from loopwright.diagrams import Diagram, experiments, subsystem
 from loopwright.diagrams.flat import functions
+from loopwright.fmus import StepOptions
 
 QUIET = {"progress": False}
 
@@ -38,9 +41,14 @@ CHANGES = {
 }
 
 
+def made_anew(diagram):
+    """Give the diagram without the functions of another one that it may share."""
+    return type(diagram)._of(diagram.name, diagram.structure, diagram.loops)
+
+
 def renumbered(diagram, changes):
     blocks = {}
-    other = diagram.replace(changes)
+    other = made_anew(diagram.replace(changes))
     for path, block in diagram.scheduled.blocks.items():
         if other.scheduled.blocks[path] != block:
             blocks[path] = other.scheduled.blocks[path]
@@ -96,3 +104,73 @@ def test_a_variant_of_an_fmu_runs_is_linearized_and_replaced_as_any_diagram():
         variant.replace({"controller.pid_par.a0": 8000.0}).structure
         == other.replace({"controller.pid_par.a0": 8000.0}).structure
     )
+
+
+def shares(diagram, other):
+    step = None if diagram.has_clock else 0.1
+    return other.flatten(step).origin is diagram.flatten(step).origin
+
+
+def test_a_replaced_diagram_shares_functions_where_numbers_alone_differ():
+    diagram = thermostat()
+    variant = diagram.replace(CHANGES)
+    assert shares(diagram, variant)
+    assert shares(diagram, variant.replace({"relay.on_point": 0.2}))
+    for options in ({}, {"compile": True}):
+        assert_equal_runs(
+            variant.simulate(1.0, **QUIET, **options), made_anew(variant).simulate(1.0, **QUIET, **options)
+        )
+    L, anew = (d.linearize(0.0).A for d in (variant, made_anew(variant)))
+    assert L.tobytes() == anew.tobytes()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"wind.amplitude": 0.0},  # an exact zero is structure of the trace
+        {"filter.sample_time": 0.1},
+        {"filter.delay": 1},
+        {"filter.smooth.denominator": (0.1, 0.3, 1.0)},
+        {"sensor": Gain(gain=2.0, name="other")},
+    ],
+    ids=str,
+)
+def test_other_structure_has_functions_of_its_own(change):
+    diagram = thermostat()
+    other = diagram.replace(change)
+    renamed = "sensor" in change
+    assert shares(diagram, other) is renamed  # names of blocks in functions are their paths
+    assert_equal_runs(other.simulate(0.4, **QUIET), made_anew(other).simulate(0.4, **QUIET))
+
+
+def test_variants_of_other_structure_share_functions_among_themselves():
+    diagram = thermostat()
+    first, second = (diagram.replace({"wind.amplitude": 0.0, "relay.on_point": on}) for on in (0.05, 0.2))
+    assert not shares(diagram, first)
+    assert shares(first, second)
+
+
+def test_blocks_of_users_share_nothing():
+    """Their equations may read what has changed since, such as a constant of their module."""
+    factor = [1.0]
+
+    class Law(Gain):
+        def output(self, t, x, u):
+            return factor[0] * self.gain * u.u
+
+    x = Integrator(name="x", initial_value=1.0)
+    diagram = Diagram("law", x(Law(gain=-1.0, name="law")(x.y)))
+    diagram.simulate(0.1, **QUIET)
+    factor[0] = 2.0
+    other = diagram.replace({"x.initial_value": 2.0})
+    assert not shares(diagram, other)
+    assert other.simulate(1.0, **QUIET)["x.y"][-1] == pytest.approx(2.0 * math.exp(-2.0), rel=1e-6)
+
+
+def test_a_replaced_start_value_of_an_fmu_shares_functions():
+    diagram = experiments.path_following().diagram
+    other = diagram.replace({"plant.start.coulomb_scale": 2.0})
+    assert shares(diagram, other)
+    assert_equal_runs(other.simulate(0.1, **QUIET), made_anew(other).simulate(0.1, **QUIET))
+    asked = diagram.replace({"plant": diagram["plant"].replace(stepping=StepOptions(communication_step=1e-3))})
+    assert not shares(diagram, asked)
