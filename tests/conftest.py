@@ -1,5 +1,6 @@
 """The quick part of products of cases (`support.drawn`), a cache for each worker, and runs that tests share."""
 
+import gc
 import os
 import sys
 from collections import defaultdict
@@ -92,6 +93,13 @@ def pytest_collection_modifyitems(items):
         return first, item.nodeid.partition("::")[0]
 
     items.sort(key=place)
+
+
+def pytest_collection_finish(session):
+    """Collect garbage less often, and never what the collection of the tests has made: a tenth of the set's time."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 50)
 
 
 @pytest.fixture(scope="session", autouse=True)

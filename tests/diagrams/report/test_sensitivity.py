@@ -1,6 +1,7 @@
 """The section on sensitivity to parameters, of a loop with a closed form."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -13,6 +14,15 @@ from loopwright.diagrams.studies import CaseState
 from support.tuned_loops import make_pi_loop, pi_phase_margin
 
 NOTHING = Requirements(stable=False, phase_margin_deg=1.0)
+
+
+@cache
+def worst_phase_margin():
+    """Return a loop, and its worst case over a range of one gain; its confirmation by injection takes seconds."""
+    diagram = make_pi_loop()
+    return diagram, diagram.worst_case(
+        {"p.gain": (0.5, 2.0)}, "u", quantity="phase_margin_deg", count=2, starts=1, steps=1
+    )
 
 
 def test_the_section_tells_the_change_of_a_margin_per_percent_and_how_it_was_confirmed():
@@ -40,8 +50,7 @@ def test_a_diagram_with_an_unstable_loop_has_no_such_section():
 
 
 def test_a_worst_case_gets_a_section_with_the_run_that_confirms_it():
-    diagram = make_pi_loop()
-    found = diagram.worst_case({"p.gain": (0.5, 2.0)}, "u", quantity="phase_margin_deg", count=2, starts=1, steps=2)
+    diagram, found = worst_phase_margin()
     report = analyse(diagram, only=("subject",), worst_case=found)
     (section,) = (s for s in report.sections if s.key == "worst_case")
     number = report.numbers()["worst_case.worst.phase_margin_deg"]
@@ -52,8 +61,7 @@ def test_a_worst_case_gets_a_section_with_the_run_that_confirms_it():
 
 
 def test_a_stable_and_a_failed_worst_case_stand_on_the_first_page():
-    diagram = make_pi_loop()
-    found = diagram.worst_case({"p.gain": (0.5, 2.0)}, "u", quantity="phase_margin_deg", count=2, starts=1, steps=1)
+    diagram, found = worst_phase_margin()
     text = "\n".join(
         map(str, analyse(diagram, only=("subject",), worst_case=found, requirements=NOTHING).sections[0].text)
     )
