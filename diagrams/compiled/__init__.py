@@ -3,6 +3,7 @@
 from .background import BackgroundCode
 from .code import TickCode, compile_ticks, find_obstacle
 from .fused import fuse
+from .fused_code import FusedPlant, compile_fused
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
 from .hybrid_code import compile_hybrid, find_hybrid_obstacle
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
@@ -16,6 +17,7 @@ __all__ = [
     "CompiledHybrid",
     "CompiledLoop",
     "Fired",
+    "FusedPlant",
     "HybridOutcome",
     "HybridReason",
     "MethodOptions",
@@ -26,6 +28,7 @@ __all__ = [
     "TickCode",
     "Watch",
     "bind_call",
+    "compile_fused",
     "compile_hybrid",
     "compile_ticks",
     "find_hybrid_obstacle",

@@ -30,7 +30,7 @@ LARGEST = 6_000
 _FLAGS = ("-fno-math-errno", "-fno-trapping-math", "-fno-builtin-pow")
 # Nobody reads errno, so that sine and cosine of one angle are one call; a power of two stays a power in every bit.
 _HELPER = re.compile(r"^(?=casadi_real\b)", re.MULTILINE)  # a line that defines one
-_MASTER = "loopwright_run"
+MASTER = "loopwright_run"
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +84,18 @@ class TickCode:
         The library, which is loaded as long as this lives.
     loops : mapping
         Equations of the algebraic loops, by the clocks that act, where there are some.
+    master : function or None
+        The C function that goes over ticks; None for the one that all diagrams share.
+    notes : tuple of str
+        What a run tells of its code.
     """
 
     ticks: Mapping[frozenset[TickPattern], StraightTick | GroupedTick]
     exact: bool
     library: ctypes.CDLL
     loops: Mapping[frozenset[TickPattern], StraightTick] = field(default_factory=dict)
+    master: Any = None
+    notes: tuple[str, ...] = ()
 
 
 _COMPILED: WeakKeyDictionary[FlatDiagram, TickCode] = WeakKeyDictionary()
@@ -151,7 +157,7 @@ class TickSources:
         CompilerError
             If there is no compiler.
         """
-        return all(_library_of(text).is_file() for text in (*self.texts, _master_source()))
+        return all(_library_of(text).is_file() for text in (*self.texts, master_source()))
 
     def load(self) -> TickCode:
         """Return the code; libraries that the cache lacks are compiled.
@@ -300,18 +306,28 @@ def master() -> Any:
     FmuError
         If the cache can't be written.
     """
-    function = load_compiled(_master_source())[_MASTER]
+    function = load_compiled(master_source())[MASTER]
     function.restype = None
     return function
 
 
-def _master_source() -> str:
+def master_source() -> str:
+    """Return the C text of the loop over ticks."""
     return read_sources("newton.c", "master.c")
 
 
 @lru_cache(maxsize=64)
-def load_compiled(source: str) -> ctypes.CDLL:
+def load_compiled(source: str, flags: tuple[str, ...] = (), known: str = "") -> ctypes.CDLL:
     """Return the library of a C source, which is compiled unless the cache has it.
+
+    Parameters
+    ----------
+    source : str
+        The C text.
+    flags : tuple of str
+        Flags after those of every library.
+    known : str
+        Whatever else the code depends on, as the processor that flags ask for.
 
     The key in the cache covers the source, the compiler with its version and flags, and the platform. A library is
     loaded only from a folder that belongs to the user alone.
@@ -323,9 +339,9 @@ def load_compiled(source: str) -> ctypes.CDLL:
     FmuError
         If the cache can't be written.
     """
-    library = _library_of(source)
+    library = _library_of(source, flags, known)
     if not _is_whole(library):
-        compile_shared({"code.c": source}, library, more_flags=_FLAGS)
+        compile_shared({"code.c": source}, library, more_flags=(*_FLAGS, *flags))
         size = _size_file(library)
         made = size.with_suffix(f".{os.getpid()}")
         made.write_text(str(library.stat().st_size))
@@ -345,10 +361,12 @@ def _is_whole(library: Path) -> bool:
         return False
 
 
-def _library_of(source: str) -> Path:
+def _library_of(source: str, flags: tuple[str, ...] = (), known: str = "") -> Path:
     """Return the file of a source's library in the cache, whether it is there or not."""
     platform = native_platform()
-    key = hashlib.sha256("\0".join((platform, *describe_compiler(platform), *_FLAGS, source)).encode()).hexdigest()
+    key = hashlib.sha256(
+        "\0".join((platform, *describe_compiler(platform), *_FLAGS, *flags, known, source)).encode()
+    ).hexdigest()
     folder = cache_folder().absolute() / "compiled"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)

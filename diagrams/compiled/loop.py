@@ -194,7 +194,7 @@ class CompiledLoop:
         if code.loops:
             solvers = [self.bind_loops(code, clocks, arguments, (loops or {}).get(clocks)) for clocks in code.ticks]
             self.structure.loops = self._address(solvers, NewtonStructure)
-        self._outcome, self._run = OutcomeStructure(), master()
+        self._outcome, self._run = OutcomeStructure(), code.master or master()
 
     def _array(self, values: np.ndarray) -> int | None:
         self._kept.append(values)

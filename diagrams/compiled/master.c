@@ -48,6 +48,17 @@ typedef struct {
 enum { DONE, FMU_FAILED, FMU_FLAGS, NOT_OK, STOPPED, HALTED };
 enum { INPUTS, STEP, OUTPUTS };
 
+/* A fused loop stands in one unit with the code of its ticks, and of FMUs; then these are no calls by address. */
+#ifndef CALL_TICK
+#define CALL_TICK(l, kind) call((l)->ticks + (kind))
+#endif
+#ifndef STEP_FUSED /* false: nothing is done, and the FMU's own functions are called */
+#define STEP_FUSED(j, p, now, width) false
+#endif
+#define STEP_ARGUMENTS(p, to, n_to, from, n_from) \
+    (p)->instance, to, n_to, (p)->inputs.values, SIZE(p, inputs), from, n_from, (p)->outputs.values, SIZE(p, outputs)
+#define SIZE(p, of) ((p)->version == 2 ? (p)->of.count : (p)->of.size)
+
 typedef struct {
     int64_t ticks, rows; /* that were gone through, and recorded */
     int64_t reason, plant, stage, status;
@@ -91,6 +102,7 @@ static int64_t step_plants(const loop *l, double now, double width, outcome *out
         const plant *p = l->fmus + j;
         int64_t reason;
         out->plant = j;
+        if (STEP_FUSED(j, p, now, width)) continue;
         if ((reason = step_plant(p, now, width, out)) != DONE ||
             (reason = read_plant(p, now, width, l->near, out)) != DONE)
             return reason;
@@ -101,8 +113,8 @@ static int64_t step_plants(const loop *l, double now, double width, outcome *out
 /* Evaluate a tick at which clocks of some kind act; return DONE, or why its results are not to be taken over. */
 static int64_t evaluate(const loop *l, int64_t kind) {
     newton *loops = l->loops ? l->loops + kind : NULL;
-    if (!loops || !loops->n) return call(l->ticks + kind) || l->ok[0] == 0.0 ? NOT_OK : DONE;
-    if (solve_loops(loops, l->x) && !call(l->ticks + kind) && l->ok[0] != 0.0) return DONE;
+    if (!loops || !loops->n) return CALL_TICK(l, kind) || l->ok[0] == 0.0 ? NOT_OK : DONE;
+    if (solve_loops(loops, l->x) && !CALL_TICK(l, kind) && l->ok[0] != 0.0) return DONE;
     undo_loops(loops, l->x); /* Python begins where this has begun */
     return NOT_OK;
 }

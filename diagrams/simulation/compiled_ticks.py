@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import islice
+from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -14,11 +15,13 @@ from ...fmus.calls import FmuInstance, NativeStep
 from ..compiled import (
     BackgroundCode,
     CompiledLoop,
+    FusedPlant,
     NewtonOptions,
     Outcome,
     Reason,
     TickCode,
     bind_call,
+    compile_fused,
     compile_ticks,
     find_obstacle,
 )
@@ -34,6 +37,7 @@ FIRST, LARGEST_CHUNK = 64, 2**20
 WISHED = 0.05
 """Seconds that a chunk takes, half or double; Ctrl-C and the progress bar have their turn after it."""
 _EXACT = 2**53  # up to which every integer is a float64
+_RK4 = 1  # the integrator of exported FMUs that is compiled into a fused loop
 CLOCKS = 16
 """Clocks up to which sets of them are numbered by their bits."""
 _SIGNS = (
@@ -92,8 +96,8 @@ class CompiledTicks:
         """How far results may differ from those of an interpreted run; empty where every bit is the same."""
         largest = max((len(self._flat.active_loops(clocks)) for clocks in self._code.loops), default=0)
         if largest > EXACT_LOOP:
-            return (_LOOPS.format(largest),)
-        return () if self._code.exact else (_SIGNS,)
+            return (*self._code.notes, _LOOPS.format(largest))
+        return self._code.notes + (() if self._code.exact else (_SIGNS,))
 
     def reaches(self, last: int) -> bool:
         """Whether times up to a tick are quotients of integers that a float64 holds."""
@@ -249,7 +253,13 @@ def bind_evaluations(workspace: Workspace, *, every: bool) -> dict[frozenset[Tic
 
 
 def make_compiled(
-    workspace: Workspace, plants: Mapping[str, Plant], stops: Sequence[int], *, every: bool, regular: bool
+    workspace: Workspace,
+    plants: Mapping[str, Plant],
+    stops: Sequence[int],
+    *,
+    every: bool,
+    regular: bool,
+    fuse: bool = False,
 ) -> tuple[CompiledTicks | None, tuple[str, ...]]:
     """Return the ticks of a run in C, None where they can't be had, and messages about them.
 
@@ -257,17 +267,36 @@ def make_compiled(
     ----------
     regular : bool
         Whether every plant steps once from each tick to the next.
+    fuse : bool, default False
+        Compile ticks and plants of our own together, for the processor of this machine.
     """
     native = _native(plants)
     reason = find_obstacle(workspace.flat) or find_obstacle_at_ticks(workspace.flat, plants, native, regular=regular)
     if reason is None:
         try:
-            found = CompiledTicks(workspace, native, stops, every=every)
+            code = _fuse(workspace.flat, native, every=every) if fuse else None
+            found = CompiledTicks(workspace, native, stops, every=every, code=code)
         except CompilerError as error:
             reason = str(error)
         else:
             return found, found.messages
     return None, (f"Interpreted, though compile=True asks for C: {reason.rstrip('.')}.",)
+
+
+def _fuse(flat: FlatDiagram, native: Mapping[str, FmuInstance], *, every: bool) -> TickCode:
+    from ...fmus.running import Fmu  # only such a run needs the block
+
+    plants = {}
+    for path, plant in native.items():
+        block, step = flat.table.blocks[path], plant.native
+        assert isinstance(block, Fmu)
+        assert step is not None
+        declared = block.description.variables.get("integrator")
+        integrator = block.start.get("integrator", None if declared is None else declared.start)
+        file = Path(block.file) if integrator == _RK4 else None
+        to, of = (() if ports is None else ports.read_references() for ports in (step.inputs, step.outputs))
+        plants[path] = FusedPlant(file, to, of)
+    return compile_fused(flat, kinds_of(flat, every=every), plants)
 
 
 class LaterTicks:

@@ -72,7 +72,7 @@ class Engine:
         self.continuous: Continuous | None = None
         self._stops = StopConditions(flat, self.workspace.log, self._find_asking)
         self._passes_on = check_start_exchange(options.start_exchange)
-        self._compile = check_compile(options.compile)
+        self._compile, self._fuse = check_compile(options.compile, fuse=options.fuse), options.fuse
         self._changed = False  # whether C has taken over within the run
         self._compiled: CompiledTicks | HybridTicks | None = None
         self.messages: tuple[str, ...] = ()
@@ -214,7 +214,7 @@ class Engine:
             self.messages += message
             return ticks
         found, message = make_compiled(
-            self.workspace, self.plants, self._stops.entries, every=self.every_tick, regular=regular
+            self.workspace, self.plants, self._stops.entries, every=self.every_tick, regular=regular, fuse=self._fuse
         )
         self.messages += message
         return found

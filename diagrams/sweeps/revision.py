@@ -25,7 +25,7 @@ from .samples import Sample
 
 _OURS = __name__.partition(".")[0]
 _SILENT = ("progress", "compile")
-"""Options of a run that change no result."""
+"""Options of a run that change no result; in fused runs, "compile" does in last digits."""
 
 
 def revision_of(plan: Plan) -> str:
@@ -34,7 +34,8 @@ def revision_of(plan: Plan) -> str:
     Equations count by their traces, so that a change in a function that they call is seen; those of blocks that Python
     evaluates count by their source. FMUs count by their content. A function of the user counts by its own code.
     """
-    options = {name: value for name, value in plan.options.items() if name not in _SILENT}
+    silent = _SILENT[:1] if plan.options.get("fuse") else _SILENT
+    options = {name: value for name, value in plan.options.items() if name not in silent}
     parts = (
         _of_diagram(plan.diagram), repr(float(plan.duration)), _text(options), repr(plan.signals),
         _text(plan.reductions), repr(plan.seeds), ca.CasadiMeta.version(),

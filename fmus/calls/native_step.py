@@ -20,6 +20,10 @@ class NativeTransfer:
     values: int
     size: int
 
+    def read_references(self) -> tuple[int, ...]:
+        """Return the value references of the ports."""
+        return tuple((ctypes.c_uint32 * self.count).from_address(self.references))
+
 
 @dataclass(frozen=True)
 class NativeStep:

@@ -2,10 +2,11 @@
 
 from .compiler import SUFFIXES, TARGETS, compile_shared, describe_compiler
 from .from_block import build, model_spec
+from .inlined import inline_model, own_functions
 from .model import Integrator, ModelSpec, Variable
 from .package import build_fmu, clear_cache
 from .python_fmu import build_python
-from .tuning import tune
+from .tuning import describe_processor, processor_flags, tune
 
 __all__ = [
     "SUFFIXES",
@@ -19,6 +20,10 @@ __all__ = [
     "clear_cache",
     "compile_shared",
     "describe_compiler",
+    "describe_processor",
+    "inline_model",
     "model_spec",
+    "own_functions",
+    "processor_flags",
     "tune",
 ]

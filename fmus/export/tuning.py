@@ -18,6 +18,18 @@ from .package import FOLDERS2, fmi_headers, zip_files
 _FLAGS = ("-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math")
 
 
+def processor_flags() -> tuple[str, ...]:
+    """Return the flags of a compiler for the processor of this machine, with products and sums fused.
+
+    Raises
+    ------
+    CompilerError
+        If there is no compiler.
+    """
+    zig_or_other = find_compiler().zig or not native_platform().startswith("x86")
+    return (*_FLAGS, "-mcpu=native" if zig_or_other else "-march=native")
+
+
 def tune(path: str | os.PathLike[str]) -> Path:
     """Return an FMU with its binary compiled anew for the processor of this machine.
 
@@ -43,9 +55,8 @@ def tune(path: str | os.PathLike[str]) -> Path:
             f"Loopwright has not built {str(file)!r} on this machine, and compiles no sources of others; expected an "
             "FMU of loopwright.fmus.build. Run it as it is, without fuse=True.",
         )
-    compiler, target = find_compiler(), native_platform()
-    flags = (*_FLAGS, "-mcpu=native" if compiler.zig or not target.startswith("x86") else "-march=native")
-    parts = (*describe_compiler(target), *flags, _describe_processor())
+    compiler, target, flags = find_compiler(), native_platform(), processor_flags()
+    parts = (*describe_compiler(target), *flags, describe_processor())
     key = hashlib.sha256(content + "\0".join(parts).encode()).hexdigest()
     out = cache_folder().absolute() / "tuned" / key[:32] / file.name
     if out.is_file() and is_built_here(hashlib.sha256(out.read_bytes()).hexdigest()):
@@ -68,7 +79,7 @@ def tune(path: str | os.PathLike[str]) -> Path:
 
 
 @lru_cache(maxsize=1)
-def _describe_processor() -> str:
+def describe_processor() -> str:
     """Return the processor's name and what it can do: a cache may be shared among machines."""
     try:
         first = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0]

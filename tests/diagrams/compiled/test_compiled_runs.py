@@ -272,12 +272,12 @@ def test_a_folder_that_others_can_write_is_not_trusted(tmp_path, monkeypatch, fr
 
 def test_a_library_that_was_cut_off_is_compiled_again(tmp_path, monkeypatch, fresh):
     monkeypatch.setenv("LOOPWRIGHT_CACHE", str(tmp_path))
-    source = code._master_source()
+    source = code.master_source()
     library = code._library_of(source)
     code.load_compiled(source)
     part = library.read_bytes()[: library.stat().st_size // 2]
     library.unlink()  # it is loaded, and must not change under this process
     library.write_bytes(part)
     code.load_compiled.cache_clear()
-    assert code._MASTER in str(code.load_compiled(source)[code._MASTER].__name__)
+    assert code.MASTER in str(code.load_compiled(source)[code.MASTER].__name__)
     assert library.stat().st_size > len(part)

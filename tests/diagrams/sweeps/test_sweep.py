@@ -477,7 +477,7 @@ def test_a_reduction_that_returns_nothing_is_a_failure():
 @pytest.mark.parametrize("how", [{"workers": 1}, {"workers": 2}, {"workers": 1, "compile": False}])
 def test_fused_runs_have_the_bits_of_fused_single_runs(how):
     experiment = experiments.hand_guiding()
-    single = experiment.simulate(fuse=True, compile=True, **QUIET)
+    single = experiment.simulate(fuse=True, compile=how.get("compile", True), **QUIET)
     found = experiment.sweep({"plant.coulomb_scale": (1.0, 0.5)}, signals="plant.position", fuse=True, **how, **QUIET)
     assert not np.array_equal(single["plant.position"], experiment.simulate(**QUIET)["plant.position"])
     assert np.array_equal(found["plant.position"][0], single["plant.position"])

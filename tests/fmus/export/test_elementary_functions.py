@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import loopwright.fmus.export as export
-from loopwright.fmus.export import compile_shared
+from loopwright.fmus.export import compile_shared, own_functions, processor_flags
 from loopwright.fmus.export.elementary_tables import FUNCTIONS, prepare_functions, restore_functions
 from loopwright.fmus.models import gantry
 
@@ -216,3 +216,18 @@ def test_an_fmu_asks_the_platform_for_none_of_them():
         assert "sources/elementary.c" in archive.namelist()
     assert b"\0tanh\0" not in held
     assert b"\0sin\0" not in held
+
+
+def test_the_functions_of_fused_code_err_by_a_few_units_in_the_last_place_of_1(tmp_path):
+    names = ("sin", "cos", "tanh")
+    before, after = own_functions(" ".join(f"{name}(x)" for name in names), "k")
+    text = (
+        before + "".join(ONE_FUNCTION.format(name, "").replace(f" lw_{name}(", f" {name}(") for name in names) + after
+    )
+    compile_shared({"all.c": text}, tmp_path / "fast.so", more_flags=processor_flags())
+    fast, rng = Functions(tmp_path / "fast.so"), np.random.default_rng(7)
+    for name in names:
+        x = np.concatenate([rng.uniform(-25, 25, 500), signed(rng, 10 ** rng.uniform(-12, 6, 500)), [0.0]])
+        exact = np.array([float(getattr(mpmath, name)(mpmath.mpf(float(v)))) for v in x])
+        assert np.abs(fast(name, x) - exact).max() < 5e-16
+        assert np.isnan(fast(name, [math.nan])).all()
