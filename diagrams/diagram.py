@@ -248,7 +248,7 @@ class Diagram(VariedDiagram):
         Raises
         ------
         UnknownNameError, ShapeError, OptionError, ParameterError
-            Ports that don't fit; a point that is not at rest; a plant without a model of its equations; several rates.
+            Ports that don't fit; a point not at rest; a plant without a model of its equations; a force behind states.
         """
         from .admittance import make_contact
 

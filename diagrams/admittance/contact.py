@@ -19,7 +19,7 @@ from .contact_limits import ContactLimit, ContactMap, CoupledLoop, check_propert
 from .contact_loop import close_loop, join_environment
 from .contact_parts import ContactParts, take_apart
 from .contact_ports import Ports
-from .rendered import CONTINUOUS, HIGHEST, LOWEST, OFF_PATH, SAMPLED, Passivity, find_negative
+from .rendered import CONTINUOUS, HIGHEST, LOWEST, OFF_PATH, PERIODIC, SAMPLED, Passivity, find_negative
 from .stability_limits import PER_DECADE
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class Contact:
     side : str
         ``"par"`` or ``"perp"`` if the direction was given so, else "".
     sample_time : float
-        Sample time of the controller in s; 0 if the diagram is continuous.
+        Sample time of the controller in s, the common period of several rates; 0 if the diagram is continuous.
     point : OperatingPoint
         Operating point of the linear model.
     derivation : Derivation
@@ -70,8 +70,18 @@ class Contact:
 
     @property
     def sample_time(self) -> float:
-        """Sample time of the controller in s; 0 if the diagram is continuous."""
+        """Sample time of the controller in s, the common period of several rates; 0 if the diagram is continuous."""
         return self.parts.sample_time
+
+    @property
+    def shortest(self) -> float:
+        """Shortest time between ticks in s: the sample time in one rate; 0 if the diagram is continuous."""
+        return self.parts.shortest
+
+    @property
+    def entry(self) -> str | None:
+        """Wire to which the environment's force is added; None if the controller does not measure it."""
+        return self.parts.entry
 
     @property
     def derivation(self) -> Derivation:
@@ -89,7 +99,8 @@ class Contact:
         Parameters
         ----------
         omega : float or array
-            Frequencies in rad/s; those of a sampled loop lie below the Nyquist frequency π/T.
+            Frequencies in rad/s; those of a sampled loop lie below the Nyquist frequency π/T. In several rates T is
+            the shortest time between ticks here, and the admittance is the velocity's part at the force's frequency.
 
         Raises
         ------
@@ -118,7 +129,7 @@ class Contact:
         OptionError
             If an end of the scan is not positive, or not below the Nyquist frequency.
         """
-        T = self.sample_time
+        T = self.parts.shortest
         top = (math.pi / T * (1.0 - 1e-9) if T else HIGHEST) if high is None else high
         intervals = find_negative(lambda w: compute_admittance(self.parts, self.direction, w), low, top, per_decade)
         poles = np.linalg.eigvals(close_loop(self.parts, join_environment(self.parts, self.direction)).A)
@@ -129,7 +140,9 @@ class Contact:
             intervals=intervals,
             scanned=(low, top),
             stable=stable,
-            caveat=(SAMPLED if T else CONTINUOUS) + (OFF_PATH if off_path else ""),
+            caveat=(SAMPLED if T else CONTINUOUS)
+            + (PERIODIC if self.parts.ticks else "")
+            + (OFF_PATH if off_path else ""),
             findings=self.findings,
         )
 
@@ -260,7 +273,7 @@ def make_contact(
     ports = Ports.find(diagram, diagram.flatten_like(point), port, position, velocity)
     parts, unusual = take_apart(diagram, ports, force, point, taken)
     if unusual:  # such as a sensor's first sample: at rest, the next tick has the same states
-        point = _move_on(point)
+        point = _move_on(point, round(parts.sample_time / float(point.base)))
         parts, _ = take_apart(diagram, ports, force, point, taken)
     unit, side, scale = _find_direction(diagram, point, ports, direction, parts.force.shape[1])
     return Contact(
@@ -268,11 +281,11 @@ def make_contact(
     )
 
 
-def _move_on(point: OperatingPoint) -> OperatingPoint:
-    """Return the operating point of the next tick of a diagram that rests."""
-    h = float(point.base)
+def _move_on(point: OperatingPoint, count: int) -> OperatingPoint:
+    """Return the operating point some ticks later, of a diagram that rests."""
+    h = float(point.base * count)
     plants = {path: {**plant, "t": plant["t"] + h} for path, plant in point.plants.items()}
-    return replace(point, t=point.t + h, tick=point.tick + 1, plants=plants)
+    return replace(point, t=point.t + h, tick=point.tick + count, plants=plants)
 
 
 def _find_direction(

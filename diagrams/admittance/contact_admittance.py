@@ -2,7 +2,8 @@
 
 Y(jω) = dᵀṗ/F along the direction d of the contact, in m/(N s). In a sampled loop F(t) = e^{jωt} acts in continuous
 time, the inputs of the plant are held, and Y is the fundamental of the velocity: the mean of dᵀṗ(t) e^{−jωt} over a
-sample. It does not contain the aliases of ω.
+sample. It does not contain the aliases of ω. In several rates the mean is that over the period: the velocity contains
+other frequencies, too, ω + 2πk/T, and Y is its part at ω alone.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...blocks.core import Array, Finding, OptionError
-from .contact_loop import close_loop, join_environment
+from .contact_loop import Joined, close_loop, join_environment
 from .contact_parts import ContactParts
 
 
@@ -49,7 +50,7 @@ def look_again(parts: ContactParts, direction: np.ndarray, omega: float) -> floa
     from scipy.optimize import brentq
 
     low, high = (1.0 - BESIDE) * omega, (1.0 + BESIDE) * omega
-    if not 0.0 < low < high < (math.pi / parts.sample_time if parts.sample_time else math.inf):
+    if not 0.0 < low < high < (math.pi / parts.shortest if parts.shortest else math.inf):
         return math.nan
 
     def real(w: float) -> float:
@@ -69,7 +70,7 @@ def compute_admittance(parts: ContactParts, direction: np.ndarray, omega: Array)
     OptionError
         If a frequency is not positive, or not below the Nyquist frequency π/T of a sampled loop.
     """
-    w, T = np.asarray(omega, dtype=float), parts.sample_time
+    w, T = np.asarray(omega, dtype=float), parts.shortest
     top = math.pi / T if T else math.inf
     if not np.all((w > 0.0) & (w < top)):
         raise OptionError(
@@ -90,10 +91,40 @@ def _continuous(parts: ContactParts, direction: np.ndarray, w: np.ndarray) -> np
 
 
 def _sampled(parts: ContactParts, direction: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Return the fundamental; states at a tick are taken relative to F at that tick."""
+    joined = join_environment(parts, direction)
+    loop = close_loop(parts, joined)
+    n, many = joined.B.shape
+    turning = {tick.duration: _turn(joined, w, tick.duration) for tick in parts.controllers}
+    steps = []
+    for step, tick in zip(loop.every_step, parts.controllers, strict=True):
+        z, push, mean = turning[tick.duration]
+        drive = np.broadcast_to(step.at_tick, (*w.shape, *step.at_tick.shape)).astype(complex)
+        drive[..., :n, :] += push
+        steps.append((z, step, drive, mean, tick.duration))
+    # over the period: z s = A s + drive, each relative to F at its tick
+    z, A, drive = steps[0][0], loop.A, steps[0][2]
+    for z_k, step, drive_k, *_ in steps[1:]:
+        drive = step.A @ drive + z * drive_k
+        z = z * z_k
+    states = np.linalg.solve(z * np.eye(len(A)) - A, drive)
+    velocity = np.concatenate([direction @ parts.velocity, np.zeros(many + 1)])
+    found: np.ndarray = np.zeros(w.shape, dtype=complex)
+    for z_k, step, drive_k, mean, duration in steps:
+        by_state, by_force = step.inputs
+        u = by_state @ states + by_force
+        now = np.concatenate([states[..., :n, :], u, np.ones((*w.shape, 1, 1))], axis=-2)
+        share = duration / parts.sample_time if parts.ticks else 1.0
+        found = found + share * (velocity @ (mean @ now))[..., 0]
+        if parts.ticks:
+            states = (step.A @ states + drive_k) / z_k
+    return found
+
+
+def _turn(joined: Joined, w: np.ndarray, T: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return e^{jωT}, the states that F = e^{jωt} makes over the time T, and the mean of (x, u, F) e^{−jωt} over it."""
     from scipy.linalg import expm
 
-    T, joined = parts.sample_time, join_environment(parts, direction)
-    loop = close_loop(parts, joined)
     n, many = joined.B.shape
     every = n + many + 1
     # x, the held u and F = e^{jωt} as one system, times e^{−jωt}, and its mean over a sample
@@ -104,13 +135,4 @@ def _sampled(parts: ContactParts, direction: np.ndarray, w: np.ndarray) -> np.nd
     turning[..., :every, every:] = np.eye(every) / T
     turned = np.asarray(expm(turning * T))
     z = np.exp(1j * w * T)[..., None, None]
-    push = z * turned[..., :n, every - 1 : every]
-    mean = turned[..., :every, every:]
-    drive = np.broadcast_to(loop.at_tick, (*w.shape, *loop.at_tick.shape)).astype(complex)
-    drive[..., :n, :] += push
-    states = np.linalg.solve(z * np.eye(len(loop.A)) - loop.A, drive)
-    by_state, by_force = loop.inputs
-    u = by_state @ states + by_force
-    now = np.concatenate([states[..., :n, :], u, np.ones((*w.shape, 1, 1))], axis=-2)
-    velocity = np.concatenate([direction @ parts.velocity, np.zeros(many + 1)])
-    return np.asarray((velocity @ (mean @ now))[..., 0])
+    return z, z * turned[..., :n, every - 1 : every], turned[..., :every, every:]

@@ -34,6 +34,8 @@ GROWN = 5.0
 """Largest growth of the mode in a run, as an exponent."""
 DECAYED = 9.0
 """Time that other modes have to decay, in their time constants relative to the mode's own."""
+UNEVEN = 1e-3
+"""Relative difference of the times between samples up to which they are even."""
 LONGEST = 8.0
 """Longest time in s that is waited for other modes."""
 
@@ -113,8 +115,8 @@ def confirm_limit(
     values = [factor * tried for factor in FACTORS]
     predicted = [trials.find_mode(value) for value in values]
     within = WITHIN * max(abs(mode.real) for mode in predicted)
-    omega = max(abs(mode.imag) for mode in predicted)
-    step = contact.sample_time or STEP
+    omega = max(trials.find_frequency(mode) for mode in predicted)
+    step = contact.shortest or STEP
     most = GROWN / max(abs(mode.real) for mode in predicted)
     window = min(max(PERIODS * 2 * math.pi / omega if omega else WINDOW, FEWEST * step), WINDOW, 0.35 * most)
     begin = max(_others_decay(trials, value, window) for value in values)
@@ -123,7 +125,7 @@ def confirm_limit(
     found = []
     for factor, value, mode in zip(FACTORS, values, predicted, strict=True):
         t, speed, fastest = trials.run(value, push, duration)
-        measured = measure_growth(t, speed, abs(mode.imag), begin, window)
+        measured = measure_growth(t, speed, trials.find_frequency(mode), begin, window)
         found.append(ContactTrial(factor, value, float(mode.real), measured, fastest))
     result = ContactConfirmation(limit, found[0], found[1], within, duration, trials.method, tried)
     coarse = ""
@@ -161,7 +163,7 @@ def measure_growth(t: np.ndarray, signal: np.ndarray, omega: float, begin: float
     Parameters
     ----------
     t, signal : (N,) array
-        Equally spaced times in s, and the signal.
+        Times in s, and the signal.
     omega : float
         Frequency of the mode in rad/s.
     begin, window : float
@@ -173,6 +175,9 @@ def measure_growth(t: np.ndarray, signal: np.ndarray, omega: float, begin: float
     >>> round(measure_growth(t, np.exp(-0.3 * t) * np.sin(80 * t), 80.0, 0.5, 1.0), 4)
     -0.3
     """
+    gaps = np.diff(t)
+    if np.max(gaps) > (1.0 + UNEVEN) * np.min(gaps):
+        return _measure_uneven(t, signal, omega, begin, window)
     dt = float(t[1] - t[0])
     first, length = round(begin / dt), round(window / dt)
     weight = np.hanning(length + 2)[1:-1]
@@ -181,6 +186,17 @@ def measure_growth(t: np.ndarray, signal: np.ndarray, omega: float, begin: float
         part = slice(k, k + length)
         sizes.append(abs(np.sum(weight * signal[part] * np.exp(-1j * omega * t[part]))))
     return float(np.log(sizes[1] / sizes[0]) / (length * dt))
+
+
+def _measure_uneven(t: np.ndarray, signal: np.ndarray, omega: float, begin: float, window: float) -> float:
+    """Return the growth rate by samples at uneven times, each of which counts by the time around it."""
+    turned = signal * np.exp(-1j * omega * t) * np.gradient(t)
+    sizes = []
+    for start in (begin, begin + window):
+        share = (t - start) / window
+        weight = np.where((share > 0.0) & (share < 1.0), 1.0 - np.cos(2.0 * np.pi * share), 0.0)
+        sizes.append(abs(np.sum(weight * turned)))
+    return float(np.log(sizes[1] / sizes[0]) / window)
 
 
 def _check(contact: TriedContact, limit: ContactLimit, push: float) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from ...blocks.core import Array, ConfirmationError, Finding, OptionError, near, on_one_thread
 from ..frequency import Number
 from .contact_loop import ClosedLoop, Modes, close_loop, controller_rows, join_environment, split_modes
+from .contact_motion import find_direction, find_frequency
 from .contact_parts import ContactParts
 from .stability_limits import (
     CONFIRMED_AT,
@@ -31,8 +32,6 @@ FEWEST_PER_DECADE = 30
 """Fewest points of a scan in a decade: above k/M = (π/T)², stability changes several times in one."""
 _ROUNDING = 1e-12
 """Relative rounding error of Brent's method."""
-_ROUNDED = 1e-9
-"""Entry of a unit vector below which it is rounding."""
 _ESTIMATED = 10.0
 """Factor by which a stated error of differences may be too small."""
 
@@ -50,7 +49,8 @@ class ContactLimit:
     unit : str
         Unit of the limit.
     frequency : float
-        Frequency in rad/s at which the loop oscillates there, 0 if it only grows; NaN without a limit.
+        Frequency in rad/s at which the loop oscillates there, 0 if it only grows; NaN without a limit. It is that of
+        the strongest part of the motion in continuous time: a sampled loop's pole leaves it open up to its aliases.
     direction : tuple of float
         Unit vector, in the axes of the force, along which the unstable mode moves the contact most; empty without a
         limit. It need not be the direction of the environment.
@@ -155,24 +155,15 @@ class CoupledLoop:
 
     def fastest_mode(self, value: float) -> tuple[float, tuple[float, ...]]:
         """Return the frequency of the mode that grows fastest, in rad/s, and the direction in which it moves."""
-        A = self.close(np.float64(value)).A
-        if not np.all(np.isfinite(A)):
+        loop = self.close(np.float64(value))
+        if not np.all(np.isfinite(loop.A)):
             return math.nan, ()
-        found, vectors = np.linalg.eig(self.modes.reduce(A))
+        found, vectors = np.linalg.eig(self.modes.reduce(loop.A))
         rates = to_rates(self.parts, found)
         i = int(np.argmax(rates.real))
-        return float(abs(rates[i].imag)), self._move(self.modes.right @ vectors[:, i])
-
-    def _move(self, state: np.ndarray) -> tuple[float, ...]:
-        """Return the unit vector of the largest motion of the contact in a mode."""
-        n = len(self.parts.plant.A)
-        moved = self.parts.position @ state[:n]
-        if not np.linalg.norm(moved):
-            moved = self.parts.velocity @ state[:n]
-        axis = np.linalg.svd(np.stack([moved.real, moved.imag], axis=-1))[0][:, 0]
-        towards = axis @ self.direction
-        axis = axis * (-1.0 if towards < 0.0 or (towards == 0.0 and axis[np.argmax(np.abs(axis))] < 0.0) else 1.0)
-        return tuple(float(v) if abs(v) > _ROUNDED else 0.0 for v in axis)
+        state = self.modes.right @ vectors[:, i]
+        frequency = find_frequency(self.parts, loop, complex(rates[i]), state)
+        return frequency, find_direction(self.parts, self.direction, state)
 
     def find_fixed_growth(self) -> tuple[float, float, tuple[float, ...]] | None:
         """Return σ, frequency and direction of an unstable mode that no such environment moves, or None.
@@ -187,9 +178,11 @@ class CoupledLoop:
             return None
         pole = fixed[int(np.argmax(excess))]
         rate = to_rates(self.parts, np.array([pole]))[0]
-        found, vectors = np.linalg.eig(self.close(np.float64(0.0)).A)
-        i = int(np.argmin(np.abs(found - pole)))
-        return float(rate.real), float(abs(rate.imag)), self._move(vectors[:, i])
+        loop = self.close(np.float64(0.0))
+        found, vectors = np.linalg.eig(loop.A)
+        state = vectors[:, int(np.argmin(np.abs(found - pole)))]
+        frequency = find_frequency(self.parts, loop, complex(rate), state)
+        return float(rate.real), frequency, find_direction(self.parts, self.direction, state)
 
     def growth_by_control(self, value: float) -> float:
         """Return σ in 1/s from python-control's discretization and feedback of plant and controller."""
@@ -200,14 +193,19 @@ class CoupledLoop:
         rows, T = controller_rows(parts, joined), parts.sample_time
         many = joined.B.shape[-1]
         if T:
-            plant = control.sample_system(control.ss(joined.A, joined.B, rows.x, 0.0 * rows.now), T, method="zoh")
-            last = control.ss(np.zeros((many, many)), np.eye(many), rows.last, rows.now, T)
-            found = control.feedback(plant + last, control.ss(*K, T), sign=1)
+            continuous = control.ss(joined.A, joined.B, rows.x, 0.0 * rows.now)
+            over: Any = None
+            for tick in parts.controllers:
+                h = tick.duration
+                plant = control.sample_system(continuous, h, method="zoh")
+                last = control.ss(np.zeros((many, many)), np.eye(many), rows.last, rows.now, h)
+                found = control.feedback(plant + last, control.ss(*tick.matrices, h), sign=1)
+                over = found.A if over is None else found.A @ over
         elif np.linalg.det(np.eye(many) - K.D @ rows.now) <= 0.0:
             return math.inf
         else:
             found = control.feedback(control.ss(joined.A, joined.B, rows.x, rows.now), control.ss(*K), sign=1)
-        poles = np.asarray(found.poles())
+        poles = np.asarray(np.linalg.eigvals(over) if parts.ticks else found.poles())
         for fixed in self.modes.fixed:
             poles = np.delete(poles, np.argmin(np.abs(poles - fixed)))
         return float(np.max(to_rates(parts, poles).real))

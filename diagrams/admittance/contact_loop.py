@@ -13,6 +13,9 @@ controller computes once a tick. f and p̈ are measured under the last inputs; s
 of a plant with equations are those under the new inputs, as in a run of the diagram. Continuous, f and u contain each
 other: that loop is solved as if nothing took time.
 
+In several rates the period has several ticks. The loop over the period is the product of those from each tick to the
+next, and its poles z are those of the period.
+
 Modes that the environment can't reach or doesn't feel stay as they are, whatever its properties, such as a drift in
 another direction. `split_modes` tells them by controllability and observability, not by the place of their poles.
 """
@@ -25,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...blocks.core import Array
-from .compliance_loop import check_environment
+from .compliance_loop import StateMatrices, check_environment
 from .contact_parts import ContactParts
 
 SLOW, SLOW_RATE = 1e-3, 1.0
@@ -123,6 +126,8 @@ class ClosedLoop:
 
     The states are those of the plant, the last inputs (of a sampled loop) and those of the controller. ``inputs`` are
     the matrices of u by the states and by F at the tick. ``solvable`` is False where a continuous loop has no solution.
+    ``steps`` holds the loops from tick to tick, of which A is the product, where there are several; the matrices by F
+    are those of the first.
     """
 
     A: np.ndarray
@@ -130,11 +135,33 @@ class ClosedLoop:
     inputs: tuple[np.ndarray, np.ndarray]
     joined: Joined
     solvable: np.ndarray
+    steps: tuple[ClosedLoop, ...] = ()
+
+    @property
+    def every_step(self) -> tuple[ClosedLoop, ...]:
+        """The loops from tick to tick: at least one."""
+        return self.steps or (self,)
 
 
 def close_loop(parts: ContactParts, joined: Joined) -> ClosedLoop:
     """Return the loop of joined plant and controller."""
-    K, rows, sampled = parts.controller, controller_rows(parts, joined), bool(parts.sample_time)
+    rows = controller_rows(parts, joined)
+    if not parts.ticks:
+        held = hold_inputs(joined, parts.sample_time) if parts.sample_time else None
+        return _close_tick(parts, joined, rows, parts.controller, held)
+    holds = {T: hold_inputs(joined, T) for T in {tick.duration for tick in parts.ticks}}
+    steps = tuple(_close_tick(parts, joined, rows, tick.matrices, holds[tick.duration]) for tick in parts.ticks)
+    A = steps[0].A
+    for step in steps[1:]:
+        A = step.A @ A
+    return ClosedLoop(A, steps[0].at_tick, steps[0].inputs, joined, steps[0].solvable, steps)
+
+
+def _close_tick(
+    parts: ContactParts, joined: Joined, rows: Rows, K: StateMatrices, held: tuple[np.ndarray, np.ndarray] | None
+) -> ClosedLoop:
+    """Return the loop from one tick to the next; ``held`` has the matrices between them, None in continuous time."""
+    sampled = held is not None
     batch, (n, many), nk = joined.A.shape[:-2], parts.plant.B.shape, len(K.A)
     E = np.eye(many) - K.D @ rows.now
     solvable = np.linalg.det(E) > 0.0 if not sampled else np.ones(batch, dtype=bool)
@@ -144,7 +171,7 @@ def close_loop(parts: ContactParts, joined: Joined) -> ClosedLoop:
     u = np.concatenate([u_x, *([u_last] if sampled else []), u_k], axis=-1)
     h = np.concatenate([rows.x, *([rows.last] if sampled else []), np.zeros((*batch, rows.x.shape[-2], nk))], axis=-1)
     h, h_F = h + rows.now @ u, rows.force + rows.now @ u_F
-    Ad, Bd = hold_inputs(joined, parts.sample_time) if sampled else (joined.A, joined.B)
+    Ad, Bd = (joined.A, joined.B) if held is None else held
     own_x = np.concatenate([Ad, np.zeros((*batch, n, u.shape[-1] - n))], axis=-1)
     own_k = np.concatenate([np.zeros((*batch, nk, u.shape[-1] - nk)), np.broadcast_to(K.A, (*batch, nk, nk))], axis=-1)
     A = np.concatenate([own_x + Bd @ u, *([u] if sampled else []), own_k + K.B @ h], axis=-2)
@@ -187,16 +214,12 @@ def split_modes(parts: ContactParts, direction: np.ndarray, loop: ClosedLoop, us
     axes = np.eye(nf) if "tool_mass" in used else direction[:, None]
     d = direction[:, None]
     size, many = len(A), parts.plant.B.shape[1]
-    pushes, felt = [], []
+    at_ticks = []
     for axis in axes.T[:, :, None]:
         free = join_environment(parts, axis[:, 0])
-        at_tick = close_loop(parts, free._replace(G=0.0 * free.G)).at_tick
-        pushes.append(at_tick)
+        at_ticks.append(close_loop(parts, free._replace(G=0.0 * free.G)).every_step)
     held = np.zeros((n + 1, n + 1))
     held[:n, :n], held[:n, n:] = loop.joined.A, parts.force @ d
-    along = np.zeros((size, 1))
-    along[:n] = np.asarray(expm(held * T))[:n, n:] if T else held[:n, n:]
-    pushes.append(along)
 
     def row(by_x: np.ndarray, by_u: np.ndarray) -> np.ndarray:
         made = np.zeros((len(by_x), size))
@@ -207,19 +230,28 @@ def split_modes(parts: ContactParts, direction: np.ndarray, loop: ClosedLoop, us
             made += by_u @ loop.inputs[0]
         return made
 
-    none = np.zeros((1, many))
+    none, rows = np.zeros((1, many)), []
     if "stiffness" in used:
-        felt.append(row(d.T @ parts.position, none))
+        rows.append(row(d.T @ parts.position, none))
     if "damping" in used:
-        felt.append(row(d.T @ parts.velocity, none))
+        rows.append(row(d.T @ parts.velocity, none))
     if "mass" in used or "tool_mass" in used:
-        rows = parts.velocity if "tool_mass" in used else d.T @ parts.velocity
-        felt.append(row(rows @ loop.joined.A, rows @ loop.joined.B))
+        by = parts.velocity if "tool_mass" in used else d.T @ parts.velocity
+        rows.append(row(by @ loop.joined.A, by @ loop.joined.B))
+    pushes, felt = np.zeros((size, 0)), np.zeros((0, size))  # at the end of the period, and at its beginning
+    until = np.eye(size)
+    for k, (step, tick) in enumerate(zip(loop.every_step, parts.controllers, strict=True)):
+        along = np.zeros((size, 1))
+        along[:n] = np.asarray(expm(held * tick.duration))[:n, n:] if T else held[:n, n:]
+        now = [one[k].at_tick for one in at_ticks]
+        pushes = np.hstack([step.A @ pushes if k else pushes, *now, along])
+        felt = np.vstack([felt, *(r @ until for r in rows)])
+        until = step.A @ until if loop.steps else until
     shifted = A - np.eye(size) if T else A
     balanced, scale = matrix_balance(shifted, permute=False, separate=True)
     scale = scale[0]
-    V, fixed = _split_fixed(balanced, np.hstack(pushes) / scale[:, None], bool(T))
-    W, more = _split_fixed((V.T @ balanced @ V).T, (np.vstack(felt) * scale @ V).T, bool(T))
+    V, fixed = _split_fixed(balanced, pushes / scale[:, None], bool(T))
+    W, more = _split_fixed((V.T @ balanced @ V).T, (felt * scale @ V).T, bool(T))
     return Modes(W.T @ V.T / scale, scale[:, None] * (V @ W), np.concatenate([fixed, more]) + (1.0 if T else 0.0))
 
 

@@ -7,9 +7,9 @@ continuous: the rest of the diagram, with its actuators, sensors and delays.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -31,10 +31,13 @@ from ..linearization import (
     find_signal,
     linearize,
     linearize_plant,
+    model_ticks,
     moves_between_ticks,
 )
 from .compliance_loop import StateMatrices
 from .contact_ports import Ports, Source, check_command, check_force_wire, check_unit
+from .contact_ticks import ControllerTick, Four, hold_signals
+from .force_entry import find_entry, find_sensor
 
 if TYPE_CHECKING:
     from ..flat import FlatDiagram, WiredDiagram
@@ -63,9 +66,10 @@ class ContactParts:
     position, velocity : ndarray, shape (n_f, n)
         Output matrices of position and velocity at the contact.
     controller : StateMatrices
-        From the plant's outputs and the n_f entries of the measured force to the plant's wired inputs.
+        From the plant's outputs and the n_f entries of the measured force to the plant's wired inputs. In several
+        rates, at the first tick of the period.
     sample_time : float
-        Sample time T of the controller in s; 0 if everything is continuous.
+        Sample time T of the controller in s, the period of several rates; 0 if everything is continuous.
     is_stepped : bool
         Whether the plant is an FMU, whose outputs at a tick are those under its last inputs.
     tool_mass : float
@@ -76,6 +80,10 @@ class ContactParts:
         Errors of the entries of ``plant``, and of those of (A, force, position, velocity); zero if they are exact.
     findings : tuple of Finding
         Kinks, stairs and flat slopes that the model leaves out.
+    entry : str or None
+        Wire to which the environment's force is added; None if the controller does not measure it.
+    ticks : tuple of ControllerTick
+        Controllers at the ticks of a period with several; empty with one.
     """
 
     plant: StateMatrices
@@ -90,6 +98,18 @@ class ContactParts:
     derivation: Derivation
     errors: tuple[StateMatrices, StateMatrices]
     findings: tuple[Finding, ...]
+    entry: str | None = None
+    ticks: tuple[ControllerTick, ...] = ()
+
+    @property
+    def controllers(self) -> tuple[ControllerTick, ...]:
+        """Controllers at the ticks of a sampled loop's period."""
+        return self.ticks or (ControllerTick(self.controller, self.sample_time),)
+
+    @property
+    def shortest(self) -> float:
+        """Shortest time between ticks in s; 0 if everything is continuous."""
+        return min(tick.duration for tick in self.controllers)
 
 
 def take_apart(
@@ -102,7 +122,7 @@ def take_apart(
     ParameterError
         If the point is not at rest, the plant has no continuous linear model, or its ports are not those of a contact.
     OptionError
-        If the diagram has several rates, or signals around a plant with equations change between the ticks.
+        If signals around a plant with equations change between the ticks, or the measured force lies behind states.
     """
     path, block = ports.plant, diagram.blocks[ports.plant]
     flat = diagram.flatten_like(point)
@@ -125,9 +145,12 @@ def take_apart(
     sources = list(dict.fromkeys(f"{wire.block}.{wire.port}" for wire in wires.values()))
     signal = None if measured is None else find_signal(flat, measured)
     inside = signal is not None and signal.port[0] == path  # the plant measures the force itself
-    injected = outputs if measured is None or inside else [*outputs, measured]
+    entry = signal
+    if signal is not None and not inside:
+        entry = find_entry(diagram, point, ports, signal, wires, outputs, options)
+    injected = outputs if entry is None or inside else [*outputs, entry.name]
     model = linearize(diagram, point, inputs=injected, outputs=sources, openings=outputs, **options)
-    _check_rates(diagram, point, path, model, outputs, sources)
+    _check_held(diagram, point, path, model, outputs, sources)
     m = _linearize_plant(diagram, point, path)
     _check_rest(path, m, model)
     pushed, position, velocity = (
@@ -143,12 +166,24 @@ def take_apart(
             port=ports.force,
         )
     wired, rows = m.inputs.entries(wires), m.outputs.entries(seen)
-    K = _cut_controller(model, path, wires, flat, signal)
-    if signal is None:
-        K = StateMatrices(K.A, _widen(K.B, len(pushed)), K.C, _widen(K.D, len(pushed)))
-    elif inside:
-        own = [rows.index(m.outputs.slices[signal.port[1]].start + i) for i in felt]
-        K = StateMatrices(K.A, np.hstack([K.B, K.B[:, own]]), K.C, np.hstack([K.D, K.D[:, own]]))
+    own = [] if not inside or signal is None else [
+        rows.index(m.outputs.slices[signal.port[1]].start + i) for i in felt
+    ]  # fmt: skip
+
+    def cut(matrices: Four, states: Sequence[str]) -> StateMatrices:
+        K = _cut_controller(matrices, states, path, wires, flat, signal if entry is signal else None)
+        if signal is None:
+            return StateMatrices(K.A, _widen(K.B, len(pushed)), K.C, _widen(K.D, len(pushed)))
+        return StateMatrices(K.A, np.hstack([K.B, K.B[:, own]]), K.C, np.hstack([K.D, K.D[:, own]]))
+
+    ticks: tuple[ControllerTick, ...] = ()
+    if model.dt and model.dt != float(point.base):
+        models, states = model_ticks(diagram, point, path, injected, sources, outputs, options.get("stairs"))
+        last = None if entry is None or inside or entry is not signal else len(injected) - 1
+        ticks = hold_signals(models, lambda four: cut(four, states), len(rows), last, inside=inside)
+        K = ticks[0].matrices
+    else:
+        K = cut((model.A, model.B, model.C, model.D), model.states)
     plant = StateMatrices(m.A, m.B[:, wired], m.C[rows], m.D[np.ix_(rows, wired)])
     n, U = len(m.A), m.error
     E = StateMatrices(U[:n, :n], U[:n, n:], U[n:, :n], U[n:, n:])
@@ -158,8 +193,10 @@ def take_apart(
         check_command(flat, ports, signal, wires)
         driven = wires.get(ports.force)
         direct = driven is not None and (driven.block, driven.port) == signal.port
-        check_force_wire(path, ports, signal, K, [wired.index(i) for i in pushed if i in wired], direct=direct)
-    sensor = None if signal is None else _find_sensor(flat, signal.port[0])
+        for one in ticks or [ControllerTick(K, 0.0)]:
+            entries = [wired.index(i) for i in pushed if i in wired]
+            check_force_wire(path, ports, signal, one.matrices, entries, direct=direct)
+    sensor = None if signal is None else find_sensor(flat, signal.port[0])
     parts = ContactParts(
         plant=plant,
         force=m.B[:, pushed],
@@ -169,28 +206,17 @@ def take_apart(
         controller=K,
         sample_time=model.dt,
         is_stepped=block.stepped,
-        tool_mass=0.0 if sensor is None else sensor.tool_mass,
+        tool_mass=0.0 if sensor is None else cast(ForceSensor, flat.table.blocks[sensor]).tool_mass,
         derivation=m.derivation,
         errors=(
             StateMatrices(E.A, E.B[:, wired], E.C[rows], E.D[np.ix_(rows, wired)]),
             StateMatrices(E.A, E.B[:, pushed], E.C[position], E.C[velocity]),
         ),
         findings=_collect_findings(model, path),
+        entry=None if entry is None else entry.name,
+        ticks=ticks,
     )
     return parts, any(isinstance(f, UnusualStart) for f in model.findings)
-
-
-def _find_sensor(flat: FlatDiagram, path: str) -> ForceSensor | None:
-    """Return the force sensor that a measured force comes from, at once or through blocks with one wire, as delays."""
-    for _ in flat.table.blocks:
-        block = flat.table.blocks[path]
-        if isinstance(block, ForceSensor):
-            return block
-        sources = [wire.block for port in block.inputs if (wire := flat.table.wires.get((path, port))) is not None]
-        if len(sources) != 1:
-            return None
-        path = sources[0]
-    return None
 
 
 def _widen(M: np.ndarray, by: int) -> np.ndarray:
@@ -204,10 +230,12 @@ def _collect_findings(model: Linearization, path: str) -> tuple[Finding, ...]:
 
 
 def _cut_controller(
-    model: Linearization, path: str, wires: Mapping[str, Source], flat: FlatDiagram, signal: Tap | None
-) -> StateMatrices:
+    matrices: Four, states: Sequence[str], path: str, wires: Mapping[str, Source], flat: FlatDiagram,
+    signal: Tap | None,
+) -> StateMatrices:  # fmt: skip
     """Return the matrices from the plant's outputs and the measured force to its inputs, without the plant's states."""
-    own = [name.startswith((f"{path}.", f"held({path}.")) for name in model.states]
+    A, B, C, D = matrices
+    own = [name.startswith((f"{path}.", f"held({path}.")) for name in states]
     keep = [i for i, mine in enumerate(own) if not mine]
     rows, start, shapes = dict[tuple[str, str], np.ndarray](), 0, flat.checked.shapes
     for block, port in dict.fromkeys((wire.block, wire.port) for wire in wires.values()):
@@ -220,18 +248,18 @@ def _cut_controller(
         for i in np.ravel(rows[wire.block, wire.port][... if wire.part is None else wire.part]).tolist()
     ]
     hidden = [i for i, mine in enumerate(own) if mine]
-    if np.any(model.A[np.ix_(keep, hidden)]) or np.any(model.C[np.ix_(picked, hidden)]):
+    if np.any(A[np.ix_(keep, hidden)]) or np.any(C[np.ix_(picked, hidden)]):
         raise OptionError(
             "found a way from its states to its inputs beside its outputs; expected none. Report this diagram as an "
             "error of loopwright.",
             block=path,
         )
-    D = model.D[picked].copy()
+    D = D[picked].copy()
     if signal is not None and signal.port in rows:  # it is measured ahead of what is injected there
         taken = np.ravel(rows[signal.port])[list(signal.entries)].tolist()
         for j, entry in enumerate(taken, D.shape[1] - len(taken)):
             D[[i for i, one in enumerate(picked) if one == entry], j] += 1.0
-    return StateMatrices(model.A[np.ix_(keep, keep)], model.B[keep], model.C[np.ix_(picked, keep)], D)
+    return StateMatrices(A[np.ix_(keep, keep)], B[keep], C[np.ix_(picked, keep)], D)
 
 
 def _linearize_plant(diagram: WiredDiagram, at: OperatingPoint, path: str) -> PlantEquations:
@@ -246,17 +274,12 @@ def _linearize_plant(diagram: WiredDiagram, at: OperatingPoint, path: str) -> Pl
         ) from error
 
 
-def _check_rates(
+def _check_held(
     diagram: WiredDiagram, at: OperatingPoint, path: str, model: Linearization, outputs: list[str], sources: list[str]
 ) -> None:
+    """Refuse signals around a plant with equations that change between the ticks of a sampled diagram."""
     if not model.dt:
         return
-    if model.dt != float(at.base):
-        raise OptionError(
-            f"found a period of {model.dt:g} s with ticks each {float(at.base):g} s; expected one rate. Give all "
-            "sampled subsystems one sample time, and no shorter step.",
-            block=diagram.name,
-        )
     moving = "" if diagram.blocks[path].stepped else moves_between_ticks(diagram, at, outputs, sources)
     if moving:
         exchanged = diagram.blocks[path].evaluated_outside

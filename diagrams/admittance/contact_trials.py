@@ -79,12 +79,16 @@ class TriedContact(Protocol):
         """Ports of the plant."""
 
     @property
-    def measured(self) -> str | None:
-        """Wire of the measured force."""
+    def entry(self) -> str | None:
+        """Wire to which the environment's force is added."""
 
     @property
     def sample_time(self) -> float:
-        """Sample time of the controller in s."""
+        """Period of the controller in s."""
+
+    @property
+    def shortest(self) -> float:
+        """Shortest time between its ticks in s."""
 
     def loop(self, vary: str, **environment: float) -> CoupledLoop:
         """Return the loop with an environment of which one property varies."""
@@ -145,7 +149,7 @@ class Trials:
 
     def find_mode(self, value: float) -> complex:
         """Return the pole, in 1/s, of the mode that the limit is about."""
-        rates, omega = self.find_rates(value), self.limit.frequency
+        rates, omega = self.find_rates(value), self._fold(self.limit.frequency)
         away = np.abs(np.abs(rates.imag) - omega)
         if self.method is TrialMethod.HELD:
             close = np.flatnonzero(away <= max(AROUND * omega, 1.0))
@@ -158,6 +162,20 @@ class Trials:
                 )
             return complex(rates[close[int(np.argmax(rates[close].real))]])
         return complex(rates[int(np.argmin(away - 1e-3 * rates.real))])
+
+    def find_frequency(self, mode: complex) -> float:
+        """Return the frequency of a mode in rad/s: of its aliases the one next to the limit's."""
+        T = self.contact.sample_time
+        if not T:
+            return abs(mode.imag)
+        turn, near = 2.0 * np.pi / T, self.limit.frequency
+        found = [sign * abs(mode.imag) + turn * round((near - sign * abs(mode.imag)) / turn) for sign in (1, -1)]
+        return float(min(found, key=lambda omega: abs(omega - near)))
+
+    def _fold(self, omega: float) -> float:
+        """Return the alias of a frequency of which a pole over the period tells, rad/s."""
+        T = self.contact.sample_time
+        return min(omega % (2.0 * np.pi / T), -omega % (2.0 * np.pi / T)) if T else omega
 
     def find_own_limit(self) -> float:
         """Return the limit that runs are tried beside: of a loop with a held force, that of its own linear model."""
@@ -182,7 +200,7 @@ class Trials:
     def run(self, value: float, push: float, duration: float) -> tuple[np.ndarray, np.ndarray, float]:
         """Return times, the velocity along the mode's direction, and the largest speed."""
         contact = self.contact
-        step = contact.sample_time or STEP
+        step = contact.shortest or STEP
         made: Any = self._diagram(value, push)
         options: dict[str, Any] = {} if made.has_clock else {"step": step}
         if self.method is TrialMethod.SOLVER:
@@ -223,7 +241,7 @@ class Trials:
             **{name: float(v) for name, v in environment.items()},
             kick=push / (mobility * step), kick_time=begin + step, kick_start=begin,
         )  # fmt: skip
-        source = find_signal(still.flatten_like(contact.point), contact.measured) if contact.measured else None
+        source = find_signal(still.flatten_like(contact.point), contact.entry) if contact.entry else None
         if self.method is TrialMethod.INSIDE:
             ports = (contact.ports.force, contact.ports.position, contact.ports.velocity)
             return moored_diagram(still, contact.plant, ports, source, mooring, tool)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...blocks import Constant, ForceSensor, Reference, Sum
+from ...blocks import Constant, ForceSensor, Hold, Reference, Sum
 from ...blocks.core import Array, Block, OptionError, Output, Source, parameter
 from ...fmus.export import build
 from ...fmus.models import gantry, gantry_elastic, gantry_stiction, scara
@@ -179,7 +179,7 @@ def moored_diagram(
     ports : (str, str, str)
         Ports of force, position and velocity at the contact.
     measured : Tap, optional
-        Signal of the measured force.
+        Wire to which its force is added, for all readers but the plant.
     mooring : Mooring
         The environment.
     tool_mass : float, optional
@@ -221,10 +221,11 @@ def moored_diagram(
             total += "_"
         for group in (table.wires, table.controls):
             for key, wire in list(group.items()):
-                if (wire.block, wire.port) == source:
+                if (wire.block, wire.port) == source and key != (plant, ports[0]):
                     group[key] = Wire(total, "y", wire.index)  # type: ignore[index]
         table.blocks[total], table.subsystem_of[total] = Sum(name=total), ""
-        table.wires[total, "u1"], table.wires[total, "u2"] = Wire(*source), Wire(plant, FORCE)
+        felt = hold_beside(table, source[0], Wire(plant, FORCE), "environment_held")
+        table.wires[total, "u1"], table.wires[total, "u2"] = Wire(*source), felt
     return diagram.with_structure(table)
 
 
@@ -234,6 +235,18 @@ def copy_table(diagram: WiredDiagram) -> Structure:
     for path, settings in table.subsystems.items():
         table.subsystems[path] = replace(settings, delay=0)
     return table
+
+
+def hold_beside(table: Structure, block: str, wire: Wire, name: str) -> Wire:
+    """Return the wire of a signal as it is at the ticks of a block; the signal's own where all ticks are the same."""
+    subsystem = table.subsystem_of[block]
+    clocks = {(settings.sample_time, settings.offset) for settings in table.subsystems.values() if settings.sample_time}
+    if len(clocks) < 2 or not table.is_sampled(subsystem):
+        return wire
+    path = f"{subsystem}.{name}"
+    table.blocks[path], table.subsystem_of[path] = Hold(name=name), subsystem
+    table.wires[path, "u"] = wire
+    return Wire(path, "y")
 
 
 def set_tool(table: Structure, tool_mass: float | None) -> None:

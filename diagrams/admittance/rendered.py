@@ -34,6 +34,10 @@ SAMPLED = (
     "Y is the fundamental of a sampled loop: Re Y(jω) < 0 disproves passivity; Re Y(jω) ≥ 0 doesn't prove it, as the "
     "aliases of a motion carry power too."
 )
+PERIODIC = (
+    " In several rates a force of one frequency moves the contact at others, too, ω + 2πk/T over the common period T; "
+    "Y is the part at ω alone."
+)
 OFF_PATH = (
     " Off the path the force that is conjugate to the rate of η is q F∥ (E22): driven by F∥, the admittance is not "
     "passive in motions that change q, whatever Re Y says at one point."

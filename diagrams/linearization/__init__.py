@@ -18,7 +18,7 @@ from .linear_model import Linearization, linearize, linearize_batch
 from .loops_over_a_period import ticks_between_renewals, ticks_to_renewal
 from .operating_points import PointLike, capture, check_options, copy_point, operating_point, run_to
 from .parameter_slopes import LoopSlope, PointFinder, differentiate_loop, loop_of_variant
-from .plant_equations import PlantEquations, linearize_plant, moves_between_ticks
+from .plant_equations import PlantEquations, TickModel, linearize_plant, model_ticks, moves_between_ticks
 from .trim_search import point_from_states, trim
 
 __all__ = [
@@ -36,6 +36,7 @@ __all__ = [
     "PointLike",
     "StepsOnly",
     "Tap",
+    "TickModel",
     "UnusualStart",
     "ZeroSlope",
     "capture",
@@ -48,6 +49,7 @@ __all__ = [
     "linearize_batch",
     "linearize_plant",
     "loop_of_variant",
+    "model_ticks",
     "moves_between_ticks",
     "operating_point",
     "point_from_states",

@@ -1,19 +1,26 @@
-"""The continuous linear model of one plant of a diagram, an FMU or a block with equations, at an operating point."""
+"""The parts of a diagram around one plant, linear at an operating point.
+
+The plant, an FMU or a block with equations, has a model in continuous time. The rest of a sampled diagram has one model
+for each tick of its period.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ...blocks.core import Block, Layout, ParameterError
 from ...fmus.running import Derivation, DerivativeMethod
-from ..flat import FlatDiagram, WiredDiagram
+from ..flat import FlatDiagram, TickPattern, WiredDiagram
 from ..results import OperatingPoint
 from ..wiring import join
-from .checks import find_moving, is_moving
+from .checks import find_moving, is_moving, replace_stairs
 from .derivatives import LocalDerivatives, Tap, find_signal
 from .exchanged import evaluators_at, linearize_exchanged
+from .flow_model import Four
+from .over_a_period import Chain, own_states, period_of
 from .plant_models import linearize_equations
 
 
@@ -127,3 +134,92 @@ def moves_between_ticks(diagram: WiredDiagram, at: OperatingPoint, outputs: list
     sources: list[Tap] = [find_signal(flat, name) for name in inputs]
     names = [*find_moving(flat, local, at), *(s.name for s in sources if is_moving(flat, s))]
     return names[0] if names else ""
+
+
+class TickModel(NamedTuple):
+    """Model of the rest of a diagram from one tick to the next, with the plant's outputs injected.
+
+    The matrices lead from the states just before the tick and the injected signals to those before the next one, and
+    to the signals that are measured at the tick.
+
+    Attributes
+    ----------
+    matrices : tuple of ndarray
+        A, B, C and D.
+    duration : float
+        Time to the next tick in s.
+    steps : bool
+        Whether the plant exchanges signals at the tick: always, if it is no FMU.
+    renews : tuple of bool
+        Whether each injected wire is renewed at the tick, by the clock of its block; wires of continuous blocks and
+        FMUs always are.
+    """
+
+    matrices: Four
+    duration: float
+    steps: bool
+    renews: tuple[bool, ...]
+
+
+def model_ticks(
+    diagram: WiredDiagram, at: OperatingPoint, path: str, inputs: Sequence[str], outputs: Sequence[str],
+    openings: Sequence[str], stairs: str | None = None,
+) -> tuple[tuple[TickModel, ...], list[str]]:  # fmt: skip
+    """Return the models of all ticks of a sampled diagram's period, and the names of their states.
+
+    Parameters
+    ----------
+    diagram : Diagram
+        Sampled diagram.
+    at : OperatingPoint
+        Instant at whose tick the period begins.
+    path : str
+        Path of the plant.
+    inputs, outputs, openings : sequence of str
+        Wires at which signals are injected and measured, and wires that are cut.
+    stairs : str, optional
+        Treatment of stairs, as `linearize` takes it.
+    """
+    flat = diagram.flatten_like(at)
+    injected, measured, cut = ([find_signal(flat, name) for name in names] for names in (inputs, outputs, openings))
+    means = replace_stairs(diagram, flat, at, stairs)
+    local = LocalDerivatives(flat, injected, measured, cut, evaluators_at(flat, at), means)
+    period = period_of(flat)
+    chain = Chain(flat, local, at, None, period)
+    chain.go_on()
+    plants = range(flat.width, flat.width + chain.n_p)
+    keep = _find_needed(chain.steps, own_states(flat) | set(plants))
+    clocks = [_clock_of(flat, tap) for tap in injected]
+    mine = flat.plant_ticks.get(path)
+    found = []
+    for (k, following), (A, B, C, D) in zip(chain.ticks, chain.steps, strict=True):
+        found.append(TickModel(
+            (A[np.ix_(keep, keep)], B[keep], C[:, keep], D),
+            float(flat.base * (following - k)),
+            mine is None or any(clock.acts(k) for clock in mine),
+            tuple(clock is None or clock.acts(k) for clock in clocks),
+        ))  # fmt: skip
+    labels = chain.labels
+    return tuple(found), [labels[i] for i in keep]
+
+
+def _clock_of(flat: FlatDiagram, tap: Tap) -> TickPattern | None:
+    """Return the clock of the subsystem that a wire comes from; None of one in continuous time."""
+    subsystem = flat.table.subsystem_of.get(tap.port[0], "")
+    return flat.clocks.get(subsystem) if flat.table.is_sampled(subsystem) else None
+
+
+def _find_needed(steps: Sequence[Four], own: set[int]) -> list[int]:
+    """Return the numbers of the own states, and of those of the others that act on anything at a tick.
+
+    A state that stays constant, whatever the others do, acts on nothing.
+    """
+    acts = np.sum([np.abs(A) for A, *_ in steps], axis=0)
+    shown = np.any([np.any(C, axis=0) for _, _, C, _ in steps], axis=0)
+    still = np.all([np.all(np.eye(len(A)) == A, axis=1) & ~np.any(B, axis=1) for A, B, *_ in steps], axis=0)
+    keep = [j for j in range(len(acts)) if j in own or not still[j]]
+    while True:
+        gone = [j for j in keep if j not in own and not shown[j] and not np.any(acts[[i for i in keep if i != j], j])]
+        if not gone:
+            return keep
+        keep = [j for j in keep if j not in gone]

@@ -68,9 +68,10 @@ def _contact(name: str, contact: Contact) -> Section:
     tried, said = _tried(contact, numbers)
     parts = contact.parts
     text = TEXTS.paragraphs(
-        "place", port=f"{contact.plant}.{contact.ports.force}", measured=contact.measured, t=contact.point.t,
+        "place", port=f"{contact.plant}.{contact.ports.force}", measured=contact.measured, entry=contact.entry,
+        t=contact.point.t,
         direction=", ".join(f"{v:.4g}" for v in contact.direction), derivation=str(contact.derivation),
-        sample_time=parts.sample_time, caveat=contact.passivity().caveat,
+        sample_time=parts.sample_time, ticks=len(parts.ticks), caveat=contact.passivity().caveat,
     )  # fmt: skip
     plots = (_admittance(name, contact), *_map(name, contact, soft))
     return Section(name, f"Contact {name!r}", (*text, *said), (*tables, *tried), plots, numbers)
@@ -165,7 +166,7 @@ def _tried(contact: Contact, numbers: dict[str, Number]) -> tuple[list[Table], t
 
 
 def _admittance(name: str, contact: Contact) -> Plot:
-    T, first = contact.sample_time, contact.passivity().frequency
+    T, first = contact.shortest, contact.passivity().frequency
     top = 0.999 * math.pi / T if T else 1e3 * (first if math.isfinite(first) else 10.0)
     w = np.geomspace(top / 3e4, top, 400)
     shown = contact.admittance(w)

@@ -1,0 +1,109 @@
+"""The wire of a contact's measured force behind delays, filters, gains and slower clocks."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import brentq
+
+from loopwright.blocks import Block, Constant, Gain, Input, OptionError, State, TransferFunction
+from loopwright.diagrams import Diagram, subsystem
+
+M, DRAG, SHARE, T = 2.0, 60.0, 3.0, 2e-3
+PORTS = {"position": "cart.position", "velocity": "cart.velocity"}
+
+
+class Cart(Block):
+    motor = Input(unit="N")
+    push = Input(unit="N")
+    position = State(unit="m", start=0.0, output=True)
+    velocity = State(unit="m/s", start=0.0, output=True)
+
+    def derivative(self, t, x, u):
+        return x.velocity, (u.motor + u.push) / M
+
+
+def diagram(sensor, delay=0, slow=T, wired=True):
+    """A cart whose drive amplifies the measured force, sampled by T, and damps it; the sensor is sampled by ``slow``."""
+    cart, hand = Cart(name="cart"), Constant(value=0.0, unit="N", name="hand")
+    other = hand if wired else Constant(value=0.0, unit="N", name="other")
+
+    @subsystem(sample_time=slow, delay=delay)
+    def sensors(push):
+        return sensor(push).named("felt")
+
+    @subsystem(sample_time=T)
+    def drive(velocity, felt):
+        return Gain(gain=SHARE, name="share")(felt) - Gain(gain=DRAG, name="drag")(velocity)
+
+    return Diagram("cart", cart(motor=drive(cart.velocity, sensors(other)), push=hand))
+
+
+def growth(k, gain=1.0, late=0, decay=0.0, slow=T):
+    """Growth in 1/s over the states position, velocity, and the filter's or the delayed force."""
+    A, B = np.array([[0.0, 1.0], [-k / M, 0.0]]), np.array([[0.0], [1.0 / M]])
+    held = expm(T * np.block([[A, B], [np.zeros((1, 3))]]))
+    columns = []
+    for p, v, kept in np.eye(3):
+        felt = -gain * k * p
+        used = kept if late or decay else felt
+        for _ in range(round(slow / T)):
+            p, v, _ = held @ [p, v, SHARE * used - DRAG * v]
+        columns.append([p, v, felt if late else decay * kept + (1.0 - decay) * felt])
+    return math.log(np.max(np.abs(np.linalg.eigvals(np.transpose(columns))))) / slow
+
+
+LAG = 0.01
+CASES = {
+    "at once": ({"sensor": Gain(gain=1.0, name="cell")}, {}, "felt"),
+    "delay": ({"sensor": Gain(gain=1.0, name="cell"), "delay": 1}, {"late": 1}, "hand.y"),
+    "gain": ({"sensor": Gain(gain=0.5, name="cell")}, {"gain": 0.5}, "hand.y"),
+    "filter": (
+        {"sensor": TransferFunction(numerator=[1.0], denominator=[LAG, 1.0], name="cell")},
+        {"decay": math.exp(-T / LAG)},
+        "hand.y",
+    ),
+    "slow": ({"sensor": Gain(gain=1.0, name="cell"), "slow": 5 * T}, {"slow": 5 * T}, "hand.y"),
+    "slow, other wire": (
+        {"sensor": Gain(gain=1.0, name="cell"), "slow": 5 * T, "wired": False},
+        {"slow": 5 * T},
+        "felt",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_environments_force_takes_the_way_of_the_force_on_the_plant(case):
+    options, expected, entry = CASES[case]
+    here = diagram(**options).contact("cart.push", force="felt", direction=[1.0], **PORTS)
+    assert here.entry.rpartition(".")[2] == entry.rpartition(".")[2]
+    limit = here.stability_limit()
+    value = brentq(lambda k: growth(k, **expected), 0.9 * limit.value, 1.1 * limit.value, xtol=1e-300, rtol=1e-13)
+    assert limit.value == pytest.approx(value, rel=1e-8)
+    assert limit.growth_below < 0.0 < limit.growth_above
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_such_limits_hold_in_the_run(case):
+    options, expected, _ = CASES[case]
+    here = diagram(**options).contact("cart.push", force="felt", direction=[1.0], **PORTS)
+    found = here.confirm(here.stability_limit())
+    for trial in found.trials:
+        assert trial.predicted == pytest.approx(growth(trial.value, **expected), rel=1e-5)
+        assert trial.measured == pytest.approx(trial.predicted, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("options", "block"),
+    [
+        ({"sensor": Gain(gain=1.0, name="cell"), "delay": 1}, "delay"),
+        ({"sensor": TransferFunction(numerator=[1.0], denominator=[LAG, 1.0], name="cell")}, "sensors.cell"),
+    ],
+)
+def test_states_to_which_the_force_on_the_plant_does_not_lead_are_refused(options, block):
+    made = diagram(wired=False, **options)
+    name = "sensors.cell.y" if block == "sensors.cell" else "felt"
+    with pytest.raises(OptionError, match=rf"behind the states of '.*{block}.*force=….*force=None"):
+        made.contact("cart.push", force=name, direction=[1.0], **PORTS)
