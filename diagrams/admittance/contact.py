@@ -15,6 +15,14 @@ from ...fmus.running import Derivation
 from ..linearization import check_options, operating_point
 from .compliance_loop import SIDES
 from .contact_admittance import ContactAdmittance, compute_admittance, look_again
+from .contact_arguments import (
+    check_property,
+    read_density,
+    read_frequencies,
+    read_positive,
+    read_row,
+    read_vector,
+)
 from .contact_limits import ContactLimit, ContactMap, CoupledLoop, check_properties, find_limit, map_growth
 from .contact_loop import close_loop, join_environment
 from .contact_parts import ContactParts, take_apart
@@ -28,6 +36,8 @@ if TYPE_CHECKING:
     from ..results import OperatingPoint
     from .contact_confirmation import ContactConfirmation
     from .contact_trials import TrialMethod
+
+_FREQUENCY = "frequency in rad/s"
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +115,9 @@ class Contact:
         Raises
         ------
         OptionError
-            If a frequency is not positive, or not below the Nyquist frequency.
+            If a frequency is no number, not positive, or not below the Nyquist frequency.
         """
-        w = np.asarray(omega, dtype=float)
+        w = read_frequencies(omega)
         target = None
         if self.filter is not None:
             s, a = 1j * w, self.filter
@@ -130,7 +140,16 @@ class Contact:
             If an end of the scan is not positive, or not below the Nyquist frequency.
         """
         T = self.parts.shortest
-        top = (math.pi / T * (1.0 - 1e-9) if T else HIGHEST) if high is None else high
+        nyquist = math.pi / T if T else math.inf
+        top = (nyquist * (1.0 - 1e-9) if T else HIGHEST) if high is None else read_positive(high, "high", _FREQUENCY)
+        low = read_positive(low, "low", _FREQUENCY)
+        if not low < top < nyquist:
+            raise OptionError(
+                f"found a scan from {low:g} to {top:g} rad/s; expected it to rise"
+                f"{f', below the Nyquist frequency {nyquist:.6g} rad/s' if T else ''}. Give other ends.",
+                port="low",
+            )
+        per_decade = read_density(per_decade, 1)
         intervals = find_negative(lambda w: compute_admittance(self.parts, self.direction, w), low, top, per_decade)
         poles = np.linalg.eigvals(close_loop(self.parts, join_environment(self.parts, self.direction)).A)
         stable = bool(np.all(np.abs(poles) <= 1.0 + 1e-6) if T else np.all(poles.real <= 1e-4))
@@ -148,8 +167,8 @@ class Contact:
 
     def loop(self, vary: str, **environment: float) -> CoupledLoop:
         """Return the loop with an environment of which one property varies; see `stability_limit`."""
-        check_properties(environment, vary)
-        return CoupledLoop.of(self.parts, self.direction, vary, environment)
+        held = check_properties(environment, vary)
+        return CoupledLoop.of(self.parts, self.direction, vary, held)
 
     def stability_limit(
         self,
@@ -181,9 +200,9 @@ class Contact:
         ConfirmationError
             If python-control's interconnection of the same parts disagrees.
         """
-        check_properties(environment, vary)
-        found = find_limit(self.parts, self.direction, vary, environment, low=low, high=high, per_decade=per_decade)
-        alone = not any(environment.values()) and "tool_mass" not in environment
+        held = check_properties(environment, vary)
+        found = find_limit(self.parts, self.direction, vary, held, low=low, high=high, per_decade=per_decade)
+        alone = not any(held.values()) and "tool_mass" not in held
         if vary == "stiffness" and alone and 0.0 < found.value < math.inf:
             found = replace(found, second_look=look_again(self.parts, self.direction, found.frequency))
         return found
@@ -221,7 +240,7 @@ class Contact:
         Raises
         ------
         OptionError
-            If the limit is infinite or 0, or the plant does not allow the method.
+            If the limit is infinite or 0, or of another contact, or the plant does not allow the method.
         ConfirmationError
             If the runs contradict the limit.
         """
@@ -250,9 +269,10 @@ class Contact:
         ConfirmationError
             If python-control's interconnection of the same parts disagrees with a limit.
         """
-        check_properties([*environment, y], x)
-        check_properties([*environment, x], y)
-        return map_growth(self.parts, self.direction, (x, x_values), (y, y_values), environment)
+        held = check_properties(environment, check_property(x, "x"))
+        check_properties({**environment, x: 0.0}, check_property(y, "y"))
+        across, up = read_row(x_values, x, rising=True), read_row(y_values, y, rising=False)
+        return map_growth(self.parts, self.direction, (x, across), (y, up), held)
 
 
 def make_contact(
@@ -310,9 +330,9 @@ def _find_direction(
         place = np.asarray(point.values[f"{ports.plant}.{ports.position}"], dtype=float)
         q = 1.0 - float(frame.curvature) * float(frame.normal @ (place - frame.sigma))
         return np.asarray(frame.tangent, dtype=float), direction, q
-    vector = np.atleast_1d(np.asarray(direction, dtype=float))
-    length = float(np.linalg.norm(vector))
-    if vector.shape != (many,) or not 0.0 < length < math.inf:
+    vector = read_vector(direction)
+    length = 0.0 if vector is None else float(np.linalg.norm(vector))
+    if vector is None or vector.shape != (many,) or not 0.0 < length < math.inf:
         raise OptionError(
             f"found {direction!r}; expected a vector of {many} finite entries that is not zero. Give one in the axes "
             "of the force.",

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...blocks.core import ConfirmationError, OptionError
+from .contact_arguments import read_positive
 from .contact_limits import ContactLimit
 from .contact_trials import STEP, TrialMethod, Trials, TriedContact
+from .stability_limits import GROWTH_AT
 
 FACTORS = (0.97, 1.03)
 """Shares of a limit at which the diagram is run."""
@@ -34,6 +36,8 @@ GROWN = 5.0
 """Largest growth of the mode in a run, as an exponent."""
 DECAYED = 9.0
 """Time that other modes have to decay, in their time constants relative to the mode's own."""
+OWN = 1e-4
+"""Largest difference of the growth rates beside a limit, absolute in 1/s and relative, of one contact."""
 UNEVEN = 1e-3
 """Relative difference of the times between samples up to which they are even."""
 LONGEST = 8.0
@@ -109,7 +113,7 @@ def confirm_limit(
     contact: TriedContact, limit: ContactLimit, push: float = PUSH, method: TrialMethod | str | None = None
 ) -> ContactConfirmation:
     """Run a contact's diagram at 0.97 and at 1.03 of a limit; see `Contact.confirm`."""
-    _check(contact, limit, push)
+    push = _check(contact, limit, push)
     trials = Trials.of(contact, limit, method)
     tried = trials.find_own_limit()
     values = [factor * tried for factor in FACTORS]
@@ -199,7 +203,14 @@ def _measure_uneven(t: np.ndarray, signal: np.ndarray, omega: float, begin: floa
     return float(np.log(sizes[1] / sizes[0]) / window)
 
 
-def _check(contact: TriedContact, limit: ContactLimit, push: float) -> None:
+def _check(contact: TriedContact, limit: ContactLimit, push: float) -> float:
+    """Return the push; refuse what is no limit of the contact, or has no two sides."""
+    if not isinstance(limit, ContactLimit):
+        raise OptionError(
+            f"found {limit!r}; expected a limit of this contact. Give contact.stability_limit(…), not its value.",
+            block=contact.plant,
+            port="limit",
+        )
     if not (math.isfinite(limit.value) and limit.value > 0.0):
         raise OptionError(
             f"found a limit of {limit.value:g} {limit.unit}; expected a finite one that is not 0. There is nothing to "
@@ -207,8 +218,18 @@ def _check(contact: TriedContact, limit: ContactLimit, push: float) -> None:
             block=contact.plant,
             port=limit.vary,
         )
-    if not 0.0 < push < math.inf:
-        raise OptionError(f"found {push!r}; expected a positive velocity in m/s. Give one.", port="push")
+    loop = contact.loop(limit.vary, **limit.environment)
+    known = (limit.growth_below, limit.growth_above)
+    found = [loop.growth_at(factor * limit.value) for factor in (1.0 - GROWTH_AT, 1.0 + GROWTH_AT)]
+    if not np.allclose(found, known, rtol=OWN, atol=OWN):
+        raise OptionError(
+            f"found a limit of another contact: beside it the growth rates are {found[0]:.6g} and {found[1]:.6g} 1/s "
+            f"here, and {known[0]:.6g} and {known[1]:.6g} 1/s there. Give one of this contact: "
+            "contact.stability_limit(…).",
+            block=contact.plant,
+            port="limit",
+        )
+    return read_positive(push, "push", "velocity in m/s")
 
 
 def _others_decay(trials: Trials, value: float, window: float) -> float:

@@ -7,14 +7,15 @@ points; Brent's method refines each change of its sign.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from ...blocks.core import Array, ConfirmationError, Finding, OptionError, near, on_one_thread
+from ...blocks.core import ConfirmationError, Finding, OptionError, on_one_thread
 from ..frequency import Number
+from .contact_arguments import check_property, read_density, read_number, read_positive
 from .contact_loop import ClosedLoop, Modes, close_loop, controller_rows, join_environment, split_modes
 from .contact_motion import find_direction, find_frequency
 from .contact_parts import ContactParts
@@ -240,7 +241,7 @@ def find_limit(
     ConfirmationError
         If python-control's interconnection of the same parts is not stable below the limit and unstable above it.
     """
-    first, last = _check_scan(vary, low, high, per_decade)
+    first, last, per_decade = _check_scan(vary, low, high, per_decade)
     loop = CoupledLoop.of(parts, direction, vary, held)
     grid = np.geomspace(first, last, max(8, math.ceil(per_decade * math.log10(last / first)) + 1))
     common: dict[str, Any] = {"vary": vary, "unit": UNITS[vary], "scanned": (first, last), "environment": dict(held)}
@@ -290,26 +291,12 @@ def find_limit(
 def map_growth(
     parts: ContactParts,
     direction: np.ndarray,
-    x: tuple[str, Array],
-    y: tuple[str, Array],
+    x: tuple[str, np.ndarray],
+    y: tuple[str, np.ndarray],
     held: Mapping[str, float],
 ) -> ContactMap:
-    """Return the growth rates over two properties, each given by its name and its values; see `Contact`.
-
-    Raises
-    ------
-    OptionError
-        If a property is given twice, or values are not a row; those of x are positive and rise.
-    """
-    across, up = np.asarray(x[1], dtype=float), np.asarray(y[1], dtype=float)
-    if x[0] == y[0] or across.ndim != 1 or up.ndim != 1:
-        raise OptionError(
-            f"found {x[0]!r} and {y[0]!r} with values of {across.ndim} and {up.ndim} axes; expected two different "
-            "properties, each with a row of values. Give x=…, y=….",
-            port=x[0],
-        )
-    if len(across) < 2 or not (across[0] > 0.0 and np.all(np.diff(across) > 0.0)):
-        raise OptionError(f"found the values {across.tolist()}; expected positive ones that rise.", port=x[0])
+    """Return the growth rates over two properties, each given by its name and its values; see `Contact`."""
+    across, up = x[1], y[1]
     rows, limits = [], []
     for value in up.tolist():
         environment = {**held, y[0]: value}
@@ -321,33 +308,34 @@ def map_growth(
     return ContactMap(x[0], y[0], across, up, np.array(rows).reshape(len(up), len(across)), tuple(limits))
 
 
-def check_properties(names: Iterable[str], vary: str) -> None:
-    """Refuse unknown properties, and one that is held and varied."""
-    for name in names:
-        if name not in UNITS:
-            raise OptionError(f"an environment has no {name!r}. {near(name, UNITS)}", port=str(name))
+def check_properties(held: Mapping[str, Any], vary: str) -> dict[str, float]:
+    """Return the properties of an environment that are held, as numbers.
+
+    Raises
+    ------
+    OptionError, ParameterError
+        If a property is unknown, or held and varied; if its value is no finite number that is not negative.
+    """
+    check_property(vary, "vary")
+    for name in held:
+        check_property(name, str(name))
         if name == vary:
             raise OptionError(
                 "found it among the held properties, too; expected it only as the one that varies. Leave it out.",
                 port=name,
             )
+    return {name: read_number(value, name, UNITS[name]) for name, value in held.items()}
 
 
-def _check_scan(vary: str, low: float | None, high: float | None, per_decade: int) -> tuple[float, float]:
-    if vary not in UNITS:
-        raise OptionError(f"an environment has no {vary!r}. {near(str(vary), UNITS)}", port="vary")
+def _check_scan(vary: str, low: Any, high: Any, per_decade: Any) -> tuple[float, float, int]:
     first, last = SCANNED[vary]
-    first, last = first if low is None else low, last if high is None else high
-    if not 0.0 < first < last < math.inf:
+    first = first if low is None else read_positive(low, "low", f"value in {UNITS[vary]}")
+    last = last if high is None else read_positive(high, "high", f"value in {UNITS[vary]}")
+    if not first < last:
         raise OptionError(
             f"found a scan from {first!r} to {last!r}; expected 0 < low < high. Give other ends.", port=vary
         )
-    if not per_decade >= FEWEST_PER_DECADE:
-        raise OptionError(
-            f"found {per_decade!r} points in a decade; expected at least {FEWEST_PER_DECADE}. Give more.",
-            port="per_decade",
-        )
-    return first, last
+    return first, last, read_density(per_decade, FEWEST_PER_DECADE)
 
 
 def _confirm(loop: CoupledLoop, value: float, step: float) -> str:

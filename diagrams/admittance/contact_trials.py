@@ -272,7 +272,7 @@ def _choose(contact: TriedContact, limit: ContactLimit, method: TrialMethod | st
         possible.insert(len(possible) - (equations and has_mass), TrialMethod.HELD)
     names = {one.name.lower(): one for one in TrialMethod}
     asked = names.get(method) if isinstance(method, str) else method
-    if method is not None and asked is None:
+    if method is not None and not isinstance(asked, TrialMethod):
         raise OptionError(f"found {method!r}. {near(str(method), names)}", block=contact.plant, port="method")
     if asked is not None and asked not in possible:
         raise OptionError(

@@ -238,7 +238,7 @@ def test_a_map_has_the_growth_rates_and_limits_by_hand():
         agree(limit, other)
     broken = contact().stability_map(stiffness, [0.0], tool_mass=0.65)
     assert np.all(broken.growth > 0.0)  # of the other direction
-    with pytest.raises(OptionError, match="expected positive ones that rise"):
+    with pytest.raises(OptionError, match="expected positive ones that rise, two at least"):
         contact().stability_map([2.0, 1.0], damping)
     with pytest.raises(OptionError, match="among the held properties"):
         contact().stability_map(stiffness, damping, x="damping")
@@ -251,7 +251,7 @@ def test_properties_of_environments_are_checked():
         contact().stability_limit("mass", stifness=3.0)
     with pytest.raises(OptionError, match="among the held properties"):
         contact().stability_limit(stiffness=3.0)
-    with pytest.raises(ParameterError, match="expected finite numbers that are not negative"):
+    with pytest.raises(ParameterError, match="expected one finite number in N.s/m that is not negative"):
         contact().stability_limit(damping=-1.0)
     with pytest.raises(OptionError, match="expected at least 30"):
         contact().stability_limit(per_decade=10)

@@ -1,7 +1,6 @@
 """Contacts of diagrams that aren't Fig. 3, against Routh's criterion and matrices of our own."""
 
 import math
-from functools import cache
 
 import numpy as np
 import pytest
@@ -16,41 +15,13 @@ from loopwright.blocks import (
     Input,
     OptionError,
     Output,
-    State,
     TransferFunction,
 )
 from loopwright.diagrams import Diagram, TrialMethod, subsystem
 from loopwright.fmus import Fmu, build, scara
+from support.carts import DRAG, SHARE, TAU, Cart, M, cart_contact, cart_diagram
 
 # --- another diagram: a cart whose drive lags behind the force that it shows -----------------------------------------
-
-M, TAU, SHARE, DRAG = 3.0, 0.02, 4.0, 8.0
-"""Mass in kg, lag in s, share of the measured force that the drive adds, drag in N s/m."""
-
-
-class Cart(Block):
-    motor = Input(unit="N")
-    push = Input(unit="N")
-    position = State(unit="m", start=0.0, output=True)
-    velocity = State(unit="m/s", start=0.0, output=True)
-
-    def derivative(self, t, x, u):
-        return x.velocity, (u.motor + u.push) / M
-
-
-def cart_diagram(cart=None):
-    cart = Cart(name="cart") if cart is None else cart
-    hand = Constant(value=0.0, unit="N", name="hand")
-    felt = Gain(gain=1.0, name="sensor")(hand).named("felt")
-    lag = TransferFunction(numerator=(1.0,), denominator=(TAU, 1.0), name="drive")
-    wanted = Gain(gain=SHARE, name="share")(felt) - Gain(gain=DRAG, name="drag")(cart.velocity)
-    return Diagram("cart", cart(motor=lag(wanted), push=hand))
-
-
-@cache
-def cart_contact():
-    ports = {"position": "cart.position", "velocity": "cart.velocity", "force": "felt"}
-    return cart_diagram().contact("cart.push", direction=[1.0], **ports)
 
 
 def test_a_cart_has_the_limits_of_routh():

@@ -1,0 +1,126 @@
+"""Arguments of a contact's methods, read and checked."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import OptionError, ParameterError, near
+from .stability_limits import UNITS
+
+
+def read_number(value: Any, port: str, unit: str) -> float:
+    """Return a number that is finite and not negative.
+
+    Raises
+    ------
+    ParameterError
+        If it is something else.
+    """
+    found = _as_array(value)
+    if found is None or found.ndim != 0 or not 0.0 <= float(found) < math.inf:
+        raise ParameterError(
+            f"found {value!r}; expected one finite number in {unit} that is not negative. Give one.",
+            block="environment",
+            port=port,
+        )
+    return float(found)
+
+
+def read_positive(value: Any, port: str, unit: str) -> float:
+    """Return a number that is finite and positive.
+
+    Raises
+    ------
+    OptionError
+        If it is something else.
+    """
+    found = _as_array(value)
+    if found is None or found.ndim != 0 or not 0.0 < float(found) < math.inf:
+        raise OptionError(f"found {value!r}; expected a positive {unit}. Give one.", port=port)
+    return float(found)
+
+
+def read_frequencies(value: Any) -> np.ndarray:
+    """Return frequencies in rad/s as they are given, as an array.
+
+    Raises
+    ------
+    OptionError
+        If they are no real numbers.
+    """
+    found = _as_array(value)
+    if found is None:
+        raise OptionError(f"found {value!r}; expected frequencies in rad/s. Give numbers.", port="omega")
+    return found
+
+
+def read_row(value: Any, name: str, *, rising: bool) -> np.ndarray:
+    """Return a row of finite values of a property that are not negative; with ``rising``, positive ones that rise.
+
+    Raises
+    ------
+    OptionError
+        If it is something else.
+    """
+    unit = UNITS[name]
+    found = _as_array(value)
+    if found is None or found.ndim != 1 or not len(found) or not np.all(np.isfinite(found)):
+        raise OptionError(f"found {value!r}; expected a row of finite values in {unit}. Give a list.", port=name)
+    if rising and (len(found) < 2 or not (found[0] > 0.0 and np.all(np.diff(found) > 0.0))):
+        raise OptionError(
+            f"found the values {found.tolist()}; expected positive ones that rise, two at least. Give others.",
+            port=name,
+        )
+    if not np.all(found >= 0.0):
+        raise OptionError(
+            f"found the values {found.tolist()}; expected none that is negative. Leave it out.", port=name
+        )
+    return found
+
+
+def read_density(value: Any, fewest: int) -> int:
+    """Return a number of points in a decade.
+
+    Raises
+    ------
+    OptionError
+        If it is no whole number, or too small.
+    """
+    found = _as_array(value)
+    if found is None or found.ndim != 0 or not fewest <= float(found) < math.inf or float(found) != int(found):
+        raise OptionError(
+            f"found {value!r} points in a decade; expected at least {fewest}, a whole number. Give more.",
+            port="per_decade",
+        )
+    return int(found)
+
+
+def read_vector(value: Any) -> np.ndarray | None:
+    """Return a row of real numbers; None of anything else."""
+    found = _as_array(value)
+    return None if found is None else np.atleast_1d(found)
+
+
+def check_property(name: Any, port: str) -> str:
+    """Return a property of an environment.
+
+    Raises
+    ------
+    OptionError
+        If an environment has none of this name.
+    """
+    if not isinstance(name, str) or name not in UNITS:
+        raise OptionError(f"an environment has no {name!r}. {near(str(name), UNITS)}", port=port)
+    return name
+
+
+def _as_array(value: Any) -> np.ndarray | None:
+    """Return real numbers as an array; None of anything else, such as texts, truth values and complex numbers."""
+    try:
+        found = np.asarray(value)
+    except ValueError:  # lists of different lengths
+        return None
+    return found.astype(float) if found.dtype.kind in "iuf" or not found.size else None
