@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace as replace_fields
 from functools import lru_cache
+from math import isfinite
 from typing import Any, ClassVar, Self, dataclass_transform
 
 import numpy as np
@@ -184,6 +185,8 @@ def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
         )
 
     kinds = _kinds(spec.annotation)
+    if type(value) is float and kinds <= _FLOAT and spec.shape is None and isfinite(value) and _is_within(value, spec):
+        return value
     array = bool(kinds & {"Array", "ndarray", "NDArray"})
     numeric = array or "float" in kinds
     if value is None and ("None" in kinds or not numeric):
@@ -226,6 +229,17 @@ def convert(value: Any, spec: ParameterSpec, owner: str, name: str) -> Any:
             return float(result)
         result.flags.writeable = False
     return result
+
+
+_FLOAT = frozenset({"float", "None"})
+
+
+def _is_within(value: float, spec: ParameterSpec) -> bool:
+    return (
+        (spec.above is None or value > spec.above)
+        and (spec.minimum is None or value >= spec.minimum)
+        and (spec.maximum is None or value <= spec.maximum)
+    )
 
 
 def _annotation_text(annotation: Any) -> str:

@@ -5,7 +5,7 @@ from .equations import initial_state, start_shapes, start_values
 from .numpy_check import GUARDS, NEXT, evaluate
 from .opaque_equations import raise_failure
 from .outside import describe_outside
-from .structure import is_traced_by, structure, traced_parameters
+from .structure import has_structure, is_traced_by, structure, traced_parameters
 from .switching_times import Line, switching_times
 from .symbols import bundle, flat_column, has_large_product, size, with_values, wrap
 from .traced import Traced, constants_of, trace
@@ -24,6 +24,7 @@ __all__ = [
     "evaluate",
     "flat_column",
     "has_large_product",
+    "has_structure",
     "hold",
     "initial_state",
     "is_traced_by",

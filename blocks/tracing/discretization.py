@@ -59,5 +59,7 @@ def hold(A: np.ndarray, T: float, method: str) -> tuple[np.ndarray, np.ndarray]:
         return solve @ (eye + T / 2 * A), T * solve
     from scipy.linalg import expm
 
-    both = expm(np.block([[A, eye], [np.zeros((n, 2 * n))]]) * T)
+    generator = np.zeros((2 * n, 2 * n))
+    generator[:n, :n], generator[:n, n:] = A, eye
+    both = expm(generator * T)
     return both[:n, :n], both[:n, n:]

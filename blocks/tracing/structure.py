@@ -25,13 +25,35 @@ def structure(block: Value) -> Any:
     items: list[Any] = [type(block)]
     for name, spec in type(block).parameter_specs.items():
         value = block.__dict__[name]
-        if isinstance(value, Block):
-            items.append((name, structure(value)))
-        elif isinstance(value, float | np.ndarray) and not spec.structural:
-            items.append((name, np.shape(value), (np.asarray(value) == 0).tobytes()))
-        else:
-            items.append((name, identity(value)))
+        items.append((name, *_item(value, structural=spec.structural)))
     return tuple(items)
+
+
+def _item(value: Any, *, structural: bool) -> tuple[Any, ...]:
+    if isinstance(value, Block):
+        return (structure(value),)
+    if isinstance(value, float | np.ndarray) and not structural:
+        return np.shape(value), (np.asarray(value) == 0).tobytes()
+    return (identity(value),)
+
+
+def has_structure(block: Value, other: Value) -> bool:
+    """Whether two blocks have equal structures; values that both share are not looked at."""
+    if type(block) is not type(other):
+        return False
+    for name, spec in type(block).parameter_specs.items():
+        new, old = block.__dict__[name], other.__dict__[name]
+        if new is old:
+            continue
+        if isinstance(new, Block) and isinstance(old, Block):
+            if not has_structure(new, old):
+                return False
+        elif isinstance(new, float) and isinstance(old, float) and not spec.structural:
+            if (new == 0.0) != (old == 0.0):
+                return False
+        elif _item(new, structural=spec.structural) != _item(old, structural=spec.structural):
+            return False
+    return True
 
 
 def is_traced_by(block: Value, other: Value) -> bool:

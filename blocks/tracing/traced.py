@@ -61,8 +61,11 @@ class Traced:
 
     def pack(self, block: Block, T: float) -> np.ndarray:
         """Return ``p`` for ``block`` (of this structure) at the sample time T."""
-        numbers = [np.ravel(v) for _, v in traced_parameters(block)]
-        p = np.concatenate([*numbers, [T], *(np.ravel(v) for v in constants_of(block, T, self.method).values())])
+        given = [value for _, value in traced_parameters(block)]
+        numbers: list[float] = []
+        for value in (*given, T, *constants_of(block, T, self.method).values()):
+            numbers += [value] if isinstance(value, float) else np.ravel(value).tolist()
+        p = np.array(numbers, dtype=float)
         if self.system_matrix is None:
             return p
         n = sum(size(s) for s in self.states.values())

@@ -128,8 +128,7 @@ def renumber(flat: FlatDiagram, blocks: Mapping[str, Block]) -> FlatDiagram:
     blocks : mapping of str to Block
         Blocks by path that differ from those of ``flat`` in numbers alone: their traces are the same ones.
     """
-    table = flat.table.copy()
-    table.blocks.update(blocks)
+    table = flat.table.with_blocks(blocks)
     p, x0 = flat.p.copy(), flat.x0.copy()
     for path, block in blocks.items():
         if path not in flat.checked.traced:

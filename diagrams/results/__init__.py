@@ -22,7 +22,7 @@ from .recorder import Recorder
 from .recording import Recording
 from .run import Run
 from .saved_state import RunState, check_fits, layout_of, not_open_error
-from .signal_names import entries, resolve
+from .signal_names import Places, entries, resolve
 from .snapshot import Snapshot
 from .stored import Occurrence, Stopped
 from .texts import TextSignal
@@ -39,6 +39,7 @@ __all__ = [
     "FreeDirection",
     "Occurrence",
     "OperatingPoint",
+    "Places",
     "PointOrigin",
     "Recorder",
     "Recording",

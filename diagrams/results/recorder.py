@@ -164,6 +164,8 @@ class Recorder:
         """Append the final sample, whatever ``every`` is, unless `row` has just kept it."""
         newest = self._chunk[self._k - 1] if self._k else self._tail
         values = vector if self._pick is None else vector[self._pick]
+        if newest is not None and newest[0] == t and (newest[1:] == values).all():
+            return
         if newest is None or newest[0] != t or not np.array_equal(newest[1:], values, equal_nan=True):
             self._keep(t, vector)
 

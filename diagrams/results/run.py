@@ -12,7 +12,7 @@ import numpy as np
 
 from ...blocks.core import Layout, OptionError, PortUnit, UnknownNameError
 from ..wiring import CheckedDiagram, Wire, split_entry
-from .signal_names import entries, resolve
+from .signal_names import Place, Places, entries, place_of, resolve
 from .snapshot import Snapshot
 from .stored import Occurrence, PathLike, Stopped, header, prepare, read, write
 from .texts import TextSignal
@@ -86,9 +86,10 @@ class Run:
     diagram_name: str = ""
     final_state: RunState | None = field(default=None, repr=False)
     """The complete state at the end, for ``simulate(…, start=)``; None where an FMU can't save its state."""
-
     recipe: Mapping[str, Any] = field(default_factory=dict, repr=False)
     """Options of the run (step, solver, tolerances, start), with which an instant of it can be found again."""
+
+    _places: Places = field(init=False, default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         if not self.diagram_name:
@@ -221,6 +222,14 @@ class Run:
         UnknownNameError
             If no signal or several have that name, or if it was not recorded.
         """
+        shape, at = self._place(name)
+        values = self.data[samples, at] if isinstance(at, slice) else self.data[samples][:, at]
+        return np.ascontiguousarray(values.reshape(len(values), *shape))
+
+    def _place(self, name: str) -> Place:
+        """Return a signal's shape, and its columns in ``data``."""
+        if isinstance(name, str) and name in self._places:
+            return self._places[name]
         full = resolve(name, self.wires, self.layout.slices)
         where = self._find_columns(full)
         if where is None:
@@ -228,12 +237,12 @@ class Run:
                 f"the signal {full!r} was not recorded in this run, as the selection left it out. Run again with "
                 f"record=[…, {full!r}], or without record for all signals."
             )
-        flat = where.ravel()
-        if flat.size and np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size)):
-            values = self.data[samples, flat[0] : flat[0] + flat.size]
-        else:
-            values = self.data[samples][:, flat]
-        return np.ascontiguousarray(values.reshape(len(values), *where.shape))
+        self._places[name] = place_of(where)
+        return self._places[name]
+
+    def find_in(self, places: Places) -> None:
+        """Find signals where other runs of the same recording have found them."""
+        object.__setattr__(self, "_places", places)
 
     def _ipython_key_completions_(self) -> list[str]:
         return self.names

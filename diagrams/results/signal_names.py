@@ -13,6 +13,18 @@ import numpy as np
 from ...blocks.core import Layout, UnknownNameError, near
 from ..wiring import Wire, index_of, split_entry
 
+Place = tuple[tuple[int, ...], slice | np.ndarray]
+"""Shape of a signal, and its columns in a run's data."""
+Places = dict[str, Place]
+"""Places by the names that were asked for."""
+
+
+def place_of(columns: np.ndarray) -> Place:
+    """Return the place of a signal whose entries stand in some columns, in its shape."""
+    flat = columns.ravel()
+    together = flat.size and np.array_equal(flat, np.arange(flat[0], flat[0] + flat.size))
+    return columns.shape, slice(int(flat[0]), int(flat[0]) + flat.size) if together else flat
+
 
 def resolve(name: str, wires: Mapping[str, Wire], ports: Collection[str]) -> str:
     """Return the full name that ``name`` stands for: a wire's or port's path, or a unique end of one; wires go first.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from time import perf_counter
@@ -36,6 +37,8 @@ FIRST, LARGEST_CHUNK = 64, 2**20
 """Ticks of a chunk: the first one, and at most."""
 WISHED = 0.05
 """Seconds that a chunk takes, half or double; Ctrl-C and the progress bar have their turn after it."""
+_WINDOW = 2**17
+"""Ticks whose times are computed at a time, at most."""
 _EXACT = 2**53  # up to which every integer is a float64
 _RK4 = 1  # the integrator of exported FMUs that is compiled into a fused loop
 CLOCKS = 16
@@ -48,6 +51,27 @@ _LOOPS = (
     "Compiled: an algebraic loop has {} values. C solves the linear equations of Newton's method with another rounding "
     "than an interpreted run, so that its values may differ by some 1e-14 times the condition of these equations."
 )
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """Some ticks after tick ``before``: the time of that and of each in s, their lengths in s, and their kinds."""
+
+    before: int
+    ticks: np.ndarray
+    times: np.ndarray
+    widths: np.ndarray
+    kinds: np.ndarray
+    unknown: np.ndarray
+    """Places of the ticks at which clocks act together for which there is no code."""
+
+    def known(self, start: int, stop: int) -> int:
+        """Return the end of the ticks from a place on for which there is code, at most ``stop``."""
+        stop = min(stop, len(self.kinds))
+        if not len(self.unknown):
+            return stop
+        next_one = int(np.searchsorted(self.unknown, start))
+        return stop if next_one == len(self.unknown) else min(stop, int(self.unknown[next_one]))
 
 
 class CompiledTicks:
@@ -90,6 +114,8 @@ class CompiledTicks:
         for kind, clocks in enumerate(self._code.ticks):
             self._kind_of[sum(1 << i for i, clock in enumerate(flat.distinct) if clock in clocks)] = kind
         self._chunk = FIRST
+        self._first: _Window | None = None
+        self._last = 0
 
     @property
     def messages(self) -> tuple[str, ...]:
@@ -121,36 +147,58 @@ class CompiledTicks:
         progress : callable
             Told the time after each chunk.
         """
-        loop, base = self._bind(recorder), self._flat.base
-        n, d = base.numerator, base.denominator
-        visited, rest = self._flat.ticks(k, last, every=self._every), np.zeros(0, dtype=np.int64)
-        while rest.size or (rest := np.fromiter(islice(visited, self._chunk), dtype=np.int64)).size:
-            rows = recorder.room(k * n / d)
+        for window in self._windows(k, last):
+            if self._run_window(window, recorder, arrived, progress):
+                return
+
+    def _run_window(
+        self, window: _Window, recorder: Recorder, arrived: Callable[[int], bool], progress: Callable[[float], Any]
+    ) -> bool:
+        """Run some ticks; return whether the run ends there."""
+        loop, at, k = self._bind(recorder), 0, window.before
+        while at < len(window.kinds):
+            rows = recorder.room(float(window.times[at]))
             loop.skip = recorder.skip
-            ticks = rest[: recorder.skip + (len(rows) - 1) * recorder.every + 1]
-            kinds = self._kinds(ticks)
-            if (kinds < 0).any():
-                ticks = ticks[: int(np.argmax(kinds < 0))]
+            stop = window.known(at, min(at + self._chunk, at + recorder.skip + (len(rows) - 1) * recorder.every + 1))
             started = perf_counter()
-            ends = np.concatenate([[k], ticks])
-            found = loop.run(ends * n / d, np.diff(ends) * n / d, kinds[: len(ticks)], rows)
+            found = loop.run(window.times[at : stop + 1], window.widths[at:stop], window.kinds[at:stop], rows)
             recorder.took(found.rows, loop.skip)
-            rest = rest[found.ticks :]
+            at += found.ticks
             if found.ticks:
-                k = int(ticks[found.ticks - 1])
+                k = int(window.ticks[at - 1])
                 if arrived(k):
-                    return
-            if found.ticks < len(ticks) or not len(ticks):  # Python looks at this tick
-                following = int(rest[0])
+                    return True
+            if at < stop or not found.ticks:  # Python looks at this tick
+                following = int(window.ticks[at])
                 self._take_tick(k, following, found, recorder)
-                k, rest = following, rest[1:]
+                k, at = following, at + 1
                 if arrived(k):
-                    return
+                    return True
             elif (took := perf_counter() - started) < WISHED:
                 self._chunk = min(2 * self._chunk, LARGEST_CHUNK)
             elif took > 2 * WISHED:
                 self._chunk = max(1, self._chunk // 2)
-            progress(k * n / d)
+            progress(float(window.times[at]))
+        return False
+
+    def _windows(self, k: int, last: int) -> Iterator[_Window]:
+        """Yield the ticks after tick ``k`` up to ``last``; the first ones are kept for the next run."""
+        if self._first is None or (self._first.before, self._last) != (k, last):
+            self._first, self._last = self._window(k, self._flat.ticks(k, last, every=self._every)), last
+        yield self._first
+        k = int(self._first.ticks[-1])
+        visited = self._flat.ticks(k, last, every=self._every)
+        while k < last:
+            window = self._window(k, visited)
+            yield window
+            k = int(window.ticks[-1])
+
+    def _window(self, k: int, visited: Iterator[int]) -> _Window:
+        base, ticks = self._flat.base, np.fromiter(islice(visited, _WINDOW), dtype=np.int64)
+        n, d, ends = base.numerator, base.denominator, np.concatenate([[k], ticks])
+        kinds = self._kinds(ticks)
+        unknown = np.flatnonzero(kinds < 0)
+        return _Window(k, ticks, ends * n / d, np.diff(ends) * n / d, kinds, unknown)
 
     def _bind(self, recorder: Recorder) -> CompiledLoop:
         if self._loop is None or recorder is not self._recorder:

@@ -91,7 +91,8 @@ def initialize(
                 t=0.0,
             )
         found = not workspace.looped or np.allclose(last, workspace.here.x, rtol=_SETTLED, atol=_SETTLED)
-        agreed = passes_on != "agree" or np.allclose(before, workspace.z, rtol=_SETTLED, atol=0.0, equal_nan=True)
+        agreed = passes_on != "agree" or bool((before == workspace.z).all())
+        agreed = agreed or np.allclose(before, workspace.z, rtol=_SETTLED, atol=0.0, equal_nan=True)
         if found and agreed:
             break
         if passes == most:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from time import perf_counter
 from typing import Any
 
@@ -12,13 +12,13 @@ from ...blocks.core import SimulationError
 from ...fmus.calls import FmuInstance
 from ..coupling import note_fine_steps, note_loops
 from ..flat import EVERY, FlatDiagram, renumber
-from ..results import Recorder, Recording, Run
+from ..results import Places, Recorder, Recording, Run
 from ..simulation import Engine, RunOptions, SimulatedDiagram, default_step, refuse_rest, ticks_in
 from .start_values import StartValues
 from .variation import Numbers
 
 LOADING = threading.Lock()
-"""Held while FMUs are loaded, reset and initialized: a library may change what the whole process shares."""
+"""Held while FMUs are loaded, and begun for the first time: loading changes what the whole process shares."""
 
 Tell = Callable[[float], None]
 
@@ -56,7 +56,9 @@ class BoundRun:
         self._recorder: Recorder = self._recording.begin(rows)
         fine = note_fine_steps(self.flat) if base is None else ()
         self._notes: tuple[str, ...] = (*fused, *fine, *note_loops(self.flat, self.engine.coupling))
+        self._has_begun = False
         self._told: dict[str, int] = {}
+        self._places: Places = {}
         self._start = StartValues(self.engine.workspace)
         self._stack = ExitStack()
 
@@ -133,17 +135,17 @@ class BoundRun:
         SimulationError
             If the start can't be found with them.
         """
-        with LOADING:
+        with nullcontext() if self._has_begun else LOADING:  # the first start traces functions
             for path, plant in self.engine.plants.items():
                 assert isinstance(plant, FmuInstance)
-                plant.reset()
-                plant.initialize(None, values=numbers.starts.get(path))
+                plant.start_anew(numbers.starts.get(path, {}))
             self.engine.begin_anew(renumber(self.flat, numbers.blocks), self._start.set)
+            self._has_begun = True
 
     def _take_record(self, started: float) -> Run:
         recorder, engine = self._recorder, self.engine
         t, data = recorder.finish()
-        return Run(
+        run = Run(
             t=t,
             data=data,
             layout=self.flat.log,
@@ -157,6 +159,8 @@ class BoundRun:
             has_states=self._recording.states,
             diagram_name=self._name,
         )
+        run.find_in(self._places)
+        return run
 
     def _take_messages(self) -> list[str]:
         """Return what the FMUs have told since the last run."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...blocks.core import LoopwrightError, SimulationError
+from ...blocks.core import Layout, LoopwrightError, SimulationError
 from ...fmus import Fmu
 from ...fmus.isolation import find_limits
 from ...fmus.platform import is_built_here
@@ -106,6 +106,7 @@ class Worker:
         self.plan, self._options = plan, plan.run_options
         self._variation: Variation[Any] = Variation(plan.diagram)
         self._bound: OrderedDict[Any, BoundRun] = OrderedDict()
+        self._known_units: tuple[Layout, dict[str, str]] | None = None
         self._repeats = self._options.start is None and plan.runs_in_threads
 
     def __enter__(self) -> Worker:
@@ -221,7 +222,12 @@ class Worker:
     def _signals(self, run: Run) -> dict[str, np.ndarray]:
         return {name: np.array(run[name]) for name in self.plan.signals}
 
-    def _units(self, run: Run) -> dict[str, str]:
+    def _units(self, run: Run) -> Mapping[str, str]:
+        if self._known_units is None or self._known_units[0] is not run.layout:
+            self._known_units = run.layout, self._find_units(run)
+        return self._known_units[1]
+
+    def _find_units(self, run: Run) -> dict[str, str]:
         found = {name: run.unit(name) for name in self.plan.signals}
         for name, function in self.plan.reductions.items():
             if isinstance(function, Reduction):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from ...blocks.core import Block, LoopwrightError, identity
-from ...blocks.tracing import structure
+from ...blocks.tracing import has_structure
 from ...fmus import Fmu
 from ...fmus.archive import FmuDescription
 from ..simulation import SimulatedDiagram
@@ -64,7 +64,7 @@ class Variation(Generic[D]):
         self._diagram = diagram
         self._others: OrderedDict[Any, D] = OrderedDict()
         self._places: dict[str, tuple[str, list[str]] | None] = {}
-        self._structures: dict[str, Any] = {}
+        self._free: dict[str, list[str]] = {}
         self._descriptions: dict[str, FmuDescription] = {}
 
     def find(self, parameters: Mapping[str, Any]) -> Numbers[D]:
@@ -148,17 +148,14 @@ class Variation(Generic[D]):
         known = split_entry(keys[0], type(block).parameter_specs)[0] in type(block).parameter_specs
         return (path, keys) if path in diagram.checked.traced and known else None
 
-    def _structure(self, path: str, block: Block) -> Any:
-        if path not in self._structures:
-            self._structures[path] = structure(block)
-        return self._structures[path]
-
     def _is_numbers(self, path: str, block: Block) -> bool:
         """Whether a block differs from that of the diagram in numbers alone: its functions are those of that."""
         old, wires = self._diagram.scheduled.blocks[path], self._diagram.scheduled.wires
-        if block.opaque or structure(block) != self._structure(path, old):
+        if block.opaque or not has_structure(block, old):
             return False
-        free = [port for port in old.inputs if (path, port) not in wires]
+        if path not in self._free:
+            self._free[path] = [port for port in old.inputs if (path, port) not in wires]
+        free = self._free[path]
         return all(identity(block.inputs[q].default) == identity(old.inputs[q].default) for q in free)
 
 

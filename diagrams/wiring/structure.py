@@ -6,8 +6,8 @@ block, across the borders of subsystems.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from fractions import Fraction
 
 from ...blocks.core import (
@@ -113,6 +113,10 @@ class Structure:
     def copy(self) -> Structure:
         """Return a structure with dictionaries of its own."""
         return Structure(*(dict(getattr(self, f.name)) for f in fields(self)))
+
+    def with_blocks(self, blocks: Mapping[str, Block]) -> Structure:
+        """Return a structure with other blocks in some places; it shares all dictionaries but that of the blocks."""
+        return replace(self, blocks={**self.blocks, **blocks})
 
     def clock(self, subsystem: str) -> SubsystemSettings | None:
         """Return the subsystem whose sample time holds in one: itself, or the nearest around it; None without any."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -11,12 +12,10 @@ import numpy as np
 
 from ...blocks.core import FmuError, FmuProcessError
 from ..archive import FmuVariable
-from ..host_state import guard_host
-from ..platform import is_built_here
 from .fmi_calls import StepCall
 from .fmu_block import FmuBlock
 from .loaded_library import MakeCalls
-from .native_step import NativeStep, native_step
+from .native_step import BoundStart, NativeStep, native_step
 from .saved_state import FmuState, StepMemory, pack_state, unpack_state
 from .shared_steps import SharedSteps
 from .step_failures import NEAR, StepFailures
@@ -67,19 +66,49 @@ class FmuInstance(StepFailures):
         self._texts = TextRecord(self.fmi, block.text_variables)
         self._careful: CarefulSteps | None = None
         self._native: tuple[StepCall, Transfer, Transfer] | None = None
+        self._starts: dict[tuple[str, ...], BoundStart | None] = {}
 
     @property
     def t(self) -> float:
         """Time of the instance in s."""
         return self._now.value + self._width.value if self._running else self._began
 
-    @guard_host
     def begin(self) -> None:
         """Leave Initialization Mode and read the outputs at the start of the run."""
-        super().begin()
-        self._now.value, self._width.value = self._began, 0.0
-        self.read(self._began)
-        self._begin_texts()
+        with self.host if self._start is None else nullcontext():
+            super().begin()
+            self._now.value, self._width.value = self._began, 0.0
+            self.read(self._began)
+            if self._texts.variables:
+                self._begin_texts()
+
+    def start_anew(self, values: Mapping[str, np.ndarray]) -> None:
+        """Reset it, set start values and enter Initialization Mode at t = 0, as `reset` and `initialize` do.
+
+        An FMU that Loopwright has built, with a plain step (`native`), is started by a few calls that are bound once.
+
+        Parameters
+        ----------
+        values : mapping of str to array
+            Start values beside those of the block, which they override, by the FMU's names.
+        """
+        self.reset()
+        given = {**self.block.start, **values}
+        if (names := tuple(given)) not in self._starts:
+            fits = self._native is not None and self.is_built_here and BoundStart.fits(self.description, names)
+            self._starts[names] = BoundStart(self.fmi, self.description, names) if fits else None
+        start = self._starts[names]
+        if start is not None:
+            self._began, self._given = 0.0, given
+            try:
+                entered = start.enter(given, self.block.stepping.tolerance)
+            except Exception as error:
+                raise self._initialization_error(error) from error
+            if entered:
+                self._start = start
+                return
+            self.reset()
+        self.initialize(None, values=values)
 
     def _settle_start(self) -> None:
         if self._careful is None:
@@ -108,7 +137,7 @@ class FmuInstance(StepFailures):
             self.step = partial(self._step_marked, self._careful.step)
         if self._texts.variables:
             self.step = partial(self._step_and_note, self.step)
-        if self.fmi.in_process and not is_built_here(self.description.digest):
+        if self.fmi.in_process and not self.is_built_here:
             self.step = partial(self._step_guarded, self.step)
         if isinstance(self.step, partial):
             self.start_step, self.finish_step = self._ask, self._take

@@ -20,6 +20,7 @@ from .fmi3 import Fmi3Calls
 from .fmi_calls import FATAL, FmiCalls
 from .fmu_block import FmuBlock
 from .message_log import MessageLog, clean_text, describe_end
+from .native_step import BoundStart
 from .shared_steps import SharedReading
 from .step_options import choose_modes
 from .texts import is_readable, list_limits, read_text, waits_for_initialization, write_text
@@ -41,7 +42,8 @@ class LoadedFmu:
         self.model_exchange, self.failed, self.fatal = model_exchange, False, False
         self.log = MessageLog(block.label, list_limits(block.label, self.description, model_exchange=model_exchange))
         self._open = self._running = False
-        self._began, self._given = 0.0, dict[str, Any]()
+        self._start: BoundStart | None = None
+        self._began, self._given, self.is_built_here = 0.0, dict[str, Any](), is_built_here(block.description.digest)
         description, self.host = self.description, HostState(self.add_note)
         if make_calls is None:
             self._refuse_second()
@@ -151,7 +153,7 @@ class LoadedFmu:
         values : mapping of str to array, optional
             Further start values, by the FMU's names; they override the block's.
         """
-        self._began = start_time
+        self._began, self._start = start_time, None
         given = self._given = {**self.block.start, **(values or {})}
         try:
             self._configure(given)
@@ -222,7 +224,7 @@ class LoadedFmu:
 
         An FMU that Loopwright has not built gets a fresh instance: the resets of many leave something behind.
         """
-        if is_built_here(self.description.digest):
+        if self.is_built_here:
             self.call("resetting it", self.fmi.reset)
         else:
             self.call("making it anew", self.fmi.renew, self.log.take, self._running and not self.failed)
@@ -236,11 +238,10 @@ class LoadedFmu:
         except Exception as error:
             raise self._initialization_error(error) from error
         self._running = True
-        others = {*self.description.texts, *(v.name for v in self.block.input_variables.values())}  # set anew, in part
-        kept = {
-            n: v for n, v in self._given.items() if n not in others and self.description.find(n).causality != "input"
-        }
-        self._refuse_lost(self._find_lost(kept), " after its initialization")
+        if self._start is None or not self._start.are_kept():
+            others = {*self.description.texts, *(v.name for v in self.block.input_variables.values())}  # set anew
+            names = [n for n in self._given if n not in others and self.description.find(n).causality != "input"]
+            self._refuse_lost(self._find_lost({n: self._given[n] for n in names}), " after its initialization")
         if self.fmi.event_mode_used:
             self._settle_start()
 
@@ -367,8 +368,8 @@ class LoadedFmu:
 
     def set_continuous_states(self, x: np.ndarray) -> None:
         """Set all continuous states in model exchange, in the order of the description's `states`."""
-        order = np.array(self.description.state_order, dtype=int)
-        self.call("setting the continuous states", self.fmi.set_continuous_states, x[order])
+        given = x[np.array(self.description.state_order, dtype=int)]
+        self.call("setting the continuous states", self.fmi.set_continuous_states, given)
 
     # ---- the end ----
 

@@ -66,7 +66,7 @@ def check_value(description: FmuDescription, name: str, value: Any, label: str) 
     port = f"start.{name}"
     if name in description.other:
         return _check_text(description, name, value, label)
-    if name not in description.names:
+    if name not in description.variables and name not in description.elements:
         known = {*description.names, *description.texts}
         raise UnknownNameError(f"the FMU has no variable {name!r}. {near(name, known)}", block=label, port="start")
     variable = description.find(name)

@@ -1,0 +1,59 @@
+"""The set-up of a run in a sweep: few calls of Python, and none for each tick."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from loopwright.diagrams import experiments
+from loopwright.diagrams.sweeps import final, maximum
+from loopwright.diagrams.sweeps.plan import Worker
+from loopwright.diagrams.sweeps.samples import Sample
+from loopwright.diagrams.sweeps.sweep import make_plan
+
+KEPT = {"xi": final("xi"), "force": maximum("motor_force")}
+
+
+def samples(count):
+    fractions = np.linspace(0.5, 1.5, count)
+    names = "plant.start.coulomb_scale", "controller.admittance_perp.stiffness"
+    return [Sample(k, {names[0]: float(f), names[1]: float(200.0 * f)}, k) for k, f in enumerate(fractions)]
+
+
+def count_calls(worker, sample):
+    """Return how many functions of Python a run calls; functions of C are not counted."""
+    seen = []
+    sys.setprofile(lambda frame, event, argument: seen.append(1) if event == "call" else None)
+    try:
+        outcome = worker.run(sample)
+    finally:
+        sys.setprofile(None)
+    assert outcome.failure is None
+    return len(seen)
+
+
+@pytest.fixture(scope="module")
+def diagram():
+    return experiments.hand_guiding().diagram
+
+
+def test_a_run_of_a_sweep_calls_few_functions_of_python_and_none_for_each_tick(diagram):
+    found = {}
+    for ticks in (2, 500):
+        with Worker(make_plan(diagram, 0.001 * ticks, (), KEPT, (), {})) as worker:
+            *first, last = samples(6)
+            for sample in first:  # the chunks of ticks grow
+                worker.run(sample)
+            found[ticks] = count_calls(worker, last)
+    assert found[2] == found[500]
+    assert found[2] < 450  # 960, and one a tick, where start values, columns and ticks are looked up in every run
+
+
+def test_start_values_are_set_in_one_call_and_a_run_of_others_is_a_single_run(diagram):
+    with Worker(make_plan(diagram, 0.05, ("xi",), {"force": KEPT["force"]}, (), {})) as worker:
+        for sample in samples(3):
+            found = worker.run(sample)
+            assert worker._bound[None].engine.plants["plant"]._start is not None  # by the short way
+            single = diagram.replace(sample.parameters).simulate(0.05, progress=False)
+            assert found.signals["xi"].tobytes() == single["xi"].tobytes()
+            assert found.numbers["force"].tobytes() == single["motor_force"].max(axis=0).tobytes()
