@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -46,6 +47,61 @@ def _is_number(block: Any, name: str) -> bool:
 
 def _holds_numbers(value: Any) -> bool:
     return isinstance(value, float | np.ndarray) and np.asarray(value).dtype.kind == "f" and np.size(value) > 0
+
+
+def check_parameters(diagram: WiredDiagram, names: Iterable[str], study: str, *, blocks: bool = False) -> None:
+    """Refuse parameters that are structure of the linear model, and no numbers in it.
+
+    These are settings of subsystems (sample time, delay, offset, method), whole numbers, such as orders and counts,
+    parameters that are true or false, and those that are no numbers.
+
+    Parameters
+    ----------
+    diagram : Diagram
+        The diagram.
+    names : iterable of str
+        Full paths.
+    study : str
+        The study, for errors.
+    blocks : bool
+        Whether whole blocks may be named.
+
+    Raises
+    ------
+    OptionError
+        Such a parameter.
+    """
+    for name in names:
+        if name in diagram.structure.blocks and blocks:
+            continue
+        head, _, last = name.rpartition(".")
+        if found := _find_structure(diagram, name):
+            raise OptionError(
+                f"found {found} among the parameters of {study}; expected numbers that change the linear model's "
+                "entries alone, by any small amount. Look at each of its values: "
+                f"diagram.replace({{{name!r}: …}}).",
+                block=head,
+                port=last,
+            )
+
+
+def _find_structure(diagram: WiredDiagram, name: str) -> str:
+    """Return in words why a parameter is structure; "" where it is a number in the equations."""
+    head, _, last = name.rpartition(".")
+    if name in diagram.structure.blocks:
+        return "a whole block"
+    if head in diagram.structure.subsystems:
+        article = "an" if last[0] in "aeio" else "a"
+        return f"{article} {last.replace('_', ' ')} of a subsystem"
+    path, keys = split_path(diagram.structure, name, diagram.name)
+    block: Any = diagram.structure.blocks[path]
+    if block.stepped and keys[0] == "start":
+        variable = block.description.find(".".join(keys[1:]))
+        kind = "b" if variable.type == "Boolean" else "i" if variable.is_integer else "f"
+    else:
+        kind = np.asarray(read_parameter(diagram, name)).dtype.kind
+    said = {"f": "", "b": "a parameter that is true or false", "i": "a whole number", "u": "a whole number"}
+    return said.get(kind, "a parameter that is no number")
 
 
 def unit_of(diagram: WiredDiagram, parameter: str) -> str:

@@ -15,7 +15,7 @@ from ..frequency import MarginSlope, Number, margin_slopes
 from ..linearization import Linearization, LoopSlope, PointFinder, differentiate_loop, linearize
 from ..results import OperatingPoint
 from ..sweeps import find_parameter
-from .parameters import list_parameters, unit_of
+from .parameters import check_parameters, list_parameters, unit_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -236,6 +236,7 @@ def sensitivities_of(
     else:
         given = [parameters] if isinstance(parameters, str) else list(parameters)
         names = list(dict.fromkeys(find_parameter(diagram, name) for name in given))
+        check_parameters(diagram, names, "a sensitivity")
     L = model.loop(*wires)
     refused = left_out if parameters is None else None
     slopes: list[LoopSlope] = differentiate_loop(model, wires, names, find=find, left_out=refused)

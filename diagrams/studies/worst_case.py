@@ -19,7 +19,7 @@ from ..requirements import Requirements
 from ..sweeps import Box, Samples, read_samples
 from .cases import Case, CaseOrigin, CaseState, Goal, describe, make_goal
 from .confirmation import RunConfirmation, confirm_case
-from .parameters import read_parameter
+from .parameters import check_parameters
 from .search import Study
 from .worst_case_plot import plot_cases
 
@@ -176,7 +176,7 @@ def find_worst_case(
     if samples == "latin" and count is None:
         count = 100
     drawn = read_samples(diagram, parameters, samples, count=count, seed=seed)
-    check_parameters(diagram, drawn.names)
+    check_parameters(diagram, drawn.names, "a worst case", blocks=True)
     boxes = _read_boxes(diagram, parameters, drawn)
     places = tuple(points) if points is not None else (at,)
     study = Study(diagram, goal, boxes, places, delay, options, progress or (lambda text: None))
@@ -193,28 +193,6 @@ def find_worst_case(
     cases = tuple(study.cases)
     worst = min(cases, key=lambda case: (case.goodness, case.index))
     return WorstCase(worst, tuple(nominal), cases, boxes, goal, diagram, places, {**options, "delay": delay})
-
-
-def check_parameters(diagram: WiredDiagram, names: Iterable[str]) -> None:
-    """Refuse parameters that are structure of the linear model: sample times, and those that are true or false."""
-    for name in names:
-        head, _, last = name.rpartition(".")
-        if name in diagram.structure.blocks:
-            continue
-        if head in diagram.structure.subsystems:
-            if last != "sample_time":
-                continue
-            found = "a sample time"
-        elif isinstance(read_parameter(diagram, name), bool | np.bool_):
-            found = "a parameter that is true or false"
-        else:
-            continue
-        raise OptionError(
-            f"found {found} among the parameters of a worst case; expected numbers that change the linear model's "
-            f"entries alone. Look for a worst case for each of its values: diagram.replace({{{name!r}: …}}).",
-            block=head,
-            port=last,
-        )
 
 
 def _read_boxes(diagram: WiredDiagram, parameters: Mapping[str, Any] | None, drawn: Samples) -> dict[str, Box]:

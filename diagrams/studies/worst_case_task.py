@@ -13,7 +13,8 @@ from ..linearization import find_signal
 from ..requirements import Requirements, TomlFile
 from ..sweeps import Box, find_parameter, read_samples
 from .cases import Goal, make_goal
-from .worst_case import WorstCase, check_parameters, find_worst_case
+from .parameters import check_parameters
+from .worst_case import WorstCase, find_worst_case
 
 TABLE = "worst_case"
 """Name of the table."""
@@ -115,7 +116,7 @@ class WorstCaseTask:
         samples = self.options.get("samples", "latin")
         for name, values in self.ranges.items():
             with _Placed(self.file, f"{TABLE}.ranges.{name}"):
-                check_parameters(diagram, [find_parameter(diagram, name)])
+                check_parameters(diagram, [find_parameter(diagram, name)], "a worst case", blocks=True)
                 if samples == "latin" and not (
                     isinstance(values, Box) or (isinstance(values, list) and len(values) == 2)
                 ):

@@ -219,23 +219,40 @@ class Switched(Block):
     u = Input()
     y = Output()
     on: bool = parameter(default=True)
+    times: int = parameter(default=2)
+    mode: str = parameter(default="plain")
 
     def output(self, t, x, u):
-        return 2.0 * u.u if self.on else u.u
+        return self.times * u.u if self.on else u.u
 
 
-@pytest.mark.parametrize("name", ["control.sample_time", "control.switch.on"])
-def test_a_sample_time_and_a_switch_are_no_parameters_of_a_worst_case(name):
-    state, told = Integrator(name="x"), list[str]()
+def make_switched():
+    state = Integrator(name="x")
 
     @subsystem(sample_time=0.1)
     def control(y):
         return Switched(name="switch")(Constant(value=0.0, name="r") - y).named("u")
 
-    diagram = Diagram("switched", state(control(state.y)))
+    return Diagram("switched", state(control(state.y)))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("control.sample_time", "a sample time of a subsystem"),
+        ("control.delay", "a delay of a subsystem"),
+        ("control.offset", "an offset of a subsystem"),
+        ("control.method", "a method of a subsystem"),
+        ("control.switch.on", "a parameter that is true or false"),
+        ("control.switch.times", "a whole number"),
+        ("control.switch.mode", "a parameter that is no number"),
+    ],
+)
+def test_structure_is_no_parameter_of_a_study(name, kind):
+    told, diagram = list[str](), make_switched()
     head, _, last = name.rpartition(".")
-    with pytest.raises(
-        OptionError, match=rf"{head}.{last}: found a .* a worst case; expected numbers .*replace"
-    ) as caught:
+    with pytest.raises(OptionError, match=rf"{head}.{last}: found {kind} .* a worst case; .*replace") as caught:
         diagram.worst_case({name: (0.0, 1.0)}, "control.u", progress=told.append)
     assert (caught.value.block, caught.value.port, told) == (head, last, [])
+    with pytest.raises(OptionError, match=rf"{head}.{last}: found {kind} among the parameters of a sensitivity"):
+        diagram.sensitivity("control.u", [name])
