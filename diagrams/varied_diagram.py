@@ -170,7 +170,8 @@ class VariedDiagram(SimulatedDiagram):
         parameters : mapping of str to (low, high) or Box
             Ranges by path; values of each for a grid; None where ``samples`` is a table.
         loop : str or list of str
-            Wire that the loop is cut at; with requirements several wires, each a loop of its own.
+            Wire that the loop is cut at; with requirements several wires, each a loop of its own. Without them several
+            wires are one loop, cut at all at once, with a disk margin.
         quantity : str, optional
             The number, ``"disk_margin"`` without it: one of those that `Requirements` can limit.
         requirements : Requirements, optional

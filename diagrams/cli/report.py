@@ -23,7 +23,7 @@ from ...blocks.core import (
 from ...fmus.models import gantry
 from ..diagram import Diagram
 from ..paper import EXPERIMENTS, Experiment
-from ..report_writing import Report
+from ..report_writing import Report, quantity
 from ..requirements import STUDIES, Reason, Requirements, Review, TomlFile, Verdict, read_requirements
 from .options import parse_options, share
 from .text import say
@@ -38,6 +38,8 @@ ABOUT = ("title", "author", "project", "date")
 """Lines of the heading that the command line can give."""
 EXIT_STATUS = {Verdict.PASSED: 0, Verdict.FAILED: 3, Verdict.UNDECIDED: 4}
 """Exit status of ``--check``."""
+NARROW = "\u202f"
+"""Narrow space between a number and its unit on the page."""
 DEFAULT = "B"
 """The experiment whose Fig. 3 is taken: both admittances are in it."""
 
@@ -148,7 +150,7 @@ def report_command(arguments: argparse.Namespace) -> int:
             return 130
     say(f"Written: {'  '.join(map(str, files))}")
     if report.review is not None:
-        say(_verdict(report.review))
+        say(verdict_text(report.review))
     return EXIT_STATUS[report.review.verdict] if arguments.check and report.review is not None else 0
 
 
@@ -194,12 +196,12 @@ def _read_measured(given: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def _verdict(reviewed: Review) -> str:
+def verdict_text(reviewed: Review) -> str:
     """Return the verdict as lines of text: all requirements that are not met, by the paths of their numbers."""
     lines = [f"Requirements: {reviewed.verdict}."]
     for result in (*reviewed.of(Verdict.FAILED), *reviewed.of(Verdict.UNDECIDED)):
         place = result.path or ".".join(part for part in (result.loop, result.variant, result.quantity) if part)
-        found = "" if result.number is None else f" found {result.number},"
+        found = "" if result.number is None else f" found {quantity(result.number).replace(NARROW, ' ')},"
         unit = "" if result.number is None else print_unit(result.number.unit)
         required = f"{result.limit}{'' if unit in ('', '°') else ' '}{unit}"
         detail = f": {result.detail}" if result.detail else ""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 from typing import IO
@@ -10,8 +11,22 @@ from ...blocks.core import OptionError
 
 _PLAIN = str.maketrans(
     {"η": "eta", "ξ": "xi", "θ": "theta", "σ": "sigma", "κ": "kappa", "ζ": "zeta", "∥": "_par", "⊥": "_perp", "²": "2"}
-    | {"…": "...", "·": "*", "−": "-", "→": "->", "∞": "inf", "√": "sqrt", "—": "-", "–": "-", "’": "'", "′": "'"}
+    | {
+        "…": "...",
+        "\u202f": " ",
+        "×": "*",
+        "·": "*",
+        "−": "-",
+        "→": "->",
+        "∞": "inf",
+        "√": "sqrt",
+        "—": "-",
+        "–": "-",
+        "’": "'",
+        "′": "'",
+    }
 )
+_POWERS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 
 
 def say(text: str, stream: IO[str] | None = None) -> None:
@@ -26,6 +41,7 @@ def fit(text: str, stream: IO[str]) -> str:
     try:
         text.encode(encoding)
     except UnicodeEncodeError:
+        text = re.sub("(?<=10)[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+", lambda power: f"^{power[0].translate(_POWERS)}", text)
         return text.translate(_PLAIN).encode(encoding, "replace").decode(encoding)
     return text
 

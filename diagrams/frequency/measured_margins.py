@@ -202,10 +202,17 @@ def _read(data: Any, uncertainty: ArrayLike | None) -> tuple[np.ndarray, np.ndar
     order = np.argsort(w)
     w, loop, r = w[order], loop[order], np.broadcast_to(r, w.shape)[order]
     fits = np.isfinite(loop) & (loop != 0.0)
-    if len(w) < 3 or not np.all(fits) or np.any(np.diff(w) <= 0.0) or w[0] <= 0.0:
+    if (twice := w[1:][np.diff(w) <= 0.0]).size:
+        raise OptionError(
+            f"found the frequency {twice[0]:g} rad/s more than once; expected each one once. Leave the others out, or "
+            "take their mean.",
+            block=name,
+            port="data",
+        )
+    if len(w) < 3 or not np.all(fits) or w[0] <= 0.0:
         raise OptionError(
             f"found {len(w)} frequencies from {w[0] if len(w) else math.nan:g} rad/s on, {int(np.sum(~fits))} of them "
-            "with a value that is not finite or is 0; expected at least 3, all different, above 0. Drop the others.",
+            "with a value that is not finite or is 0; expected at least 3, above 0. Drop the others.",
             block=name,
             port="data",
         )
@@ -350,7 +357,15 @@ def read_frequency_data(file: str | os.PathLike[str], *, dt: float = 0.0) -> Fre
         gain, phase = take("gain", "gain_db"), take("phase_deg", "phase_rad")
         size = 10.0 ** (columns[gain] / 20.0) if gain == "gain_db" else columns[gain]
         value = size * np.exp(1j * (np.radians(columns[phase]) if phase == "phase_deg" else columns[phase]))
-    order = np.argsort(omega)
+    order = np.argsort(omega, kind="stable")
+    if (twice := np.flatnonzero(np.diff(omega[order]) == 0.0)).size:
+        first, second = (numbered[1 + int(order[k])][0] for k in (twice[0], twice[0] + 1))
+        raise OptionError(
+            f"found the frequency {columns[frequency][order[twice[0]]]:g} in line {first} and again in line {second}; "
+            "expected each one once. Leave one of the rows out, or take their mean.",
+            block=str(file),
+            port=frequency,
+        )
     data = control.frd(value[order], omega[order], dt)
     data.uncertainty = columns["uncertainty"][order] if "uncertainty" in columns else None
     return data

@@ -83,6 +83,12 @@ def measure_step(t: np.ndarray, r: np.ndarray, *, held: bool, target: float | No
     }
 
 
+def is_at_rest(r: np.ndarray) -> bool:
+    """Return whether a response hardly moves in the last tenth of its record, beside its largest change."""
+    tail = r[int(0.9 * len(r)) :]
+    return float(np.max(np.abs(tail - np.mean(tail)))) <= FLAT * float(np.max(np.abs(r)))
+
+
 def _inside(t: np.ndarray, y: np.ndarray, last: int) -> float:
     """Return when a response comes into the band for good, between the samples ``last`` and the next."""
     before, after = abs(y[last] - 1.0), abs(y[last + 1] - 1.0)

@@ -32,6 +32,10 @@ SAMPLES = 1000
 """Samples of the response of a diagram that is not sampled."""
 GROWN = 1e6
 """Growth of a signal, relative to the step and to the signal before, that no stable loop makes."""
+SLOWEST = 1e-6
+"""Poles slower than that, relative to the fastest, are taken as integrators that nothing feeds back."""
+CONSTANTS = 40.0
+"""Time constants of the slowest other pole after which a linear model rests."""
 CHUNK = 500
 """Samples between two looks at a signal's growth."""
 
@@ -69,6 +73,8 @@ class StepResponse:
     prediction : (N, 1 + K) ndarray, optional
         v and the outputs as the linear model predicts them; None where it can't, as at a wire that is renewed several
         times in the period of all clocks.
+    final : (1 + K,) ndarray, optional
+        Values that the linear model's v and outputs come to, NaN where they don't rest; None without a prediction.
     """
 
     wire: str
@@ -84,6 +90,7 @@ class StepResponse:
     dt: float
     held: bool
     prediction: np.ndarray | None
+    final: np.ndarray | None = None
 
     def answer(self, to_output: bool = False, *, linear: bool = False) -> np.ndarray:
         """Return the response per unit of the step: −v/size, the loop's at the wire, or that of the first output.
@@ -106,6 +113,12 @@ class StepResponse:
                 raise OptionError("found no prediction; expected one. Take the run's response.", port="linear")
             data = self.prediction
         return np.asarray(data[:, 1] if to_output else -data[:, 0]) / self.size
+
+    def final_answer(self, to_output: bool = False) -> float:
+        """Return the value per unit of the step that the linear model's response comes to; NaN where there is none."""
+        if self.final is None:
+            return math.nan
+        return float(self.final[1] if to_output else -self.final[0]) / self.size
 
 
 def step_response(
@@ -213,15 +226,15 @@ def step_response(
         if slow > 1:
             raise OptionError("the wire is renewed within the model's period. Measure another one.", port=wire)
         model = linearize(variant, point, inputs=[wire], outputs=[wire, *names], stairs=stairs)
-        prediction = predict(model, d, t)
+        prediction, final = predict(model, d, t), size * find_final(model)
     except LoopwrightError:
-        prediction = None
+        prediction, final = None, None
     labels = tuple(label for tap in taps for label in tap.labels)
     is_held = bool(held) and steady and not _follows_states(flat, signal.port)
     return StepResponse(
         wire, float(size), t, d, change[:, 0], labels, change[:, 1:], rest[0, 1:], float(rest[0, 0]),
         moved, float(period), is_held,
-        prediction,
+        prediction, final,
     )  # fmt: skip
 
 
@@ -239,6 +252,37 @@ def predict(model: Linearization, d: np.ndarray, t: np.ndarray) -> np.ndarray:
         rows.append(C @ x + D[:, 0] * value)
         x = A @ x + B[:, 0] * value
     return np.array(rows)
+
+
+def find_final(model: Linearization) -> np.ndarray:
+    """Return the values that a linear model's outputs come to after a unit step, NaN of those that don't rest.
+
+    They are those after many time constants of its slowest pole; poles slower than `SLOWEST` of the fastest stay where
+    they are.
+    """
+    from scipy.linalg import expm
+
+    A, B, C, D, n = model.A, model.B[:, :1], model.C, model.D[:, 0], len(model.A)
+    poles = np.linalg.eigvals(A)
+    with np.errstate(divide="ignore"):
+        rates = np.abs(np.log(np.abs(poles)) / model.dt if model.dt else poles.real)
+    rates = np.minimum(rates, np.pi / model.dt) if model.dt else rates
+    rates = rates[rates > SLOWEST * np.max(rates, initial=0.0)]
+    if not rates.size:
+        return np.asarray(D, dtype=float)
+    h = model.dt or 0.1 / float(np.max(np.abs(poles)))
+    if model.dt:
+        M = np.block([[A, B], [np.zeros((1, n)), np.ones((1, 1))]])
+    else:
+        M = expm(np.block([[A, B], [np.zeros((1, n + 1))]]) * h)
+    doublings = max(1, math.ceil(math.log2(CONSTANTS / float(np.min(rates)) / h)))
+    for _ in range(doublings):
+        M = M @ M
+    with np.errstate(all="ignore"):
+        size = np.sum(np.abs(C), axis=1) * np.max(np.abs(M[:n, n]), initial=0.0) + np.abs(D)
+        once, twice = C @ M[:n, n] + D, C @ (M @ M)[:n, n] + D
+        rests = np.abs(twice - once) <= 1e-9 * size + 1e-6 * np.maximum(np.abs(once), np.abs(twice))
+    return np.where(rests & np.isfinite(once), once, np.nan)
 
 
 def _follows_states(flat: FlatDiagram, port: tuple[str, str]) -> bool:

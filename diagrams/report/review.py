@@ -253,6 +253,7 @@ def _step(
     numbers: Mapping[str, Number],
     loop: str | None = None,
 ) -> Iterator[RequirementResult]:
+    settled, length = (numbers.get(f"steps.{key}.{v.key}.{name}") for name in ("settled", "length"))
     for name, limit in step.limits.items():
         path = f"steps.{key}.{v.key}.{name}"
         number = numbers.get(path)
@@ -260,7 +261,20 @@ def _step(
         result = RequirementResult(f"step.{name}", where, v.key, limit, Verdict.UNDECIDED, Reason.NOT_MEASURED)
         if loop == "":
             result = replace(result, detail=key)
-        yield _with(state, result, None if number is None else (path, number))
+        result = _with(state, result, None if number is None else (path, number))
+        if number is not None and settled is not None and not settled.value and length is not None:
+            result = _not_settled(result, number, length)
+        yield result
+
+
+def _not_settled(result: RequirementResult, number: Number, length: Number) -> RequirementResult:
+    """Return a result on a response that moves at the end of its record: its numbers so far are least values."""
+    if result.reason is Reason.UNSTABLE:
+        return result
+    least = length.value if math.isinf(number.value) else number.value - number.tolerance
+    if least > result.limit.high:
+        return result
+    return replace(result, verdict=Verdict.UNDECIDED, reason=Reason.NOT_SETTLED, detail=f"{length.value:.4g} s")
 
 
 def _plain(

@@ -15,7 +15,7 @@ from .. import report_figures as figures
 from ..flat import WiredDiagram
 from ..frequency import Confirmation, Number, Realization
 from ..linearization import find_signal
-from ..measure import StepResponse, measure_step, step_response
+from ..measure import NONE, StepResponse, is_at_rest, measure_step, step_response
 from ..report_writing import Plot, Section, Table, Texts
 from ..requirements import StepLimits
 from .case import Case
@@ -39,6 +39,8 @@ SIZE = 100.0
 """Size of a step, in amplitudes of the injection check, where none is given."""
 SLOWEST = 1e-6
 """Poles slower than that, relative to the fastest, are taken as integrators that nothing feeds back."""
+OF_SETTLED = ("final", "overshoot", "settling", "rise")
+"""Numbers of a response that has settled."""
 NAMES: Mapping[str, str] = {
     "overshoot": "overshoot",
     "settling": "settling time, 2 %",
@@ -110,6 +112,8 @@ def steps(case: Case) -> Section | None:
             text += [TEXTS.line("saturated", variant=v.title, wire=test.wire, blocks=saturated)] if saturated else []
             if got.prediction is None:
                 text.append(TEXTS.line("unpredicted", variant=v.title, wire=test.wire))
+            if not own["settled"].value:
+                text.append(TEXTS.line("unsettled", variant=v.title, wire=test.wire, length=own["length"].value))
             if got.moved > 1e-6:
                 text.append(TEXTS.line("moved", variant=v.title, wire=test.wire, moved=got.moved))
             found.setdefault(replace(test, limits=None), {})[v.key] = got
@@ -236,11 +240,18 @@ def _numbers(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]
     how = _how(got)
     units = {"settling": "s", "rise": "s", "peak": _unit(v.diagram, test.output or test.wire)}
     found = {}
-    known, target = {}, None
+    known, target, settled = {}, None, is_at_rest(got.answer(output)[begins:])
     if got.prediction is not None:
-        known = measure_step(t, got.answer(output, linear=True)[begins:], held=held)
-        target = known["final"].value if math.isfinite(known["final"].value) else None
+        last = got.final_answer(output)
+        known = measure_step(t, got.answer(output, linear=True)[begins:], held=held, target=_or_none(last))
+        if math.isinf(known["settling"].value):  # the record is too short for the linear model
+            settled, known = False, known | dict.fromkeys(OF_SETTLED, NONE)
+        target = _or_none(known["final"].value)
     measured = measure_step(t, got.answer(output)[begins:], held=held, target=target)
+    if known and math.isnan(known["final"].value) and not settled:
+        measured |= dict.fromkeys(OF_SETTLED, NONE)
+    found["length"] = Number(float(t[-1]), "s", 0.0, "", given=True)
+    found["settled"] = Number(float(settled), "1", 0.0, how)
     for name, (value, tolerance) in measured.items():
         factor = abs(got.size) if name == "peak" else 1.0
         found[name] = Number(factor * value, units.get(name, "1"), factor * tolerance, how)
@@ -251,6 +262,10 @@ def _numbers(got: StepResponse, test: StepTest, v: Variant) -> dict[str, Number]
             found[f"linear.{name}"] = Number(factor * value, units.get(name, "1"), factor * tolerance, said)
         found["difference"] = Number(_deviation(got), "1", 1e-9, "co-simulation and linear model, sample by sample")
     return found
+
+
+def _or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _deviation(got: StepResponse) -> float:

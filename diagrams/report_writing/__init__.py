@@ -5,7 +5,7 @@ from .files import check_files, write_report
 from .model import Judged, Plot, Section, Table
 from .report import Report
 from .templating import Texts
-from .values import plain
+from .values import plain, quantity
 
 __all__ = [
     "DEFINITIONS",
@@ -17,6 +17,7 @@ __all__ = [
     "Texts",
     "check_files",
     "plain",
+    "quantity",
     "read_definitions",
     "write_report",
 ]

@@ -157,8 +157,16 @@ def make_goal(
     wires = [loops] if isinstance(loops, str) else list(loops or ())
     if requirements is None:
         if not wires:
-            raise OptionError("found no loop; expected the name of a wire. Give loop='u'.", block=diagram)
+            raise OptionError("found no loop; expected the name of a wire. Give loop='u'.", block=diagram, port="loop")
         assert quantity is not None
+        if len(wires) > 1 and quantity != "disk_margin":
+            raise OptionError(
+                f"found {quantity!r} of {len(wires)} wires; a loop that is cut at several wires at once has a disk "
+                f"margin alone. Give one wire, quantity='disk_margin', or requirements=Requirements({quantity}=…), "
+                "which take each wire as a loop of its own.",
+                block=diagram,
+                port="loop",
+            )
         return Goal({tuple(wires): {quantity: None}})
     found: dict[tuple[str, ...], Mapping[str, Limit | None]] = {}
     for wire in dict.fromkeys([*wires, *requirements.loops]):

@@ -116,7 +116,11 @@ class Study:
                 numbers=numbers,
             )  # fmt: skip
         if not worst[1]:
-            return replace(case, reason="none of its loops has any of the numbers that are asked for")
+            asked = ", ".join(dict.fromkeys(name for limits in self.goal.loops.values() for name in limits))
+            there = ", ".join(dict.fromkeys(name for found in numbers.values() for name in found)) or "none"
+            return replace(
+                case, reason=f"found no {asked} that is a number; its loops have {there}. Take one of these."
+            )
         state = CaseState.STABLE if rests or not base.is_equilibrium else CaseState.MOVING
         return replace(case, state=state, goodness=worst[0], loop=worst[1], quantity=worst[2], numbers=numbers)
 

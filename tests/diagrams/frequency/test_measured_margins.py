@@ -28,6 +28,15 @@ def frd(points, noise=0.0, seed=0):
     return control.frd(loop(w) * (1 + wrong), w)
 
 
+def test_a_frequency_that_is_given_twice_is_refused_with_both_lines(tmp_path):
+    file = tmp_path / "u.csv"
+    file.write_text("hz,gain,phase_deg\n1,2,-90\n\n10,0.5,-120\n1,1.9,-91\n", encoding="utf-8")
+    with pytest.raises(OptionError, match=r"u.csv.hz: found the frequency 1 in line 2 and again in line 5"):
+        read_frequency_data(file)
+    with pytest.raises(OptionError, match=r"data: found the frequency 1 rad/s more than once"):
+        measured_margins(control.frd([2.0, 1.0, 0.5 + 0j], [1.0, 1.0, 2.0]))
+
+
 def test_exact_data_give_the_closed_form():
     found = measured_margins(frd(200))
     assert float(found.phase_margin_deg) == pytest.approx(PHASE, abs=0.01)

@@ -36,6 +36,14 @@ def test_a_continuous_loop_answers_as_its_complementary_sensitivity():
     np.testing.assert_allclose(found.answer(True), y, atol=1e-8)
 
 
+def test_the_final_value_is_that_of_the_linear_model_at_frequency_zero():
+    found = step_response(spring(), "u", size=0.1, length=0.2, outputs=["place.y", "speed.y"])
+    np.testing.assert_allclose(found.final / 0.1, [-1.0, 1 / 40, 0.0], atol=1e-9)
+    assert found.final_answer() == pytest.approx(1.0)
+    held = step_response(sampled(), "u", size=0.1, length=0.1, outputs=["lag.y"])
+    np.testing.assert_allclose(held.final / 0.1, [-1.0, 1 / 3], atol=1e-9)
+
+
 def test_overshoot_and_settling_are_those_of_the_closed_form():
     w, zeta = np.sqrt(40.0), 3.0 / (2 * np.sqrt(40.0))
     t = np.linspace(0.0, 6.0, 3001)

@@ -3,22 +3,33 @@
 import json
 import math
 import pickle
+from dataclasses import replace
 from functools import cache
 
 import control
 import numpy as np
 import pytest
 
-from loopwright.blocks import Gain, Integrator, Quantizer, Saturation, UnknownNameError
+from loopwright.blocks import (
+    Constant,
+    Gain,
+    Integrator,
+    Quantizer,
+    Saturation,
+    Sum,
+    TransferFunction,
+    UnknownNameError,
+)
 from loopwright.diagrams import Diagram, Number, Requirements, Verdict, analyse, experiments, subsystem
 from loopwright.diagrams.cli.command_line import main
+from loopwright.diagrams.cli.report import verdict_text
 from loopwright.diagrams.report.case import Case
 from loopwright.diagrams.report.content_hash import content_hash
 from loopwright.diagrams.report.review import review
 from loopwright.diagrams.report_writing.definitions import definition
 from loopwright.diagrams.report_writing.html import to_html
 from loopwright.diagrams.report_writing.json import to_json
-from loopwright.diagrams.requirements import Reason
+from loopwright.diagrams.requirements import Limit, Reason, RequirementResult, Review
 from tests.support import reviewed
 
 PARTS = ("poles", "inner")
@@ -174,6 +185,35 @@ def test_a_step_is_judged_by_the_running_diagram():
     assert found["step.peak"].number.value == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.parametrize(("peak", "verdict"), [(0.9, Verdict.UNDECIDED), (0.4, Verdict.FAILED)])
+def test_a_record_that_ends_early_decides_only_what_has_been_exceeded(peak, verdict):
+    """After 0.2 s the response 1 − 0.97^k has come to 0.456; in the end it comes to 1."""
+    asked = Requirements(step={"peak": peak, "overshoot": 0.1, "settling": 10.0, "size": 1.0, "length": 0.2})
+    report = analyse(loop(), only=("poles", "inner", "steps"), requirements=asked)
+    found = by_quantity(report)
+    assert found["step.peak"].verdict is verdict
+    assert report.numbers()["steps.u.sampled_d0.peak"].value == pytest.approx(1 - 0.97**20, abs=1e-3)
+    for name in ("step.overshoot", "step.settling"):
+        assert (found[name].verdict, found[name].reason) == (Verdict.UNDECIDED, Reason.NOT_SETTLED)
+    assert report.numbers()["steps.u.sampled_d0.settled"].value == 0.0
+    (steps,) = (s for s in report.sections if s.key == "steps")
+    assert any("has not settled in its record of 0.2 s" in text for text in steps.text)
+
+
+def test_a_slow_part_that_the_record_does_not_see_leaves_a_step_undecided():
+    """Half of the response comes within 0.05 s, the other half with a time constant of 10 s."""
+    wish = Constant(value=0.0, name="wish").named("w")
+    fast = TransferFunction(numerator=[0.5], denominator=[0.01, 1.0], name="fast")
+    slow = TransferFunction(numerator=[0.5], denominator=[10.0, 1.0], name="slow")
+    diagram = Diagram("two", Sum(signs="++", name="sum")(fast(wish), slow(wish)).named("y"))
+    for length, verdict in ((0.2, Verdict.UNDECIDED), (100.0, Verdict.FAILED)):
+        step = {"input": "w", "output": "y", "settling": 0.1, "overshoot": 0.1, "length": length}
+        report = analyse(diagram, only=("poles", "steps"), requirements=Requirements(step=step))
+        assert by_quantity(report)["step.settling"].verdict is verdict
+        assert report.numbers()["steps.w_to_y.continuous.settled"].value == float(verdict is Verdict.FAILED)
+    assert report.numbers()["steps.w_to_y.continuous.settling"].value == pytest.approx(10 * math.log(25), abs=0.2)
+
+
 def test_a_limit_that_acts_fails_a_step_that_the_linear_model_passes():
     asked = Requirements(step={"settling": 1.5, "size": -1.0})
     report = analyse(loop(limit=0.5), only=("poles", "inner", "steps"), requirements=asked)
@@ -184,6 +224,17 @@ def test_a_limit_that_acts_fails_a_step_that_the_linear_model_passes():
     assert found.number.value == math.inf  # the command stays at its limit
     (steps,) = (s for s in report.sections if s.key == "steps")
     assert any("limits act, of controller.limit" in text for text in steps.text)
+
+
+def test_the_command_line_rounds_as_the_page_does():
+    small = RequirementResult(
+        "stable", "", "continuous", Limit(-math.inf, -1.0), Verdict.FAILED, Reason.UNSTABLE,
+        number=Number(-1.38778e-16, "1/s", 1e-12, "eigenvalues"),
+    )  # fmt: skip
+    rough = replace(small, number=Number(12.3456789, "1/s", 0.02, "a run"))
+    told = verdict_text(Review((small, rough)))
+    assert "found 0 1/s," in told
+    assert "found 12.35 1/s," in told
 
 
 def test_a_single_number_is_judged_by_its_path_and_a_missing_one_is_not_decided():

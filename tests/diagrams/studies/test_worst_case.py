@@ -209,6 +209,8 @@ def test_wrong_questions_are_refused():
         diagram.worst_case({"p.gain": (0.5, 2.0)}, "u", quantity="ms", requirements=Requirements(ms=2))
     with pytest.raises(OptionError, match="ms"):
         diagram.worst_case({"p.gain": (0.5, 2.0)}, "u", quantity="mss")
+    with pytest.raises(OptionError, match=r"pi.loop: found .ms. of 2 wires; .*=Requirements\(ms=…\)"):
+        diagram.worst_case({"p.gain": (0.5, 2.0)}, ["u", "x.y"], quantity="ms")
     with pytest.raises(OptionError, match="no loop"):
         diagram.worst_case({"p.gain": (0.5, 2.0)}, quantity="ms")
     with pytest.raises(OptionError, match="limit no number"):
