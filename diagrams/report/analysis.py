@@ -172,7 +172,7 @@ def analyse(
         "diagram": diagram.name,
         **lines,
         "revision": content_hash(diagram),
-        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+        "made": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
         "versions": versions(),
         "variants": {key: v.title if not v.problem else f"left out: {v.problem}" for key, v in case.variants.items()},
         "definitions": dict(kind.definitions),

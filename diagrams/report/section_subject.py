@@ -81,13 +81,14 @@ def subject(case: Case) -> Section:
         columns = ("block", "model", "version", "made by", "FMI", "gives", "SHA-256")
         tables.append(Table("FMUs", columns, tuple(plants)))
     tables.insert(0, _variants(case))
-    tables.append(Table("Parameters", ("block", "type", "parameter", "value", "unit"), tuple(parameters)))
+    listed = Table("Parameters", ("block", "type", "parameter", "value", "unit"), tuple(parameters))
+    parts = (Section("parameters", "Parameters", tables=(listed,)),) if parameters else ()
     tables.append(Table("Versions", ("package", "version"), tuple(versions().items()), details=True))
     text = [TEXTS.line("diagram", name=diagram.name, blocks=len(diagram.blocks), wires=len(diagram.names))]
     if case.experiment is not None:
         name = case.experiment.diagram.name.replace("_", " ")
         text.append(TEXTS.line("experiment", letter=case.experiment.letter, name=name))
-    return Section("subject", SUBJECT_TITLE, tuple(text), tuple(tables), (), numbers)
+    return Section("subject", SUBJECT_TITLE, tuple(text), tuple(tables), (), numbers, parts)
 
 
 def remarks(case: Case) -> Section | None:

@@ -34,9 +34,9 @@ def _drawings(diagram: WiredDiagram) -> Iterator[Plot]:
     found = re.search(r'width="([\d.]+)"', whole)
     subsystems = [path for path in diagram.subsystems if path]
     if not subsystems or (found is not None and float(found[1]) <= ACROSS):
-        yield Plot("diagram", TEXTS.line("diagram", closed=False), whole, ahead=True)
+        yield Plot("diagram", TEXTS.line("diagram", closed=False), whole)
         return
-    yield Plot("diagram", TEXTS.line("diagram", closed=True), draw(diagram, closed=True), ahead=True)
+    yield Plot("diagram", TEXTS.line("diagram", closed=True), draw(diagram, closed=True))
     for subsystem in subsystems:
         inside = draw(diagram, subsystem=subsystem, closed=True)
         yield Plot(f"diagram.{subsystem}", TEXTS.line("inside", subsystem=subsystem), inside, details=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ...blocks.core import OptionError
+from .filled_pages import fill_pages
 
 
 def printer() -> Any:
@@ -62,11 +63,13 @@ def write_pdf(html: str, path: str | os.PathLike[str], paper: str = "A4") -> int
     """
     check_paper(paper)
     library = printer()
-    book = library.Book(
-        library.PAGE_SIZE_LETTER if paper == "letter" else library.PAGE_SIZE_A4,
-        library.PAGE_MARGINS_NONE,
-        library.MEDIA_TYPE_PRINT,
-    )
-    book.load_html(html, base_url="file:///report.html")
+    size = library.PAGE_SIZE_LETTER if paper == "letter" else library.PAGE_SIZE_A4
+
+    def lay_out(page: str) -> Any:
+        book = library.Book(size, library.PAGE_MARGINS_NONE, library.MEDIA_TYPE_PRINT)
+        book.load_html(page, base_url="file:///report.html")
+        return book
+
+    book = lay_out(fill_pages(html, lay_out, library.ImageCanvas))
     book.write_to_pdf(str(Path(path)))
     return int(book.get_page_count())

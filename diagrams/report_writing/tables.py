@@ -13,7 +13,7 @@ from ..frequency import MARK, Number, method_of
 from .model import Judged, Table
 from .values import cell, is_numeric, mark, quantity, reason, tolerance_text, value_text
 
-LONG, LONG_DETAILS = 30, 8
+LONG, LONG_DETAILS = 14, 8
 """Rows above which a table, or one in the appendix, may go over to the next page."""
 WIDE = 6
 """Columns above which a table is set small."""

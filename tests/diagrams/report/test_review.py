@@ -351,7 +351,7 @@ def test_an_fmu_is_named_by_model_tool_and_digest():
     assert row["model"] == "gantry"
     assert row["made by"].startswith("Loopwright")
     assert len(row["SHA-256"]) == 64
-    (parameters,) = [t for t in section.tables if t.title == "Parameters"]
+    (parameters,) = section.sections[0].tables
     assert ("plant", "Fmu", "gravity", "9.81", "m/s²") in parameters.rows
 
 
@@ -388,7 +388,7 @@ def test_every_number_of_a_step_is_defined_and_has_the_units_of_its_signals():
 
 def test_a_function_is_shown_by_its_name_and_not_by_its_place_in_memory():
     (section,) = analyse(reviewed.tank(), only=("subject",)).sections
-    (parameters,) = [t for t in section.tables if t.title == "Parameters"]
+    (parameters,) = section.sections[0].tables
     assert ("outlet", "Function", "function", "<lambda>", "") in parameters.rows
     assert not any(" at 0x" in str(cell) for row in parameters.rows for cell in row)
 
