@@ -1,24 +1,29 @@
 """What a diagram costs by its number of blocks: python benchmarks/scaling.py [picture.png].
 
-Chains, nested boxes, a net of feedback, sampled and continuous, of 10 to 3000 blocks. Building is what `Diagram(…)`
-does, preparing is the rest until a run can start (flattening, functions, start), stepping is a tick, or one step of RK4
-with the four evaluations of the rates. Exponents are fitted over the sizes from 100 blocks on: 1 is linear. Times
-are the processor's, the smallest of three. The plot goes to benchmarks/out/scaling.png, or where
-it is told to; benchmarks/images/scaling.png is one such.
+Chains, nested boxes, a net of feedback, sampled and continuous, of 10 to 10,000 blocks. Building is what `Diagram(…)`
+does, preparing is the rest until an interpreted run can start (flattening, functions, start), stepping is a tick, or
+one step of RK4 with the four evaluations of the rates. Compiling is what `compile=True` adds to flattening, with a
+cache that has the library. Steps in C are told with one signal recorded, and with all: the difference is mostly the
+operating system's, which hands out memory that no run has used before. Exponents are fitted over the sizes from 100
+blocks on: 1 is linear. Times are the processor's, the smallest of three. The plot goes to benchmarks/out/scaling.png, or
+where it is told to; benchmarks/images/scaling.png is one such.
 """
 
 from __future__ import annotations
 
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from loopwright.blocks import Gain, Sine, Sum, TransferFunction, UnitDelay
 from loopwright.diagrams import Diagram, subsystem
+from loopwright.diagrams.compiled import write_hybrid, write_ticks
+from loopwright.diagrams.simulation.compiled_ticks import kinds_of
 
-SIZES = (10, 30, 100, 300, 1000, 3000)
+SIZES = (10, 30, 100, 300, 1000, 3000, 10000)
 LIMIT = 5.0  # s, to build a diagram of 1000 blocks
 
 
@@ -114,6 +119,30 @@ def measured(make, n: int, sampled: bool) -> tuple[float, float, float]:
     return build, prepared, step
 
 
+def measured_in_c(make, n: int, sampled: bool) -> tuple[float, float, float]:
+    """Return the seconds for compiling, and of a step in C with one signal recorded, and with all."""
+    options = {"step": 1e-3, "compile": True} | ({} if sampled else {"solver": "rk4"})
+    found = []
+    for fewer in ({"record": ["source"], "states": False}, {}):
+        with make(n, sampled).simulation(**options, **fewer) as simulation:
+            ticks = max(20, 20000 // n)
+            simulation.advance(ticks * 1e-3)
+            found.append(seconds(partial(simulation.advance, ticks * 1e-3), runs=10) / ticks)
+    diagram = make(n, sampled)
+    diagram.flatten(1e-3)
+    return seconds(lambda: compile_again(diagram, sampled)), *found
+
+
+def compile_again(diagram: Diagram, sampled: bool) -> None:
+    """Compile a diagram's functions, as at the first time in a process."""
+    flat = diagram.flatten(1e-3)
+    kinds = kinds_of(flat, every=not sampled)
+    if sampled:
+        write_ticks(flat, kinds).load()
+    else:
+        write_hybrid(flat, kinds, stiff=False).load()
+
+
 def exponent(sizes, times) -> float:
     """Return the slope in logarithmic scales, from 100 blocks on."""
     large = np.asarray(sizes) >= 100
@@ -153,17 +182,22 @@ def main() -> int:
     """Print one row for each kind and size, and the exponents; 1 if building is too slow."""
     results, slow = {}, []
     measured(chain, 10, sampled=True)  # imports, warm caches
-    print("diagram               blocks    build, ms   prepare, ms   step, µs   step, ns a block")
+    print(
+        "diagram               blocks    build, ms   prepare, ms   step, µs   step, ns a block"
+        "   compile, ms   step in C, ns a block   all recorded"
+    )
     for make in (chain, nested, net):
         for sampled in (True, False):
             name = f"{make.__name__}, {'sampled' if sampled else 'continuous'}"
             rows = []
             for n in SIZES:
                 build, prepared, step = measured(make, n, sampled)
+                compiling, in_c, recorded = measured_in_c(make, n, sampled)
                 rows.append((build, prepared, step))
                 print(
                     f"{name:20}  {n:6}  {build * 1e3:11.1f}  {prepared * 1e3:12.1f}"
-                    f"  {step * 1e6:9.1f}  {step / n * 1e9:17.1f}",
+                    f"  {step * 1e6:9.1f}  {step / n * 1e9:17.1f}  {compiling * 1e3:12.1f}"
+                    f"  {in_c / n * 1e9:22.1f}  {recorded / n * 1e9:13.1f}",
                     flush=True,
                 )
                 if n == 1000 and build > LIMIT:

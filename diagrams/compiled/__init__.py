@@ -1,11 +1,11 @@
 """The compiled loop: C code of a diagram's ticks and of what happens between them, and the masters that run it."""
 
 from .background import BackgroundCode
-from .code import TickCode, compile_ticks, find_obstacle
+from .code import TickCode, compile_ticks, find_obstacle, write_ticks
 from .fused import fuse
 from .fused_code import FusedPlant, compile_fused
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
-from .hybrid_code import compile_hybrid, find_hybrid_obstacle
+from .hybrid_code import compile_hybrid, find_hybrid_obstacle, write_hybrid
 from .loop import CompiledLoop, NewtonOptions, Outcome, Reason
 from .native_tick import bind_call
 from .watch import RECENT, Fired, Watch
@@ -34,4 +34,6 @@ __all__ = [
     "find_hybrid_obstacle",
     "find_obstacle",
     "fuse",
+    "write_hybrid",
+    "write_ticks",
 ]

@@ -177,27 +177,28 @@ def write_ticks(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> 
     """Write the C code of the ticks at which these sets of clocks act; see `compile_ticks`."""
     ticks = None if flat.by_block else _write_straight(flat, acting)
     ticks = ticks or _write_grouped(flat, acting)
-    loops = _loop_functions(flat, acting)
+    loops = loop_functions(flat, acting)
     if not loops:
         return replace(ticks, make=lambda libraries: _COMPILED.setdefault(flat, ticks.make(libraries)))
-    text = _write_loops(loops)
+    text = write_loops(loops)
     exact = ticks.exact and all(len(flat.active_loops(clocks)) <= EXACT_LOOP for clocks in loops)
 
     def make(libraries: Sequence[ctypes.CDLL]) -> TickCode:
-        found = _find_loops(loops, libraries[-1])
+        found = find_loops(loops, libraries[-1])
         return _COMPILED.setdefault(flat, replace(ticks.make(libraries), exact=exact, loops=found))
 
     count = sum(function.n_instructions() for function in loops.values())
     return TickSources([*ticks.texts, text], ticks.operations + count, exact, make)
 
 
-def _loop_functions(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> dict[frozenset[TickPattern], Any]:
+def loop_functions(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]) -> dict[frozenset[TickPattern], Any]:
     """Return the equations of the algebraic loops at ticks: their mismatch, and its derivative."""
     found = {clocks: flat.loop_equations(clocks) for clocks in acting} if flat.loops.slices else {}
     return {c: rename(made.fast, f"loops{i}") for i, (c, made) in enumerate(found.items()) if made is not None}
 
 
-def _write_loops(loops: Mapping[frozenset[TickPattern], Any]) -> str:
+def write_loops(loops: Mapping[frozenset[TickPattern], Any]) -> str:
+    """Return the C code of the equations of algebraic loops."""
     generator = ca.CodeGenerator("loops.c")
     for function in loops.values():
         check_size(function)
@@ -205,18 +206,11 @@ def _write_loops(loops: Mapping[frozenset[TickPattern], Any]) -> str:
     return make_visible(generator.dump())
 
 
-def _find_loops(
+def find_loops(
     loops: Mapping[frozenset[TickPattern], Any], library: ctypes.CDLL
 ) -> dict[frozenset[TickPattern], StraightTick]:
+    """Return the equations of algebraic loops in the library of `write_loops`."""
     return {clocks: StraightTick(f, address_of(library, f.name())) for clocks, f in loops.items()}
-
-
-def compile_loops(
-    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]
-) -> dict[frozenset[TickPattern], StraightTick]:
-    """Return the equations of the algebraic loops at ticks, compiled: their mismatch, and its derivative."""
-    loops = _loop_functions(flat, acting)
-    return _find_loops(loops, load_compiled(_write_loops(loops))) if loops else {}
 
 
 def check_size(function: Any) -> None:

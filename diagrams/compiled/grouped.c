@@ -62,3 +62,80 @@ VISIBLE int grouped(const double **arguments, double **results, long long *iw, d
         if (!(v[g->guards[i]] > 0)) ok[0] = 0;
     return 0;
 }
+
+/* A function between ticks of many blocks: rates, indicators, states after events.
+
+   v holds the time, w, x, further arguments (those behind p), then whatever else it needs. */
+typedef struct {
+    const int32_t *runs, *rows;
+    int64_t count;                  /* of runs */
+    int64_t states, outside, more;  /* entries of x, of w, of further arguments */
+    const int32_t *where;           /* where the results stand in v, one after the other */
+    int64_t lengths[2];             /* entries of each result */
+    int (*python)(int64_t call);
+} part;
+
+VISIBLE int grouped_part(const double **arguments, double **results, long long *iw, double *v, int memory) {
+    const part *g = (const part *)iw;
+    const double *p = arguments[3];
+    const int32_t *where = g->where;
+    (void)memory;
+    v[0] = arguments[0][0];
+    if (g->outside) memcpy(v + 1, arguments[2], (size_t)g->outside * sizeof(double));
+    if (g->states) memcpy(v + 1 + g->outside, arguments[1], (size_t)g->states * sizeof(double));
+    if (g->more) memcpy(v + 1 + g->outside + g->states, arguments[4], (size_t)g->more * sizeof(double));
+    for (int64_t i = 0; i < g->count; i++) {
+        const int32_t *run = g->runs + 3 * i, *row = g->rows + run[2];
+        if (run[0] < 0) {
+            for (int32_t k = 0; k < run[1]; k++)
+                if (g->python(row[k])) return 1;
+        } else {
+            kernels[run[0]](run[1], row, v, p);
+        }
+    }
+    for (int r = 0; r < 2; r++)
+        for (int64_t i = 0; i < g->lengths[r]; i++) results[r][i] = v[*where++];
+    return 0;
+}
+
+/* The derivative of the rates by differences: columns without a common row are moved together. */
+typedef struct {
+    int (*rates)(const double **, double **, long long *, double *, int);
+    const double **arguments;
+    double **results;
+    long long *iw;
+    double *v, *x, *dx, *before, *step;
+    const double *typical;          /* sizes of the states, below which steps don't become smaller */
+    int64_t n, colors;
+    const int64_t *where;           /* of each column: its entry of x */
+    const int32_t *first, *columns; /* of each color: where its columns begin */
+    const int32_t *rows_first, *rows; /* of each column: where its rows begin */
+} differences;
+
+VISIBLE int grouped_differences(const double **arguments, double **results, long long *iw, double *w, int memory) {
+    const differences *g = (const differences *)iw;
+    double *out = results[0];
+    (void)w;
+    if (g->rates(g->arguments, g->results, g->iw, g->v, memory)) return 1;
+    memcpy(g->before, g->dx, (size_t)g->n * sizeof(double));
+    (void)arguments;
+    for (int64_t c = 0; c < g->colors; c++) {
+        for (int32_t k = g->first[c]; k < g->first[c + 1]; k++) {
+            double *x = g->x + g->where[g->columns[k]];
+            volatile double moved = *x + 1.5e-8 * fmax(fabs(*x), g->typical[g->columns[k]]);
+            g->step[k] = *x;
+            *x = moved;
+        }
+        const int failed = g->rates(g->arguments, g->results, g->iw, g->v, memory);
+        for (int32_t k = g->first[c]; k < g->first[c + 1]; k++) {
+            const int32_t j = g->columns[k];
+            double *x = g->x + g->where[j];
+            const double h = *x - g->step[k];
+            *x = g->step[k];
+            for (int32_t i = g->rows_first[j]; i < g->rows_first[j + 1]; i++)
+                out[i] = (g->dx[g->rows[i]] - g->before[g->rows[i]]) / h;
+        }
+        if (failed) return 1;
+    }
+    return 0;
+}

@@ -9,7 +9,7 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 
 from ...blocks.core import without_collection
-from ..flat import COPY, Ids, Operation, Program, TickProgram
+from ..flat import COPY, Ids, Operation, PartProgram, Program, TickProgram
 from .kernels import Kernel
 
 PYTHON = -1
@@ -82,22 +82,7 @@ def make_tables(tick: TickProgram, kernels: Mapping[int | str, Kernel]) -> Table
     program = tick.program
     places, memory, first = _place(tick)
     p_first = program.p.ids.start if isinstance(program.p.ids, range) else 0
-    runs, rows, python = list[tuple[int, int, int]](), list[int](), list[PythonCall]()
-    at = places.tolist()
-    for run in _runs(program, kernels):
-        kernel = kernels.get(run[0].kernel)
-        start = len(rows)
-        if kernel is None:
-            for op in run:
-                rows.append(len(python))
-                python.append(_python_call(op, at, p_first))
-            runs.append((PYTHON, len(run), start))
-            continue
-        for op in run:
-            given, made = op.arguments, op.results
-            for out, k in kernel.columns:
-                rows.append(at[made[k].start] if out else at[given[k].start])
-        runs.append((kernel.place, len(run), start))
+    runs, rows, python = _write_runs(program, program.operations, kernels, places, p_first)
     copies = _copies(tick, places, first)
     if len(copies):
         runs.append((kernels[COPY].place, len(copies), len(rows)))
@@ -119,6 +104,85 @@ def make_tables(tick: TickProgram, kernels: Mapping[int | str, Kernel]) -> Table
         residual=tick.mismatch is not None,
         python=python,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class PartTables:
+    """A function between ticks as tables for grouped code.
+
+    Attributes
+    ----------
+    runs, rows, memory, python
+        See `Tables`.
+    where : ndarray of int32
+        Where the results stand in v, one after the other.
+    lengths : tuple of int
+        Entries of each result.
+    """
+
+    runs: np.ndarray
+    rows: np.ndarray
+    memory: np.ndarray
+    where: np.ndarray
+    lengths: tuple[int, ...]
+    python: Sequence[PythonCall]
+
+
+@without_collection
+def make_part_tables(part: PartProgram, kernels: Mapping[int | str, Kernel]) -> PartTables:
+    """Return the tables of a function between ticks; see `make_tables`.
+
+    v holds the time, w, x, further arguments, and whatever the operations make.
+    """
+    program = part.program
+    places, end = np.full(program.count, -1, dtype=np.int64), 0
+    for cells in (program.t, program.w, program.x, program.more):
+        places[cells.ids] = end + np.arange(len(cells.ids))
+        end += len(cells.ids)
+    places[program.p.ids] = np.arange(len(program.p.ids))
+    for column in program.columns:
+        places[column.start : column.stop] = end + np.arange(len(column))
+        end += len(column)
+    memory = np.zeros(end + 1)
+    if program.constants:
+        memory[places[[*program.constants]]] = [*program.constants.values()]
+    p_first = program.p.ids.start if isinstance(program.p.ids, range) else 0
+    runs, rows, python = _write_runs(program, part.operations, kernels, places, p_first)
+    return PartTables(
+        runs=np.array(runs, dtype=np.int32).reshape(-1, 3),
+        rows=np.array(rows, dtype=np.int32),
+        memory=memory,
+        where=places[[value for ids in part.results for value in ids]].astype(np.int32),
+        lengths=tuple(map(len, part.results)),
+        python=python,
+    )
+
+
+def _write_runs(
+    program: Program,
+    operations: Sequence[Operation],
+    kernels: Mapping[int | str, Kernel],
+    places: np.ndarray,
+    p_first: int,
+) -> tuple[list[tuple[int, int, int]], list[int], list[PythonCall]]:
+    """Return the runs of equal blocks, their rows, and the calls of Python among them."""
+    runs, rows, python = list[tuple[int, int, int]](), list[int](), list[PythonCall]()
+    at = places.tolist()
+    for run in _runs(program, operations, kernels):
+        kernel = kernels.get(run[0].kernel)
+        start = len(rows)
+        if kernel is None:
+            for op in run:
+                rows.append(len(python))
+                python.append(_python_call(op, at, p_first))
+            runs.append((PYTHON, len(run), start))
+            continue
+        for op in run:
+            given, made = op.arguments, op.results
+            for out, k in kernel.columns:
+                rows.append(at[made[k].start] if out else at[given[k].start])
+        runs.append((kernel.place, len(run), start))
+    return runs, rows, python
 
 
 def _place(tick: TickProgram) -> tuple[np.ndarray, np.ndarray, int]:
@@ -171,12 +235,14 @@ def _python_call(op: Operation, at: Sequence[int], p_first: int) -> PythonCall:
     return PythonCall(int(op.kernel), (*map(place, given), p), tuple(map(place, op.results)))
 
 
-def _runs(program: Program, kernels: Mapping[int | str, Kernel]) -> list[list[Operation]]:
+def _runs(
+    program: Program, operations: Sequence[Operation], kernels: Mapping[int | str, Kernel]
+) -> list[list[Operation]]:
     """Return the operations as runs of one kernel each, every operation after those whose results it takes.
 
     Of the kernels that something is ready for, the one with most operations comes first.
     """
-    operations, given = program.operations, program.given
+    given = program.given
     maker = [-1] * program.count
     for i, op in enumerate(operations):
         for column in op.results:

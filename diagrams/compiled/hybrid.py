@@ -12,7 +12,7 @@ import numpy as np
 
 from ..flat import NONE, FlatDiagram, TickPattern
 from .bound import BoundFunction, address
-from .hybrid_code import Compiled, HybridCode, hybrid_master
+from .hybrid_code import Between, HybridCode, hybrid_master
 from .loop import CompiledLoop, LoopStructure, NewtonOptions, OutcomeStructure, TickStructure
 from .radau import radau_numbers
 from .watch import Fired, Watch, WatchStructure
@@ -197,12 +197,12 @@ class CompiledHybrid:
         trial = [np.zeros(1), x.copy(), w, p]
         where = self._own(flat.continuous.astype(np.int64))
         slope = code.between.get("slope")
-        slopes = np.zeros(0 if slope is None else slope.function.numel_out(0) if loops else slope.function.nnz_out(0))
+        slopes = np.zeros(0 if slope is None else n * n if loops else len(slope.pattern[0]))
         self._hybrid = hybrid = _Hybrid(l=loop.structure, automatic=len(methods) > 1, accepts=accepts)
         z, inputs = held
         if inputs is not z:
             hybrid.z, hybrid.held, hybrid.inputs = self._own(z), self._own(inputs), z.size
-        hybrid.budget = _budget(code.between["flow"].function, methods, n)
+        hybrid.budget = _budget(code.between["flow"].operations, methods, n)
         hybrid.between = self.kinds[NONE]
         hybrid.p = _Problem(
             n=n,
@@ -223,9 +223,10 @@ class CompiledHybrid:
             hybrid.solved = self._own(np.zeros(m))
             results += [through[: n * m], through[n * m :], np.zeros(m * m)]
         if slope is not None:
-            hybrid.p.slope = self._bind(slope, trial, results)
+            typical = np.maximum(np.abs(methods[-1].atol) / methods[-1].rtol, 1e-300)
+            hybrid.p.slope = self._bind(slope, trial, results, typical)
             if loops is None:
-                rows, columns = slope.function.sparsity_out(0).get_triplet()
+                rows, columns = slope.pattern
                 hybrid.p.entries = len(rows)
                 hybrid.p.row, hybrid.p.column = (self._own(np.array([*v, 0], dtype=np.int64)) for v in (rows, columns))
         of = ctypes.addressof(hybrid) + _Hybrid.p.offset
@@ -251,8 +252,14 @@ class CompiledHybrid:
         self._kept.append(values)
         return address(values)
 
-    def _bind(self, function: Compiled, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> Any:
-        bound = BoundFunction(function.function, function.address, arguments, results)
+    def _bind(
+        self,
+        function: Between,
+        arguments: Sequence[np.ndarray],
+        results: Sequence[np.ndarray],
+        typical: np.ndarray | None = None,
+    ) -> Any:
+        bound = BoundFunction(function, arguments, results, typical)
         self._kept.append(bound)
         return bound.structure
 
@@ -377,7 +384,7 @@ class CompiledHybrid:
         )
 
 
-def _budget(flow: Any, methods: Sequence[MethodOptions], n: int) -> int:
+def _budget(flow: int, methods: Sequence[MethodOptions], n: int) -> int:
     """Return the steps of a call: an operation takes about 1 ns, and so does one of the factors of a Jacobian."""
-    step = 100 + 15 * flow.n_instructions() + (4 * n**3 if any(m.name == "Radau" for m in methods) else 0)
+    step = 100 + 15 * flow + (4 * n**3 if any(m.name == "Radau" for m in methods) else 0)
     return max(10, int(_SECONDS * 1e9 / step))

@@ -3,28 +3,37 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import casadi as ca
+import numpy as np
 
 from ..flat import NONE, FlatDiagram, TickPattern
 from .code import (
+    GroupedTick,
     StraightTick,
     TickCode,
     address_of,
     check_size,
-    compile_loops,
+    find_loops,
     load_compiled,
+    loop_functions,
     make_visible,
     read_sources,
     rename,
+    write_loops,
 )
+from .grouped_parts import Differences, GroupedPart, find_differences
+from .grouping import make_part_tables, make_tables
+from .kernels import write_kernels
 
 _SOURCES = ("newton.c", "master.c", "methods.c", "radau.c", "events.c", "instants.c", "hybrid.c")
+
+_GROUPED = ("grouped", "grouped_part", "grouped_differences")
 
 EMBEDDED = ("euler", "heun", "rk4", "RK23", "RK45", "DOP853", "Radau", "auto")
 """Solvers that there are in C."""
@@ -37,6 +46,21 @@ class Compiled:
     function: Any
     address: int
 
+    @property
+    def operations(self) -> int:
+        """Operations of one evaluation."""
+        return int(self.function.n_instructions())
+
+    @property
+    def pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column of each entry of its first result that may not be 0."""
+        rows, columns = self.function.sparsity_out(0).get_triplet()
+        return np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64)
+
+
+Between = Compiled | GroupedPart | Differences
+"""A function between ticks that was compiled."""
+
 
 @dataclass(frozen=True, eq=False)
 class HybridCode:
@@ -46,12 +70,42 @@ class HybridCode:
     ----------
     ticks : TickCode
         Its ticks; that at which no clock acts is an instant between ticks.
-    between : mapping of str to Compiled
+    between : mapping
         Its other functions that there are, by name: ``"flow"``, ``"slope"``, ``"indicators"``, ``"jump"``.
     """
 
     ticks: TickCode
-    between: Mapping[str, Compiled]
+    between: Mapping[str, Between]
+
+
+@dataclass(frozen=True, eq=False)
+class HybridSources:
+    """The C code of a diagram with continuous states, written.
+
+    Attributes
+    ----------
+    texts : sequence of str
+        The sources of its libraries.
+    make : callable
+        Makes the code of its libraries.
+    """
+
+    texts: Sequence[str]
+    make: Callable[[Sequence[ctypes.CDLL]], HybridCode]
+
+    def load(self) -> HybridCode:
+        """Return the code; libraries that the cache lacks are compiled.
+
+        Raises
+        ------
+        CompilerError
+            If there is no compiler, or it fails.
+        FmuError
+            If the cache can't be written.
+        """
+        libraries = [load_compiled(text) for text in self.texts]
+        hybrid_master()  # if it can't be compiled, the run is interpreted
+        return self.make(libraries)
 
 
 _COMPILED: WeakKeyDictionary[FlatDiagram, dict[tuple[Any, ...], HybridCode]] = WeakKeyDictionary()
@@ -74,8 +128,8 @@ def find_hybrid_obstacle(flat: FlatDiagram, solver: str) -> str | None:
     if flat.outside:
         return f"the FMU {flat.outside[0]!r} in model exchange is evaluated by Python"
     opaque = sorted(path for path in flat.checked.traced if blocks[path].opaque)
-    if opaque:
-        return f"the block {opaque[0]!r} is evaluated by Python"
+    if opaque and flat.loops.slices:
+        return f"it has an algebraic loop beside the block {opaque[0]!r}, which Python evaluates"
     return None
 
 
@@ -98,8 +152,38 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
     """
     kinds = (NONE, *(clocks for clocks in acting if clocks))
     known = _COMPILED.setdefault(flat.origin, {})
-    if (kinds, stiff) in known:
-        return known[kinds, stiff]
+    if (kinds, stiff) not in known:
+        known[kinds, stiff] = write_hybrid(flat.origin, acting, stiff=stiff).load()
+    return known[kinds, stiff]
+
+
+def write_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:
+    """Write the C code of a diagram with continuous states; see `compile_hybrid`.
+
+    Small diagrams are expanded: each function is one of scalar operations. Large ones, by the rule of
+    `FlatDiagram.by_block`, are grouped, so that the compiler sees each kind of block once. The derivative of the rates
+    is computed by differences then. Diagrams with algebraic loops between ticks are expanded.
+
+    Raises
+    ------
+    CompilerError
+        If a function is too large for a compiler.
+    """
+    kinds = (NONE, *(clocks for clocks in acting if clocks))
+    grouped = flat.by_block and not flat.active_loops(NONE)
+    written = _write_grouped(flat, kinds, stiff=stiff) if grouped else _write_straight(flat, kinds, stiff=stiff)
+    loops = loop_functions(flat, kinds)
+    if not loops:
+        return written
+
+    def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
+        code = written.make(libraries)
+        return replace(code, ticks=replace(code.ticks, loops=find_loops(loops, libraries[-1])))
+
+    return HybridSources([*written.texts, write_loops(loops)], make)
+
+
+def _write_straight(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:
     ticks = {clocks: rename(flat.at_tick(clocks).last.fast, f"tick{i}") for i, clocks in enumerate(kinds)}
     others = {"flow": flat.flow.last.fast}
     if stiff:
@@ -112,12 +196,41 @@ def compile_hybrid(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], 
     for function in (*ticks.values(), *others.values()):
         check_size(function)
         generator.add(function)
-    library = load_compiled(make_visible(generator.dump()))
-    hybrid_master()  # if it can't be compiled, the run is interpreted
-    straight = {c: StraightTick(ticks[c], address_of(library, f"tick{i}")) for i, c in enumerate(kinds)}
-    between = {name: Compiled(function, address_of(library, name)) for name, function in others.items()}
-    made = HybridCode(TickCode(straight, exact=False, library=library, loops=compile_loops(flat, kinds)), between)
-    return known.setdefault((kinds, stiff), made)
+
+    def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
+        library = libraries[0]
+        straight = {c: StraightTick(ticks[c], address_of(library, f"tick{i}")) for i, c in enumerate(kinds)}
+        between = {name: Compiled(function, address_of(library, name)) for name, function in others.items()}
+        return HybridCode(TickCode(straight, exact=False, library=library), between)
+
+    return HybridSources([make_visible(generator.dump())], make)
+
+
+def _write_grouped(flat: FlatDiagram, kinds: Sequence[frozenset[TickPattern]], *, stiff: bool) -> HybridSources:
+    programs = {clocks: flat.program_at(clocks) for clocks in kinds}
+    names = ("flow", "indicators", "jump") if flat.events else ("flow",)
+    parts = {name: flat.part_program(name) for name in names}
+    every = [tick.program for tick in programs.values()] + [part.program for part in parts.values()]
+    functions = {key: f for program in every for key, f in program.functions.items()}
+    opaque = {id(flat.blocks.of(path, names)) for path, names in flat.order.steps if flat.table.blocks[path].opaque}
+    kernels = write_kernels({key: f for key, f in functions.items() if key not in opaque})
+    of_python = {key: f for key, f in functions.items() if key in opaque}
+
+    def make(libraries: Sequence[ctypes.CDLL]) -> HybridCode:
+        library = libraries[0]
+        tick, part, differences = (address_of(library, name) for name in _GROUPED)
+        ticks = {c: GroupedTick(make_tables(p, kernels.of), of_python, tick) for c, p in programs.items()}
+        between: dict[str, Between] = {}
+        for name, program in parts.items():
+            count = sum(functions[op.kernel].n_instructions() for op in program.operations if op.kernel in functions)
+            between[name] = GroupedPart(make_part_tables(program, kernels.of), of_python, count, part)
+        if stiff:
+            rates = between["flow"]
+            assert isinstance(rates, GroupedPart)
+            between["slope"] = find_differences(parts["flow"], flat.continuous, rates, differences)
+        return HybridCode(TickCode(ticks, exact=False, library=library), between)
+
+    return HybridSources([kernels.source], make)
 
 
 def _sparse_slope(flat: FlatDiagram) -> Any:

@@ -12,12 +12,13 @@ from typing import Any
 import casadi as ca
 
 from ...blocks.core import CompilerError
-from ..flat import AND, CHOOSE, COPY, NOT, OR, TRUE, TRUE_OF
+from ..flat import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE, TRUE_OF
 
 _SCRATCH = 8192  # numbers that a kernel keeps on the stack
 _SINGLE = {
     COPY: "{0}",
     TRUE_OF: f"{{0}} > {TRUE!r}",
+    LESS: f"{{0}} - {TRUE!r}",
     AND: "{0} && {1}",
     OR: "{0} || {1}",
     NOT: "!{0}",

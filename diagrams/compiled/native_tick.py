@@ -57,12 +57,17 @@ def bind_native(
     """Return a tick bound to the vectors (t, x, w, p) and (x_next, z, log, ok) of a run."""
     if isinstance(tick, StraightTick):
         f = tick.function
-        given, made = _list(arguments, f.sz_arg()), _list(results, f.sz_res())
+        given, made = list_vectors(arguments, f.sz_arg()), list_vectors(results, f.sz_res())
         iw, w = np.zeros(f.sz_iw() + 1, dtype=np.int64), np.zeros(f.sz_w() + 1)
         kept: list[Any] = [given, made, iw, w]
         return NativeTick(tick.address, ctypes.addressof(given), ctypes.addressof(made), at(iw), at(w), kept)
-    given, made, v, tables = _list(arguments, 4), _list(results, 4), tick.tables.memory.copy(), tick.tables
-    calls = [_bind_python(call, tick.functions, v, arguments[3]) for call in tables.python]
+    given, made, v, tables = (
+        list_vectors(arguments, 4),
+        list_vectors(results, 4),
+        tick.tables.memory.copy(),
+        tick.tables,
+    )
+    calls = [bind_python(call, tick.functions, v, arguments[3]) for call in tables.python]
 
     def call(i: int) -> int:
         calls[i]()
@@ -109,7 +114,8 @@ def _group(tables: Tables, arguments: Sequence[np.ndarray], python: Any) -> _Gro
     )
 
 
-def _bind_python(call: PythonCall, functions: Mapping[int, Any], v: np.ndarray, p: np.ndarray) -> Callable[[], None]:
+def bind_python(call: PythonCall, functions: Mapping[int, Any], v: np.ndarray, p: np.ndarray) -> Callable[[], None]:
+    """Return the call that lets Python evaluate a block from v and p into v."""
     *given, parameters = call.arguments
     columns = [v[:1], *(v[where] for where in given[1:]), p[parameters]]
     bound = bind_function(functions[call.key], columns, [v[where] for where in call.results])
@@ -120,7 +126,8 @@ def _bind_python(call: PythonCall, functions: Mapping[int, Any], v: np.ndarray, 
     return evaluate
 
 
-def _list(vectors: Sequence[np.ndarray], length: int) -> Any:
+def list_vectors(vectors: Sequence[np.ndarray], length: int) -> Any:
+    """Return the addresses of vectors as C's array of at least this length."""
     found = (ctypes.c_void_p * length)()
     for i, vector in enumerate(vectors):
         found[i] = at(vector)

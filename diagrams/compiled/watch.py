@@ -10,7 +10,7 @@ import numpy as np
 
 from ..flat import FlatDiagram
 from .bound import BoundFunction, address
-from .hybrid_code import Compiled
+from .hybrid_code import Between
 from .loop import TickStructure
 
 _LOGGED = 2**22  # bytes of what has fired in a call
@@ -52,7 +52,7 @@ class Watch:
     ----------
     flat : FlatDiagram
         The diagram.
-    functions : mapping of str to Compiled
+    functions : mapping of str to Between
         Its functions ``"indicators"`` and ``"jump"``.
     trial, here : sequence of ndarray
         The vectors (t, x, w, p) of a trial, and of the instant that is reached.
@@ -76,7 +76,7 @@ class Watch:
     def __init__(
         self,
         flat: FlatDiagram,
-        functions: Mapping[str, Compiled],
+        functions: Mapping[str, Between],
         trial: Sequence[np.ndarray],
         here: Sequence[np.ndarray],
         x_next: np.ndarray,
@@ -130,9 +130,9 @@ class Watch:
         setattr(self.structure, name, address(vector))
 
     def _bind(
-        self, name: str, function: Compiled, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
+        self, name: str, function: Between, arguments: Sequence[np.ndarray], results: Sequence[np.ndarray]
     ) -> None:
-        bound = BoundFunction(function.function, function.address, arguments, results)
+        bound = BoundFunction(function, arguments, results)
         self._kept.append(bound)
         setattr(self.structure, name, bound.structure)
 

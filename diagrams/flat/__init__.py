@@ -10,7 +10,7 @@ from .functions import indicators_of
 from .layout import FlatEvent, StateLayout
 from .logic import TRUE, is_true
 from .plant_ticks import own_step, takes_any_step
-from .program import AND, CHOOSE, COPY, NOT, OR, TRUE_OF, Ids, Operation, Program, TickProgram
+from .program import AND, CHOOSE, COPY, LESS, NOT, OR, TRUE_OF, Ids, Operation, PartProgram, Program, TickProgram
 from .stages import Bound, Evaluators, Schedule, bind_function, evaluate_apart
 from .total_derivative import Derivative
 from .trace_stages import trace_schedule
@@ -25,6 +25,7 @@ __all__ = [
     "EXACT_LOOP",
     "INDICATORS",
     "JUMP",
+    "LESS",
     "NONE",
     "NOT",
     "OR",
@@ -41,6 +42,7 @@ __all__ = [
     "Instant",
     "Layout",
     "Operation",
+    "PartProgram",
     "Program",
     "Schedule",
     "StateLayout",

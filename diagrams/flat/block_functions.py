@@ -44,6 +44,26 @@ class BlockFunctions:
             self._parts[key] = f.slice("block", list(range(f.n_in())), [every.index(n) for n in names])
         return self._parts[key]
 
+    def of_events(self, path: str, name: str) -> Any:
+        """Return the CasADi function of the indicators of a block's events, or its jump, with p as the last argument.
+
+        Parameters
+        ----------
+        name : {"indicators", "jump"}
+            Which of the two.
+        """
+        trace = self.traced[path]
+        function = getattr(trace, name)
+        if name == "indicators":
+            return function
+        key = (id(trace), (name,))
+        if key not in self._parts:
+            scalar = function.is_a("SXFunction")
+            given = function.sx_in() if scalar else function.mx_in()
+            *before, p, fired = given
+            self._parts[key] = ca.Function("block_jump", [*before, fired, p], function.call(given))
+        return self._parts[key]
+
 
 def call_block(function: Any, arguments: Sequence[Any]) -> list[Any]:
     """Call a block's function; one with a product with a large matrix is written out in place of the call.

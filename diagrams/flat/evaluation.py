@@ -229,6 +229,8 @@ class Instant:
         t, state, inputs, p = self._arguments(path, {q: self.source(path, q) for q in trace.inputs})
         if path in self.layout.apart:
             return self._call_apart(path, (name,), state, [*inputs, *more])[0]
+        if isinstance(t, Cells):
+            return call_block(self.functions.of_events(path, name), [t, state, *inputs, *more, p])[0]
         function = trace.indicators if name == INDICATORS else trace.jump
         return call_block(function, [t, state, *inputs, p, *more])[0]
 

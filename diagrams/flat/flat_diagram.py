@@ -21,7 +21,7 @@ from . import functions
 from .block_functions import BlockFunctions
 from .clocks import TickPattern
 from .layout import FlatLayout, sample_time_of
-from .program import TickProgram
+from .program import PartProgram, TickProgram
 from .stages import Schedule
 from .total_derivative import Derivative
 
@@ -109,6 +109,10 @@ class FlatDiagram(FlatLayout):
     def program_at(self, acting: frozenset[TickPattern]) -> TickProgram:
         """Return a tick at which the given clocks act as calls of block functions, for grouped code."""
         return functions.trace_tick_program(self, self.blocks, acting)
+
+    def part_program(self, name: str) -> PartProgram:
+        """Return "flow", "indicators" or "jump" as calls of block functions, for grouped code."""
+        return functions.trace_part_program(self, self.blocks, name)
 
     @_shared
     def by_block(self) -> bool:

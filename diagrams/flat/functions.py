@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import reduce
 from typing import Any
 
 import casadi as ca
@@ -21,12 +22,12 @@ from .block_functions import BlockFunctions
 from .clocks import NONE, TickPattern
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, rows
 from .layout import FlatLayout
-from .logic import choose, is_true, logic_and, logic_not
-from .program import Program, TickProgram
+from .logic import above_true, choose, is_true, logic_and, logic_not, logic_or, to_number
+from .program import Cells, PartProgram, Program, TickProgram
 from .stages import Schedule
 from .total_derivative import Derivative
 from .trace_stages import trace_schedule
-from .vectors import join_columns, log, loop_mismatch, next_x, outputs_of, plant_inputs, rates
+from .vectors import densify, entries_of, join_columns, log, loop_mismatch, next_x, outputs_of, plant_inputs, rates
 
 LARGEST = float(np.finfo(float).max)
 
@@ -130,17 +131,19 @@ def indicators_of(instant: Instant) -> tuple[list[Any], list[Any]]:
     g, opened, blocks = [], [], dict[str, Any]()
     for event in layout.events:
         if event.subsystem:
-            g.append(instant.control(event.path) - 0.5)
+            g.append(above_true(instant.control(event.path)))
             gate: Any = True
             for subsystem in layout.table.gates(event.path.rpartition(".")[0]):
                 gate = logic_and(gate, instant.is_open(subsystem))
         else:
             path = event.path
             if path not in blocks:
-                blocks[path] = ca.vertsplit(instant.events_of(path, INDICATORS))
+                blocks[path] = entries_of(instant.events_of(path, INDICATORS))
             g.append(blocks[path][list(layout.table.blocks[path].events).index(event.name)])
             gate = instant.gate_of(path)
-        opened.append(ca.MX(1.0) if gate is True else ca.MX(0.0) if gate is False else gate)
+        if isinstance(gate, bool):
+            gate = to_number(gate) if isinstance(instant.t, Cells) else ca.MX(float(gate))
+        opened.append(gate)
     return g, opened
 
 
@@ -150,37 +153,63 @@ def trace_jump(layout: FlatLayout, functions: BlockFunctions) -> Schedule:
     A block that is evaluated from outside is asked whatever fires: it has events of its own.
     """
     symbols = make_symbols(layout)
-    x, fired = symbols["x"], ca.MX.sym("fired", len(layout.events))
+    fired = ca.MX.sym("fired", len(layout.events))
+
+    def results(apart: Apart) -> Mapping[str, Any]:
+        instant = evaluate(layout, functions, NONE, **symbols, fired=fired, apart=apart)
+        _let_fire(instant)
+        return {"x_next": next_x(instant)}
+
+    return trace_schedule("jump", {**symbols, "fired": fired}, results)
+
+
+def _let_fire(instant: Instant) -> None:
+    """Put the states of an instant to those after the events that fire there."""
+    layout, x, fired = instant.layout, instant.x, instant.fired
     states, starts = layout.states.slices, layout.starts.slices
     own: dict[str, list[int]] = {path: [] for path in layout.outside}
     for i, event in enumerate(layout.events):
         own.setdefault(event.path, []).append(i)
+    for path, indices in own.items():
+        if path in layout.table.controls:
+            continue
+        each = [fired[i : i + 1] for i in indices]
+        after = instant.events_of(path, JUMP, join_columns(each))
+        acts = instant.gate_of(path)
+        if path not in layout.outside:  # those look at every event themselves
+            acts = logic_and(acts, reduce(logic_or, map(is_true, each)))
+        instant.new[path] = choose(acts, densify(after), rows(x, states[path]))
+    for i, event in enumerate(layout.events):
+        if event.subsystem and event.name == "enable":
+            mode = rows(x, layout.gates.slices[event.path])
+            turned = is_true(fired[i : i + 1])
+            instant.gates[event.path] = choose(turned, logic_not(is_true(mode)), mode)
+            if layout.table.subsystems[event.path].when == "reset":
+                opens = logic_and(turned, logic_not(is_true(mode)))
+                for path, where in starts.items():
+                    if event.path in layout.around[layout.table.subsystem_of[path]]:
+                        old = instant.new.get(path, rows(x, states[path]))
+                        instant.new[path] = choose(opens, rows(x, where), old)
 
-    def results(apart: Apart) -> Mapping[str, Any]:
-        instant = evaluate(layout, functions, NONE, **symbols, fired=fired, apart=apart)
-        for path, indices in own.items():
-            if path in layout.table.controls:
-                continue
-            mine = join_columns([fired[i] for i in indices])
-            after = instant.events_of(path, JUMP, mine)
-            acts = instant.gate_of(path)
-            if path not in layout.outside:  # those look at every event themselves
-                acts = logic_and(acts, ca.sum1(mine) > 0.5)
-            instant.new[path] = choose(acts, ca.densify(after), rows(x, states[path]))
-        for i, event in enumerate(layout.events):
-            if event.subsystem and event.name == "enable":
-                mode = rows(x, layout.gates.slices[event.path])
-                turned = is_true(fired[i : i + 1])
-                instant.gates[event.path] = choose(turned, 1 - mode, mode)
-                if layout.table.subsystems[event.path].when == "reset":
-                    opens = logic_and(turned, logic_not(is_true(mode)))
-                    for path, where in starts.items():
-                        if event.path in layout.table.gates(layout.table.subsystem_of[path]):
-                            old = instant.new.get(path, rows(x, states[path]))
-                            instant.new[path] = choose(opens, rows(x, where), old)
-        return {"x_next": next_x(instant)}
 
-    return trace_schedule("jump", {**symbols, "fired": fired}, results)
+PARTS = ("flow", "indicators", "jump")
+"""Functions between ticks that grouped code is made from."""
+
+
+@without_collection
+def trace_part_program(layout: FlatLayout, functions: BlockFunctions, name: str) -> PartProgram:
+    """Return one of `PARTS` as a program; that of a jump takes which events fire as a further argument."""
+    fires = name == "jump"
+    sizes = (layout.width, layout.plant_outputs.total, layout.parameters.total)
+    program = Program(sizes, len(layout.events) if fires else 0)
+    fired = program.more if fires else None
+    instant = evaluate(layout, functions, NONE, program.t, program.x, program.w, program.p, fired=fired)
+    if name == "flow":
+        return PartProgram.of(program, program.join([rates(instant)]))
+    if name == "indicators":
+        return PartProgram.of(program, *map(program.join, indicators_of(instant)))
+    _let_fire(instant)
+    return PartProgram.of(program, program.join([next_x(instant)]))
 
 
 def trace_loops(layout: FlatLayout, functions: BlockFunctions, acting: frozenset[TickPattern]) -> Derivative | None:

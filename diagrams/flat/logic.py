@@ -11,7 +11,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .program import AND, CHOOSE, NOT, OR, TRUE_OF, Cells
+from .program import AND, CHOOSE, LESS, NOT, OR, TRUE_OF, Cells
 
 TRUE = 0.5
 """A logic signal is true above this."""
@@ -24,6 +24,11 @@ def is_true(value: Any) -> Any:
     if isinstance(value, ca.MX):
         return value > TRUE
     return bool(float(np.ravel(np.array(value))[0]) > TRUE)
+
+
+def above_true(value: Any) -> Any:
+    """Return by how much a logic signal is above the value from which it is true."""
+    return value.program.apply(LESS, value) if isinstance(value, Cells) else value - TRUE
 
 
 def logic_and(a: Any, b: Any) -> Any:

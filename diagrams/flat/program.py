@@ -15,7 +15,7 @@ import numpy as np
 
 Ids = range | tuple[int, ...]
 
-COPY, TRUE_OF, AND, OR, NOT, CHOOSE = "copy", "is_true", "and", "or", "not", "choose"
+COPY, TRUE_OF, AND, OR, NOT, CHOOSE, LESS = "copy", "is_true", "and", "or", "not", "choose", "less_true"
 """Operations on single values, beside the calls of block functions."""
 
 
@@ -58,8 +58,8 @@ class Program:
 
     Attributes
     ----------
-    t, x, w, p : Cells
-        The arguments.
+    t, x, w, p, more : Cells
+        The arguments; ``more`` is a further one, such as the events that fire.
     functions : dict
         CasADi functions of the operations, by key.
     operations : list of Operation
@@ -71,6 +71,7 @@ class Program:
     """
 
     widths: tuple[int, int, int]
+    further: int = 0
     functions: dict[int, Any] = field(default_factory=dict)
     operations: list[Operation] = field(default_factory=list)
     constants: dict[int, float] = field(default_factory=dict)
@@ -78,7 +79,7 @@ class Program:
 
     def __post_init__(self) -> None:
         self.count = 0
-        self.t, self.x, self.w, self.p = (Cells(self, self._new(n)) for n in (1, *self.widths))
+        self.t, self.x, self.w, self.p, self.more = (Cells(self, self._new(n)) for n in (1, *self.widths, self.further))
         self.given = self.count
         self._constants: dict[bytes, range] = {}
         self._sizes: dict[int, list[int]] = {}
@@ -171,3 +172,36 @@ class TickProgram:
     log: Ids
     guards: Ids
     mismatch: tuple[Ids, Ids] | None
+
+
+@dataclass(frozen=True, eq=False)
+class PartProgram:
+    """A function between ticks as a program: rates, indicators, or states after events.
+
+    Attributes
+    ----------
+    program : Program
+        The operations.
+    operations : list of Operation
+        Those that the results need, in an order in which they can be done.
+    results : tuple of Ids
+        The values of each result.
+    """
+
+    program: Program
+    operations: list[Operation]
+    results: tuple[Ids, ...]
+
+    @classmethod
+    def of(cls, program: Program, *results: Cells) -> PartProgram:
+        """Return the part of a program that some results need."""
+        needed = bytearray(program.count)
+        for value in (value for cells in results for value in cells.ids):
+            needed[value] = 1
+        kept = list[Operation]()
+        for op in reversed(program.operations):
+            if any(needed[value] for column in op.results for value in column):
+                kept.append(op)
+                for value in (value for column in op.arguments for value in column):
+                    needed[value] = 1
+        return cls(program, kept[::-1], tuple(cells.ids for cells in results))

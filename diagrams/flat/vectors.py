@@ -55,9 +55,11 @@ def rates(instant: Instant) -> Any:
     """Return the rates of the entries of x that are integrated."""
     layout = instant.layout
     if not layout.continuous.size:
-        return ca.MX(0, 1)
+        return instant.t.program.join([]) if isinstance(instant.t, Cells) else ca.MX(0, 1)
     states = layout.states.slices.items()
-    of_all = join_columns([instant.rates.get(path, ca.MX.zeros(s.stop - s.start)) for path, s in states])
+    none = np.zeros if isinstance(instant.t, Cells) else ca.MX.zeros
+    columns = [instant.rates[path] if path in instant.rates else none(s.stop - s.start) for path, s in states]
+    of_all = join_columns(columns)
     return of_all[layout.continuous.tolist()]
 
 
@@ -102,3 +104,15 @@ def join_columns(columns: Sequence[Any]) -> Any:
     if any(isinstance(column, Cells) for column in columns):
         return next(column.program for column in columns if isinstance(column, Cells)).join(columns)
     return ca.vertcat(*columns) if columns else ca.MX(0, 1)
+
+
+def entries_of(column: Any) -> list[Any]:
+    """Return the entries of a column, each as a column."""
+    if isinstance(column, Cells):
+        return [column[i : i + 1] for i in range(column.numel())]
+    return [*ca.vertsplit(column)]
+
+
+def densify(column: Any) -> Any:
+    """Return a column that holds every entry, zeros too."""
+    return column if isinstance(column, Cells) else ca.densify(column)

@@ -1,0 +1,117 @@
+"""Grouped code of diagrams with continuous states: rates, events and derivatives by tables of equal blocks."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from loopwright.blocks import Gain, PythonFunction, Sine, StateSpace, Sum, TransferFunction
+from loopwright.blocks.core import SimulationError
+from loopwright.diagrams import Diagram
+from loopwright.diagrams.compiled import write_hybrid
+from loopwright.diagrams.compiled.grouped_parts import Differences, find_differences
+from loopwright.diagrams.flat import NONE, flat_diagram
+
+QUIET = {"progress": False}
+
+
+@pytest.fixture
+def grouped(monkeypatch):
+    """Every diagram is compiled block by block."""
+    monkeypatch.setattr(flat_diagram, "LARGEST", 0)
+
+
+def lag_of(rate, start, name):
+    return StateSpace(A=[[-rate]], B=[rate], C=[1.0], D=0.0, initial_state=start, name=name)
+
+
+def ring(n, rate=1.0):
+    """Lags x' = rate (u − x), each driven by 0.3 times the sum of two others."""
+    lags = [lag_of(rate, float(i == 0), f"x{i}") for i in range(n)]
+    calls = []
+    for i, lag in enumerate(lags):
+        total = Sum(signs="+-", name=f"s{i}")(lags[(i + 1) % n].y, lags[(7 * i + 3) % n].y)
+        calls.append(lag(Gain(gain=0.3, name=f"g{i}")(total)))
+    return Diagram("ring", *calls), [f"x{i}" for i in range(n)]
+
+
+def matrix_of(n, rate=1.0):
+    a = -np.eye(n)
+    for i in range(n):
+        a[i, (i + 1) % n] += 0.3
+        a[i, (7 * i + 3) % n] -= 0.3
+    return rate * a
+
+
+@pytest.mark.parametrize("solver", ["DOP853", "Radau"])
+def test_a_ring_of_lags_is_the_matrix_exponential(grouped, solver):
+    n, rate = 12, 5.0
+    made, names = ring(n, rate)
+    run = made.simulate(1.0, step=0.05, solver=solver, rtol=1e-9, atol=1e-11, compile=True, **QUIET)
+    assert run.tier == "compiled"
+    start = np.array([run[f"{name}.y"][0] for name in names])
+    expected = expm(matrix_of(n, rate)) @ start
+    assert np.max(np.abs([run[f"{name}.y"][-1] for name in names] - expected)) < 1e-8
+
+
+def test_the_code_of_many_blocks_is_as_short_as_that_of_few(grouped):
+    """A compiler reads no more of it: straight-line code of 300 blocks took it seconds."""
+    texts = [write_hybrid(ring(n)[0].flatten(1e-3), [NONE], stiff=True).texts[0] for n in (20, 60)]
+    assert abs(len(texts[1]) - len(texts[0])) < 0.02 * len(texts[0])
+
+
+def test_the_derivative_of_the_rates_needs_few_evaluations(grouped):
+    n = 40
+    made, _ = ring(n)
+    flat = made.flatten(1e-3)
+    found = find_differences(flat.part_program("flow"), flat.continuous, None, 0)
+    assert isinstance(found, Differences)
+    assert len(found.first) - 1 <= 9  # colors; a column for itself would be 40
+    dense = np.zeros((n, n), bool)
+    dense[found.pattern] = True
+    order = [flat.continuous.tolist().index(flat.states.slices[f"x{i}"].start) for i in range(n)]
+    assert np.all(dense[np.ix_(order, order)] >= (matrix_of(n) != 0.0))
+    assert np.sum(dense) <= 3 * n
+    for color in range(len(found.first) - 1):
+        columns = found.columns[found.first[color] : found.first[color + 1]]
+        assert np.sum(dense[:, columns], axis=1).max() == 1
+
+
+def test_states_of_a_vector_depend_on_what_their_entries_do(grouped):
+    a = [[-1.0, 0.5, 0.0], [0.0, -2.0, 0.0], [0.0, 0.0, -3.0]]
+    system = StateSpace(A=a, B=np.eye(3), C=np.eye(3), D=np.zeros((3, 3)), name="system")
+    made = Diagram("vector", system(Gain(gain=np.eye(3)[::-1], name="back")(system.y)))
+    flat = made.flatten(1e-3)
+    found = find_differences(flat.part_program("flow"), flat.continuous, None, 0)
+    dense = np.zeros((3, 3), bool)
+    dense[found.pattern] = True
+    assert np.all(dense[np.array(a) + np.eye(3)[::-1] != 0.0])
+
+
+def test_a_block_of_python_is_called_from_c():
+    """u = sin through a lag, the sine by Python: the closed form."""
+    sine = PythonFunction(np.sin, arguments={"u": ()}, results={"y": ()}, name="python")
+    clock = TransferFunction(numerator=1.0, denominator=[1.0, 0.0], name="t")
+    lag = TransferFunction(numerator=1.0, denominator=[0.5, 1.0], name="lag")
+    made = Diagram("python", lag(sine(clock(Gain(gain=1.0)(Sine(frequency=0.0, bias=1.0, name="one"))))))
+    run = made.simulate(1.0, step=0.1, rtol=1e-7, atol=1e-9, compile=True, **QUIET)
+    assert run.tier == "compiled"
+    t, w = run.t, 0.5
+    expected = (np.sin(t) - w * np.cos(t) + w * np.exp(-t / w)) / (1.0 + w**2)
+    assert np.max(np.abs(run["lag.y"] - expected)) < 1e-6
+
+
+def test_an_error_of_a_block_of_python_is_told_as_in_interpreted_runs():
+    def fail(u):
+        if u > 0.9:
+            raise ValueError("too large")
+        return u
+
+    source = Sine(frequency=1.0, name="source")
+    python = PythonFunction(fail, arguments={"u": ()}, results={"y": ()}, name="python")
+    made = Diagram("failing", TransferFunction(numerator=1.0, denominator=[0.1, 1.0], name="lag")(python(source)))
+    found = []
+    for form in (False, True):
+        with pytest.raises(SimulationError, match=r"python, t = 0\.178\d* s: its output failed: ValueError") as error:
+            made.simulate(0.5, step=1e-3, compile=form, **QUIET)
+        found.append(error.value.run.t[-1])
+    assert found[0] == found[1]
