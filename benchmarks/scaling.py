@@ -5,8 +5,8 @@ does, preparing is the rest until an interpreted run can start (flattening, func
 one step of RK4 with the four evaluations of the rates. Compiling is what `compile=True` adds to flattening, with a
 cache that has the library. Steps in C are told with one signal recorded, and with all: the difference is mostly the
 operating system's, which hands out memory that no run has used before. Exponents are fitted over the sizes from 100
-blocks on: 1 is linear. Times are the processor's, the smallest of three. The plot goes to benchmarks/out/scaling.png, or
-where it is told to; benchmarks/images/scaling.png is one such.
+blocks on: 1 is linear. Times are the processor's, the smallest of three. The plot goes to benchmarks/out/scaling.png,
+or where it is told to; benchmarks/images/scaling.png is one such.
 """
 
 from __future__ import annotations
