@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..flat import PartProgram
+from ..flat import Operation, PartProgram
 from .grouping import PartTables
 
 PythonTick = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64)
@@ -60,6 +60,11 @@ class GroupedPart:
     operations: int
     address: int
 
+    @property
+    def pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        """Row and column of each entry: none, it is no derivative."""
+        return np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.int32)
+
 
 @dataclass(frozen=True, eq=False)
 class Differences:
@@ -88,6 +93,11 @@ class Differences:
     first: np.ndarray
     rows: np.ndarray
     rows_first: np.ndarray
+
+    @property
+    def operations(self) -> int:
+        """Operations of one evaluation."""
+        return len(self.first) * self.rates.operations
 
     @property
     def pattern(self) -> tuple[np.ndarray, np.ndarray]:
@@ -125,7 +135,7 @@ def _find_rows(part: PartProgram, continuous: np.ndarray) -> list[np.ndarray]:
         if not any(map(any, masks)):
             continue
         if op.kernel not in patterns:
-            patterns[op.kernel] = _pattern_of(program.functions.get(op.kernel), op)
+            patterns[op.kernel] = _pattern_of(program.functions, op)
         for column, by_entry in zip(op.results, patterns[op.kernel], strict=True):
             for value, sources in zip(column, by_entry, strict=True):
                 mask = 0
@@ -143,10 +153,11 @@ def _find_rows(part: PartProgram, continuous: np.ndarray) -> list[np.ndarray]:
     return [np.array(own, dtype=np.int32) for own in rows]
 
 
-def _pattern_of(function: Any, op: Any) -> list[list[list[tuple[int, int]]]]:
+def _pattern_of(functions: Mapping[int, Any], op: Operation) -> list[list[list[tuple[int, int]]]]:
     """Return, for each result and entry of it, the arguments and their entries that it may depend on."""
     every = [(k, i) for k, column in enumerate(op.arguments) for i in range(len(column))]
     found = [[list[tuple[int, int]]() for _ in column] for column in op.results]
+    function = functions[op.kernel] if isinstance(op.kernel, int) else None
     if function is None or not function.is_a("SXFunction"):
         return [[every for _ in column] for column in op.results]
     for i, into in enumerate(found):

@@ -27,7 +27,18 @@ from .program import Cells, PartProgram, Program, TickProgram
 from .stages import Schedule
 from .total_derivative import Derivative
 from .trace_stages import trace_schedule
-from .vectors import densify, entries_of, join_columns, log, loop_mismatch, next_x, outputs_of, plant_inputs, rates
+from .vectors import (
+    densify,
+    entries_of,
+    join_columns,
+    kept_states,
+    log,
+    loop_mismatch,
+    next_x,
+    outputs_of,
+    plant_inputs,
+    rates,
+)
 
 LARGEST = float(np.finfo(float).max)
 
@@ -69,7 +80,7 @@ def trace_tick_program(layout: FlatLayout, functions: BlockFunctions, acting: fr
         program,
         x_next=program.join([next_x(instant)]).ids,
         z=plant_inputs(instant).ids,
-        log=program.join([instant.w, *outputs_of(instant), instant.x]).ids,
+        log=program.join([instant.w, *outputs_of(instant), kept_states(instant)]).ids,
         guards=program.join(instant.guards).ids,
         mismatch=(program.join(made).ids, program.join(taken).ids) if layout.loops.slices else None,
     )

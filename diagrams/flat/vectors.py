@@ -73,10 +73,28 @@ def plant_inputs(instant: Instant) -> Any:
 
 
 def log(instant: Instant) -> Any:
-    """Return w, all outputs of blocks, x, and, where loops are solved, the residual of the algebraic loops."""
+    """Return w, all outputs of blocks, `kept_states`, and, where loops are solved, the residual of the loops."""
     return ca.vertcat(
-        instant.w, *outputs_of(instant), instant.x, *([residual(instant)] if instant.layout.loops.slices else [])
+        instant.w,
+        *outputs_of(instant),
+        kept_states(instant),
+        *([residual(instant)] if instant.layout.loops.slices else []),
     )
+
+
+def kept_states(instant: Instant) -> Any:
+    """Return x as it is recorded: before the instant.
+
+    An output that a subsystem in continuous time holds is an exception. While the subsystem is open it changes all the
+    time, and x follows only where a solver accepts a step: recorded is what would be held from now on.
+    """
+    layout, parts, end = instant.layout, list[Any](), 0
+    for name, where in layout.held.slices.items():
+        subsystem = layout.table.subsystem_of[layout.ports[name][0]]
+        if name in instant.held and layout.clocks.get(subsystem) is None:
+            parts += [rows(instant.x, slice(end, where.start)), instant.held[name]]
+            end = where.stop
+    return join_columns([*parts, rows(instant.x, slice(end, layout.width))]) if parts else instant.x
 
 
 def outputs_of(instant: Instant) -> list[Any]:

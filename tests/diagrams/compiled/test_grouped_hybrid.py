@@ -4,9 +4,20 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from loopwright.blocks import Gain, PythonFunction, Sine, StateSpace, Sum, TransferFunction
+from loopwright.blocks import (
+    Constant,
+    Gain,
+    Integrator,
+    PythonFunction,
+    Sine,
+    StateSpace,
+    Step,
+    Sum,
+    TransferFunction,
+    UnitDelay,
+)
 from loopwright.blocks.core import SimulationError
-from loopwright.diagrams import Diagram
+from loopwright.diagrams import Diagram, subsystem
 from loopwright.diagrams.compiled import write_hybrid
 from loopwright.diagrams.compiled.grouped_parts import Differences, find_differences
 from loopwright.diagrams.flat import NONE, flat_diagram
@@ -115,3 +126,26 @@ def test_an_error_of_a_block_of_python_is_told_as_in_interpreted_runs():
             made.simulate(0.5, step=1e-3, compile=form, **QUIET)
         found.append(error.value.run.t[-1])
     assert found[0] == found[1]
+
+
+@pytest.mark.parametrize("form", ["interpreted", "compiled", "grouped"])
+@pytest.mark.parametrize(("mode", "solver"), [("held", "RK45"), ("reset", "rk4")])
+def test_the_output_that_an_open_subsystem_will_hold_is_recorded(form, mode, solver, monkeypatch):
+    """Between ticks x lagged behind by a tick in C, and by a step of the solver in Python."""
+    if form == "grouped":
+        monkeypatch.setattr(flat_diagram, "LARGEST", 0)
+
+    @subsystem(enabled=mode, name="box")
+    def box(u):
+        return Integrator(name="inner")(u)
+
+    @subsystem(sample_time=0.1, name="sampled")
+    def sampled(u):
+        return UnitDelay(initial_value=0.0, name="delay")(u)
+
+    enable = Step(times=(0.25, 0.75), values=(1.0, 0.0), name="enable")
+    made = Diagram("held", sampled(box(Constant(value=1.0, name="one"), enable=enable)))
+    run = made.simulate(1.0, step=0.05, solver=solver, compile=form != "interpreted", **QUIET)
+    held = made.flatten(0.05).held.slices["box.inner.y"].start
+    found = np.array([run.at(t).state[held] for t in run.t])
+    assert found == pytest.approx(np.clip(run.t - 0.25, 0.0, 0.5), abs=1e-9)
