@@ -213,6 +213,14 @@ def find_loops(
     return {clocks: StraightTick(f, address_of(library, f.name())) for clocks, f in loops.items()}
 
 
+def compile_loops(
+    flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]]
+) -> dict[frozenset[TickPattern], StraightTick]:
+    """Return the equations of the algebraic loops at ticks, compiled: their mismatch, and its derivative."""
+    loops = loop_functions(flat, acting)
+    return find_loops(loops, load_compiled(write_loops(loops))) if loops else {}
+
+
 def check_size(function: Any) -> None:
     """Refuse a function that is too large to be compiled as a whole.
 
