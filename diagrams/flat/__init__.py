@@ -2,7 +2,7 @@
 
 from ...blocks.core import Layout
 from .announced import Announcer, Times, announcers
-from .clocks import EVERY, NONE, TickPattern
+from .clocks import EVERY, NONE, ClockSets, TickPattern, bits_of
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator
 from .flat_diagram import EXACT_LOOP, FlatDiagram
 from .flatten import renumber
@@ -34,6 +34,7 @@ __all__ = [
     "Announcer",
     "Apart",
     "Bound",
+    "ClockSets",
     "Derivative",
     "Evaluators",
     "FlatDiagram",
@@ -53,6 +54,7 @@ __all__ = [
     "WiredDiagram",
     "announcers",
     "bind_function",
+    "bits_of",
     "evaluate",
     "evaluate_apart",
     "indicators_of",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -15,6 +18,10 @@ class TickPattern:
     def acts(self, k: int) -> bool:
         """Whether it acts at tick ``k``."""
         return k >= self.offset and (k - self.offset) % self.every == 0
+
+    def among(self, ticks: np.ndarray) -> np.ndarray:
+        """Return at which of some ticks it acts."""
+        return np.asarray((ticks >= self.offset) & ((ticks - self.offset) % self.every == 0))
 
     def after(self, k: int) -> int:
         """Return the first of its ticks after tick ``k``."""
@@ -30,3 +37,36 @@ EVERY = TickPattern()
 def in_order(clocks: frozenset[TickPattern] | set[TickPattern]) -> tuple[TickPattern, ...]:
     """Return clocks in an order of their own, fastest first."""
     return tuple(sorted(clocks, key=lambda c: (c.every, c.offset)))
+
+
+class ClockSets:
+    """Numbers of sets of clocks that act together.
+
+    Parameters
+    ----------
+    clocks : sequence of TickPattern
+        All clocks; at most some 20.
+    sets : mapping of frozenset of TickPattern to int
+        The number of each set.
+    other : int
+        Number of all other sets.
+    """
+
+    def __init__(self, clocks: Sequence[TickPattern], sets: Mapping[frozenset[TickPattern], int], other: int = -1):
+        self._clocks = tuple(clocks)
+        self._numbers = np.full(1 << len(self._clocks), other, dtype=np.int32)
+        for acting, number in sets.items():
+            self._numbers[sum(1 << i for i, clock in enumerate(self._clocks) if clock in acting)] = number
+
+    def at(self, ticks: np.ndarray) -> np.ndarray:
+        """Return the number of the set that acts at each of some ticks."""
+        found: np.ndarray = self._numbers[bits_of(self._clocks, ticks)]
+        return found
+
+
+def bits_of(clocks: Sequence[TickPattern], ticks: np.ndarray) -> np.ndarray:
+    """Return which clocks act at each of some ticks, one bit a clock."""
+    bits = np.zeros(len(ticks), dtype=np.int64)
+    for i, clock in enumerate(clocks):
+        bits |= clock.among(ticks).astype(np.int64) << i
+    return bits

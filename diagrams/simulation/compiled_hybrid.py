@@ -23,7 +23,7 @@ from ..compiled import (
     find_hybrid_obstacle,
 )
 from ..coupling import Plant, PlantSteps
-from ..flat import EVERY, NONE
+from ..flat import EVERY, NONE, ClockSets
 from ..results import Occurrence, Recorder
 from ..solvers import AutoSolver
 from .compiled_hand_over import (
@@ -39,7 +39,6 @@ from .compiled_ticks import (
     FIRST,
     LARGEST_CHUNK,
     WISHED,
-    acts,
     find_obstacle_at_ticks,
     is_exact,
     kinds_of,
@@ -211,25 +210,17 @@ class HybridTicks:
         while edges is None:
             ticks = ticks[: max(1, len(ticks) // 2)]
             edges = find_edges(self._continuous, t, self._time_of(int(ticks[-1])), limited=len(ticks) > 1)
-        kinds = self._kinds(ticks)
+        kinds = self._kinds.at(ticks)
         lands = np.ones(len(ticks), dtype=np.uint8)
         if not self._lands:
             lands[:] = ticks == last
             for clock in self._clocks:
-                lands |= acts(clock, ticks).astype(np.uint8)
+                lands |= clock.among(ticks).astype(np.uint8)
         end = int(ticks[-1])
         beyond = min([*(clock.after(end) for clock in self._clocks), last]) if not lands[-1] else end
         ends = np.concatenate([[k], ticks])
         n, d = base.numerator, base.denominator
         return Span(ends * n / d, np.diff(ends) * n / d, kinds, lands, self._time_of(beyond), *edges), lands
-
-    def _kinds(self, ticks: np.ndarray) -> np.ndarray:
-        """Return the clocks that act at ticks, as places among the compiled functions."""
-        bits = np.zeros(len(ticks), dtype=np.int64)
-        for i, clock in enumerate(self._flat.distinct):
-            bits |= acts(clock, ticks).astype(np.int64) << i
-        found: np.ndarray = self._kind_of[bits]
-        return found
 
     # --- by Python ---------------------------------------------------------------------------------------------------
 
@@ -319,9 +310,7 @@ class HybridTicks:
                 held=(workspace.z, self._steps.inputs),
                 loops=newton_options(self._flat, NONE) if self._flat.active_loops(NONE) else None,
             )  # fmt: skip
-            self._kind_of = np.zeros(1 << len(self._flat.distinct), dtype=np.int32)
-            for clocks, kind in self._loop.kinds.items():
-                self._kind_of[sum(1 << i for i, clock in enumerate(self._flat.distinct) if clock in clocks)] = kind
+            self._kinds = ClockSets(self._flat.distinct, self._loop.kinds, other=0)
         return self._loop
 
     def _hand_over(self, loop: CompiledHybrid, t: float) -> None:

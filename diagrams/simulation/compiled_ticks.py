@@ -27,7 +27,7 @@ from ..compiled import (
     find_obstacle,
 )
 from ..coupling import Plant
-from ..flat import EXACT_LOOP, FlatDiagram, TickPattern
+from ..flat import EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, bits_of
 from ..results import Recorder
 from .algebraic_loops import HALVINGS, ITERATIONS, ROUNDING, SINGULAR, TOLERANCE
 from .diagnosis import forget_trials
@@ -110,9 +110,7 @@ class CompiledTicks:
         self._code = compile_ticks(flat, kinds_of(flat, every=every)) if code is None else code
         self._loop: CompiledLoop | None = None
         self._recorder: Recorder | None = None
-        self._kind_of = np.full(1 << len(flat.distinct), -1, dtype=np.int32)
-        for kind, clocks in enumerate(self._code.ticks):
-            self._kind_of[sum(1 << i for i, clock in enumerate(flat.distinct) if clock in clocks)] = kind
+        self._kinds = ClockSets(flat.distinct, {clocks: kind for kind, clocks in enumerate(self._code.ticks)})
         self._chunk = FIRST
         self._first: _Window | None = None
         self._last = 0
@@ -196,7 +194,7 @@ class CompiledTicks:
     def _window(self, k: int, visited: Iterator[int]) -> _Window:
         base, ticks = self._flat.base, np.fromiter(islice(visited, _WINDOW), dtype=np.int64)
         n, d, ends = base.numerator, base.denominator, np.concatenate([[k], ticks])
-        kinds = self._kinds(ticks)
+        kinds = self._kinds.at(ticks)
         unknown = np.flatnonzero(kinds < 0)
         return _Window(k, ticks, ends * n / d, np.diff(ends) * n / d, kinds, unknown)
 
@@ -221,14 +219,6 @@ class CompiledTicks:
                 loops={clocks: newton_options(self._flat, clocks) for clocks in self._code.loops},
             )
         return self._loop
-
-    def _kinds(self, ticks: np.ndarray) -> np.ndarray:
-        """Return the clocks that act at ticks, as places among the compiled functions; −1 where none is."""
-        bits = np.zeros(len(ticks), dtype=np.int64)
-        for i, clock in enumerate(self._flat.distinct):
-            bits |= acts(clock, ticks).astype(np.int64) << i
-        found: np.ndarray = self._kind_of[bits]
-        return found
 
     def _take_tick(self, before: int, k: int, found: Outcome, recorder: Recorder) -> None:
         """Go through a tick at which the loop has returned: from the call on that it could not go beyond."""
@@ -264,20 +254,13 @@ def is_exact(flat: FlatDiagram, last: int) -> bool:
     return max(flat.base.denominator, last * flat.base.numerator) < _EXACT
 
 
-def acts(clock: TickPattern, ticks: np.ndarray) -> np.ndarray:
-    """Return at which of some ticks a clock acts."""
-    return np.asarray((ticks >= clock.offset) & ((ticks - clock.offset) % clock.every == 0))
-
-
 def kinds_of(flat: FlatDiagram, *, every: bool) -> list[frozenset[TickPattern]]:
     """Return the sets of clocks that act together at some tick, as far as they are found in the first million."""
     clocks = flat.distinct
     period = int(np.lcm.reduce([1, *(clock.every for clock in clocks)]))
     ticks = np.arange(min(max((clock.offset for clock in clocks), default=0) + period + 1, LARGEST_CHUNK))
-    bits = np.zeros(len(ticks), dtype=np.int64)
-    for i, clock in enumerate(clocks):
-        bits |= acts(clock, ticks).astype(np.int64) << i
-    found = [frozenset(c for i, c in enumerate(clocks) if mask >> i & 1) for mask in np.unique(bits).tolist()]
+    masks = np.unique(bits_of(clocks, ticks)).tolist()
+    found = [frozenset(c for i, c in enumerate(clocks) if mask >> i & 1) for mask in masks]
     return [acting for acting in found if acting or every or not clocks]
 
 
