@@ -37,6 +37,7 @@ class VariedDiagram(SimulatedDiagram):
         workers: int | None = None,
         client: Any = None,
         progress: bool | None = None,
+        lanes: bool | int = False,
         **options: Unpack[KeptKeywords],
     ) -> Sweep:
         """Run the diagram with many values of its parameters, on every core; see docs/sweeps.md.
@@ -74,6 +75,11 @@ class VariedDiagram(SimulatedDiagram):
             A Dask cluster that runs the samples.
         progress : bool, optional
             Show a progress bar; see `simulate`.
+        lanes : bool or {2, 4, 8, 16}, optional
+            Make so many runs side by side in the lanes of the processor's vectors, 8 for True: some times as fast.
+            Their values then differ from those of single runs in their last digits, and the sweep's messages say so.
+            Every FMU must have been built by Loopwright on this machine, with steps of fixed length and without events;
+            runs that can't go so are made one after the other, which is told.
         **options
             Options of each run, as for `simulate`; ``compile=True`` is the default, but with ``seeds``.
 
@@ -94,7 +100,7 @@ class VariedDiagram(SimulatedDiagram):
         return sweep(
             self, parameters, duration, samples=samples, count=count, seed=seed, seeds=seeds, signals=signals,
             reduce=reduce, to=to, overwrite=overwrite, workers=workers, client=client, progress=progress,
-            options=options,
+            lanes=lanes, options=options,
         )  # fmt: skip
 
     def sensitivity(

@@ -1,7 +1,7 @@
 """The compiled loop: C code of a diagram's ticks and of what happens between them, and the masters that run it."""
 
 from .background import BackgroundCode
-from .code import TickCode, compile_ticks, find_obstacle, write_ticks
+from .code import LARGEST, TickCode, compile_ticks, find_obstacle, load_compiled, write_ticks
 from .fused import fuse
 from .fused_code import FusedPlant, compile_fused
 from .hybrid import FIXED, CompiledHybrid, HybridOutcome, HybridReason, MethodOptions, Span
@@ -12,6 +12,7 @@ from .watch import RECENT, Fired, Watch
 
 __all__ = [
     "FIXED",
+    "LARGEST",
     "RECENT",
     "BackgroundCode",
     "CompiledHybrid",
@@ -34,6 +35,7 @@ __all__ = [
     "find_hybrid_obstacle",
     "find_obstacle",
     "fuse",
+    "load_compiled",
     "write_hybrid",
     "write_ticks",
 ]

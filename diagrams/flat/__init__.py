@@ -2,6 +2,7 @@
 
 from ...blocks.core import Layout
 from .announced import Announcer, Times, announcers
+from .clock_sets import is_exact, kinds_of
 from .clocks import EVERY, NONE, ClockSets, TickPattern, bits_of
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator
 from .flat_diagram import EXACT_LOOP, FlatDiagram
@@ -58,8 +59,10 @@ __all__ = [
     "evaluate",
     "evaluate_apart",
     "indicators_of",
+    "is_exact",
     "is_true",
     "join_columns",
+    "kinds_of",
     "loop_mismatch",
     "next_x",
     "no_evaluator",

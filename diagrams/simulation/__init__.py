@@ -7,6 +7,7 @@ from .run_options import KeptKeywords, RunKeywords, RunOptions, default_step, re
 from .simulated_diagram import SimulatedDiagram
 from .simulation import Simulation, simulate
 from .start_at_point import apply_point, copy_states
+from .stops import StopConditions
 from .view import SimulationView
 from .workspace import Workspace
 
@@ -19,6 +20,7 @@ __all__ = [
     "SimulatedDiagram",
     "Simulation",
     "SimulationView",
+    "StopConditions",
     "Workspace",
     "apply_point",
     "copy_states",

@@ -23,7 +23,7 @@ from ..compiled import (
     find_hybrid_obstacle,
 )
 from ..coupling import Plant, PlantSteps
-from ..flat import EVERY, NONE, ClockSets
+from ..flat import EVERY, NONE, ClockSets, is_exact, kinds_of
 from ..results import Occurrence, Recorder
 from ..solvers import AutoSolver
 from .compiled_hand_over import (
@@ -40,8 +40,6 @@ from .compiled_ticks import (
     LARGEST_CHUNK,
     WISHED,
     find_obstacle_at_ticks,
-    is_exact,
-    kinds_of,
     newton_options,
 )
 from .continuous import Continuous

@@ -27,7 +27,7 @@ from ..compiled import (
     find_obstacle,
 )
 from ..coupling import Plant
-from ..flat import EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, bits_of
+from ..flat import EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of
 from ..results import Recorder
 from .algebraic_loops import HALVINGS, ITERATIONS, ROUNDING, SINGULAR, TOLERANCE
 from .diagnosis import forget_trials
@@ -39,7 +39,6 @@ WISHED = 0.05
 """Seconds that a chunk takes, half or double; Ctrl-C and the progress bar have their turn after it."""
 _WINDOW = 2**17
 """Ticks whose times are computed at a time, at most."""
-_EXACT = 2**53  # up to which every integer is a float64
 _RK4 = 1  # the integrator of exported FMUs that is compiled into a fused loop
 CLOCKS = 16
 """Clocks up to which sets of them are numbered by their bits."""
@@ -247,21 +246,6 @@ class CompiledTicks:
 def newton_options(flat: FlatDiagram, clocks: frozenset[TickPattern]) -> NewtonOptions:
     """Return Newton's method for the algebraic loops at a tick at which some clocks act."""
     return NewtonOptions(flat.active_loops(clocks), TOLERANCE, ROUNDING, SINGULAR, ITERATIONS, HALVINGS)
-
-
-def is_exact(flat: FlatDiagram, last: int) -> bool:
-    """Whether times up to a tick are quotients of integers that a float64 holds."""
-    return max(flat.base.denominator, last * flat.base.numerator) < _EXACT
-
-
-def kinds_of(flat: FlatDiagram, *, every: bool) -> list[frozenset[TickPattern]]:
-    """Return the sets of clocks that act together at some tick, as far as they are found in the first million."""
-    clocks = flat.distinct
-    period = int(np.lcm.reduce([1, *(clock.every for clock in clocks)]))
-    ticks = np.arange(min(max((clock.offset for clock in clocks), default=0) + period + 1, LARGEST_CHUNK))
-    masks = np.unique(bits_of(clocks, ticks)).tolist()
-    found = [frozenset(c for i, c in enumerate(clocks) if mask >> i & 1) for mask in masks]
-    return [acting for acting in found if acting or every or not clocks]
 
 
 def bind_evaluations(workspace: Workspace, *, every: bool) -> dict[frozenset[TickPattern], Callable[[], None]]:

@@ -42,6 +42,11 @@ class StopConditions:
         """Entries of the outputs that end the run where they are true."""
         return [entry for entry, _ in self._entries]
 
+    @property
+    def paths(self) -> list[str]:
+        """Paths of the blocks that these entries belong to."""
+        return [path for _, path in self._entries]
+
     def is_met(self) -> bool:
         """Whether any is true."""
         return any(self._log[i] > TRUE for i, _ in self._entries) or bool(self._asking())

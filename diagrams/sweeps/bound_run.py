@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
 from time import perf_counter
 from typing import Any
+
+import numpy as np
 
 from ...blocks.core import SimulationError
 from ...fmus.calls import FmuInstance
 from ..coupling import note_fine_steps, note_loops
 from ..flat import EVERY, FlatDiagram, renumber
-from ..results import Places, Recorder, Recording, Run
+from ..results import Places, Recorder, Recording, Run, Stopped
 from ..simulation import Engine, RunOptions, SimulatedDiagram, default_step, refuse_rest, ticks_in
 from .start_values import StartValues
 from .variation import Numbers
@@ -43,17 +45,17 @@ class BoundRun:
         run, fused = options.apply_fuse(diagram)
         base = default_step(run, options.step, duration, options.solver)
         self.flat: FlatDiagram = run.flatten(base) if base is options.step else run.flattened(base)
-        self._count, rest = ticks_in(duration, self.flat.base, diagram.name)
+        self.count, rest = ticks_in(duration, self.flat.base, diagram.name)
         if rest:
-            refuse_rest(self.flat, self._count, duration, diagram.name)
-        self._end = float(self._count * self.flat.base + rest) if rest else None
+            refuse_rest(self.flat, self.count, duration, diagram.name)
+        self._end = float(self.count * self.flat.base + rest) if rest else None
         record, every, states = options.record, options.every, options.states
         self._recording = Recording(self.flat, diagram.name, record, every, states, None, False)
         every_tick = base is not None or EVERY in self.flat.visited
-        self._recording.check_memory(self._count, every_tick=every_tick)
+        self._recording.check_memory(self.count, every_tick=every_tick)
         self.engine = Engine(self.flat, diagram.name, options, every_tick=every_tick, on_event=lambda event: None)
-        rows = self._count + 2 if self.engine.every_tick else None
-        self._recorder: Recorder = self._recording.begin(rows)
+        rows = self.count + 2 if self.engine.every_tick else None
+        self.recorder: Recorder = self._recording.begin(rows)
         fine = note_fine_steps(self.flat) if base is None else ()
         self._notes: tuple[str, ...] = (*fused, *fine, *note_loops(self.flat, self.engine.coupling))
         self._has_begun = False
@@ -84,6 +86,11 @@ class BoundRun:
         return self.engine.can_begin_anew and StartValues.fits(self.flat)
 
     @property
+    def ends_between_ticks(self) -> bool:
+        """Whether the duration is no whole number of ticks."""
+        return self._end is not None
+
+    @property
     def is_compiled(self) -> bool:
         """Whether it goes from tick to tick in C."""
         return self.engine.is_compiled
@@ -108,14 +115,14 @@ class BoundRun:
         SimulationError
             As of `Diagram.simulate`; ``error.run`` holds what was recorded until then.
         """
-        engine, recorder, started = self.engine, self._recorder, perf_counter()
+        engine, recorder, started = self.engine, self.recorder, perf_counter()
         recorder.begin_anew()
         try:
             self.begin(numbers)
             engine.take_first_tick(None, recorder.row)
             if engine.position.stopped is None:
-                if self._count:
-                    engine.go(self._count, recorder, tell)
+                if self.count:
+                    engine.go(self.count, recorder, tell)
                 if self._end is not None and engine.position.stopped is None:
                     engine.end_between_ticks(self._end, recorder.row, tell)
         except SimulationError as error:
@@ -143,8 +150,26 @@ class BoundRun:
             self._has_begun = True
 
     def _take_record(self, started: float) -> Run:
-        recorder, engine = self._recorder, self.engine
-        t, data = recorder.finish()
+        t, data = self.recorder.finish()
+        return self.make_run(t, data, self.engine.position.stopped, started)
+
+    def make_run(
+        self, t: np.ndarray, data: np.ndarray, stopped: Stopped | None, started: float, messages: Sequence[str] = ()
+    ) -> Run:
+        """Return samples of a run with the numbers that it was begun with, and what has been told since.
+
+        Parameters
+        ----------
+        t, data : ndarray
+            Times in s, and the samples that the recorder would keep.
+        stopped : Stopped or None
+            The stop condition that has ended it.
+        started : float
+            Reading of the clock at its start.
+        messages : sequence of str
+            Further messages.
+        """
+        engine = self.engine
         run = Run(
             t=t,
             data=data,
@@ -153,9 +178,9 @@ class BoundRun:
             units=self._recording.units,
             diagram=None,
             elapsed=perf_counter() - started,
-            messages=(*self._notes, *engine.messages, *engine.workspace.messages, *self._take_messages()),
-            stopped=engine.position.stopped,
-            columns=recorder.columns,
+            messages=(*self._notes, *engine.messages, *engine.workspace.messages, *self._take_messages(), *messages),
+            stopped=stopped,
+            columns=self.recorder.columns,
             has_states=self._recording.states,
             diagram_name=self._name,
         )

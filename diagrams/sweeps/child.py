@@ -53,16 +53,17 @@ def main() -> None:
         send(answers, error_text(error))
         return
     from ...blocks.core import one_thread
-    from .plan import Worker
+    from .workers import make_worker
 
-    with one_thread(), Worker(plan) as worker:
+    with one_thread(), make_worker(plan) as worker:
         send(answers, "")
         while True:
             try:
                 sample = receive(orders)
             except EOFError:
                 return
-            send(answers, worker.run(sample))
+            for outcome in worker.run_all([sample]):
+                send(answers, outcome)
 
 
 def error_text(error: BaseException) -> str:

@@ -20,6 +20,7 @@ from .outcome import WORKER_ENDED, Failure, Outcome
 from .plan import Plan, Worker
 from .processes import to_bytes
 from .samples import Sample
+from .workers import make_worker
 
 _CHUNKS = 8
 """Chunks of samples for each thread of the cluster."""
@@ -101,7 +102,7 @@ class _Bench:
         """Yield a worker that nobody else has."""
         with self.alone:
             with self.lock:
-                worker = self.idle.pop() if self.idle else Worker(self.plan)
+                worker = self.idle.pop() if self.idle else make_worker(self.plan)
             yield worker
             with self.lock:
                 self.idle.append(worker)
@@ -131,7 +132,7 @@ def run_chunk(key: str, parcel: bytes, digests: Sequence[str], samples: Sequence
             _benches[key] = _Bench(found.unpack(dict(zip(digests, contents, strict=True))))
         bench = _benches[key]
     with one_thread(), bench.take() as worker:
-        return [worker.run(sample) for sample in samples]
+        return [*worker.run_all(samples)]
 
 
 def release(key: str) -> None:

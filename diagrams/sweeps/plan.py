@@ -45,6 +45,8 @@ class Plan:
         Functions of a run by name.
     seeds : tuple of str
         Full paths of the parameters that take a sample's seed.
+    lanes : int
+        Runs that go side by side in the lanes of a vector; 1 for one after the other.
     """
 
     diagram: SimulatedDiagram
@@ -53,6 +55,7 @@ class Plan:
     signals: tuple[str, ...] = ()
     reductions: Mapping[str, Callable[[Run], Any]] = field(default_factory=dict)
     seeds: tuple[str, ...] = ()
+    lanes: int = 1
 
     @property
     def run_options(self) -> RunOptions:
@@ -70,10 +73,6 @@ class Plan:
         """Return all parameters of a sample, seeds included."""
         seeds = {path: seed_of(sample.seed, k) % 2**53 for k, path in enumerate(self.seeds)}
         return {**sample.parameters, **seeds}
-
-    def make_worker(self) -> Worker:
-        """Return a worker that runs samples in this thread."""
-        return Worker(self)
 
     @property
     def runs_in_threads(self) -> bool:
@@ -143,8 +142,12 @@ class Worker:
         tell : callable
             Told the simulated time in s now and then; what it raises ends the run.
         """
+        return self._judge(sample, lambda: self._simulate(self.plan.parameters_of(sample), tell))
+
+    def _judge(self, sample: Sample, make: Callable[[], Run]) -> Outcome:
+        """Return the outcome of a sample whose run is made here, whether it fails or not."""
         try:
-            return self._outcome(sample, self._simulate(self.plan.parameters_of(sample), tell))
+            return self._outcome(sample, make())
         except LoopwrightError as error:
             failure = describe_failure(sample.index, error)
             run = error.run if isinstance(error, SimulationError) else None

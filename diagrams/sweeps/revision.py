@@ -39,6 +39,7 @@ def revision_of(plan: Plan) -> str:
     parts = (
         _of_diagram(plan.diagram), repr(float(plan.duration)), _text(options), repr(plan.signals),
         _text(plan.reductions), repr(plan.seeds), ca.CasadiMeta.version(),
+        repr(plan.lanes > 1),
     )  # fmt: skip
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 

@@ -26,7 +26,10 @@ from .revision import key_of, revision_of
 from .samples import Sample, read_samples
 from .store import Store
 from .threads import run_in_threads
+from .workers import make_worker
 
+_LANES = 8
+_MANY_LANES = (2, 4, 8, 16)
 _REFUSED = {
     "to": "of a sweep, to= is the folder of its results",
     "overwrite": "of a sweep, overwrite= belongs to its folder",
@@ -64,12 +67,13 @@ def sweep(
     workers: int | None = None,
     client: Any = None,
     progress: bool | None = None,
+    lanes: bool | int = False,
     options: Mapping[str, Any],
 ) -> Sweep:
     """Run a diagram with many values of its parameters; see `Diagram.sweep`."""
     started, name = perf_counter(), diagram.name
     found = read_samples(diagram, parameters, samples, count=count, seed=seed)
-    plan = make_plan(diagram, duration, signals, reduce, seeds, options, count=len(found))
+    plan = make_plan(diagram, duration, signals, reduce, seeds, options, count=len(found), lanes=lanes)
     _check_names(plan, found.names)
     count_workers = _check_workers(workers)
     store, known = None, dict[str, Outcome]()
@@ -116,6 +120,7 @@ def make_plan(
     options: Mapping[str, Any],
     *,
     count: int = 1,
+    lanes: bool | int = False,
 ) -> Plan:
     """Return a sweep as a value, with its names and options checked.
 
@@ -140,7 +145,9 @@ def make_plan(
         )
     paths = [find_parameter(diagram, path) for path in ((seeds,) if isinstance(seeds, str) else seeds)]
     compiled = not paths  # a seed is a fixed number in the code, which would be compiled anew for every sample
-    plan = Plan(diagram, duration, {"compile": compiled, **options}, chosen, reductions, tuple(paths))
+    plan = Plan(
+        diagram, duration, {"compile": compiled, **options}, chosen, reductions, tuple(paths), _check_lanes(lanes)
+    )
     flat = Simulation(diagram, plan.run_options, duration=duration).flat  # it checks the options
     for signal in [*chosen, *(f.signal for f in reductions.values() if isinstance(f, Reduction))]:
         resolve(signal, flat.table.names, flat.log.slices)
@@ -161,7 +168,7 @@ def _run(plan: Plan, samples: Sequence[Sample], workers: int, client: Any) -> Ge
 
         yield from run_on_cluster(plan, samples, client)
         return
-    with plan.make_worker() as worker:
+    with make_worker(plan) as worker:
         if workers == 1:
             for k in range(0, len(samples), worker.width):
                 yield from worker.run_all(samples[k : k + worker.width])
@@ -192,6 +199,18 @@ def _check_names(plan: Plan, swept: Sequence[str]) -> None:
             block=plan.diagram.name,
             port="reduce",
         )
+
+
+def _check_lanes(lanes: object) -> int:
+    """Return the number of runs that go side by side."""
+    if lanes is False or lanes is True:
+        return _LANES if lanes else 1
+    if not isinstance(lanes, int | np.integer) or lanes not in _MANY_LANES:
+        raise OptionError(
+            f"found lanes={lanes!r}; expected True for {_LANES} runs side by side, {', '.join(map(str, _MANY_LANES))}, "
+            "or False for one after the other."
+        )
+    return int(lanes)
 
 
 def _check_workers(workers: int | None) -> int:

@@ -8,6 +8,7 @@ from .desk import Desk
 from .outcome import Outcome
 from .plan import Plan
 from .samples import Sample
+from .workers import make_worker
 
 
 class Halt(BaseException):
@@ -34,7 +35,7 @@ def run_in_threads(plan: Plan, samples: Iterable[Sample], count: int) -> Generat
             if desk.is_closed:
                 raise Halt
 
-        with plan.make_worker() as worker:
+        with make_worker(plan) as worker:
             while taken := desk.take(worker.width):
                 for outcome in worker.run_all(taken, tell):
                     desk.put(outcome)

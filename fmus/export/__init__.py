@@ -7,6 +7,7 @@ from .model import Integrator, ModelSpec, Variable
 from .package import build_fmu, clear_cache
 from .python_fmu import build_python
 from .tuning import describe_processor, processor_flags, tune
+from .written_equations import WrittenEquations, read_equations
 
 __all__ = [
     "SUFFIXES",
@@ -14,6 +15,7 @@ __all__ = [
     "Integrator",
     "ModelSpec",
     "Variable",
+    "WrittenEquations",
     "build",
     "build_fmu",
     "build_python",
@@ -25,5 +27,6 @@ __all__ = [
     "model_spec",
     "own_functions",
     "processor_flags",
+    "read_equations",
     "tune",
 ]

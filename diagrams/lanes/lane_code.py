@@ -1,0 +1,184 @@
+"""The C code of a vector of runs: a diagram's ticks and its FMUs' equations, compiled for this processor."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from threading import Lock
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import casadi as ca
+
+from ...blocks.core import CompilerError, FmuError
+from ...fmus import Fmu
+from ...fmus.export import describe_processor, processor_flags
+from ..compiled import LARGEST, load_compiled
+from ..flat import TRUE, FlatDiagram, TickPattern
+from .lane_plants import LanePlant, read_plant
+from .no_lanes import NoLanesError
+from .vector_code import write_vectors
+
+# A product and a sum of one expression are fused, whatever the optimizer does; more of it gains nothing.
+FLAGS = ("-O2", "-ffp-contract=on")
+_TICK = ("t", "x", "w", "p")
+
+
+@dataclass(frozen=True)
+class LaneSizes:
+    """Numbers of entries of the vectors of a run."""
+
+    x: int
+    w: int
+    z: int
+    p: int
+    log: int
+
+
+def write_lanes(ticks: Sequence[Any], plants: Sequence[LanePlant], sizes: LaneSizes, count: int) -> str:
+    """Write the C code that goes over ticks with a vector of runs.
+
+    Parameters
+    ----------
+    ticks : sequence of casadi.Function
+        ``(t, x, w, p) -> (x_next, z, log, ok)``, of scalar operations, one for each set of clocks that act together.
+    plants : sequence of LanePlant
+        The FMUs in their order.
+    sizes : LaneSizes
+        Entries of the vectors.
+    count : int
+        Runs in a vector.
+    """
+    parts = [f"#define LANES {count}\n", f"#define TRUTH {TRUE!r}\n"]
+    parts += [f"#define N_{name.upper()} {size}\n" for name, size in vars(sizes).items()]
+    parts.append(read_source("vectors.h"))
+    prepare, steps, go_on, keep = [], [], [], []
+    cases = []
+    for i, tick in enumerate(ticks):
+        code = write_vectors(f"tick{i}", tick, _TICK, {3})
+        parts.append(code.text)
+        prepare.append(f"vec kept_tick{i}[AT_LEAST_1({code.kept})]; tick{i}_prepare(p, kept_tick{i});")
+        cases.append(f"case {i}: tick{i}(t, x, w, p, kept_tick{i}, x_next, z, log, ok); break;")
+    at = 0
+    for i, plant in enumerate(plants):
+        parts.append(plant.write(f"plant{i}"))
+        first, at = at, at + plant.width
+        prepare.append(f"plant{i} of{i}; plant{i}_begin(&of{i}, (const vec *)l->plant + {first});")
+        steps.append(f"plant{i}_step(&of{i}, t0, h, substeps(h, l->steps[{i}]), z, w);")
+        go_on.append(f"plant{i}_go_on(&of{i}, which, from);")
+        keep.append(f"plant{i}_end(&of{i}, (vec *)l->plant + {first});")
+    evaluate = f"switch (kind) {{ {' '.join(cases)} }}"
+    parts += [
+        f"#define PREPARE {' '.join(prepare)}\n",
+        f"#define STEP_PLANTS(t0, h) {' '.join(steps)}\n",
+        f"#define EVALUATE(kind) {evaluate}\n",
+        f"#define PLANTS_GO_ON(which, from) {' '.join(go_on)}\n",
+        f"#define KEEP_PLANTS {' '.join(keep)}\n",
+        read_source("lanes.c"),
+    ]
+    return "".join(parts)
+
+
+def read_source(name: str) -> str:
+    """Return a C source of this package."""
+    return files(__package__).joinpath(name).read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True, eq=False)
+class LaneCode:
+    """The C code of a vector of runs, loaded.
+
+    Attributes
+    ----------
+    run : callable
+        Goes over ticks.
+    kinds : mapping
+        The sets of clocks that act together, with their numbers.
+    plants : mapping of str to LanePlant
+        The FMUs by path.
+    sizes : LaneSizes
+        Entries of the vectors.
+    count : int
+        Runs in a vector.
+    library : CDLL
+        The library, which is loaded as long as this lives.
+    """
+
+    run: Any
+    kinds: Mapping[frozenset[TickPattern], int]
+    plants: Mapping[str, LanePlant]
+    sizes: LaneSizes
+    count: int
+    library: ctypes.CDLL
+
+
+_COMPILED: WeakKeyDictionary[FlatDiagram, dict[int, LaneCode]] = WeakKeyDictionary()
+_COMPILING = Lock()
+
+
+def compile_lanes(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], count: int) -> LaneCode:
+    """Compile the code that goes over ticks with a vector of runs, unless the cache has it.
+
+    Parameters
+    ----------
+    flat : FlatDiagram
+        The diagram.
+    acting : sequence of frozenset of TickPattern
+        The sets of clocks that act together at some tick.
+    count : int
+        Runs in a vector.
+
+    Raises
+    ------
+    NoLanesError
+        If its runs can't go side by side, or there is no compiler.
+    """
+    with _COMPILING:
+        known = _COMPILED.setdefault(flat.origin, {})
+        if count not in known:
+            known[count] = _compile(flat.origin, acting, count)
+        return known[count]
+
+
+def _compile(flat: FlatDiagram, acting: Sequence[frozenset[TickPattern]], count: int) -> LaneCode:
+    if flat.hybrid or flat.loops.slices or flat.apart:
+        raise NoLanesError("it has continuous states, algebraic loops or blocks that are evaluated from outside")
+    if flat.by_block:
+        raise NoLanesError("its ticks have too many operations to be compiled as a whole")
+    ticks = [flat.at_tick(clocks).last.fast for clocks in acting]
+    if not all(tick.is_a("SXFunction") for tick in ticks):
+        raise NoLanesError("it has tables, matrix products or blocks of Python, which are no scalar operations")
+    if sum(tick.n_instructions() for tick in ticks) > LARGEST:
+        raise NoLanesError("its ticks have too many operations to be compiled as a whole")
+    ticks = [_share(tick) for tick in ticks]
+    plants = {path: _plant(flat, path) for path in flat.plant_ticks}
+    first = ticks[0]
+    sizes = LaneSizes(
+        *(first.numel_in(1), first.numel_in(2), first.numel_out(1), first.numel_in(3), first.numel_out(2))
+    )
+    source = write_lanes(ticks, [*plants.values()], sizes, count)
+    try:
+        library = load_compiled(source, (*processor_flags(), *FLAGS), describe_processor())
+    except (CompilerError, FmuError) as error:
+        raise NoLanesError(str(error).rstrip(".")) from error
+    run = library["loopwright_lanes"]
+    run.restype = None
+    return LaneCode(run, {clocks: i for i, clocks in enumerate(acting)}, plants, sizes, count, library)
+
+
+def _share(tick: Any) -> Any:
+    symbols = tick.sx_in()
+    return ca.Function(tick.name(), symbols, ca.cse(tick.call(symbols)))
+
+
+def _plant(flat: FlatDiagram, path: str) -> LanePlant:
+    block = flat.table.blocks[path]
+    if not isinstance(block, Fmu):
+        raise NoLanesError(f"{path} is no FMU")
+
+    def mine(slices: Mapping[str, slice]) -> dict[str, slice]:
+        return {flat.ports[name][1]: where for name, where in slices.items() if flat.ports[name][0] == path}
+
+    return read_plant(path, block, mine(flat.plant_inputs.slices), mine(flat.plant_outputs.slices))

@@ -1,0 +1,169 @@
+"""Runs side by side: their numbers in vectors, and the calls of the C code that goes over their ticks."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .lane_code import LaneCode
+
+
+@dataclass(frozen=True, eq=False)
+class LaneStart:
+    """The numbers of a run at its first tick.
+
+    Attributes
+    ----------
+    x, w, z, p : ndarray
+        States, outputs and inputs of the FMUs, and parameters of the diagram.
+    plants : mapping of str to ndarray
+        Parameters, inputs and states of each FMU.
+    steps : tuple of float
+        Longest step of each FMU's integrator in s. Runs go side by side if these are equal.
+    row : ndarray
+        The entries of the log that are kept.
+    """
+
+    x: np.ndarray
+    w: np.ndarray
+    z: np.ndarray
+    p: np.ndarray
+    plants: Mapping[str, np.ndarray]
+    steps: tuple[float, ...]
+    row: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class LaneEnd:
+    """The end of a run that went side by side with others.
+
+    Attributes
+    ----------
+    failed : int
+        The tick that it could not go beyond, counted from the first one that was gone to; 0 if none.
+    stopped : int
+        The tick at which a stop condition ended it; 0 if none.
+    by : int
+        That condition, by its place.
+    last : ndarray
+        The entries of the log that are kept, at its end.
+    """
+
+    failed: int
+    stopped: int
+    by: int
+    last: np.ndarray
+
+
+class LaneRuns:
+    """A vector of runs of one diagram, at most as many as the code has lanes.
+
+    Parameters
+    ----------
+    code : LaneCode
+        The code.
+    starts : sequence of LaneStart
+        The runs; their steps are equal.
+    columns : ndarray
+        Entries of the log that are kept.
+    every : int
+        One of so many rows is kept.
+    stops : sequence of int
+        Entries of the log that end a run where they are true.
+    """
+
+    def __init__(
+        self, code: LaneCode, starts: Sequence[LaneStart], *, columns: np.ndarray, every: int, stops: Sequence[int]
+    ):
+        self._code, self._columns = code, np.ascontiguousarray(columns, dtype=np.int64)
+        self._stops = np.array([*stops], dtype=np.int64)
+        self._steps = np.array(starts[0].steps)
+        width, count = code.count, len(starts)
+        filled = [*starts, *[starts[0]] * (width - count)]  # lanes without a run of their own repeat one
+        plants = [np.concatenate([np.zeros(0), *(start.plants[path] for path in code.plants)]) for start in filled]
+        self._vectors = [
+            _aligned(np.stack(values, axis=1))
+            for values in (*([getattr(s, name) for s in filled] for name in "pxwz"), plants, [s.row for s in filled])
+        ]
+        p, x, w, z, plant, last = (vector.ctypes.data for vector in self._vectors)
+        self._last, self._count = self._vectors[-1], count
+        self._structure = _structure(width)(
+            every=every, skip=every - 1, columns=self._columns.size, stops=self._stops.size,
+            column=self._columns.ctypes.data, stop=self._stops.ctypes.data, p=p, x=x, w=w, z=z, plant=plant,
+            steps=self._steps.ctypes.data, last=last,
+        )  # fmt: skip
+        self._structure.alive[:] = [-1] * count + [0] * (width - count)
+
+    @property
+    def is_going(self) -> bool:
+        """Whether any run has not ended yet."""
+        return any(self._structure.alive)
+
+    @property
+    def skip(self) -> int:
+        """Rows to be left out before the next one that is kept."""
+        return int(self._structure.skip)
+
+    def room(self, rows: int) -> np.ndarray:
+        """Return memory for some rows of all runs, shape (rows, columns, lanes)."""
+        return _aligned(np.zeros((max(rows, 1), max(self._columns.size, 1), self._code.count)))
+
+    def run(self, times: np.ndarray, widths: np.ndarray, kinds: np.ndarray, rows: np.ndarray) -> int:
+        """Go through ticks, as `CompiledLoop.run` does; return the number of rows that were written.
+
+        Parameters
+        ----------
+        times : ndarray, shape (n + 1,)
+            Time of the tick before them, and of each of them, in s.
+        widths : ndarray, shape (n,)
+            Length of each tick, in s.
+        kinds : ndarray, shape (n,), of int32
+            Clocks that act at each of them, as numbers of the code.
+        rows : ndarray
+            The memory, of `room`.
+        """
+        self._structure.rows = 0
+        self._code.run(
+            ctypes.byref(self._structure),
+            ctypes.c_int64(len(widths)),
+            *(ctypes.c_void_p(vector.ctypes.data) for vector in (times, widths, kinds, rows)),
+        )
+        return int(self._structure.rows)
+
+    def ends(self) -> list[LaneEnd]:
+        """Return the ends of the runs, in their order."""
+        found = self._structure
+        return [
+            LaneEnd(found.failed[i], found.stopped[i], found.by[i], self._last[: self._columns.size, i].copy())
+            for i in range(self._count)
+        ]
+
+
+_STRUCTURES: dict[int, type[ctypes.Structure]] = {}
+
+
+def _structure(count: int) -> type[ctypes.Structure]:
+    """Return the structure that C knows, for some number of lanes."""
+    if count not in _STRUCTURES:
+        integer, pointer, lanes = ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64 * count
+        fields = [
+            *((name, integer) for name in ("every", "skip", "columns", "stops")),
+            *((name, pointer) for name in ("column", "stop", "p", "x", "w", "z", "plant", "steps", "last")),
+            *((name, lanes) for name in ("alive", "failed", "stopped", "by")),
+            *((name, integer) for name in ("ticks", "rows")),
+        ]
+        _STRUCTURES[count] = type("LanesStructure", (ctypes.Structure,), {"_fields_": fields})
+    return _STRUCTURES[count]
+
+
+def _aligned(values: np.ndarray) -> np.ndarray:
+    """Return a copy at an address that suits vectors of its last axis: C loads and stores them whole."""
+    size = 8 * values.shape[-1]
+    memory = np.empty(values.nbytes + size, dtype=np.uint8)
+    begin = -memory.ctypes.data % size
+    found = memory[begin : begin + values.nbytes].view(float).reshape(values.shape)
+    found[...] = values
+    return found

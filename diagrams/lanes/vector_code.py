@@ -1,0 +1,215 @@
+"""C code over vectors of a function of scalar operations: each entry of a vector belongs to another run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import casadi as ca
+
+_INFIX = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_DIV: "/"}
+_COMPARED = {ca.OP_LT: "<", ca.OP_LE: "<=", ca.OP_EQ: "==", ca.OP_NE: "!="}
+_CALLS = {
+    ca.OP_EXP: "exp", ca.OP_LOG: "log", ca.OP_SQRT: "sqrt", ca.OP_SIN: "sin", ca.OP_COS: "cos", ca.OP_TAN: "tan",
+    ca.OP_ASIN: "asin", ca.OP_ACOS: "acos", ca.OP_ATAN: "atan", ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil",
+    ca.OP_FMOD: "fmod", ca.OP_FABS: "fabs", ca.OP_SIGN: "sign", ca.OP_COPYSIGN: "copysign", ca.OP_ERF: "erf",
+    ca.OP_FMIN: "fmin", ca.OP_FMAX: "fmax", ca.OP_SINH: "sinh", ca.OP_COSH: "cosh", ca.OP_TANH: "tanh",
+    ca.OP_ASINH: "asinh", ca.OP_ACOSH: "acosh", ca.OP_ATANH: "atanh", ca.OP_ATAN2: "atan2", ca.OP_LOG1P: "log1p",
+    ca.OP_EXPM1: "expm1", ca.OP_HYPOT: "hypot", ca.OP_REMAINDER: "remainder", ca.OP_POW: "pow", ca.OP_CONSTPOW: "pow",
+}  # fmt: skip
+_LOGIC = (ca.OP_NOT, ca.OP_AND, ca.OP_OR)
+
+
+@dataclass(frozen=True)
+class VectorCode:
+    """The C code of a function.
+
+    Attributes
+    ----------
+    text : str
+        ``NAME_prepare(arguments that are fixed, kept)`` and ``NAME(arguments, kept, results)``.
+    kept : int
+        Number of vectors that are computed from fixed arguments, once.
+    operations : int
+        Number of operations.
+    """
+
+    text: str
+    kept: int
+    operations: int
+
+
+@dataclass
+class _Value:
+    """The result of an operation: its C expression, whether it is a mask, and whether fixed arguments determine it."""
+
+    text: str
+    fixed: bool
+    mask: bool = False
+    product: bool = False
+    uses: int = 0
+    place: int | None = None
+    constant: float | None = None
+    negated: str | None = field(default=None)
+
+
+def write_vectors(name: str, function: Any, arguments: Sequence[str], fixed: Collection[int]) -> VectorCode:
+    """Write a function of scalar operations as C code over vectors.
+
+    Its operations are those of the function, one for one, but for two: a product that is used in one sum alone is
+    written within it, so that the processor may do both at once (FMA), and a division by what fixed arguments
+    determine is a product with its reciprocal.
+
+    Parameters
+    ----------
+    name : str
+        Name of the C function.
+    function : casadi.Function
+        The function, an ``SXFunction``.
+    arguments : sequence of str
+        Names of its arguments in C; each is an array of vectors.
+    fixed : collection of int
+        Arguments that don't change in a run: what they determine is computed once.
+    """
+    writer = _Writer(function, arguments, fixed)
+    writer.write()
+    given = "".join(f"const vec *restrict {arguments[i]}, " for i in sorted(fixed))
+    all_given = "".join(f"const vec *restrict {argument}, " for argument in arguments)
+    made = ", ".join(f"vec *restrict out{i}" for i in range(function.n_out()))
+    head = f"static void {name}_prepare({given}vec *restrict kept) {{\n"
+    body = f"static inline __attribute__((always_inline)) void {name}({all_given}const vec *restrict kept, {made}) {{\n"
+    text = f"{head}{''.join(writer.early)}}}\n\n{body}{''.join(writer.late)}}}\n"
+    return VectorCode(text, writer.kept, function.n_instructions())
+
+
+class _Writer:
+    def __init__(self, function: Any, arguments: Sequence[str], fixed: Collection[int]):
+        self._f, self._arguments, self._fixed = function, arguments, fixed
+        self.early: list[str] = []
+        self.late: list[str] = []
+        self.kept = 0
+        self._made = 0
+        self._reciprocals: dict[str, _Value] = {}
+
+    def write(self) -> None:
+        f = self._f
+        uses = _count_uses(f)
+        work: dict[int, _Value] = {}
+        filled: set[tuple[int, int]] = set()
+        for k in range(f.n_instructions()):
+            op, out, operands = f.instruction_id(k), f.instruction_output(k), f.instruction_input(k)
+            if op == ca.OP_OUTPUT:
+                place = out[0], f.sparsity_out(out[0]).row()[out[1]]
+                filled.add(place)
+                self.late.append(f"    out{place[0]}[{place[1]}] = {self._late(self._number(work[operands[0]]))};\n")
+            elif op == ca.OP_INPUT:
+                place = operands[0], f.sparsity_in(operands[0]).row()[operands[1]]
+                work[out[0]] = _Value(f"{self._arguments[place[0]]}[{place[1]}]", place[0] in self._fixed)
+            elif op == ca.OP_CONST:
+                value = f.instruction_constant(k)
+                work[out[0]] = _Value(f"splat({_number(value)})", True, constant=value)
+            elif op == ca.OP_ASSIGN:
+                work[out[0]] = work[operands[0]]
+            else:
+                work[out[0]] = self._operation(op, [work[i] for i in operands], uses[k])
+        for i in range(f.n_out()):
+            for j in range(f.numel_out(i)):
+                if (i, j) not in filled:  # a structural zero is no operation
+                    self.late.append(f"    out{i}[{j}] = splat(0.0);\n")
+
+    def _operation(self, op: int, operands: Sequence[_Value], uses: int) -> _Value:
+        fixed = all(value.fixed for value in operands)
+        a, *rest = operands
+        if op in _COMPARED:
+            x, y = (self._use(self._number(value), fixed) for value in operands)
+            return self._new(f"{x} {_COMPARED[op]} {y}", fixed, mask=True)
+        if op in _LOGIC:
+            masks = [self._use(self._mask(value), fixed) for value in operands]
+            text = f"~{masks[0]}" if op == ca.OP_NOT else f"{masks[0]} {'&' if op == ca.OP_AND else '|'} {masks[1]}"
+            return self._new(text, fixed, mask=True)
+        if op == ca.OP_IF_ELSE_ZERO:
+            mask, value = self._use(self._mask(a), fixed), self._use(self._number(rest[0]), fixed)
+            return self._new(f"where({mask}, {value})", fixed)
+        if op == ca.OP_DIV and rest[0].fixed and not fixed:
+            below = self._number(rest[0])
+            if below.text not in self._reciprocals:
+                self._reciprocals[below.text] = self._new(f"1.0 / {below.text}", True)
+            rest, op = [self._reciprocals[below.text]], ca.OP_MUL
+        x, *others = (self._use(self._number(value), fixed, op) for value in (a, *rest))
+        if op in _INFIX:
+            product = op == ca.OP_MUL and uses == 1 and not fixed
+            return self._new(f"{x} {_INFIX[op]} {others[0]}", fixed, product=product)
+        if op == ca.OP_SQ:
+            return self._new(f"{x} * {x}", fixed, product=uses == 1 and not fixed)
+        if op == ca.OP_TWICE:
+            return self._new(f"2.0 * {x}", fixed)
+        if op == ca.OP_INV:
+            return self._new(f"1.0 / {x}", fixed)
+        if op == ca.OP_NEG:
+            return self._new(f"-{x}", fixed)
+        if op in _CALLS:
+            return self._new(f"vec_{_CALLS[op]}({', '.join([x, *others])})", fixed)
+        raise NotImplementedError(f"operation {op}")
+
+    def _new(self, text: str, fixed: bool, *, mask: bool = False, product: bool = False) -> _Value:
+        if product:  # written where it is used
+            return _Value(text, False, product=True)
+        name = f"v{self._made}"
+        self._made += 1
+        line = f"    const {'mask' if mask else 'vec'} {name} = {text};\n"
+        (self.early if fixed else self.late).append(line)
+        return _Value(name, fixed, mask)
+
+    def _use(self, value: _Value, fixed: bool, op: int | None = None) -> str:
+        """Return a value in an operation, which is done once if it is fixed."""
+        if value.product:
+            if op in (ca.OP_ADD, ca.OP_SUB):
+                return f"({value.text})"
+            made = self._new(value.text, False)
+            value.text, value.product = made.text, False
+        return value.text if fixed else self._late(value)
+
+    def _late(self, value: _Value) -> str:
+        """Return a value in the function: what is fixed was kept."""
+        if value.product:
+            return value.text
+        if not value.fixed or value.constant is not None or "[" in value.text:
+            return value.text
+        if value.place is None:
+            value.place, self.kept = self.kept, self.kept + 1
+            text = f"(vec){value.text}" if value.mask else value.text
+            self.early.append(f"    kept[{value.place}] = {text};\n")
+        return f"((mask)kept[{value.place}])" if value.mask else f"kept[{value.place}]"
+
+    def _number(self, value: _Value) -> _Value:
+        """Return a value as a number: 1 where a mask is true."""
+        return self._new(f"one_where({self._use(value, value.fixed)})", value.fixed) if value.mask else value
+
+    def _mask(self, value: _Value) -> _Value:
+        if value.mask:
+            return value
+        return self._new(f"{self._use(value, value.fixed)} != 0.0", value.fixed, mask=True)
+
+
+def _number(value: float) -> str:
+    if math.isnan(value):
+        return "NAN"
+    if math.isinf(value):
+        return "INFINITY" if value > 0 else "-INFINITY"
+    return value.hex()
+
+
+def _count_uses(f: Any) -> dict[int, int]:
+    """Return the number of reads of each operation's result; places of work are reused."""
+    made: dict[int, int] = {}
+    uses = dict.fromkeys(range(f.n_instructions()), 0)
+    for k in range(f.n_instructions()):
+        op = f.instruction_id(k)
+        if op not in (ca.OP_CONST, ca.OP_INPUT):
+            for i in f.instruction_input(k):
+                uses[made[i]] += 1
+        if op != ca.OP_OUTPUT:
+            made[f.instruction_output(k)[0]] = k
+    return uses

@@ -1,0 +1,204 @@
+"""Samples of a sweep side by side in the lanes of vectors, as far as their runs allow it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from ...blocks.core import LoopwrightError
+from ...fmus.calls import FmuInstance
+from ..flat import ClockSets, is_exact, kinds_of
+from ..lanes import LaneCode, LaneEnd, LaneRuns, LaneStart, NoLanesError, compile_lanes
+from ..results import Run, Stopped
+from ..simulation import StopConditions
+from .bound_run import BoundRun, Tell
+from .outcome import Outcome
+from .plan import Plan, Worker
+from .samples import Sample
+from .variation import Numbers
+
+DIFFER = "Side by side in vector lanes: values differ from those of single runs in their last digits."
+_MOST_SUBSTEPS = 10_000
+_BYTES, _TICKS = 2**20, 2**14
+"""Of the rows of a chunk, and ticks of one, at most: C keeps them in the processor's cache, Ctrl-C has its turn."""
+
+
+class LaneWorker(Worker):
+    """Runs samples of a sweep side by side; those whose runs can't go so are run one after the other.
+
+    A run that fails in its lane is run again by itself, which says what has happened.
+
+    Parameters
+    ----------
+    plan : Plan
+        The sweep.
+    """
+
+    def __init__(self, plan: Plan):
+        super().__init__(plan)
+        self.width = plan.lanes
+        self._found: dict[Any, _Lanes | str] = {}
+
+    def can_compile(self, sample: Sample) -> bool:
+        """Whether a sample's run goes from tick to tick in C; its code is prepared, and not run."""
+        if not super().can_compile(sample):
+            return False
+        numbers = self._variation.find(self.plan.parameters_of(sample))
+        bound = self._bind(numbers)
+        if bound is not None:
+            self._lanes(numbers, bound)
+        return True
+
+    def run_all(self, samples: Iterable[Sample], tell: Tell = lambda t: None) -> Iterator[Outcome]:
+        """Yield the outcomes of some samples; see `run`."""
+        alike: dict[Any, list[tuple[Sample, Numbers[Any]]]] = {}
+        for sample in samples:
+            try:
+                numbers = self._variation.find(self.plan.parameters_of(sample))
+            except LoopwrightError:  # its run says what it is
+                yield self.run(sample, tell)
+                continue
+            alike.setdefault(numbers.key, []).append((sample, numbers))
+        for group in alike.values():
+            for k in range(0, len(group), self.width):
+                yield from self._run_alike(group[k : k + self.width], tell)
+
+    def _run_alike(self, group: Sequence[tuple[Sample, Numbers[Any]]], tell: Tell) -> Iterator[Outcome]:
+        """Yield the outcomes of samples that share their functions."""
+        numbers = group[0][1]
+        bound = self._bind(numbers) if self._repeats else None
+        found = "each of them needs a set-up of its own" if bound is None else self._lanes(numbers, bound)
+        if bound is None or isinstance(found, str):
+            for sample, _ in group:
+                yield _note(self.run(sample, tell), f"Not side by side in vector lanes: {found}.")
+            return
+        started = perf_counter()
+        ready: dict[tuple[float, ...], list[tuple[Sample, LaneStart]]] = {}
+        alone: list[tuple[Sample, str | None]] = []
+        for sample, own in group:
+            try:
+                start = found.start(own)
+            except NoLanesError as reason:
+                alone.append((sample, f"Not side by side in vector lanes: {reason}."))
+            except LoopwrightError:
+                alone.append((sample, None))
+            else:
+                if start is None:
+                    alone.append((sample, None))
+                else:
+                    ready.setdefault(start.steps, []).append((sample, start))
+        for runs in ready.values():
+            for (sample, _), run in zip(runs, found.run([start for _, start in runs], tell, started), strict=True):
+                if run is None:
+                    alone.append((sample, None))
+                else:
+                    yield self._judge(sample, partial(_itself, run))
+        for sample, note in alone:
+            outcome = self.run(sample, tell)
+            yield outcome if note is None else _note(outcome, note)
+
+    def _lanes(self, numbers: Numbers[Any], bound: BoundRun) -> _Lanes | str:
+        """Return the lanes of bound runs, or why there are none."""
+        found = self._found.get(numbers.key)
+        if isinstance(found, str) or (found is not None and found.bound is bound):
+            return found
+        try:
+            self._found[numbers.key] = made = _Lanes(bound, self.plan.lanes)
+        except NoLanesError as reason:
+            self._found[numbers.key] = text = str(reason)
+            return text
+        return made
+
+
+class _Lanes:
+    """The lanes of the runs of one bound diagram."""
+
+    def __init__(self, bound: BoundRun, count: int):
+        self.bound, engine, flat = bound, bound.engine, bound.flat
+        if not bound.is_compiled:
+            told = next(iter(engine.messages), "compile=True was not asked for")
+            raise NoLanesError(f"they don't go from tick to tick in C ({told.rstrip('.')})")
+        if bound.ends_between_ticks or not is_exact(flat, bound.count):
+            raise NoLanesError("their duration is no whole number of ticks, or of too many")
+        acting = kinds_of(flat, every=engine.every_tick)
+        self._ticks = np.fromiter(flat.ticks(0, bound.count, every=engine.every_tick), dtype=np.int64)
+        self._kinds = ClockSets(flat.distinct, {clocks: k for k, clocks in enumerate(acting)}).at(self._ticks)
+        if (self._kinds < 0).any():
+            raise NoLanesError("at some tick no clock acts, such as that at which they end, or a set that comes late")
+        ends, base = np.concatenate([[0], self._ticks]), flat.base
+        self._times = ends * base.numerator / base.denominator
+        self._widths = np.diff(ends) * base.numerator / base.denominator
+        self._code: LaneCode = compile_lanes(flat, acting, count)
+        entries = bound.recorder.entries
+        self._columns = np.arange(engine.workspace.log.size) if entries is None else entries
+        self._stops = StopConditions(flat, engine.workspace.log, str)
+
+    def start(self, numbers: Numbers[Any]) -> LaneStart | None:
+        """Return a run's numbers at its first tick; None if it ends there.
+
+        Raises
+        ------
+        NoLanesError
+            If this run can't go with others.
+        """
+        bound, rows = self.bound, list[np.ndarray]()
+        engine, workspace = bound.engine, bound.engine.workspace
+        bound.begin(numbers)
+        engine.take_first_tick(None, lambda t, log: rows.append(log[self._columns]))
+        if engine.position.stopped is not None or not len(self._ticks):
+            return None
+        plants, steps = dict[str, np.ndarray](), list[float]()
+        for path, plant in self._code.plants.items():
+            instance = engine.plants[path]
+            assert isinstance(instance, FmuInstance)
+            plants[path], step = plant.read(instance)
+            if self._widths.max() > _MOST_SUBSTEPS * step:
+                raise NoLanesError(f"{path} integrates with {step:g} s, more than {_MOST_SUBSTEPS} substeps in a tick")
+            steps.append(step)
+        here = workspace.here
+        return LaneStart(here.x.copy(), here.w.copy(), workspace.z.copy(), here.p.copy(), plants, tuple(steps), rows[0])
+
+    def run(self, starts: Sequence[LaneStart], tell: Tell, started: float) -> Iterator[Run | None]:
+        """Yield the runs; None for one that has failed."""
+        bound, n = self.bound, len(self._columns)
+        runs = LaneRuns(
+            self._code, starts, columns=self._columns, every=bound.recorder.every, stops=self._stops.entries
+        )
+        kept = [[start.row[None]] for start in starts]
+        chunk = max(1, min(_TICKS, bound.recorder.every * _BYTES // (8 * max(n, 1) * self._code.count)))
+        room = runs.room(chunk // bound.recorder.every + 1)
+        k, total = 0, len(self._ticks)
+        while k < total and runs.is_going:
+            end = min(k + chunk, total)
+            rows = runs.run(self._times[k : end + 1], self._widths[k:end], self._kinds[k:end], room)
+            for lane, parts in enumerate(kept):
+                parts.append(np.ascontiguousarray(room[:rows, :n, lane]))
+            k = end
+            tell(float(self._times[k]))
+        for parts, end_of in zip(kept, runs.ends(), strict=True):
+            yield None if end_of.failed else self._make_run(parts, end_of, started)
+
+    def _make_run(self, parts: Sequence[np.ndarray], end: LaneEnd, started: float) -> Run:
+        """Return a run from its rows, of which those after its end are left out."""
+        every = self.bound.recorder.every
+        last = end.stopped or len(self._ticks)
+        count = 1 + last // every
+        data = np.concatenate(parts)[:count]
+        t = self._times[: last + 1 : every]
+        if last % every:  # the last sample is kept in any case
+            data, t = np.concatenate([data, end.last[None]]), np.append(t, self._times[last])
+        stopped = Stopped(float(self._times[last]), self._stops.paths[end.by]) if end.stopped else None
+        return self.bound.make_run(t.copy(), data, stopped, started, (DIFFER,))
+
+
+def _itself(run: Run) -> Run:
+    return run
+
+
+def _note(outcome: Outcome, text: str) -> Outcome:
+    return replace(outcome, messages=(*outcome.messages, text))

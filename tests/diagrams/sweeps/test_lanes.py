@@ -1,0 +1,244 @@
+"""Sweeps side by side in vector lanes: near single runs to a stated bound, with failures that harm nobody."""
+
+import functools
+import warnings
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from loopwright.blocks import Block, Compare, Gain, Input, OptionError, Output, Step, StopCondition, UnitDelay
+from loopwright.diagrams import Diagram, experiments, subsystem
+from loopwright.diagrams.sweeps import final, maximum, mean, minimum, settling_time
+from loopwright.diagrams.sweeps.lane_worker import DIFFER
+from loopwright.fmus import Fmu, ModelSpec, Variable, build_fmu
+
+QUIET = {"progress": False}
+T, STEP = 0.01, 2.5e-3
+LANES = 4
+NEAR = 1e-12
+"""Difference of a run in a lane from a single one, of the largest value: some thousand roundings of a stable loop."""
+PAPER = 1e-9
+"""The difference that docs/sweeps.md states for the experiments of the paper, whose friction is steep near rest."""
+
+
+@functools.lru_cache(maxsize=1)
+def lag():
+    """An FMU of dx/dt = (gain u − x − bend x²) / lag, x(0) = 0, that puts out x and 2 x + u."""
+    t, x, u, p = ca.SX.sym("t"), ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("p", 3)
+    numbers = {"gain": ("tunable", 1.0), "lag": ("tunable", 0.2), "bend": ("fixed", 0.0)}
+    return build_fmu(
+        ModelSpec(
+            name="lag",
+            description="A lag",
+            inputs=(Variable("u", "input"),),
+            outputs=(Variable("mixed", "output"),),
+            parameters=tuple(Variable(name, "parameter", kind, start=v) for name, (kind, v) in numbers.items()),
+            states=(Variable("x", "output", start=0.0, state=True),),
+            derivative=ca.Function("f", [t, x, u, p], [(p[0] * u - x - p[2] * x * x) / p[1]]),
+            output=ca.Function("g", [t, x, u, p], [2.0 * x + u]),
+            internal_step=STEP,
+        )
+    )
+
+
+def loop(*, stops=False, slow=1, more=None):
+    """The lag under a proportional controller of reference 1, with a counter at a lower rate."""
+    plant = Fmu(lag(), name="plant")
+
+    @subsystem(sample_time=T, name="box")
+    def box(x, reference):
+        u = Gain(gain=2.0, name="kp")(reference - x)
+        if stops:
+            StopCondition(name="stop")(Compare(">", name="above")(x, 0.5))
+        return u if more is None else more(u)
+
+    @subsystem(sample_time=slow * T, offset=T if slow > 1 else 0.0, name="slow")
+    def counter(x):
+        kept = UnitDelay(initial_value=0.1, name="kept")
+        kept(x + 0.5 * kept.y)
+        return kept.y
+
+    force = box(plant.x, Step(times=0.0, values=1.0, name="reference"))
+    call = plant(u=force)
+    signals = plant.x.named("x"), plant.mixed.named("mixed"), force.named("u"), counter(plant.x).named("k")
+    return Diagram("lag_loop", call, *signals)
+
+
+def exact_states(gain, lag, kp, ticks):
+    """x at ticks: a step of the integrator of order 4 of a linear equation is known in closed form."""
+    z = -STEP / lag
+    growth = (1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24) ** round(T / STEP)
+    x = [0.0]
+    for _ in range(ticks):
+        x.append(growth * x[-1] + (1 - growth) * gain * kp * (1.0 - x[-1]))
+    return np.array(x)
+
+
+def assert_near_single_runs(diagram, found, duration, names, *, bound=NEAR, **options):
+    for sample, outcome in zip(found.samples, found.outcomes, strict=True):
+        single = diagram.replace(sample.parameters).simulate(duration, **QUIET, **options)
+        assert np.array_equal(outcome.t, single.t)
+        assert outcome.end == single.t[-1]
+        assert outcome.stopped == ("" if single.stopped is None else single.stopped.block)
+        for name in names:
+            largest = max(np.abs(single[name]).max(), 1e-3)
+            assert outcome.signals[name].shape == single[name].shape
+            assert np.abs(outcome.signals[name] - single[name]).max() <= bound * largest, (sample, name)
+
+
+def ran_in_lanes(found):
+    return DIFFER in found.messages and not any("Not side by side" in text for text in found.messages)
+
+
+def test_runs_are_those_of_the_closed_form_with_other_parameters_in_every_lane():
+    gains, lags, factors = (0.5, 1.0, 2.0), (0.1, 0.3), (1.0, 2.0)  # 12 runs in vectors of 4, and 2 left over
+    table = [{"plant.gain": g, "plant.lag": lag, "kp.gain": k} for g in gains for lag in lags for k in factors] + [
+        {"plant.gain": 0.7, "plant.lag": 0.2, "kp.gain": 1.5},
+        {"plant.gain": 0.9, "plant.lag": 0.25, "kp.gain": 0.5},
+    ]
+    reduce = {
+        "end": final("x"), "top": maximum("x"), "bottom": minimum("u"), "mean": mean("x"),
+        "settled": settling_time("x", band=0.02), "late": settling_time("x", band=0.02, since=0.1),
+        "mine": lambda run: [run["x"][10], run.t[10]],
+    }  # fmt: skip
+    found = loop().sweep(None, 1.0, samples=table, signals=["x", "mixed"], reduce=reduce, lanes=LANES, **QUIET)
+    assert ran_in_lanes(found)
+    assert not found.failures
+    for i, sample in enumerate(table):
+        x = exact_states(sample["plant.gain"], sample["plant.lag"], sample["kp.gain"], 100)
+        np.testing.assert_allclose(found["x"][i], x, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(found["mixed"][i][1:], 2 * x[1:] + sample["kp.gain"] * (1 - x[:-1]), atol=1e-12)
+        assert found["end"][i] == found["x"][i][-1]
+        assert found["top"][i] == found["x"][i].max()
+        assert found["bottom"][i] == pytest.approx(sample["kp.gain"] * (1 - x.max()), abs=1e-12)
+        assert found["mean"][i] == pytest.approx(np.trapezoid(x, dx=T), abs=1e-12)
+        assert found["mine"][i] == pytest.approx([x[10], 0.1], abs=1e-13)
+    single = loop().sweep(None, 1.0, samples=table, reduce=reduce, **QUIET)
+    assert not any(DIFFER in text for text in single.messages)
+    for name in reduce:
+        np.testing.assert_allclose(found[name], single[name], rtol=1e-11, atol=1e-12)
+
+
+def test_the_number_of_lanes_and_of_threads_and_the_neighbours_change_no_bit():
+    rng = np.random.default_rng(4)
+    table = [{"plant.gain": g, "plant.bend": b} for g, b in rng.uniform(0.5, 1.5, (11, 2))]
+    ends = [
+        loop().sweep(None, 0.5, samples=samples, reduce={"end": final("x")}, lanes=LANES, workers=workers, **QUIET)[
+            "end"
+        ]
+        for samples, workers in ((table, 1), (table, 3), (table[::-1], 1), (table[3:5], 1))
+    ]
+    assert ends[0].tobytes() == ends[1].tobytes() == ends[2][::-1].tobytes()
+    assert ends[0][3:5].tobytes() == ends[3].tobytes()
+
+
+def test_a_run_that_fails_says_what_a_single_one_says_and_harms_no_other():
+    table = [{"plant.bend": b} for b in (0.0, 0.3, -9.0, 0.1, 0.2)]  # of −9 the state grows without bound
+    diagram = loop()
+    found = diagram.sweep(None, 2.0, samples=table, signals="x", reduce={"end": final("x")}, lanes=LANES, **QUIET)
+    alone = diagram.sweep(None, 2.0, samples=table, signals="x", reduce={"end": final("x")}, **QUIET)
+    assert [(f.index, f.kind, f.message, f.t) for f in found.failures] == [
+        (f.index, f.kind, f.message, f.t) for f in alone.failures
+    ]
+    (failure,) = found.failures
+    assert failure.index == 2
+    assert "became" in failure.message
+    assert found.outcomes[2].signals["x"].tobytes() == alone.outcomes[2].signals["x"].tobytes()
+    others = [0, 1, 3, 4]
+    np.testing.assert_allclose(found["x"][others], alone["x"][others], rtol=NEAR, atol=NEAR)
+    without = diagram.sweep(None, 2.0, samples=[table[i] for i in others], signals="x", lanes=LANES, **QUIET)
+    assert found["x"][others].tobytes() == without["x"].tobytes()
+
+
+def test_all_runs_of_a_vector_may_fail_and_values_that_are_refused_are_failures():
+    table = [{"plant.bend": b} for b in (-8.0, -9.0, -10.0, -11.0, "much", 0.1)]
+    found = loop().sweep(None, 2.0, samples=table, reduce={"end": final("x")}, lanes=LANES, **QUIET)
+    assert found.failed.tolist() == [True] * 5 + [False]
+
+
+@pytest.mark.parametrize("every", [1, 7])
+def test_runs_that_stop_end_at_their_own_ticks_and_rates_are_kept(every):
+    table = [{"plant.gain": g, "kp.gain": k} for g in (0.6, 0.8, 1.1) for k in (0.5, 2.0)]
+    diagram = loop(stops=True, slow=3)
+    found = diagram.sweep(None, 0.37, samples=table, signals=["x", "k"], lanes=LANES, every=every, **QUIET)
+    assert ran_in_lanes(found)
+    assert len({*found.end.tolist()}) > 2
+    assert_near_single_runs(diagram, found, 0.37, ["x", "k"], every=every)
+
+
+def test_runs_of_other_structure_or_other_steps_go_side_by_side_with_their_like():
+    table = [
+        {"plant.internal_step": h, "kp.gain": k, "plant.gain": g}
+        for h in (STEP, 5e-3) for k in (0.0, 2.0) for g in (1.0, 1.2, 1.4)
+    ]  # fmt: skip
+    diagram = loop()
+    found = diagram.sweep(None, 0.2, samples=table, signals="x", lanes=LANES, **QUIET)
+    assert ran_in_lanes(found)
+    assert_near_single_runs(diagram, found, 0.2, ["x"])
+
+
+class Odd(Block):
+    """Twice its input, evaluated by Python."""
+
+    opaque = True
+    u = Input()
+    y = Output()
+
+    def output(self, t, x, u):
+        return 2.0 * u.u
+
+
+def test_runs_that_cannot_go_side_by_side_go_by_themselves_and_say_why():
+    def notes(diagram, table, duration=0.1, **options):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = diagram.sweep(
+                None, duration, samples=table, signals="x", lanes=LANES, workers=1, **QUIET, **options
+            )
+        assert not found.failures
+        bare = diagram.sweep(None, duration, samples=table, signals="x", workers=1, **QUIET, **options)
+        assert found["x"].tobytes() == bare["x"].tobytes()
+        (text,) = (text for text in found.messages if text.startswith("Not side by side in vector lanes: "))
+        assert DIFFER not in found.messages
+        return text
+
+    table = [{"kp.gain": 1.0}, {"kp.gain": 1.5}]
+    assert "don't go from tick to tick in C" in notes(loop(), table, compile=False)
+    assert "integrator chooses its steps" in notes(loop(), [{**row, "plant.integrator": 2} for row in table])
+    assert "more than 10000 substeps" in notes(loop(), [{**row, "plant.internal_step": 1e-8} for row in table], 0.01)
+    assert "set-up of its own" in notes(loop(more=lambda u: Odd(name="odd")(u)), table)
+    assert "whole number of ticks" in notes(loop(), table, 0.105)
+
+
+def test_lanes_are_a_number_that_processors_have():
+    for wrong in (3, 0, "all", 4.5):
+        with pytest.raises(OptionError, match=r"found lanes=.*; expected True for 8 runs side by side, 2, 4, 8, 16"):
+            loop().sweep({"kp.gain": (1.0,)}, 0.1, signals="x", lanes=wrong, **QUIET)
+
+
+def test_results_in_lanes_are_stored_apart_from_those_of_single_runs(tmp_path):
+    values = [0.5, 0.7, 0.9, 1.1, 1.3]
+
+    def run(values, **options):
+        return loop().sweep(
+            {"kp.gain": values}, 0.1, reduce={"end": final("x")}, to=tmp_path / "kept", **QUIET, **options
+        )
+
+    first = run(values[:3], lanes=LANES)
+    again = run(values, lanes=2)  # how many there are changes no bit
+    assert (first.reused, again.reused) == (0, 3)
+    assert again["end"][:3].tobytes() == first["end"].tobytes()
+    assert DIFFER in again.messages
+    with pytest.raises(OptionError, match="differs from this one"):
+        run(values)
+
+
+@pytest.mark.slow
+def test_experiment_c_is_near_single_runs_whatever_its_friction_and_its_compliance():
+    experiment = experiments.hand_guiding()
+    ranges = {"plant.coulomb_scale": (0.5, 1.5), "controller.admittance_perp.stiffness": (100.0, 300.0)}
+    names = ["xi", "motor_force", "f_perp"]
+    found = experiment.diagram.sweep(ranges, 0.3, samples="latin", count=9, signals=names, lanes=8, **QUIET)
+    assert ran_in_lanes(found)
+    assert_near_single_runs(experiment.diagram, found, 0.3, names, bound=PAPER)
