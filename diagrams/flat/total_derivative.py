@@ -71,6 +71,24 @@ class Derivative:
         outputs = [f"o{i}" for i in range(len(shown) + len(slopes))]
         return ca.Function(f"{stage.name}_derivative", [*stage.arguments], [*shown, *slopes], names, outputs)
 
+    def is_constant(self, result: str, argument: str, entries: Sequence[int] | None = None) -> bool:
+        """Whether no derivative of a result depends on an argument, or on some of its entries.
+
+        False where a stage is evaluated from outside, or has tables: its operations can't be looked at.
+        """
+        last, names = self.schedule.last, self.schedule.arguments
+        if self.schedule.opaque:
+            return False
+        try:  # operation by operation: seen from outside, each call of a block's function depends on all it takes
+            f = ca.Function("whole", [*last.arguments], [last.results[self.schedule.results.index(result)]]).expand()
+        except RuntimeError:
+            return False
+        symbols = dict(zip(names, f.sx_in(), strict=True))
+        (made,) = f.call(list(symbols.values()))
+        slopes = ca.jacobian(made, ca.vertcat(*(symbols[name] for name, _ in self.by)))
+        moved = symbols[argument] if entries is None else symbols[argument][list(entries)]
+        return not ca.depends_on(slopes, moved)
+
     @cached_property
     def fast(self) -> Any:
         """The one function of a schedule without opaque stages as it is evaluated fastest."""

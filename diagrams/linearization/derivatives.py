@@ -13,6 +13,7 @@ import numpy as np
 from ...blocks.core import Layout, NonFiniteError, UnknownNameError, elements, near
 from ...blocks.tracing import size
 from ..flat import (
+    NONE,
     Apart,
     Derivative,
     Evaluators,
@@ -144,6 +145,16 @@ class LocalDerivatives:
     def varies(self) -> bool:
         """Whether the flow between ticks depends on time, or on algebraic loops."""
         return bool(self.flat.flow.depends("dx", "t").any()) or self._workspace is not None
+
+    @cached_property
+    def is_linear(self) -> bool:
+        """Whether the flow between ticks is linear in what changes there: its derivatives are constants."""
+        made, continuous = self._trace_derivative(NONE), self.flat.continuous.tolist()
+
+        def is_constant() -> bool:
+            return made.is_constant("dx", "t") and made.is_constant("dx", "x", continuous)
+
+        return not self.varies and self._kept("linear", NONE, is_constant)
 
     def _kept(self, name: str, acting: frozenset[TickPattern], make: Callable[[], T]) -> T:
         """Return a function of these taps, made once for all diagrams with the same functions.

@@ -39,8 +39,9 @@ def differentiate_flow(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the derivatives of x after the time h by x before it, by w and by d, and x after the time h.
 
-    Only continuous states change. At an equilibrium the derivative is a matrix exponential. Elsewhere the variational
-    equation is integrated along the motion (DOP853 at 1e-12), from one discontinuity of a source to the next.
+    Only continuous states change. At an equilibrium, and everywhere where the flow is linear, the derivative is a
+    matrix exponential. Elsewhere the variational equation is integrated along the motion (DOP853 at 1e-12), from one
+    discontinuity of a source to the next.
     """
     from scipy.linalg import expm
 
@@ -64,6 +65,11 @@ def differentiate_flow(
         big[:nc] = F
         whole = np.asarray(expm(big * h))[:nc]
         final[xc] = start + f0 * h
+    elif local.is_linear:
+        big = np.zeros((nc + many + 1, nc + many + 1), dtype=F.dtype)
+        big[:nc] = np.hstack([F, f0[:, None]])
+        whole = np.asarray(expm(big * h))[:nc]
+        whole, final[xc] = whole[:, :-1], start + whole[:, -1]
     else:
         from scipy.integrate import solve_ivp
 

@@ -25,7 +25,7 @@ from ...fmus.models import Gantry
 from ...fmus.running import Fmu
 from ..admittance import check_plant, control_rate, is_discrete
 from ..flat import WiredDiagram
-from ..report import Basis, Case, Implementation, InjectionPlan, Variant, point_of
+from ..report import OUTSIDE, Basis, Case, Implementation, InjectionPlan, Variant, point_of
 from ..report_writing import Texts
 from ..results import OperatingPoint
 from .reduced_loops import FRICTION, NO_FRICTION, ReducedLoops
@@ -226,7 +226,9 @@ class Fig3Case(Case):
         for name in REFERENCES:
             if f"{name}.y" in variant.point.values:
                 changes[name] = Reference(float(np.ravel(variant.point.values[f"{name}.y"])[0]), unit="m", name=name)
-        return InjectionPlan(variant.with_parameters(changes), FREQUENCIES, AMPLITUDE)
+        plan = InjectionPlan(variant.with_parameters(changes), FREQUENCIES, AMPLITUDE)
+        asked_outside = bool(variant.diagram.flatten_like(variant.point).outside)
+        return plan.shortened(OUTSIDE) if asked_outside else plan
 
     @cached_property
     def _elsewhere(self) -> WeakKeyDictionary[Variant, dict[tuple[float, float], Variant | None]]:

@@ -15,7 +15,7 @@ from .analysis import (
     SUBJECT,
     analyse,
 )
-from .case import Basis, Case, InjectionPlan
+from .case import OUTSIDE, Basis, Case, InjectionPlan
 from .disks import disk_numbers, disk_range
 from .parts import MakesSections, ReportKind, ReportPart
 from .points import point_of
@@ -35,6 +35,7 @@ __all__ = [
     "LIMITS_TITLE",
     "MEMORY",
     "OPERATING_POINTS",
+    "OUTSIDE",
     "POLES_TITLE",
     "REMARKS",
     "SENSITIVITY",

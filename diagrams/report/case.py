@@ -25,8 +25,9 @@ AMPLITUDE = 1e-4
 """Size of the test signal of the injection check, relative to 1 + the size of the signal."""
 
 
-SAMPLES, SOLVED = 20_000, 1_000
-"""Samples at most in a period of the injection check, and those where a solver goes from one to the next."""
+SAMPLES, SOLVED, OUTSIDE = 20_000, 1_000, 400
+"""Samples at most in a period of the injection check, those where a solver goes from one to the next, and those where
+the solver asks a block that is evaluated from outside, as an FMU in model exchange."""
 
 
 class ReportedExperiment(Protocol):
@@ -55,11 +56,35 @@ class Basis(NamedTuple):
 
 
 class InjectionPlan(NamedTuple):
-    """A test signal: the variant that it is added to, frequencies in rad/s, and the amplitude."""
+    """A test signal: the variant that it is added to, frequencies in rad/s, and the amplitude.
+
+    ``left_out`` is the number of frequencies whose periods have more than ``samples`` samples: they would take too
+    long.
+    """
 
     variant: Variant
     frequencies: np.ndarray
     amplitude: float
+    left_out: int = 0
+    samples: int = 0
+
+    def shortened(self, samples: int) -> InjectionPlan:
+        """Return the test signal with the frequencies whose periods have so many samples at most; the last one stays.
+
+        A variant in continuous time has no samples, and keeps all frequencies.
+        """
+        w, dt = self.frequencies, self.variant.model.dt
+        if not dt:
+            return self
+        kept = w[w * dt * samples >= 2 * np.pi]
+        kept = kept if len(kept) else w[-1:]
+        return self._replace(frequencies=kept, left_out=len(w) - len(kept), samples=samples)
+
+
+def most_samples(variant: Variant) -> int:
+    """Return the samples at most in a period of the injection check of a sampled variant, by the price of a tick."""
+    flat = variant.diagram.flatten_like(variant.point)
+    return OUTSIDE if flat.outside else SOLVED if flat.hybrid else SAMPLES
 
 
 class Case:
@@ -179,8 +204,7 @@ class Case:
         fastest = np.pi / dt if dt else np.inf
         w = w[(w > 1e-6) & (w < 0.3 * fastest)]
         centre = float(np.median(w)) if len(w) else 0.03 * fastest if dt else 1.0
-        solved = bool(variant.diagram.flatten_like(variant.point).hybrid) if dt else False
-        lowest = max(centre / 10, 2 * np.pi / (dt * (SOLVED if solved else SAMPLES))) if dt else centre / 10
+        lowest = max(centre / 10, 2 * np.pi / (dt * most_samples(variant))) if dt else centre / 10
         source = variant.diagram.names.get(wire)
         path = wire if source is None else f"{source.block}.{source.port}"
         value = np.ravel(variant.point.values.get(path, 0.0))

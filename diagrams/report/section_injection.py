@@ -12,7 +12,7 @@ from ..frequency import Confirmation, Number
 from ..linearization import Linearization
 from ..measure import FrequencyResponse, frequency_response
 from ..report_writing import Section, Table, Texts
-from .case import Case
+from .case import Case, InjectionPlan
 from .stability import Stability
 from .variant import Implementation, Variant
 
@@ -32,6 +32,7 @@ def injected(case: Case) -> Section | None:
     text: list[str] = []
     plots = []
     taken, skipped = 0, list[str]()
+    shortened: InjectionPlan | None = None
     for key, wire in case.loop_wires().items():
         if taken == WIRES:
             break
@@ -49,7 +50,10 @@ def injected(case: Case) -> Section | None:
             try:
                 case.tell(f"injection at {wire}, {v.title}")
                 L = v.loop(wire)  # a wire without a loop at one rate needs no measurement
-                found, model = _measured(case, v, wire)
+                plan = case.excitation(v, wire)
+                found, model = _measured(plan, wire), plan.variant.model
+                if plan.left_out:
+                    shortened = plan
                 deviation = found.deviation(model, "L")
             except PeriodicLoopError:
                 refused = True
@@ -90,6 +94,9 @@ def injected(case: Case) -> Section | None:
         text.append(TEXTS.line("skipped", wires=", ".join(skipped), many=WIRES))
     if not rows:
         return Section("injection", "Injection check", tuple(text)) if text else None
+    if shortened is not None:
+        count, samples = len(shortened.frequencies), shortened.samples
+        text = [TEXTS.line("shortened", count=count, every=count + shortened.left_out, samples=samples), *text]
     text = [*TEXTS.paragraphs("measurement"), *text]
     columns = ("wire", "variant", "frequencies", "largest deviation", "uncertainty", f"within {CONFIRMED:g}")
     table = Table("Injected against linearized", columns, tuple(rows))
@@ -109,12 +116,11 @@ def _moving(v: Variant) -> dict[str, Any]:
     return {"state": v.model.states[most], "change": moves[most], "period": bool(v.model.dt)}
 
 
-def _measured(case: Case, v: Variant, wire: str) -> tuple[FrequencyResponse, Linearization]:
-    excited, frequencies, amplitude = case.excitation(v, wire)
-    found = frequency_response(
-        excited.diagram, wire, frequencies, amplitude=amplitude, at=excited.point.t, compile=True
+def _measured(plan: InjectionPlan, wire: str) -> FrequencyResponse:
+    excited = plan.variant
+    return frequency_response(
+        excited.diagram, wire, plan.frequencies, amplitude=plan.amplitude, at=excited.point.t, compile=True
     )
-    return found, excited.model
 
 
 def _curve(title: str, found: FrequencyResponse, L: Linearization) -> figures.Measured:

@@ -9,7 +9,7 @@ from loopwright.diagrams.measure.measurement import Measurement, measure_part
 from loopwright.diagrams.measure.waveforms import SAMPLES, plan_signal
 from loopwright.diagrams.report import Case
 from loopwright.diagrams.report.case import SAMPLES as LONGEST
-from loopwright.diagrams.report.case import SOLVED
+from loopwright.diagrams.report.case import SOLVED, InjectionPlan
 
 
 class Windows:
@@ -103,3 +103,13 @@ def test_a_loop_as_fast_as_its_samples_is_measured_around_its_poles():
     frequencies = case.excitation(variant, next(iter(case.loop_wires().values()))).frequencies
     pole = -np.log(1 - 0.01 / 0.05) / 0.01
     assert frequencies[0] == pytest.approx(pole / 10, rel=1e-6)
+
+
+def test_frequencies_that_are_left_out_are_counted():
+    variant = Case(sampled(0.05, 0.01, True)).variants["sampled_d0"]
+    plan = InjectionPlan(variant, np.array([0.1, 1.0, 2 * np.pi / (400 * 0.01), 10.0, 100.0]), 1e-4)
+    kept = plan.shortened(400)
+    assert kept.frequencies.tolist() == plan.frequencies[2:].tolist()
+    assert (kept.left_out, kept.samples) == (2, 400)
+    assert plan.shortened(10**6).left_out == 0
+    assert plan.shortened(1).frequencies.tolist() == [100.0]  # the highest one stays

@@ -1,0 +1,69 @@
+"""Between ticks a linear plant's derivative is a matrix exponential wherever it is, and no integration."""
+
+import numpy as np
+import pytest
+import scipy.integrate
+from scipy.linalg import expm
+
+from loopwright.blocks import Block, Constant, Gain, Input, Output, State, TransferFunction
+from loopwright.diagrams import Diagram, subsystem
+
+T = 0.05
+
+
+def loop(plant):
+    @subsystem(sample_time=T, name="controller")
+    def controller(y):
+        return Gain(gain=-3.0, name="k")(y - Constant(value=1.0, name="r")()).named("u")
+
+    return Diagram("loop", plant(controller(plant.y)))
+
+
+def test_a_linear_plant_that_moves_is_no_integration(monkeypatch):
+    monkeypatch.setattr(scipy.integrate, "solve_ivp", lambda *_, **__: pytest.fail("integrated"))
+    diagram = loop(TransferFunction(numerator=(1.0,), denominator=(0.02, 0.3, 1.0), name="plant"))
+    model = diagram.linearize()
+    assert np.max(np.abs(model.affine)) > 1e-3  # it is not at rest
+    A, B, C = np.array([[-15.0, -50.0], [1.0, 0.0]]), np.array([[1.0], [0.0]]), np.array([[0.0, 50.0]])
+    held = expm(np.block([[A, B], [np.zeros((1, 3))]]) * T)
+    closed = held[:2, :2] - 3.0 * held[:2, 2:] @ C
+    assert np.sort_complex(model.poles[np.abs(model.poles) > 1e-12]) == pytest.approx(
+        np.sort_complex(np.linalg.eigvals(closed)), rel=1e-12
+    )
+
+
+def test_the_slopes_of_a_moving_linear_plant_are_exact(monkeypatch):
+    """One time constant τ under a sampled gain k: z = e − k (1 − e), e = exp(−T/τ)."""
+    monkeypatch.setattr(scipy.integrate, "solve_ivp", lambda *_, **__: pytest.fail("integrated"))
+    tau = 0.3
+    diagram = loop(TransferFunction(numerator=(1.0,), denominator=(tau, 1.0), name="plant"))
+    found = diagram.sensitivity("u", ["plant.denominator[1]"])
+    e = np.exp(-T / tau)
+    high = (1.0 + e) / (3.0 * (1.0 - e))  # largest factor of k: z = −1
+    assert found["plant.denominator[1]", "gain_margin_high"].number.value == pytest.approx(high, rel=1e-9)
+    by_e = 2.0 / (3.0 * (1.0 - e) ** 2)
+    slope = by_e * e * T / tau**2
+    assert found["plant.denominator[1]", "gain_margin_high"].slope.value == pytest.approx(slope, rel=1e-8)
+
+
+class Tank(Block):
+    """A tank: what flows out goes with the square of the level."""
+
+    u = Input(shape=())
+    y = Output(shape=())
+    level = State(start=0.0)
+
+    def derivative(self, t, x, u):
+        return u.u - x.level**2
+
+    def output(self, t, x, u):
+        return x.level
+
+
+def test_a_plant_that_is_not_linear_is_integrated(monkeypatch):
+    calls = []
+    plain = scipy.integrate.solve_ivp
+    monkeypatch.setattr(scipy.integrate, "solve_ivp", lambda *a, **k: calls.append(1) or plain(*a, **k))
+    model = loop(Tank(name="plant")).linearize()
+    assert calls
+    assert np.max(np.abs(model.affine)) == pytest.approx(np.sqrt(3.0) * np.tanh(np.sqrt(3.0) * T), rel=1e-9)
