@@ -3,7 +3,7 @@
 from ...blocks.core import Layout
 from .announced import Announcer, Times, announcers
 from .clock_sets import is_exact, kinds_of
-from .clocks import EVERY, NONE, ClockSets, TickPattern, bits_of
+from .clocks import EVERY, NONE, ClockSets, TickPattern, bits_of, ticks_after
 from .evaluation import INDICATORS, JUMP, Apart, Instant, evaluate, no_evaluator
 from .flat_diagram import EXACT_LOOP, FlatDiagram
 from .flatten import renumber
@@ -71,5 +71,6 @@ __all__ = [
     "rates",
     "renumber",
     "takes_any_step",
+    "ticks_after",
     "trace_schedule",
 ]

@@ -21,6 +21,8 @@ class TickPattern:
 
     def among(self, ticks: np.ndarray) -> np.ndarray:
         """Return at which of some ticks it acts."""
+        if self.every == 1:
+            return np.asarray(ticks >= self.offset)
         return np.asarray((ticks >= self.offset) & ((ticks - self.offset) % self.every == 0))
 
     def after(self, k: int) -> int:
@@ -32,6 +34,33 @@ NONE: frozenset[TickPattern] = frozenset()
 """The clocks that act between two ticks."""
 EVERY = TickPattern()
 """The clock that acts at every tick."""
+
+
+def ticks_after(patterns: Sequence[TickPattern], k: int, last: int, count: int) -> np.ndarray:
+    """Return the first ``count`` ticks of some patterns after tick ``k``, up to ``last``, which ends them.
+
+    Parameters
+    ----------
+    patterns : sequence of TickPattern
+        The patterns; at least one.
+    k, last : int
+        Ticks.
+    count : int
+        Number of ticks, at least 1.
+
+    Returns
+    -------
+    ndarray, shape (n,), of int64
+        Ticks in order; empty if ``k`` is ``last``.
+    """
+    first = [pattern.after(k) for pattern in patterns]
+    every = min(pattern.every for pattern in patterns)
+    beyond = min(last, min(first) + count * every)  # the fastest has as many by then, or another one begins earlier
+    found = [np.arange(a, beyond, p.every, dtype=np.int64) for a, p in zip(first, patterns, strict=True)]
+    ticks = found[0] if len(found) == 1 else np.unique(np.concatenate(found))
+    if beyond == last and k < last and len(ticks) < count:
+        return np.append(ticks, last)
+    return ticks[:count]
 
 
 def in_order(clocks: frozenset[TickPattern] | set[TickPattern]) -> tuple[TickPattern, ...]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import islice
+from collections.abc import Callable, Mapping, Sequence
 from time import perf_counter
 from typing import Any
 
@@ -23,7 +22,7 @@ from ..compiled import (
     find_hybrid_obstacle,
 )
 from ..coupling import Plant, PlantSteps
-from ..flat import EVERY, NONE, ClockSets, is_exact, kinds_of
+from ..flat import EVERY, NONE, ClockSets, is_exact, kinds_of, ticks_after
 from ..results import Occurrence, Recorder
 from ..solvers import AutoSolver
 from .compiled_hand_over import (
@@ -144,9 +143,9 @@ class HybridTicks:
         arrived: Callable[[int], bool],
         progress: Callable[[float], Any],
     ) -> float | None:
-        visited, rest = self._visited(k, last), np.zeros(0, dtype=np.int64)
+        visited, rest = (EVERY,) if self._sampled else self._clocks, np.zeros(0, dtype=np.int64)
         t = self._time_of(k)
-        while rest.size or (rest := np.fromiter(islice(visited, self._chunk), dtype=np.int64)).size:
+        while rest.size or (rest := ticks_after(visited, k, last, self._chunk)).size:
             rows = recorder.room(t)
             loop.skip = recorder.skip
             started = perf_counter()
@@ -192,14 +191,6 @@ class HybridTicks:
     def _time_of(self, k: int) -> float:
         base = self._flat.base
         return k * base.numerator / base.denominator
-
-    def _visited(self, k: int, last: int) -> Iterator[int]:
-        if self._sampled:
-            yield from range(k + 1, last + 1)
-            return
-        while k < last:
-            k = min([*(clock.after(k) for clock in self._clocks), last])
-            yield k
 
     def _span(self, k: int, ticks: np.ndarray, last: int, t: float) -> tuple[Span, np.ndarray]:
         """Return the ticks of a call, from tick ``k`` on, where the states have come to t; and which are landed on."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -27,7 +26,7 @@ from ..compiled import (
     find_obstacle,
 )
 from ..coupling import Plant
-from ..flat import EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of
+from ..flat import EVERY, EXACT_LOOP, ClockSets, FlatDiagram, TickPattern, is_exact, kinds_of, ticks_after
 from ..results import Recorder
 from .algebraic_loops import HALVINGS, ITERATIONS, ROUNDING, SINGULAR, TOLERANCE
 from .diagnosis import forget_trials
@@ -37,7 +36,7 @@ FIRST, LARGEST_CHUNK = 64, 2**20
 """Ticks of a chunk: the first one, and at most."""
 WISHED = 0.05
 """Seconds that a chunk takes, half or double; Ctrl-C and the progress bar have their turn after it."""
-_WINDOW = 2**17
+_WINDOW = 2**14
 """Ticks whose times are computed at a time, at most."""
 _RK4 = 1  # the integrator of exported FMUs that is compiled into a fused loop
 CLOCKS = 16
@@ -181,17 +180,17 @@ class CompiledTicks:
     def _windows(self, k: int, last: int) -> Iterator[_Window]:
         """Yield the ticks after tick ``k`` up to ``last``; the first ones are kept for the next run."""
         if self._first is None or (self._first.before, self._last) != (k, last):
-            self._first, self._last = self._window(k, self._flat.ticks(k, last, every=self._every)), last
+            self._first, self._last = self._window(k, last), last
         yield self._first
         k = int(self._first.ticks[-1])
-        visited = self._flat.ticks(k, last, every=self._every)
         while k < last:
-            window = self._window(k, visited)
+            window = self._window(k, last)
             yield window
             k = int(window.ticks[-1])
 
-    def _window(self, k: int, visited: Iterator[int]) -> _Window:
-        base, ticks = self._flat.base, np.fromiter(islice(visited, _WINDOW), dtype=np.int64)
+    def _window(self, k: int, last: int) -> _Window:
+        base, visited = self._flat.base, (EVERY,) if self._every else self._flat.visited
+        ticks = ticks_after(visited, k, last, _WINDOW)
         n, d, ends = base.numerator, base.denominator, np.concatenate([[k], ticks])
         kinds = self._kinds.at(ticks)
         unknown = np.flatnonzero(kinds < 0)
