@@ -25,7 +25,7 @@ TOP, BOTTOM = 18.0 / 25.4 * 72, 18.0 / 25.4 * 72
 MARK = 2.0
 """Height of a mark in points; marks stand in the text's left edge ahead of each figure and table."""
 
-_PLACE = re.compile(r'<figure id="[^"]*"[^>]*>(?:\s*<div class="scroll">\s*<svg)?|<div class="table( long)?">')
+_PLACE = re.compile(r"""<figure\sid="[^"]*"[^>]*>(?:\s*<div\sclass="scroll">\s*<svg)?|<div\sclass="table(\slong)?">""")
 _WIDTH = re.compile(r'<svg[^>]*?\bwidth="([\d.]+)(pt|px)?"')
 _TEXT_WIDTH = (210 - 37) / 25.4 * 96
 """Width of the text of an A4 page in pixels."""
